@@ -1,0 +1,14 @@
+//! Writes the place of libtorch into the run path of every binary, test and benchmark of the package that names this
+//! file as its build script, so that none of them needs LD_LIBRARY_PATH.
+
+use std::env;
+
+fn main() {
+    println!("cargo:rerun-if-changed=build.rs");
+    // Set by the build script of torch-sys, however it was told where libtorch is.
+    let Ok(lib_dir) = env::var("DEP_TCH_LIBTORCH_LIB") else {
+        return;
+    };
+    let lib_dir = std::path::absolute(&lib_dir).map_or(lib_dir, |path| path.display().to_string());
+    println!("cargo:rustc-link-arg=-Wl,-rpath,{lib_dir}");
+}

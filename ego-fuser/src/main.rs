@@ -1,0 +1,3 @@
+//! Command line of `ego-fuser`.
+
+fn main() {}

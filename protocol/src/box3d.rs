@@ -1,0 +1,80 @@
+//! Oriented boxes and what a detector says of them.
+
+use nalgebra::{Isometry3, Point3, Vector3};
+use serde::{Deserialize, Serialize};
+
+use crate::CavId;
+
+/// An upright box: centre, full sizes, heading.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Box3d {
+    /// Centre x, y, z in metres.
+    pub center_m: [f64; 3],
+    /// Full length (along the heading), width and height in metres.
+    pub size_m: [f64; 3],
+    /// Turn about z from x towards y, radians.
+    pub heading_rad: f64,
+}
+
+impl Box3d {
+    /// Corners in metres: bottom face `(+l, -w) (+l, +w) (-l, +w) (-l, -w)`, then the top face in the same order.
+    #[must_use]
+    pub fn corners(&self) -> [[f64; 3]; 8] {
+        const SIGNS: [(f64, f64); 4] = [(1.0, -1.0), (1.0, 1.0), (-1.0, 1.0), (-1.0, -1.0)];
+        let (sin, cos) = self.heading_rad.sin_cos();
+        let [x, y, z] = self.center_m;
+        let [half_l, half_w, half_h] = self.size_m.map(|size| size / 2.0);
+        std::array::from_fn(|corner| {
+            let (sign_l, sign_w) = SIGNS[corner % 4];
+            let (l, w) = (sign_l * half_l, sign_w * half_w);
+            let h = if corner < 4 { -half_h } else { half_h };
+            [x + cos * l - sin * w, y + sin * l + cos * w, z + h]
+        })
+    }
+
+    /// The box in another frame. Roll and pitch that the transform adds are dropped, as boxes stay upright.
+    #[must_use]
+    pub fn transformed(&self, target_from_source: &Isometry3<f64>) -> Self {
+        let center = target_from_source * Point3::from(self.center_m);
+        let (sin, cos) = self.heading_rad.sin_cos();
+        let forward = target_from_source * Vector3::new(cos, sin, 0.0);
+        Self { center_m: center.into(), heading_rad: forward.y.atan2(forward.x), ..*self }
+    }
+}
+
+/// A box that a detector reports.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Detection {
+    /// Where, in the ego's LiDAR frame.
+    #[serde(rename = "box")]
+    pub box3d: Box3d,
+    /// Confidence, 0..1.
+    pub score: f32,
+    /// The CAV that saw it, where one alone did (late fusion).
+    pub source: Option<CavId>,
+}
+
+#[cfg(test)]
+mod tests {
+    use std::f64::consts::FRAC_PI_2;
+
+    use super::*;
+
+    const CAR: Box3d = Box3d { center_m: [10.0, 2.0, 0.5], size_m: [4.0, 2.0, 1.5], heading_rad: 0.0 };
+
+    #[test]
+    fn corners_start_at_the_front_right() {
+        let corners = CAR.corners();
+        assert_eq!(corners[0], [12.0, 1.0, -0.25]);
+        assert_eq!(corners[6], [8.0, 3.0, 1.25]);
+    }
+
+    #[test]
+    fn a_quarter_turn_moves_and_turns_the_box() {
+        let turn = Isometry3::rotation(Vector3::z() * FRAC_PI_2);
+        let turned = CAR.transformed(&turn);
+        assert!((turned.center_m[0] + 2.0).abs() < 1e-12 && (turned.center_m[1] - 10.0).abs() < 1e-12);
+        assert!((turned.heading_rad - FRAC_PI_2).abs() < 1e-12);
+        assert_eq!(turned.size_m, CAR.size_m);
+    }
+}

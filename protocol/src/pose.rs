@@ -1,0 +1,181 @@
+//! Where a CAV is: SE(3) as translation and unit quaternion.
+
+use nalgebra::{Isometry3, Matrix3, Matrix4, Quaternion, Rotation3, Translation3, UnitQuaternion};
+use serde::{Deserialize, Serialize};
+
+/// Positions farther from the origin than this are refused as outside data, metres.
+const MAX_ABS_M: f64 = 1e7;
+/// How far a quaternion's norm, or a matrix from orthonormality, may be off.
+const UNIT_TOLERANCE: f64 = 1e-4;
+
+/// Why numbers from outside are not a pose.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum PoseError {
+    /// A component is NaN, infinite or absurdly large.
+    #[error("pose component {0} is not a finite number within {MAX_ABS_M:e}")]
+    NotFinite(f64),
+    /// The quaternion is not of length one.
+    #[error("pose quaternion has length {0}, not 1")]
+    NotUnit(f64),
+    /// The rotation part of a matrix is not orthonormal or mirrors.
+    #[error(
+        "pose matrix is not a rotation: largest deviation from orthonormality {deviation:.2e}, determinant {determinant:.6}"
+    )]
+    NotRotation {
+        /// Largest absolute entry of `R * R^T - I`.
+        deviation: f64,
+        /// Determinant of the rotation part.
+        determinant: f64,
+    },
+    /// The last row of a 4x4 matrix is not `0 0 0 1`.
+    #[error("pose matrix ends in the row {0:?}, not 0 0 0 1")]
+    LastRow([f64; 4]),
+}
+
+/// A rigid transform, target-from-source: metres and a unit quaternion.
+///
+/// Owned here rather than taken from `nalgebra`, so that another crate's layout never defines our bytes.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Pose {
+    /// Translation x, y, z in metres.
+    pub translation_m: [f64; 3],
+    /// Rotation as quaternion w, x, y, z.
+    pub rotation_wxyz: [f64; 4],
+}
+
+impl Pose {
+    /// The transform that changes nothing.
+    pub const IDENTITY: Self = Self { translation_m: [0.0; 3], rotation_wxyz: [1.0, 0.0, 0.0, 0.0] };
+
+    /// A planar pose: position, height and heading.
+    #[must_use]
+    pub fn from_xyz_yaw(translation_m: [f64; 3], yaw_rad: f64) -> Self {
+        let (sin, cos) = (yaw_rad / 2.0).sin_cos();
+        Self { translation_m, rotation_wxyz: [cos, 0.0, 0.0, sin] }
+    }
+
+    /// Reads a row-major 4x4 matrix from outside.
+    ///
+    /// # Errors
+    /// [`PoseError`] when an entry is not finite, the last row is not `0 0 0 1` or the rotation is off orthonormal by
+    /// more than 1e-4.
+    pub fn from_matrix(matrix: &Matrix4<f64>) -> Result<Self, PoseError> {
+        for &entry in matrix.iter() {
+            check_bounded(entry)?;
+        }
+        let last: [f64; 4] = std::array::from_fn(|column| matrix[(3, column)]);
+        if last != [0.0, 0.0, 0.0, 1.0] {
+            return Err(PoseError::LastRow(last));
+        }
+        let rotation: Matrix3<f64> = matrix.fixed_view::<3, 3>(0, 0).into();
+        let deviation = (rotation * rotation.transpose() - Matrix3::identity()).amax();
+        let determinant = rotation.determinant();
+        if deviation > UNIT_TOLERANCE || determinant < 0.0 {
+            return Err(PoseError::NotRotation { deviation, determinant });
+        }
+        let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(rotation));
+        let translation = Translation3::new(matrix[(0, 3)], matrix[(1, 3)], matrix[(2, 3)]);
+        Ok(Isometry3::from_parts(translation, rotation).into())
+    }
+
+    /// Checks a pose that came from outside.
+    ///
+    /// # Errors
+    /// [`PoseError`] when a number is not finite, beyond 10,000 km, or the quaternion is not of length one.
+    pub fn validate(&self) -> Result<(), PoseError> {
+        for &component in self.translation_m.iter().chain(&self.rotation_wxyz) {
+            check_bounded(component)?;
+        }
+        let norm = self.rotation_wxyz.iter().map(|q| q * q).sum::<f64>().sqrt();
+        if (norm - 1.0).abs() > UNIT_TOLERANCE { Err(PoseError::NotUnit(norm)) } else { Ok(()) }
+    }
+
+    /// Heading: the angle from the target's x axis to the source's, seen from above, in radians.
+    #[must_use]
+    pub fn yaw_rad(&self) -> f64 {
+        let [w, x, y, z] = self.rotation_wxyz;
+        (2.0 * (w * z + x * y)).atan2(1.0 - 2.0 * (y * y + z * z))
+    }
+
+    /// The transform as `nalgebra` computes with it.
+    #[must_use]
+    pub fn isometry(&self) -> Isometry3<f64> {
+        let [w, x, y, z] = self.rotation_wxyz;
+        let [tx, ty, tz] = self.translation_m;
+        Isometry3::from_parts(Translation3::new(tx, ty, tz), UnitQuaternion::new_normalize(Quaternion::new(w, x, y, z)))
+    }
+
+    /// `target_from_source` from two poses in one world: `self` is `world_from_target`.
+    #[must_use]
+    pub fn from_world(&self, world_from_source: &Self) -> Self {
+        self.isometry().inv_mul(&world_from_source.isometry()).into()
+    }
+}
+
+impl From<Isometry3<f64>> for Pose {
+    fn from(isometry: Isometry3<f64>) -> Self {
+        let q = isometry.rotation.quaternion();
+        Self { translation_m: isometry.translation.vector.into(), rotation_wxyz: [q.w, q.i, q.j, q.k] }
+    }
+}
+
+fn check_bounded(value: f64) -> Result<(), PoseError> {
+    if value.abs() <= MAX_ABS_M { Ok(()) } else { Err(PoseError::NotFinite(value)) }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::f64::consts::{FRAC_PI_2, PI};
+
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn any_pose() -> impl Strategy<Value = Pose> {
+        (prop::array::uniform3(-1e4..1e4), -PI..PI, -1.5..1.5, -PI..PI).prop_map(|(t, roll, pitch, yaw)| {
+            Isometry3::from_parts(Translation3::from(t), UnitQuaternion::from_euler_angles(roll, pitch, yaw)).into()
+        })
+    }
+
+    proptest! {
+        #[test]
+        fn matrix_round_trip(pose in any_pose()) {
+            let back = Pose::from_matrix(&pose.isometry().to_homogeneous()).unwrap();
+            let error = pose.isometry().inv_mul(&back.isometry());
+            prop_assert!(error.translation.vector.norm() < 1e-6 && error.rotation.angle() < 1e-6);
+        }
+
+        #[test]
+        fn from_world_of_itself_is_identity(pose in any_pose()) {
+            let identity = pose.from_world(&pose).isometry();
+            prop_assert!(identity.translation.vector.norm() < 1e-8 && identity.rotation.angle() < 1e-7);
+        }
+    }
+
+    #[test]
+    fn a_quarter_turn_takes_forward_to_left() {
+        let pose = Pose::from_xyz_yaw([1.0, 2.0, 3.0], FRAC_PI_2);
+        let moved = pose.isometry() * nalgebra::Point3::new(1.0, 0.0, 0.0);
+        assert!((moved - nalgebra::Point3::new(1.0, 3.0, 3.0)).norm() < 1e-12);
+        assert!((pose.yaw_rad() - FRAC_PI_2).abs() < 1e-12);
+    }
+
+    #[test]
+    fn refuses_what_is_no_pose() {
+        let with = |index: usize, value: f64| {
+            let mut pose = Pose::IDENTITY;
+            if index < 3 {
+                pose.translation_m[index] = value
+            } else {
+                pose.rotation_wxyz[index - 3] = value
+            }
+            pose.validate()
+        };
+        for value in [f64::NAN, f64::INFINITY, 1e30] {
+            assert!(matches!(with(1, value), Err(PoseError::NotFinite(_))));
+        }
+        assert!(matches!(with(3, 0.5), Err(PoseError::NotUnit(_))));
+        let mirror = Matrix4::from_diagonal(&[1.0, -1.0, 1.0, 1.0].into());
+        assert!(matches!(Pose::from_matrix(&mirror), Err(PoseError::NotRotation { .. })));
+    }
+}

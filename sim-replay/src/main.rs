@@ -1,0 +1,3 @@
+//! Command line of `sim-replay`.
+
+fn main() {}
