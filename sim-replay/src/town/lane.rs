@@ -1,0 +1,178 @@
+//! Lanes and how they hang together.
+
+use std::f64::consts::PI;
+
+/// A lane by its place in [`LaneGraph::lanes`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct LaneId(pub u32);
+
+/// A junction, numbered from 0 without gaps.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub struct JunctionId(pub u32);
+
+/// Which way a lane leads through a junction.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+pub enum Turn {
+    /// Ahead, and every lane outside junctions.
+    Straight,
+    /// More than 30 degrees to the left.
+    Left,
+    /// More than 30 degrees to the right.
+    Right,
+}
+
+/// All driving lanes of a town.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct LaneGraph {
+    /// The lanes; `lanes[i].id == LaneId(i)`.
+    pub lanes: Vec<Lane>,
+}
+
+/// A stretch of driving lane without branches inside.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Lane {
+    /// Its own place in the graph.
+    pub id: LaneId,
+    /// Middle of the lane, in driving direction, at even steps of about 1 m (at least two points), metres in the world frame.
+    pub centerline: Vec<[f64; 3]>,
+    /// Length of the centre line in the plane, metres.
+    pub length_m: f64,
+    /// Width at each point of the centre line, metres.
+    pub widths_m: Vec<f64>,
+    /// Median width, metres.
+    pub width_m: f64,
+    /// Speed limit, metres per second.
+    pub speed_limit_mps: f64,
+    /// Lanes that begin where this one ends.
+    pub successors: Vec<LaneId>,
+    /// Lanes that end where this one begins.
+    pub predecessors: Vec<LaneId>,
+    /// Neighbour to the left that leads the same way.
+    pub left: Option<LaneId>,
+    /// Neighbour to the right that leads the same way.
+    pub right: Option<LaneId>,
+    /// Whether it lies inside a junction.
+    pub in_junction: bool,
+    /// The junction it lies in.
+    pub junction: Option<JunctionId>,
+    /// Which way it leads through its junction.
+    pub turn: Turn,
+    /// Lanes of the same junction that cross it or end where it ends (not those that begin together with it); give way
+    /// by these.
+    pub conflicts: Vec<LaneId>,
+}
+
+impl Lane {
+    /// A lane of one width outside junctions, not yet linked. `centerline` holds at least two points.
+    #[must_use]
+    pub fn new(id: LaneId, centerline: Vec<[f64; 3]>, width_m: f64, speed_limit_mps: f64) -> Self {
+        let length_m = centerline.windows(2).map(|pair| (pair[1][0] - pair[0][0]).hypot(pair[1][1] - pair[0][1])).sum();
+        let widths_m = vec![width_m; centerline.len()];
+        Self {
+            id,
+            centerline,
+            length_m,
+            widths_m,
+            width_m,
+            speed_limit_mps,
+            successors: Vec::new(),
+            predecessors: Vec::new(),
+            left: None,
+            right: None,
+            in_junction: false,
+            junction: None,
+            turn: Turn::Straight,
+            conflicts: Vec::new(),
+        }
+    }
+
+    /// Place on the centre line at `s_m` metres from its start (clamped to the lane), and the heading there in radians.
+    #[must_use]
+    pub fn at(&self, s_m: f64) -> ([f64; 3], f64) {
+        let last = self.centerline.len() - 1;
+        let step = (s_m / self.length_m * last as f64).clamp(0.0, last as f64);
+        let index = (step as usize).min(last - 1);
+        let share = step - index as f64;
+        let (from, to) = (self.centerline[index], self.centerline[index + 1]);
+        let point = std::array::from_fn(|axis| from[axis] + share * (to[axis] - from[axis]));
+        // Headings belong to the middles of the steps; between them they turn evenly, so that a vehicle does not jerk.
+        let neighbour = if share < 0.5 { index.saturating_sub(1) } else { (index + 1).min(last - 1) };
+        let own = self.step_heading_rad(index);
+        let turn = wrap_angle(self.step_heading_rad(neighbour) - own);
+        (point, wrap_angle(own + turn * (share - 0.5).abs()))
+    }
+
+    /// Heading at the start, radians.
+    #[must_use]
+    pub fn start_heading_rad(&self) -> f64 {
+        self.at(0.0).1
+    }
+
+    /// Heading at the end, radians.
+    #[must_use]
+    pub fn end_heading_rad(&self) -> f64 {
+        self.at(self.length_m).1
+    }
+
+    fn step_heading_rad(&self, index: usize) -> f64 {
+        let (from, to) = (self.centerline[index], self.centerline[index + 1]);
+        (to[1] - from[1]).atan2(to[0] - from[0])
+    }
+}
+
+impl LaneGraph {
+    /// A graph of `lanes`, whose ids are their places.
+    #[must_use]
+    pub fn new(lanes: Vec<Lane>) -> Self {
+        debug_assert!(lanes.iter().enumerate().all(|(index, lane)| lane.id.0 as usize == index));
+        Self { lanes }
+    }
+
+    /// The lane of an id that this graph gave out.
+    #[must_use]
+    pub fn lane(&self, id: LaneId) -> &Lane {
+        &self.lanes[id.0 as usize]
+    }
+
+    /// Length of all lanes together, metres.
+    #[must_use]
+    pub fn total_length_m(&self) -> f64 {
+        self.lanes.iter().map(|lane| lane.length_m).sum()
+    }
+}
+
+/// Takes an angle into (-pi, pi].
+#[must_use]
+pub(crate) fn wrap_angle(angle_rad: f64) -> f64 {
+    let wrapped = angle_rad.rem_euclid(2.0 * PI);
+    if wrapped > PI { wrapped - 2.0 * PI } else { wrapped }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn position_and_heading_on_a_circle() {
+        let radius = 20.0;
+        let points: Vec<_> = (0..=31).map(|i| f64::from(i) / 31.0 * PI / 2.0).collect();
+        let centerline = points.iter().map(|a| [radius * a.sin(), radius * (1.0 - a.cos()), 0.0]).collect();
+        let lane = Lane::new(LaneId(0), centerline, 3.5, 10.0);
+        assert!((lane.length_m - radius * PI / 2.0).abs() < 0.01);
+        for share in [0.0, 0.21, 0.5, 0.77, 1.0] {
+            let angle = share * PI / 2.0;
+            let (point, heading) = lane.at(share * lane.length_m);
+            assert!((point[0] - radius * angle.sin()).abs() < 0.02, "{share}: {point:?}");
+            assert!((point[1] - radius * (1.0 - angle.cos())).abs() < 0.02);
+            // Half a step is missing at both ends.
+            assert!((heading - angle).abs() < 0.03, "{share}: {heading}");
+        }
+    }
+
+    #[test]
+    fn angles_wrap_into_the_half_open_circle() {
+        assert!((wrap_angle(3.0 * PI) - PI).abs() < 1e-12);
+        assert!((wrap_angle(-PI) - PI).abs() < 1e-12);
+        assert!((wrap_angle(0.5 - 4.0 * PI) - 0.5).abs() < 1e-12);
+    }
+}

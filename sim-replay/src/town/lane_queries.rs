@@ -1,0 +1,199 @@
+//! Which lane is near, and what lies ahead on it.
+
+use super::lane::{Lane, LaneGraph, LaneId, wrap_angle};
+
+/// Edge of a cell of the index, metres.
+const CELL_M: f64 = 8.0;
+
+/// A place on a lane.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LanePosition {
+    /// The lane.
+    pub lane: LaneId,
+    /// Distance from the lane's start along its centre line, metres.
+    pub s_m: f64,
+    /// Distance from the centre line, positive to the left, metres.
+    pub offset_m: f64,
+}
+
+/// A grid over the points of all centre lines, for the nearest lane in constant time.
+#[derive(Debug, Clone)]
+pub struct LaneIndex {
+    origin_m: [f64; 2],
+    columns: usize,
+    rows: usize,
+    /// First entry of each cell in `entries`, and the end of the last.
+    starts: Vec<u32>,
+    /// Lane and index of a point on its centre line, by cell.
+    entries: Vec<(LaneId, u32)>,
+}
+
+impl LaneIndex {
+    /// Indexes every centre line of `graph`.
+    #[must_use]
+    pub fn new(graph: &LaneGraph) -> Self {
+        let points = || graph.lanes.iter().flat_map(|lane| lane.centerline.iter());
+        let low = points().fold([f64::INFINITY; 2], |low, p| [low[0].min(p[0]), low[1].min(p[1])]);
+        let high = points().fold([f64::NEG_INFINITY; 2], |high, p| [high[0].max(p[0]), high[1].max(p[1])]);
+        let cells = |axis: usize| ((high[axis] - low[axis]).max(0.0) / CELL_M) as usize + 1;
+        let mut index =
+            Self { origin_m: low, columns: cells(0), rows: cells(1), starts: Vec::new(), entries: Vec::new() };
+        let mut tagged: Vec<(usize, LaneId, u32)> = Vec::new();
+        for lane in &graph.lanes {
+            for (place, point) in lane.centerline.iter().enumerate() {
+                let [column, row] = index.cell(point[0], point[1]);
+                tagged.push((row as usize * index.columns + column as usize, lane.id, place as u32));
+            }
+        }
+        tagged.sort_unstable();
+        let mut filled = 0;
+        for cell in 0..=index.columns * index.rows {
+            while filled < tagged.len() && tagged[filled].0 < cell {
+                filled += 1;
+            }
+            index.starts.push(filled as u32);
+        }
+        index.entries = tagged.into_iter().map(|(_, lane, place)| (lane, place)).collect();
+        index
+    }
+
+    /// The lane nearest to `x`, `y` within `radius_m`; with `heading_rad`, only lanes that lead the same way within
+    /// 60 degrees; with `z_m`, only where the lane is within 3 m of that height (roads pass above each other).
+    #[must_use]
+    pub fn nearest(
+        &self,
+        graph: &LaneGraph,
+        [x, y]: [f64; 2],
+        radius_m: f64,
+        heading_rad: Option<f64>,
+        z_m: Option<f64>,
+    ) -> Option<LanePosition> {
+        let mut best: Option<(f64, LanePosition)> = None;
+        self.visit(x, y, radius_m, |id, place| {
+            let lane = graph.lane(id);
+            if z_m.is_some_and(|z| (lane.centerline[place][2] - z).abs() > 3.0) {
+                return;
+            }
+            let position = project_near(lane, place, x, y);
+            let (point, heading) = lane.at(position.s_m);
+            if heading_rad.is_some_and(|wanted| wrap_angle(wanted - heading).abs() > 60f64.to_radians()) {
+                return;
+            }
+            let distance = (x - point[0]).hypot(y - point[1]);
+            if distance <= radius_m && best.is_none_or(|(least, _)| distance < least) {
+                best = Some((distance, position));
+            }
+        });
+        best.map(|(_, position)| position)
+    }
+
+    /// Calls `found` with each lane point in the cells within `radius_m` of `x`, `y`.
+    fn visit(&self, x: f64, y: f64, radius_m: f64, mut found: impl FnMut(LaneId, usize)) {
+        let low = self.cell(x - radius_m, y - radius_m);
+        let high = self.cell(x + radius_m, y + radius_m);
+        let clamp = |value: i64, count: usize| value.clamp(0, count as i64 - 1) as usize;
+        if self.entries.is_empty() || high[0] < 0 || high[1] < 0 {
+            return;
+        }
+        if low[0] >= self.columns as i64 || low[1] >= self.rows as i64 {
+            return;
+        }
+        for row in clamp(low[1], self.rows)..=clamp(high[1], self.rows) {
+            for column in clamp(low[0], self.columns)..=clamp(high[0], self.columns) {
+                let cell = row * self.columns + column;
+                for &(lane, place) in &self.entries[self.starts[cell] as usize..self.starts[cell + 1] as usize] {
+                    found(lane, place as usize);
+                }
+            }
+        }
+    }
+
+    fn cell(&self, x: f64, y: f64) -> [i64; 2] {
+        [((x - self.origin_m[0]) / CELL_M).floor() as i64, ((y - self.origin_m[1]) / CELL_M).floor() as i64]
+    }
+}
+
+impl LaneGraph {
+    /// Distance from `s_m` on `lane` to the next junction along first successors, and the lane before it, when the
+    /// junction is at most `horizon_m` ahead. Zero inside a junction.
+    #[must_use]
+    pub fn junction_ahead(&self, lane: LaneId, s_m: f64, horizon_m: f64) -> Option<(f64, LaneId)> {
+        let mut current = self.lane(lane);
+        let mut distance_m = 0.0;
+        if current.in_junction {
+            return Some((0.0, lane));
+        }
+        let mut left_m = current.length_m - s_m;
+        loop {
+            distance_m += left_m;
+            if distance_m > horizon_m {
+                return None;
+            }
+            let next = self.lane(*current.successors.first()?);
+            if next.in_junction {
+                return Some((distance_m, current.id));
+            }
+            // A ring of lanes without a junction ends at the horizon: every lane has a length.
+            left_m = next.length_m.max(1e-3);
+            current = next;
+        }
+    }
+}
+
+/// The place on `lane` nearest to `x`, `y`, looked for on the two steps around a point of its centre line.
+fn project_near(lane: &Lane, place: usize, x: f64, y: f64) -> LanePosition {
+    let steps = lane.centerline.len() - 1;
+    let step_m = lane.length_m / steps as f64;
+    let candidates = [place.saturating_sub(1), place.min(steps - 1)].map(|index| {
+        let (from, to) = (lane.centerline[index], lane.centerline[index + 1]);
+        let (dx, dy) = (to[0] - from[0], to[1] - from[1]);
+        let squared = (dx * dx + dy * dy).max(1e-12);
+        let share = (((x - from[0]) * dx + (y - from[1]) * dy) / squared).clamp(0.0, 1.0);
+        let distance = (x - from[0] - share * dx).hypot(y - from[1] - share * dy);
+        let offset_m = (dx * (y - from[1]) - dy * (x - from[0])) / squared.sqrt();
+        (distance, LanePosition { lane: lane.id, s_m: (index as f64 + share) * step_m, offset_m })
+    });
+    if candidates[0].0 <= candidates[1].0 { candidates[0].1 } else { candidates[1].1 }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn two_way() -> LaneGraph {
+        let line = |y: f64, forward: bool| {
+            (0..=100).map(|i| [if forward { f64::from(i) } else { f64::from(100 - i) }, y, 0.0]).collect()
+        };
+        LaneGraph::new(vec![
+            Lane::new(LaneId(0), line(-2.0, true), 3.5, 10.0),
+            Lane::new(LaneId(1), line(2.0, false), 3.5, 10.0),
+        ])
+    }
+
+    #[test]
+    fn nearest_lane_with_and_without_heading() {
+        let graph = two_way();
+        let index = LaneIndex::new(&graph);
+        let found = index.nearest(&graph, [30.3, -1.2], 5.0, None, None).unwrap();
+        assert_eq!(found.lane, LaneId(0));
+        assert!((found.s_m - 30.3).abs() < 1e-9 && (found.offset_m - 0.8).abs() < 1e-9);
+        let found = index.nearest(&graph, [30.3, -1.2], 5.0, Some(3.0), Some(0.5)).unwrap();
+        assert_eq!(found.lane, LaneId(1));
+        assert!((found.s_m - 69.7).abs() < 1e-9 && (found.offset_m - 3.2).abs() < 1e-9);
+        assert!(index.nearest(&graph, [30.3, 40.0], 5.0, None, None).is_none());
+        assert!(index.nearest(&graph, [30.3, -1.2], 5.0, None, Some(6.0)).is_none());
+    }
+
+    #[test]
+    fn junction_ahead_counts_to_the_end_of_the_lane_before_it() {
+        let mut graph = two_way();
+        let mut inner = Lane::new(LaneId(2), vec![[100.0, -2.0, 0.0], [110.0, -2.0, 0.0]], 3.5, 10.0);
+        inner.in_junction = true;
+        graph.lanes.push(inner);
+        graph.lanes[0].successors.push(LaneId(2));
+        assert_eq!(graph.junction_ahead(LaneId(0), 60.0, 50.0), Some((40.0, LaneId(0))));
+        assert_eq!(graph.junction_ahead(LaneId(0), 10.0, 50.0), None);
+        assert_eq!(graph.junction_ahead(LaneId(2), 1.0, 50.0), Some((0.0, LaneId(2))));
+        assert_eq!(graph.junction_ahead(LaneId(1), 1.0, 500.0), None);
+    }
+}

@@ -1,0 +1,150 @@
+//! Solid things beside and above the road.
+
+/// What a solid is; decides how it answers a beam and what it may stand next to.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, PartialOrd, Ord)]
+#[non_exhaustive]
+pub enum SolidKind {
+    /// Part of a building, roof structures included.
+    Building,
+    /// Garden wall or retaining wall.
+    Wall,
+    /// Fence.
+    Fence,
+    /// Hedge or bush.
+    Hedge,
+    /// Trunk of a tree.
+    TreeTrunk,
+    /// Crown of a tree.
+    TreeCrown,
+    /// Lamp post, traffic-light post, sign post, bollard.
+    Pole,
+    /// Sign plate, traffic-light head, gantry board.
+    Sign,
+    /// Crash barrier, parapet, median barrier.
+    Barrier,
+    /// Noise wall along a motorway.
+    NoiseWall,
+    /// Slab under an elevated road, tunnel roof.
+    BridgeDeck,
+    /// Pillar under a bridge.
+    Pillar,
+    /// Side wall of an under-pass or tunnel.
+    TunnelWall,
+    /// Bus shelter, kiosk, bin, hydrant, cabinet, bench.
+    StreetFurniture,
+}
+
+/// A convex shape; upright, its own axes turned about z only.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Shape {
+    /// Cuboid by its half lengths along its own x, y and z, metres.
+    Box {
+        /// Half lengths, metres.
+        half_m: [f64; 3],
+    },
+    /// Upright cylinder.
+    Cylinder {
+        /// Radius, metres.
+        radius_m: f64,
+        /// Half of the height, metres.
+        half_height_m: f64,
+    },
+    /// Ellipsoid by its radii along its own x, y and z, metres.
+    Ellipsoid {
+        /// Radii, metres.
+        radii_m: [f64; 3],
+    },
+}
+
+impl Shape {
+    /// Half of the height, metres.
+    #[must_use]
+    pub fn half_height_m(&self) -> f64 {
+        match *self {
+            Self::Box { half_m: [_, _, half] } | Self::Cylinder { half_height_m: half, .. } => half,
+            Self::Ellipsoid { radii_m: [_, _, radius] } => radius,
+        }
+    }
+
+    /// Half lengths along the shape's own x and y of the rectangle around its outline seen from above, metres.
+    #[must_use]
+    pub fn half_footprint_m(&self) -> [f64; 2] {
+        match *self {
+            Self::Box { half_m: [x, y, _] } | Self::Ellipsoid { radii_m: [x, y, _] } => [x, y],
+            Self::Cylinder { radius_m, .. } => [radius_m, radius_m],
+        }
+    }
+}
+
+/// One solid in the world.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Solid {
+    /// What it is.
+    pub kind: SolidKind,
+    /// Its shape in its own frame.
+    pub shape: Shape,
+    /// Centre of the shape (not its foot), metres in the world frame.
+    pub center_m: [f64; 3],
+    /// Turn of its own x axis from the world's, radians.
+    pub yaw_rad: f64,
+    /// Share of near-infrared light that it throws back, 0 to 1.
+    pub reflectivity: f32,
+}
+
+impl Solid {
+    /// A solid by its parts.
+    #[must_use]
+    pub fn new(kind: SolidKind, shape: Shape, center_m: [f64; 3], yaw_rad: f64, reflectivity: f32) -> Self {
+        Self { kind, shape, center_m, yaw_rad, reflectivity }
+    }
+
+    /// Height of its lowest point, metres in the world frame.
+    #[must_use]
+    pub fn bottom_m(&self) -> f64 {
+        self.center_m[2] - self.shape.half_height_m()
+    }
+
+    /// Height of its highest point, metres in the world frame.
+    #[must_use]
+    pub fn top_m(&self) -> f64 {
+        self.center_m[2] + self.shape.half_height_m()
+    }
+
+    /// Axis-aligned bounds in the world frame: lowest and highest corner, metres.
+    #[must_use]
+    pub fn bounds_m(&self) -> ([f64; 3], [f64; 3]) {
+        let [half_x, half_y] = self.shape.half_footprint_m();
+        let (sin, cos) = self.yaw_rad.sin_cos();
+        let half = match self.shape {
+            Shape::Box { .. } => {
+                [(half_x * cos).abs() + (half_y * sin).abs(), (half_x * sin).abs() + (half_y * cos).abs()]
+            }
+            Shape::Cylinder { radius_m, .. } => [radius_m, radius_m],
+            Shape::Ellipsoid { .. } => [(half_x * cos).hypot(half_y * sin), (half_x * sin).hypot(half_y * cos)],
+        };
+        let half = [half[0], half[1], self.shape.half_height_m()];
+        (
+            std::array::from_fn(|axis| self.center_m[axis] - half[axis]),
+            std::array::from_fn(|axis| self.center_m[axis] + half[axis]),
+        )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bounds_of_a_turned_box_and_of_an_ellipsoid() {
+        let shape = Shape::Box { half_m: [2.0, 1.0, 3.0] };
+        let solid = Solid::new(SolidKind::Building, shape, [10.0, 0.0, 3.0], std::f64::consts::FRAC_PI_2, 0.4);
+        let (low, high) = solid.bounds_m();
+        let expected = ([9.0, -2.0, 0.0], [11.0, 2.0, 6.0]);
+        for axis in 0..3 {
+            assert!((low[axis] - expected.0[axis]).abs() < 1e-12 && (high[axis] - expected.1[axis]).abs() < 1e-12);
+        }
+        let shape = Shape::Ellipsoid { radii_m: [2.0, 2.0, 1.0] };
+        let (low, _) = Solid::new(SolidKind::TreeCrown, shape, [0.0; 3], 0.7, 0.3).bounds_m();
+        assert!((low[0] + 2.0).abs() < 1e-12 && (low[1] + 2.0).abs() < 1e-12);
+    }
+}
