@@ -1,0 +1,30 @@
+//! `ego-fuser methods`: the registry as a table or JSON.
+
+use anyhow::Result;
+use ego_fuser::Method;
+
+/// Lists the collaboration methods.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Arguments {
+    /// Print JSON for machines.
+    #[arg(long)]
+    json: bool,
+}
+
+impl Arguments {
+    /// Prints the registry to standard output.
+    pub(crate) fn run(self) -> Result<()> {
+        if self.json {
+            let rows: Vec<_> = Method::ALL
+                .iter()
+                .map(|method| serde_json::json!({"method": method, "exchange": method.exchange(), "summary": method.summary()}))
+                .collect();
+            println!("{}", serde_json::to_string_pretty(&rows)?);
+        } else {
+            for method in Method::ALL {
+                println!("{method:<10} {}", method.summary());
+            }
+        }
+        Ok(())
+    }
+}

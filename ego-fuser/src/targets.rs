@@ -1,0 +1,304 @@
+//! Training targets: which anchors are objects, and what each has to regress.
+//!
+//! The rule of OpenCOOD's label generator: overlap of axis-aligned boxes with one metre added to every side, positive
+//! above 0.6 or where an anchor is some object's best, negative below 0.45, the band between unassigned. Overlaps are
+//! computed in `f32` in the reference's order of operations, because anchors that lie wholly inside an object tie, and
+//! rounding decides which of them is its best.
+
+use protocol::Box3d;
+
+/// Numbers of one box that the head predicts: x, y, z, h, w, l, yaw.
+pub const BOX_CODE: usize = 7;
+
+/// Overlaps that decide between object and background.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct TargetRule {
+    /// Above it an anchor is an object.
+    pub positive_iou: f32,
+    /// Below it, for every object, an anchor is background.
+    pub negative_iou: f32,
+}
+
+impl Default for TargetRule {
+    fn default() -> Self {
+        Self { positive_iou: 0.6, negative_iou: 0.45 }
+    }
+}
+
+/// An anchor that stands for an object.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Positive {
+    /// Flat index of the anchor, in the order row, column, anchor of the cell.
+    pub anchor: usize,
+    /// What the head has to predict there: x, y, z, h, w, l, yaw, encoded relative to the anchor.
+    pub code: [f64; BOX_CODE],
+}
+
+/// Targets of one sample. Every anchor that is neither positive nor unassigned is background.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Labels {
+    /// Number of anchors, `H * W * A`.
+    pub anchors: usize,
+    /// Objects, by rising anchor index.
+    pub positives: Vec<Positive>,
+    /// Anchors in the band between the two overlaps, by rising index.
+    pub unassigned: Vec<usize>,
+}
+
+/// Why anchors cannot be used.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum LatticeError {
+    /// The number of anchors is not the product of the shape.
+    #[error("{found} anchors do not fill a lattice of {height} x {width} x {per_cell}")]
+    Count {
+        /// Anchors given.
+        found: usize,
+        /// Rows.
+        height: usize,
+        /// Columns.
+        width: usize,
+        /// Anchors of a cell.
+        per_cell: usize,
+    },
+    /// Centres do not grow with row and column, so objects cannot be looked up.
+    #[error("anchor {index} breaks the lattice: x must grow with the column and y with the row, and nothing else")]
+    NotSeparable {
+        /// Flat index of the first anchor off the lattice.
+        index: usize,
+    },
+}
+
+/// Finds the targets of a frame among the anchors of a head.
+#[derive(Debug, Clone)]
+pub struct TargetAssigner {
+    rule: TargetRule,
+    anchors: Vec<Box3d>,
+    standing: Vec<Standing>,
+    column_x: Vec<f64>,
+    row_y: Vec<f64>,
+    per_cell: usize,
+    /// Largest half extent of an anchor along an axis, metres.
+    reach: f64,
+}
+
+impl TargetAssigner {
+    /// Prepares `anchors`, flat in the order row (y), column (x), anchor of the cell; `shape` is `[H, W, A]`.
+    ///
+    /// # Errors
+    /// [`LatticeError`] when the anchors do not fill the shape or do not lie on a lattice.
+    pub fn new(anchors: Vec<Box3d>, shape: [usize; 3], rule: TargetRule) -> Result<Self, LatticeError> {
+        let [height, width, per_cell] = shape;
+        if anchors.len() != height * width * per_cell || anchors.is_empty() {
+            return Err(LatticeError::Count { found: anchors.len(), height, width, per_cell });
+        }
+        let column_x: Vec<f64> = (0..width).map(|column| anchors[column * per_cell].center_m[0]).collect();
+        let row_y: Vec<f64> = (0..height).map(|row| anchors[row * width * per_cell].center_m[1]).collect();
+        let on_lattice = |(index, anchor): (usize, &Box3d)| {
+            let cell = index / per_cell;
+            anchor.center_m[0] == column_x[cell % width] && anchor.center_m[1] == row_y[cell / width]
+        };
+        if let Some(index) = anchors.iter().enumerate().position(|entry| !on_lattice(entry)) {
+            return Err(LatticeError::NotSeparable { index });
+        }
+        if !column_x.is_sorted_by(|a, b| a < b) || !row_y.is_sorted_by(|a, b| a < b) {
+            return Err(LatticeError::NotSeparable { index: 0 });
+        }
+        let standing: Vec<Standing> = anchors.iter().map(Standing::of).collect();
+        let reach = anchors.iter().map(|anchor| anchor.size_m[0].hypot(anchor.size_m[1]) / 2.0).fold(0.0, f64::max);
+        Ok(Self { rule, anchors, standing, column_x, row_y, per_cell, reach })
+    }
+
+    /// Targets of the objects of one frame, boxes in the frame of the anchors.
+    #[must_use]
+    pub fn assign(&self, objects: &[Box3d]) -> Labels {
+        const FREE: u32 = u32::MAX;
+        // Per anchor: the first object it overlaps enough, and whether anything keeps it from being background.
+        let mut owner = vec![FREE; self.anchors.len()];
+        let mut near = vec![false; self.anchors.len()];
+        let mut best = Vec::with_capacity(objects.len());
+        for (object, owner_id) in objects.iter().zip(0u32..) {
+            let target = Standing::of(object);
+            let mut highest = (0.0f32, None);
+            self.for_each_near(object, |index| {
+                let iou = self.standing[index].overlap(&target);
+                if iou > highest.0 {
+                    highest = (iou, Some(index));
+                }
+                if iou > self.rule.positive_iou && owner[index] == FREE {
+                    owner[index] = owner_id;
+                }
+                near[index] |= iou >= self.rule.negative_iou;
+            });
+            best.push(highest.1);
+        }
+        // An object's best anchor is positive however small the overlap, unless the anchor is already taken.
+        for (best, owner_id) in best.into_iter().zip(0u32..) {
+            if let Some(index) = best
+                && owner[index] == FREE
+            {
+                owner[index] = owner_id;
+            }
+        }
+        let mut labels = Labels { anchors: self.anchors.len(), ..Labels::default() };
+        for (anchor, (&owner, &near)) in owner.iter().zip(&near).enumerate() {
+            if owner != FREE {
+                let code = encode(&objects[owner as usize], &self.anchors[anchor]);
+                labels.positives.push(Positive { anchor, code });
+            } else if near {
+                labels.unassigned.push(anchor);
+            }
+        }
+        labels
+    }
+
+    /// Visits the anchors that can overlap `object`, by rising index.
+    fn for_each_near(&self, object: &Box3d, mut visit: impl FnMut(usize)) {
+        // The added metre, and a little for the rounding to f32.
+        let reach = self.reach + object.size_m[0].hypot(object.size_m[1]) / 2.0 + 1.01;
+        let within = |centers: &[f64], middle: f64| {
+            centers.partition_point(|&at| at < middle - reach)..centers.partition_point(|&at| at <= middle + reach)
+        };
+        let columns = within(&self.column_x, object.center_m[0]);
+        for row in within(&self.row_y, object.center_m[1]) {
+            let first = (row * self.column_x.len() + columns.start) * self.per_cell;
+            (first..first + columns.len() * self.per_cell).for_each(&mut visit);
+        }
+    }
+}
+
+/// What the head predicts for `object` at `anchor`: offsets by the anchor's diagonal and height, logarithms of size
+/// ratios, plain difference of yaw.
+#[must_use]
+pub fn encode(object: &Box3d, anchor: &Box3d) -> [f64; BOX_CODE] {
+    let [l, w, h] = object.size_m;
+    let [anchor_l, anchor_w, anchor_h] = anchor.size_m;
+    let diagonal = (anchor_w.powi(2) + anchor_l.powi(2)).sqrt();
+    let offset = |axis: usize| object.center_m[axis] - anchor.center_m[axis];
+    [
+        offset(0) / diagonal,
+        offset(1) / diagonal,
+        offset(2) / anchor_h,
+        (h / anchor_h).ln(),
+        (w / anchor_w).ln(),
+        (l / anchor_l).ln(),
+        object.heading_rad - anchor.heading_rad,
+    ]
+}
+
+/// The axis-aligned box around a footprint, metres.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct Standing {
+    low: [f32; 2],
+    high: [f32; 2],
+    area: f32,
+}
+
+impl Standing {
+    fn of(box3d: &Box3d) -> Self {
+        // Single precision as the reference: sizes, angle and centre are rounded before they are combined.
+        let heading = f64::from(box3d.heading_rad as f32);
+        let (sin, cos) = (heading.sin() as f32, heading.cos() as f32);
+        let [half_l, half_w] = [box3d.size_m[0] as f32 * 0.5, box3d.size_m[1] as f32 * 0.5];
+        let [x, y] = [box3d.center_m[0] as f32, box3d.center_m[1] as f32];
+        let mut standing = Self { low: [f32::INFINITY; 2], high: [f32::NEG_INFINITY; 2], area: 0.0 };
+        for (l, w) in [(half_l, -half_w), (half_l, half_w), (-half_l, half_w), (-half_l, -half_w)] {
+            let corner = [(l * cos + w * -sin) + x, (l * sin + w * cos) + y];
+            for ((low, high), at) in standing.low.iter_mut().zip(&mut standing.high).zip(corner) {
+                *low = low.min(at);
+                *high = high.max(at);
+            }
+        }
+        standing.area = (standing.high[0] - standing.low[0] + 1.0) * (standing.high[1] - standing.low[1] + 1.0);
+        standing
+    }
+
+    /// Intersection over union with one metre added to every side, as if metres were pixels.
+    fn overlap(&self, other: &Self) -> f32 {
+        let side = |axis: usize| self.high[axis].min(other.high[axis]) - self.low[axis].max(other.low[axis]) + 1.0;
+        let (x, y) = (side(0), side(1));
+        if x <= 0.0 || y <= 0.0 {
+            return 0.0;
+        }
+        x * y / (self.area + other.area - x * y)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::f64::consts::FRAC_PI_2;
+
+    use super::*;
+
+    const CAR: [f64; 3] = [3.9, 1.6, 1.56];
+
+    fn lattice(height: usize, width: usize) -> Vec<Box3d> {
+        let cell = |row: usize, column: usize| [column as f64 * 0.8, row as f64 * 0.8, -1.0];
+        (0..height * width * 2)
+            .map(|index| Box3d {
+                center_m: cell(index / 2 / width, index / 2 % width),
+                size_m: CAR,
+                heading_rad: if index % 2 == 0 { 0.0 } else { FRAC_PI_2 },
+            })
+            .collect()
+    }
+
+    fn assigner() -> TargetAssigner {
+        TargetAssigner::new(lattice(20, 30), [20, 30, 2], TargetRule::default()).unwrap()
+    }
+
+    #[test]
+    fn an_object_on_an_anchor_has_nothing_to_regress_there() {
+        let anchors = lattice(20, 30);
+        let labels = assigner().assign(&[anchors[777]]);
+        let at = labels.positives.iter().find(|positive| positive.anchor == 777).unwrap();
+        assert!(at.code.iter().all(|value| value.abs() < 1e-12));
+        assert!(
+            labels.positives.iter().all(|positive| positive.anchor % 2 == 777 % 2),
+            "the other heading overlaps less"
+        );
+    }
+
+    #[test]
+    fn a_truck_that_overlaps_little_still_has_its_best_anchor() {
+        let truck = Box3d { center_m: [12.0, 8.0, 0.0], size_m: [14.0, 3.0, 3.5], heading_rad: 0.4 };
+        let labels = assigner().assign(&[truck]);
+        assert_eq!(labels.positives.len(), 1);
+        assert!((labels.positives[0].code[3] - (3.5f64 / 1.56).ln()).abs() < 1e-12);
+    }
+
+    #[test]
+    fn restriction_to_near_anchors_changes_nothing() {
+        let objects = [
+            Box3d { center_m: [3.3, 4.1, -0.8], size_m: [4.5, 1.9, 1.6], heading_rad: 0.3 },
+            Box3d { center_m: [5.1, 4.9, -0.8], size_m: [4.2, 1.8, 1.6], heading_rad: 1.3 },
+        ];
+        let assigner = assigner();
+        let labels = assigner.assign(&objects);
+        let standing: Vec<Standing> = objects.iter().map(Standing::of).collect();
+        for index in 0..labels.anchors {
+            let overlap = |object: &Standing| assigner.standing[index].overlap(object);
+            let over = standing.iter().map(overlap).fold(0.0, f32::max);
+            let positive = labels.positives.iter().any(|positive| positive.anchor == index);
+            assert!(positive || over <= 0.6);
+            assert_eq!(labels.unassigned.contains(&index), !positive && over >= 0.45);
+        }
+    }
+
+    #[test]
+    fn no_objects_no_targets() {
+        let labels = assigner().assign(&[]);
+        assert!(labels.positives.is_empty() && labels.unassigned.is_empty());
+        let far = Box3d { center_m: [1e6, 0.0, 0.0], size_m: CAR, heading_rad: 0.0 };
+        assert!(assigner().assign(&[far]).positives.is_empty());
+    }
+
+    #[test]
+    fn anchors_off_a_lattice_are_refused() {
+        let mut anchors = lattice(4, 5);
+        let error = TargetAssigner::new(anchors.clone(), [4, 4, 2], TargetRule::default()).unwrap_err();
+        assert!(matches!(error, LatticeError::Count { found: 40, .. }));
+        anchors[13].center_m[0] += 0.1;
+        let error = TargetAssigner::new(anchors, [4, 5, 2], TargetRule::default()).unwrap_err();
+        assert_eq!(error, LatticeError::NotSeparable { index: 13 });
+    }
+}
