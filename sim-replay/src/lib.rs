@@ -1,4 +1,11 @@
 //! Scenes as live traffic: reading recorded scenes, generating new ones, streaming both, and the emulated air between
 //! vehicles.
+//!
+//! Recorded datasets differ in axes, units, pose formats and file layouts. All of that ends at this crate's readers:
+//! behind [`dataset::open`] there is one [`frame::Frame`], in the conventions of [`protocol`].
 
+pub mod carla_pose;
+pub mod dataset;
+pub mod frame;
+pub mod ground_truth;
 pub mod town;

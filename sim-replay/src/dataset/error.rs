@@ -1,0 +1,115 @@
+//! What is wrong with a dataset, with the place where it is wrong.
+
+use std::fmt;
+use std::path::{Path, PathBuf};
+
+/// Why a dataset, or a frame of it, cannot be read.
+#[derive(Debug, thiserror::Error)]
+pub enum ReadError {
+    /// The operating system refused.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file or folder.
+        path: PathBuf,
+        /// What the system says.
+        source: std::io::Error,
+    },
+    /// The folder is no layout that is known here.
+    #[error("{}: {reason}", path.display())]
+    Layout {
+        /// The folder.
+        path: PathBuf,
+        /// What was looked for and found.
+        reason: String,
+    },
+    /// A file says something that cannot be.
+    #[error("{}{}: {}{reason}", path.display(), Line(*.line), Field(field.as_deref()))]
+    Malformed {
+        /// The file.
+        path: PathBuf,
+        /// The line, from 1, where the file has lines.
+        line: Option<u64>,
+        /// The field, for example `vehicles.4335.extent`.
+        field: Option<String>,
+        /// What was found and what was expected.
+        reason: String,
+    },
+    /// The caller asked for an agent, a tick or a variant that the scenario does not have.
+    #[error("scenario {scenario}: {what} {asked} does not exist ({available})")]
+    NoSuch {
+        /// The scenario.
+        scenario: String,
+        /// `agent`, `tick` or `LiDAR variant`.
+        what: &'static str,
+        /// What was asked for.
+        asked: String,
+        /// What there is.
+        available: String,
+    },
+}
+
+impl ReadError {
+    /// A [`ReadError::Malformed`] of a whole file.
+    pub fn malformed(path: &Path, reason: impl Into<String>) -> Self {
+        Self::Malformed { path: path.to_owned(), line: None, field: None, reason: reason.into() }
+    }
+
+    /// A [`ReadError::Io`].
+    pub fn io(path: &Path, source: std::io::Error) -> Self {
+        Self::Io { path: path.to_owned(), source }
+    }
+
+    /// The file or folder at fault, if the error is about one.
+    #[must_use]
+    pub fn path(&self) -> Option<&Path> {
+        match self {
+            Self::Io { path, .. } | Self::Layout { path, .. } | Self::Malformed { path, .. } => Some(path),
+            Self::NoSuch { .. } => None,
+        }
+    }
+
+    /// The line at fault, from 1.
+    #[must_use]
+    pub fn line(&self) -> Option<u64> {
+        if let Self::Malformed { line, .. } = self { *line } else { None }
+    }
+
+    /// The field at fault.
+    #[must_use]
+    pub fn field(&self) -> Option<&str> {
+        if let Self::Malformed { field, .. } = self { field.as_deref() } else { None }
+    }
+}
+
+struct Line(Option<u64>);
+
+impl fmt::Display for Line {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.0.map_or(Ok(()), |line| write!(f, ":{line}"))
+    }
+}
+
+struct Field<'a>(Option<&'a str>);
+
+impl fmt::Display for Field<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.0.map_or(Ok(()), |field| write!(f, "{field}: "))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_message_names_file_line_and_field() {
+        let error = ReadError::Malformed {
+            path: "a/000069.pcd".into(),
+            line: Some(10),
+            field: Some("POINTS".into()),
+            reason: "3 stated, 2 found".into(),
+        };
+        assert_eq!(error.to_string(), "a/000069.pcd:10: POINTS: 3 stated, 2 found");
+        assert_eq!(ReadError::malformed(Path::new("b.bin"), "empty").to_string(), "b.bin: empty");
+    }
+}

@@ -1,0 +1,137 @@
+//! Datasets on disk, whatever their layout, as scenarios of agents and ticks.
+//!
+//! ```no_run
+//! # fn main() -> Result<(), sim_replay::dataset::ReadError> {
+//! use sim_replay::dataset::{self, LoadOptions};
+//!
+//! let dataset = dataset::open("v2xset/validate".as_ref())?;
+//! let scenario = &dataset.scenarios[0];
+//! let ego_frame = scenario.load(0, 0, &LoadOptions::default())?;
+//! println!("{} points", ego_frame.points.len());
+//! # Ok(())
+//! # }
+//! ```
+
+mod error;
+
+use std::path::Path;
+use std::sync::Arc;
+
+use protocol::{CavId, Handedness};
+use serde::Serialize;
+
+pub use error::ReadError;
+
+use crate::frame::Frame;
+
+/// The layouts that are known here.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Layout {
+    /// OPV2V, V2XSet, V2X-R, V2VDet and generated scenes: a folder per agent, YAML and PCD per frame, left-handed.
+    Opv2v,
+    /// V2V4Real: the same folders, with pose matrices and objects in the LiDAR frame, right-handed.
+    V2v4Real,
+    /// Localization sequences of NCLT, as recorded or as converted by LightLoc.
+    Nclt,
+    /// Localization sequences of Oxford and QEOxford, as converted by LightLoc.
+    Oxford,
+    /// KITTI odometry.
+    KittiOdometry,
+    /// KITTI object detection.
+    KittiObject,
+}
+
+/// A dataset, or the part of one that was opened.
+#[derive(Debug)]
+pub struct Dataset {
+    /// Its layout.
+    pub layout: Layout,
+    /// Its scenarios, in text order of their names.
+    pub scenarios: Vec<Scenario>,
+    /// What is wrong with it and could be left out: missing files, folders that are not understood.
+    pub problems: Vec<ReadError>,
+}
+
+/// One moment of a scenario.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Tick {
+    /// The name of the moment's files, without suffix: a tick counter or a time stamp, by layout.
+    pub stem: String,
+    /// Capture time on the scene's clock, nanoseconds.
+    pub capture_nanos: u64,
+}
+
+/// Some vehicles on the way together.
+#[derive(Debug, Clone)]
+pub struct Scenario {
+    /// Name: its path below the folder that was opened, or that folder's own name.
+    pub name: String,
+    /// The agents, ego first: in text order, a roadside unit that would come first last.
+    pub agents: Vec<CavId>,
+    /// The moments that every agent has, in order.
+    pub ticks: Vec<Tick>,
+    /// Variants of the LiDAR sweep beside the plain one, for example `fog_0.060`.
+    pub lidar_variants: Vec<String>,
+    /// Which way the axes of the recording turned.
+    pub source_handedness: Handedness,
+    source: Arc<dyn FrameSource>,
+}
+
+/// What to read of a frame.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct LoadOptions {
+    /// A variant of [`Scenario::lidar_variants`] in place of the plain sweep.
+    pub lidar_variant: Option<String>,
+    /// Whether to read the LiDAR's points. Off, only poses and objects are read.
+    pub points: bool,
+    /// Whether to read the radar's points.
+    pub radar: bool,
+}
+
+impl Default for LoadOptions {
+    fn default() -> Self {
+        Self { lidar_variant: None, points: true, radar: false }
+    }
+}
+
+/// How a layout finds and reads its frames.
+trait FrameSource: std::fmt::Debug + Send + Sync {
+    /// Reads one frame. Both indices lie within the scenario's `agents` and `ticks`.
+    fn load(&self, agent: (usize, &CavId), tick: (usize, &Tick), options: &LoadOptions) -> Result<Frame, ReadError>;
+}
+
+impl Scenario {
+    /// Reads the frame of an agent at a tick, by their indices in [`Self::agents`] and [`Self::ticks`].
+    ///
+    /// # Errors
+    /// [`ReadError`] when there is no such agent, tick or variant, and when a file is missing or malformed.
+    pub fn load(&self, agent_index: usize, tick_index: usize, options: &LoadOptions) -> Result<Frame, ReadError> {
+        let agent =
+            self.agents.get(agent_index).ok_or_else(|| self.no_such("agent", agent_index, self.agents.len()))?;
+        let tick = self.ticks.get(tick_index).ok_or_else(|| self.no_such("tick", tick_index, self.ticks.len()))?;
+        if let Some(variant) = options.lidar_variant.as_ref().filter(|variant| !self.lidar_variants.contains(variant)) {
+            return Err(ReadError::NoSuch {
+                scenario: self.name.clone(),
+                what: "LiDAR variant",
+                asked: variant.clone(),
+                available: format!("there are {:?}", self.lidar_variants),
+            });
+        }
+        self.source.load((agent_index, agent), (tick_index, tick), options)
+    }
+
+    fn no_such(&self, what: &'static str, index: usize, count: usize) -> ReadError {
+        let available = format!("there are {count}, counted from 0");
+        ReadError::NoSuch { scenario: self.name.clone(), what, asked: index.to_string(), available }
+    }
+}
+
+/// Opens the dataset, split, scenario or sequence in `dir`; the layout is found out.
+///
+/// # Errors
+/// [`ReadError`] when `dir` cannot be read or is no layout that is known here. What is wrong with single frames is
+/// found when they are loaded; what had to be left out stands in [`Dataset::problems`].
+pub fn open(dir: &Path) -> Result<Dataset, ReadError> {
+    Err(ReadError::Layout { path: dir.to_owned(), reason: "no known layout".into() })
+}

@@ -1,0 +1,86 @@
+//! What one CAV measured at one capture time, with what the recording knows to be true about it.
+//!
+//! Every layout is read into this one frame: right-handed, metres, radians, nanoseconds (see [`protocol`]).
+
+use protocol::{CavId, Handedness, PointCloud, Pose};
+use serde::{Deserialize, Serialize};
+
+/// What an annotated object is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ObjectClass {
+    /// A passenger car; also every object of datasets that do not name types.
+    Car,
+    /// A van.
+    Van,
+    /// A truck of any kind.
+    Truck,
+    /// A bus or tram.
+    Bus,
+    /// A bicycle, motorcycle or scooter, with or without rider.
+    TwoWheeler,
+    /// A person on foot or sitting.
+    Pedestrian,
+    /// Anything else that was annotated.
+    Other,
+}
+
+impl ObjectClass {
+    /// Whether detection counts the object: all but pedestrians are one class (the rule of V2V4Real).
+    #[must_use]
+    pub fn is_detection_target(self) -> bool {
+        self != Self::Pedestrian
+    }
+}
+
+/// An annotated object.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Object {
+    /// The same for the same object in the frames of all CAVs of a scenario.
+    pub id: i64,
+    /// What it is.
+    pub class: ObjectClass,
+    /// The box: its centre, and x along its length.
+    pub world_from_object: Pose,
+    /// Full length, width, height in metres.
+    pub size_m: [f64; 3],
+    /// Speed, metres per second, where recorded.
+    pub speed_mps: Option<f64>,
+}
+
+/// One sweep of one CAV.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Frame {
+    /// Who measured.
+    pub cav: CavId,
+    /// When, on the clock of the scene, nanoseconds.
+    pub capture_nanos: u64,
+    /// The sweep in the LiDAR frame. Without points where [`crate::dataset::LoadOptions::points`] was off.
+    pub points: PointCloud,
+    /// Points of the file that were left out because a coordinate or intensity is not finite.
+    pub dropped_points: usize,
+    /// The 4D radar's points in the LiDAR frame, where the recording has them; the fourth value as stored.
+    pub radar: Option<PointCloud>,
+    /// True pose of the LiDAR. `None` where the dataset gives no pose.
+    pub world_from_lidar: Option<Pose>,
+    /// True pose of the vehicle's own origin (not the LiDAR's), where recorded.
+    pub world_from_vehicle: Option<Pose>,
+    /// What the vehicle's GNSS and IMU filter believed its origin to be, where recorded.
+    pub gnss_world_from_vehicle: Option<Pose>,
+    /// Forward speed in metres per second, where recorded. May be slightly negative.
+    pub speed_mps: Option<f64>,
+    /// What this CAV's annotation lists. A CAV never lists itself.
+    pub objects: Vec<Object>,
+    /// Which way the axes of the recording turned.
+    pub source_handedness: Handedness,
+}
+
+impl Frame {
+    /// The GNSS estimate carried over to the LiDAR by the true mount of the LiDAR on the vehicle.
+    #[must_use]
+    pub fn gnss_world_from_lidar(&self) -> Option<Pose> {
+        let gnss = self.gnss_world_from_vehicle?.isometry();
+        let vehicle_from_lidar = self.world_from_vehicle?.isometry().inv_mul(&self.world_from_lidar?.isometry());
+        Some((gnss * vehicle_from_lidar).into())
+    }
+}
