@@ -1,1 +1,4 @@
-//! deploy
+//! The operator's side of the fleet: reads a scenario, starts and supervises the processes, scores what the ego
+//! reports and writes it down.
+
+pub mod scenario;

@@ -1,0 +1,242 @@
+//! Reads scenario files: where a field is wrong, the message names file, line and field.
+
+use std::path::{Path, PathBuf};
+
+use super::Scenario;
+
+/// Largest scenario file, bytes.
+const MAX_BYTES: u64 = 1 << 20;
+
+/// Why a scenario cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum ScenarioError {
+    /// The file cannot be read.
+    #[error("cannot read scenario {}: {source}", path.display())]
+    Read {
+        /// The scenario file.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// The file is not YAML, or a field is unknown, missing or of the wrong kind.
+    #[error("{}{}: {reason}", path.display(), line.map_or(String::new(), |line| format!(":{line}")))]
+    Syntax {
+        /// The scenario file.
+        path: PathBuf,
+        /// Line of the offence, from 1.
+        line: Option<u64>,
+        /// What is wrong there.
+        reason: String,
+    },
+    /// A field has a value that makes no sense.
+    #[error("{}: {field} is {found}: {rule}", path.display())]
+    Value {
+        /// The scenario file.
+        path: PathBuf,
+        /// The field, with its parents.
+        field: &'static str,
+        /// What it says.
+        found: String,
+        /// What it may say.
+        rule: &'static str,
+    },
+    /// A path names nothing.
+    #[error("{}: {field}: {} does not exist", path.display(), missing.display())]
+    Missing {
+        /// The scenario file.
+        path: PathBuf,
+        /// The field, with its parents.
+        field: &'static str,
+        /// The file or folder that is not there.
+        missing: PathBuf,
+    },
+}
+
+impl Scenario {
+    /// Reads and checks a scenario. Relative paths in it are taken from its folder and come back absolute.
+    ///
+    /// # Errors
+    /// [`ScenarioError`] names the file, the line or field, and what is wrong.
+    pub fn load(path: &Path) -> Result<Self, ScenarioError> {
+        let scenario = Self::read(path)?;
+        scenario.check(path)?;
+        Ok(scenario)
+    }
+
+    fn read(path: &Path) -> Result<Self, ScenarioError> {
+        let unreadable = |source| ScenarioError::Read { path: path.into(), source };
+        let size = std::fs::metadata(path).map_err(unreadable)?.len();
+        if size > MAX_BYTES {
+            return Err(unreadable(std::io::Error::other(format!("{size} bytes, more than {MAX_BYTES}"))));
+        }
+        let text = std::fs::read_to_string(path).map_err(unreadable)?;
+        let mut scenario = Self::parse(&text, path)?;
+        let folder = std::path::absolute(path).map_err(unreadable)?;
+        let folder = folder.parent().unwrap_or(Path::new("/"));
+        for place in [&mut scenario.scene.dir, &mut scenario.models.weights] {
+            *place = without_dots(&folder.join(&place));
+        }
+        Ok(scenario)
+    }
+
+    fn parse(text: &str, path: &Path) -> Result<Self, ScenarioError> {
+        serde_saphyr::from_str(text).map_err(|error| ScenarioError::Syntax {
+            path: path.into(),
+            line: error.location().map(|location| location.line()),
+            reason: first_line(&error.without_snippet().to_string()),
+        })
+    }
+
+    /// Checks the values of the fields and that what they name exists.
+    ///
+    /// # Errors
+    /// [`ScenarioError`] for the first field that makes no sense; `path` is named in it.
+    pub fn check(&self, path: &Path) -> Result<(), ScenarioError> {
+        let value = |field, found: String, rule| ScenarioError::Value { path: path.into(), field, found, rule };
+        let positive = |field, number: f64| {
+            let fits = number.is_finite() && number > 0.0;
+            if fits { Ok(()) } else { Err(value(field, number.to_string(), "must be a number above 0")) }
+        };
+        positive("scene.rate", self.scene.rate)?;
+        positive("timeouts.ready_s", self.timeouts.ready_s)?;
+        positive("timeouts.drain_s", self.timeouts.drain_s)?;
+        positive("timeouts.stop_s", self.timeouts.stop_s)?;
+        if self.scene.frames == Some(0) {
+            return Err(value("scene.frames", "0".into(), "must be at least 1"));
+        }
+        if !(1..=256).contains(&self.models.threads) {
+            return Err(value("models.threads", self.models.threads.to_string(), "must be 1 to 256"));
+        }
+        if self.ego.deadline_ms > 60_000 {
+            return Err(value("ego.deadline_ms", self.ego.deadline_ms.to_string(), "must be at most 60000"));
+        }
+        if let Some(ego) = &self.ego.id
+            && !self.scene.agents.is_empty()
+            && !self.scene.agents.contains(ego)
+        {
+            return Err(value("ego.id", ego.to_string(), "must be one of scene.agents"));
+        }
+        for endpoint in std::iter::once(&self.network.listen).chain(&self.network.connect) {
+            if !endpoint.starts_with("tcp/") || endpoint.rsplit_once(':').is_none_or(|(_, port)| port.parse::<u16>().is_err()) {
+                return Err(value("network", endpoint.clone(), "must read tcp/ADDRESS:PORT"));
+            }
+        }
+        for (field, place) in [("scene.dir", &self.scene.dir), ("models.weights", &self.models.weights)] {
+            if !place.exists() {
+                return Err(ScenarioError::Missing { path: path.into(), field, missing: place.clone() });
+            }
+        }
+        Ok(())
+    }
+}
+
+/// The path with `.` and `a/..` taken out, so that messages and the resolved copy read well.
+fn without_dots(path: &Path) -> PathBuf {
+    use std::path::Component;
+    let mut clean = PathBuf::new();
+    for component in path.components() {
+        match component {
+            Component::CurDir => {}
+            Component::ParentDir => {
+                clean.pop();
+            }
+            other => clean.push(other),
+        }
+    }
+    clean
+}
+
+fn first_line(text: &str) -> String {
+    text.lines().next().unwrap_or_default().trim().to_owned()
+}
+
+#[cfg(test)]
+mod tests {
+    use protocol::CavId;
+
+    use super::super::{Dtype, Method, NoiseMode, PoseSource, Publish};
+    use super::*;
+
+    const SMALL: &str = "scene: {dir: ../scene}\nmodels: {weights: w.safetensors}\n";
+
+    fn parse(text: &str) -> Result<Scenario, ScenarioError> {
+        Scenario::parse(text, Path::new("s.yaml"))
+    }
+
+    #[test]
+    fn scene_and_weights_are_enough() {
+        let scenario = parse(SMALL).unwrap();
+        assert_eq!(scenario.method, Method::Attention);
+        assert_eq!(scenario.network.listen, "tcp/127.0.0.1:0");
+        assert_eq!(scenario.scene.rate, 1.0);
+    }
+
+    #[test]
+    fn a_vehicle_overrides_single_fields() {
+        let text = format!(
+            "{SMALL}agents: {{zstd: true, dtype: f32}}\nvehicles:\n  4288:\n    dtype: i8\n    pose: {{noisy: {{mode: fixed, std_m: 1.5}}}}\n"
+        );
+        let scenario = parse(&text).unwrap();
+        let own = scenario.settings_of(&CavId::new("4288").unwrap());
+        assert_eq!((own.dtype, own.zstd), (Dtype::I8, true));
+        let PoseSource::Noisy(noise) = own.pose else { panic!("{:?}", own.pose) };
+        assert_eq!((noise.mode, noise.std_m, noise.std_deg), (NoiseMode::Fixed, 1.5, 0.2));
+        assert_eq!(scenario.settings_of(&CavId::new("4279").unwrap()), scenario.agents);
+    }
+
+    #[test]
+    fn an_unknown_field_is_refused_with_file_line_and_field() {
+        let message = parse(&format!("{SMALL}ego:\n  dedline_ms: 5\n")).unwrap_err().to_string();
+        assert!(message.starts_with("s.yaml:4:") && message.contains("dedline_ms"), "{message}");
+        assert!(message.contains("deadline_ms"), "the message should name what is known: {message}");
+    }
+
+    #[test]
+    fn a_field_of_the_wrong_kind_is_refused_with_its_line() {
+        let message = parse("scene:\n  dir: a\n  rate: fast\nmodels: {weights: w}\n").unwrap_err().to_string();
+        assert!(message.starts_with("s.yaml:3:"), "{message}");
+        let message = parse(&format!("{SMALL}method: magic\n")).unwrap_err().to_string();
+        assert!(message.starts_with("s.yaml:3:") && message.contains("magic"), "{message}");
+    }
+
+    #[test]
+    fn values_that_make_no_sense_are_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("s.yaml");
+        for (line, field) in [
+            ("scene: {dir: ., rate: 0}", "scene.rate is 0"),
+            ("scene: {dir: ., frames: 0}", "scene.frames is 0"),
+            ("scene: {dir: nowhere}", "nowhere does not exist"),
+            ("scene: {dir: .}\nnetwork: {listen: localhost}", "network is localhost"),
+            ("scene: {dir: ., agents: [a]}\nego: {id: b}", "ego.id is b"),
+            ("scene: {dir: .}\nmodels: {weights: none.safetensors}", "none.safetensors does not exist"),
+        ] {
+            let models = if line.contains("models") { "" } else { "models: {weights: s.yaml}\n" };
+            std::fs::write(&file, format!("{line}\n{models}")).unwrap();
+            let message = Scenario::load(&file).unwrap_err().to_string();
+            assert!(message.contains(field) && message.contains("s.yaml"), "{line}: {message}");
+        }
+    }
+
+    #[test]
+    fn paths_are_taken_from_the_scenario_file() {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::create_dir_all(folder.path().join("scenarios")).unwrap();
+        std::fs::create_dir(folder.path().join("scene")).unwrap();
+        let file = folder.path().join("scenarios/s.yaml");
+        std::fs::write(folder.path().join("scenarios/w.safetensors"), b"").unwrap();
+        std::fs::write(&file, SMALL).unwrap();
+        let scenario = Scenario::load(&file).unwrap();
+        assert!(scenario.scene.dir.is_absolute() && scenario.scene.dir.ends_with("scene"));
+        assert!(scenario.models.weights.exists());
+    }
+
+    #[test]
+    fn what_is_written_reads_back_the_same() {
+        let mut scenario = parse(SMALL).unwrap();
+        scenario.agents.publish = Some(Publish::Boxes);
+        scenario.agents.pose = PoseSource::Noisy(super::super::PoseNoise::default());
+        let text = serde_saphyr::to_string(&scenario).unwrap();
+        assert_eq!(parse(&text).unwrap(), scenario);
+    }
+}
