@@ -2,3 +2,4 @@
 //! reports and writes it down.
 
 pub mod scenario;
+pub mod supervise;

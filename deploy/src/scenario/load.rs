@@ -117,7 +117,9 @@ impl Scenario {
             return Err(value("ego.id", ego.to_string(), "must be one of scene.agents"));
         }
         for endpoint in std::iter::once(&self.network.listen).chain(&self.network.connect) {
-            if !endpoint.starts_with("tcp/") || endpoint.rsplit_once(':').is_none_or(|(_, port)| port.parse::<u16>().is_err()) {
+            if !endpoint.starts_with("tcp/")
+                || endpoint.rsplit_once(':').is_none_or(|(_, port)| port.parse::<u16>().is_err())
+            {
                 return Err(value("network", endpoint.clone(), "must read tcp/ADDRESS:PORT"));
             }
         }
