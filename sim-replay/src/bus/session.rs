@@ -1,0 +1,301 @@
+//! Opening the bus: explicit endpoints, no discovery, every limit set on purpose.
+
+use std::fmt;
+use std::net::TcpListener;
+use std::time::{Duration, Instant};
+
+use serde_json::{Value, json};
+use zenoh::{Config, Session, Wait};
+
+/// First and longest pause between two attempts to reach the router again.
+const RETRY_FIRST: Duration = Duration::from_millis(100);
+const RETRY_LONGEST: Duration = Duration::from_secs(1);
+
+/// Which end of the star a process is.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Role {
+    /// The middle: routes for all others. One process of a run, usually the one that starts the others.
+    Router {
+        /// Where it listens, for example `tcp/127.0.0.1:7447`.
+        listen: Endpoint,
+    },
+    /// Everyone else.
+    Client {
+        /// The router's endpoint.
+        connect: Endpoint,
+    },
+}
+
+/// A checked zenoh endpoint on TCP: `tcp/HOST:PORT`.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Endpoint(String);
+
+impl Endpoint {
+    /// Reads `tcp/HOST:PORT`; IPv6 hosts stand in brackets.
+    ///
+    /// # Errors
+    /// [`BusError::Endpoint`] names what is not one.
+    pub fn new(text: &str) -> Result<Self, BusError> {
+        let bad = || BusError::Endpoint(text.chars().take(100).collect());
+        let address = text.strip_prefix("tcp/").ok_or_else(bad)?;
+        let (host, port) = address.rsplit_once(':').ok_or_else(bad)?;
+        let bracketed = host.starts_with('[') && host.ends_with(']');
+        let clean = |c: char| c.is_ascii_alphanumeric() || ".-_".contains(c) || (bracketed && "[]:%".contains(c));
+        if host.is_empty() || !host.chars().all(clean) || port.parse::<u16>().is_err() {
+            return Err(bad());
+        }
+        Ok(Self(text.into()))
+    }
+
+    /// The endpoint on this machine's loopback at `port`.
+    #[must_use]
+    pub fn loopback(port: u16) -> Self {
+        Self(format!("tcp/127.0.0.1:{port}"))
+    }
+
+    /// The endpoint as zenoh writes it.
+    #[must_use]
+    pub fn as_str(&self) -> &str {
+        &self.0
+    }
+
+    fn address(&self) -> &str {
+        self.0.trim_start_matches("tcp/")
+    }
+}
+
+impl fmt::Display for Endpoint {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
+impl std::str::FromStr for Endpoint {
+    type Err = BusError;
+
+    fn from_str(text: &str) -> Result<Self, BusError> {
+        Self::new(text)
+    }
+}
+
+/// How to open a session.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct BusOptions {
+    /// Router or client, and where.
+    pub role: Role,
+    /// How long a client tries to reach the router before it gives up.
+    pub patience: Duration,
+    /// Bytes of shared memory for large messages on one machine; `None` keeps everything on the socket, which is what
+    /// experiments with an emulated link need. At least three times the bytes of all maps under way at once.
+    pub shared_memory_pool: Option<usize>,
+    /// Largest message accepted from outside, in bytes; larger ones close the connection they came on.
+    pub max_message_bytes: usize,
+    /// How long one connection may refuse to take another byte before it is closed. While it does, a router delivers
+    /// nothing else that the same sender sends, so this bounds what one stuck receiver costs the others.
+    pub stall_limit: Duration,
+}
+
+impl BusOptions {
+    /// A router that listens at `listen`.
+    #[must_use]
+    pub fn router(listen: Endpoint) -> Self {
+        Self::with_role(Role::Router { listen })
+    }
+
+    /// A client of the router at `connect`.
+    #[must_use]
+    pub fn client(connect: Endpoint) -> Self {
+        Self::with_role(Role::Client { connect })
+    }
+
+    fn with_role(role: Role) -> Self {
+        Self {
+            role,
+            patience: Duration::from_secs(10),
+            shared_memory_pool: None,
+            // Twice a full map of OpenCOOD's size (256 x 48 x 176 cells of f32 at stride 4 are 8.7 MB) and every cloud.
+            max_message_bytes: 32 << 20,
+            stall_limit: Duration::from_secs(5),
+        }
+    }
+
+    /// The keys of zenoh's configuration that differ from its defaults, or on which this crate relies.
+    fn settings(&self) -> Vec<(&'static str, Value)> {
+        let (mode, listen, connect) = match &self.role {
+            Role::Router { listen } => ("router", vec![listen.as_str()], vec![]),
+            Role::Client { connect } => ("client", vec![], vec![connect.as_str()]),
+        };
+        let millis = |duration: Duration| u64::try_from(duration.as_millis()).unwrap_or(u64::MAX);
+        vec![
+            ("mode", json!(mode)),
+            ("listen/endpoints", json!(listen)),
+            ("listen/timeout_ms", json!(0)),
+            ("listen/exit_on_failure", json!(true)),
+            ("connect/endpoints", json!(connect)),
+            ("connect/timeout_ms", json!(millis(self.patience))),
+            ("connect/exit_on_failure", json!(true)),
+            (
+                "connect/retry",
+                json!({
+                    "period_init_ms": millis(RETRY_FIRST),
+                    "period_max_ms": millis(RETRY_LONGEST),
+                    "period_increase_factor": 2.0,
+                }),
+            ),
+            // A neighbour's fleet on the same network must not leak into this run.
+            ("scouting/multicast/enabled", json!(false)),
+            ("scouting/gossip/enabled", json!(false)),
+            // Capture times stand in our own header; the router's clock has no say.
+            ("timestamping/enabled", json!(false)),
+            // It loses messages over 64 KiB without a word.
+            ("transport/unicast/lowlatency", json!(false)),
+            ("transport/unicast/qos/enabled", json!(true)),
+            ("transport/link/rx/max_message_size", json!(self.max_message_bytes)),
+            (
+                "transport/link/tx/queue/congestion_control/block/wait_before_close",
+                json!(u64::try_from(self.stall_limit.as_micros()).unwrap_or(u64::MAX)),
+            ),
+            ("transport/shared_memory/enabled", json!(self.shared_memory_pool.is_some())),
+            ("transport/shared_memory/transport_optimization/enabled", json!(self.shared_memory_pool.is_some())),
+            (
+                "transport/shared_memory/transport_optimization/pool_size",
+                json!(self.shared_memory_pool.unwrap_or(16 << 20)),
+            ),
+        ]
+    }
+}
+
+/// Why the bus could not be opened or used.
+#[derive(Debug, thiserror::Error)]
+pub enum BusError {
+    /// Not an endpoint.
+    #[error("{0:?} is not an endpoint: tcp/HOST:PORT, for example tcp/127.0.0.1:7447")]
+    Endpoint(String),
+    /// zenoh refused or changed a setting.
+    #[error("zenoh setting {key}: wanted {wanted}, {found}")]
+    Setting {
+        /// The key of the configuration.
+        key: &'static str,
+        /// The value that was asked for.
+        wanted: Value,
+        /// What zenoh made of it.
+        found: String,
+    },
+    /// Another process listens there.
+    #[error("cannot listen at {endpoint}: the port is in use; end the other process or choose another port")]
+    PortInUse {
+        /// Where.
+        endpoint: Endpoint,
+    },
+    /// Nothing answers at the router's place.
+    #[error(
+        "no router at {endpoint} after {waited_s:.1} s; start it first (v2vloc up, or zenohd) or correct the endpoint"
+    )]
+    Unreachable {
+        /// Where.
+        endpoint: Endpoint,
+        /// Seconds waited.
+        waited_s: f64,
+    },
+    /// Anything else that zenoh says.
+    #[error("zenoh, {doing}: {cause}")]
+    Zenoh {
+        /// What was tried.
+        doing: String,
+        /// zenoh's words.
+        cause: String,
+    },
+}
+
+impl BusError {
+    pub(super) fn zenoh(doing: impl Into<String>, cause: &zenoh::Error) -> Self {
+        Self::Zenoh { doing: doing.into(), cause: cause.to_string() }
+    }
+}
+
+/// Opens a session, waiting until it listens (router) or is connected (client).
+///
+/// A client that loses its router later reconnects by itself, at first after 100 ms, then ever more slowly up to 1 s.
+/// Inside tokio this needs the multi-thread runtime: zenoh panics on a current-thread one.
+///
+/// # Errors
+/// [`BusError`] names the endpoint and what to do.
+pub fn open(options: &BusOptions) -> Result<Session, BusError> {
+    let config = config(options)?;
+    let began = Instant::now();
+    zenoh::open(config).wait().map_err(|cause| match &options.role {
+        // Asked only after zenoh has failed, so the answer cannot race with a successful start.
+        Role::Router { listen } if port_in_use(listen) => BusError::PortInUse { endpoint: listen.clone() },
+        Role::Router { listen } => BusError::zenoh(format!("listening at {listen}"), &cause),
+        Role::Client { connect } => {
+            BusError::Unreachable { endpoint: connect.clone(), waited_s: began.elapsed().as_secs_f64() }
+        }
+    })
+}
+
+fn port_in_use(endpoint: &Endpoint) -> bool {
+    TcpListener::bind(endpoint.address()).is_err_and(|error| error.kind() == std::io::ErrorKind::AddrInUse)
+}
+
+fn config(options: &BusOptions) -> Result<Config, BusError> {
+    let mut config = Config::default();
+    for (key, wanted) in options.settings() {
+        config
+            .insert_json5(key, &wanted.to_string())
+            .map_err(|cause| BusError::Setting { key, wanted: wanted.clone(), found: format!("refused: {cause}") })?;
+    }
+    // zenoh accepts some keys and ignores them: what counts is what can be read back.
+    for (key, wanted) in options.settings() {
+        let found = config.get_json(key).map_err(|cause| BusError::Setting {
+            key,
+            wanted: wanted.clone(),
+            found: format!("cannot be read back: {cause}"),
+        })?;
+        if !serde_json::from_str::<Value>(&found).is_ok_and(|found| same(&found, &wanted)) {
+            return Err(BusError::Setting { key, wanted, found: format!("reads back as {found}") });
+        }
+    }
+    Ok(config)
+}
+
+/// Equality that takes `1` and `1.0` for the same, and looks only at the keys that were set.
+fn same(found: &Value, wanted: &Value) -> bool {
+    match (found, wanted) {
+        (Value::Number(found), Value::Number(wanted)) => found.as_f64() == wanted.as_f64(),
+        (Value::Object(found), Value::Object(wanted)) => {
+            wanted.iter().all(|(key, value)| found.get(key).is_some_and(|found| same(found, value)))
+        }
+        _ => found == wanted,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn reads_endpoints() {
+        for text in ["tcp/127.0.0.1:7447", "tcp/[::1]:7447", "tcp/router.local:1"] {
+            assert_eq!(Endpoint::new(text).unwrap().as_str(), text);
+        }
+        for text in ["", "127.0.0.1:7447", "tcp/:1", "tcp/host", "tcp/host:70000", "udp/host:1", "tcp/a b:1", "tcp/::1:1"] {
+            let error = Endpoint::new(text).unwrap_err();
+            assert!(error.to_string().contains("tcp/HOST:PORT"), "{text}: {error}");
+        }
+    }
+
+    #[test]
+    fn every_setting_reads_back() {
+        let mut options = BusOptions::client(Endpoint::loopback(7447));
+        config(&options).unwrap();
+        options.shared_memory_pool = Some(64 << 20);
+        config(&options).unwrap();
+        config(&BusOptions::router(Endpoint::loopback(7447))).unwrap();
+    }
+
+    #[test]
+    fn numbers_compare_by_value() {
+        assert!(same(&json!({"a": 1, "b": 2}), &json!({"a": 1.0})));
+        assert!(!same(&json!({"b": 2}), &json!({"a": 1.0})));
+    }
+}

@@ -1,0 +1,182 @@
+//! Ending on request, and ending in time.
+
+use std::sync::mpsc;
+use std::sync::{Arc, Condvar, Mutex, PoisonError};
+use std::thread;
+use std::time::{Duration, Instant};
+
+type Reaction = Box<dyn FnOnce() + Send>;
+
+#[derive(Default)]
+struct State {
+    requested: bool,
+    reactions: Vec<Reaction>,
+}
+
+/// A request to end that every thread of a process can see, make, wait for and react to.
+#[derive(Clone, Default)]
+pub struct Stop(Arc<(Mutex<State>, Condvar)>);
+
+impl Stop {
+    /// Nobody has asked yet.
+    #[must_use]
+    pub fn new() -> Self {
+        Self::default()
+    }
+
+    /// Asks everyone to end; the first request runs the reactions.
+    pub fn request(&self) {
+        let reactions = {
+            let mut state = self.lock();
+            state.requested = true;
+            std::mem::take(&mut state.reactions)
+        };
+        self.0.1.notify_all();
+        for reaction in reactions {
+            reaction();
+        }
+    }
+
+    /// Whether someone has asked.
+    #[must_use]
+    pub fn requested(&self) -> bool {
+        self.lock().requested
+    }
+
+    /// Runs `reaction` when someone asks, at once if that has happened. It must not wait for anything: it is meant for
+    /// closing the mailbox a thread waits at.
+    pub fn on_request(&self, reaction: impl FnOnce() + Send + 'static) {
+        let mut state = self.lock();
+        if state.requested {
+            drop(state);
+            reaction();
+        } else {
+            state.reactions.push(Box::new(reaction));
+        }
+    }
+
+    /// Waits until someone asks, at most until `deadline`; tells whether someone did.
+    #[must_use]
+    pub fn wait_until(&self, deadline: Instant) -> bool {
+        let mut state = self.lock();
+        while !state.requested {
+            let left = deadline.saturating_duration_since(Instant::now());
+            if left.is_zero() {
+                return false;
+            }
+            state = self.0.1.wait_timeout(state, left).unwrap_or_else(PoisonError::into_inner).0;
+        }
+        true
+    }
+
+    /// Makes Ctrl-C and SIGTERM a request. A second one ends the process at once, with exit code 130.
+    ///
+    /// # Errors
+    /// When the signal handlers cannot be installed.
+    pub fn on_signals(&self) -> std::io::Result<()> {
+        let runtime = tokio::runtime::Builder::new_multi_thread().worker_threads(1).enable_all().build()?;
+        let (mut interrupt, mut terminate) = {
+            use tokio::signal::unix::{SignalKind, signal};
+            let _inside = runtime.enter();
+            (signal(SignalKind::interrupt())?, signal(SignalKind::terminate())?)
+        };
+        let stop = self.clone();
+        thread::Builder::new().name("signals".into()).spawn(move || {
+            runtime.block_on(async {
+                loop {
+                    tokio::select! {
+                        _ = interrupt.recv() => {}
+                        _ = terminate.recv() => {}
+                    }
+                    if stop.requested() {
+                        std::process::exit(130);
+                    }
+                    stop.request();
+                }
+            });
+        })?;
+        Ok(())
+    }
+
+    fn lock(&self) -> std::sync::MutexGuard<'_, State> {
+        self.0.0.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// Teardown took longer than it may.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+#[error("{what} did not end within {limit:?}")]
+pub struct Overdue {
+    /// What was being ended.
+    pub what: &'static str,
+    /// How long it had.
+    pub limit: Duration,
+}
+
+/// Runs `teardown` on a thread of its own and waits for it for at most `limit`.
+///
+/// Closing a zenoh session over a dead link takes 10 s and undeclaring has no limit at all, so neither may run on a
+/// thread that somebody waits for. An overdue teardown is left behind; the end of the process ends it.
+///
+/// # Errors
+/// [`Overdue`] when it is not done in time.
+pub fn within<T: Send + 'static>(
+    limit: Duration,
+    what: &'static str,
+    teardown: impl FnOnce() -> T + Send + 'static,
+) -> Result<T, Overdue> {
+    let (done, wait) = mpsc::sync_channel(1);
+    let helper = thread::Builder::new().name(format!("end-{what}")).spawn(move || {
+        // The receiver is gone only when it gave up waiting.
+        let _ = done.send(teardown());
+    });
+    let overdue = Overdue { what, limit };
+    helper.map_err(|_| overdue)?;
+    wait.recv_timeout(limit).map_err(|_| overdue)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::atomic::{AtomicUsize, Ordering};
+
+    use super::*;
+
+    #[test]
+    fn reactions_run_once_however_late_they_come() {
+        let (stop, runs) = (Stop::new(), Arc::new(AtomicUsize::new(0)));
+        let count = |runs: &Arc<AtomicUsize>| {
+            let runs = Arc::clone(runs);
+            move || {
+                runs.fetch_add(1, Ordering::Relaxed);
+            }
+        };
+        stop.on_request(count(&runs));
+        assert!(!stop.requested());
+        stop.request();
+        stop.request();
+        stop.on_request(count(&runs));
+        assert!(stop.requested());
+        assert_eq!(runs.load(Ordering::Relaxed), 2);
+    }
+
+    #[test]
+    fn waiting_ends_with_the_request_or_the_deadline() {
+        let stop = Stop::new();
+        assert!(!stop.wait_until(Instant::now() + Duration::from_millis(5)));
+        let waiter = thread::spawn({
+            let stop = stop.clone();
+            move || stop.wait_until(Instant::now() + Duration::from_secs(60))
+        });
+        stop.request();
+        assert!(waiter.join().unwrap());
+    }
+
+    #[test]
+    fn a_teardown_that_hangs_is_left_behind() {
+        let (release, hang) = mpsc::channel::<()>();
+        let overdue = within(Duration::from_millis(20), "a dead link", move || hang.recv()).unwrap_err();
+        assert_eq!(overdue.to_string(), "a dead link did not end within 20ms");
+        drop(release);
+        assert_eq!(within(Duration::from_secs(60), "a live one", || 7), Ok(7));
+    }
+}
