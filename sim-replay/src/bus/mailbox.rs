@@ -170,7 +170,8 @@ enum Full {
 
 /// Lanes that run empty are forgotten, so that peers that come and go do not use the lanes up.
 fn pop_oldest<K: Ord + Clone, T>(lanes: &mut BTreeMap<K, VecDeque<(u64, T)>>) -> Option<(K, T)> {
-    let oldest = lanes.iter().filter_map(|(key, lane)| Some((lane.front()?.0, key))).min_by_key(|(arrival, _)| *arrival);
+    let oldest =
+        lanes.iter().filter_map(|(key, lane)| Some((lane.front()?.0, key))).min_by_key(|(arrival, _)| *arrival);
     let key = oldest?.1.clone();
     let lane = lanes.get_mut(&key)?;
     let (_, item) = lane.pop_front()?;

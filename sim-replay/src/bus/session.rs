@@ -240,9 +240,11 @@ fn port_in_use(endpoint: &Endpoint) -> bool {
 fn config(options: &BusOptions) -> Result<Config, BusError> {
     let mut config = Config::default();
     for (key, wanted) in options.settings() {
-        config
-            .insert_json5(key, &wanted.to_string())
-            .map_err(|cause| BusError::Setting { key, wanted: wanted.clone(), found: format!("refused: {cause}") })?;
+        config.insert_json5(key, &wanted.to_string()).map_err(|cause| BusError::Setting {
+            key,
+            wanted: wanted.clone(),
+            found: format!("refused: {cause}"),
+        })?;
     }
     // zenoh accepts some keys and ignores them: what counts is what can be read back.
     for (key, wanted) in options.settings() {
@@ -278,7 +280,9 @@ mod tests {
         for text in ["tcp/127.0.0.1:7447", "tcp/[::1]:7447", "tcp/router.local:1"] {
             assert_eq!(Endpoint::new(text).unwrap().as_str(), text);
         }
-        for text in ["", "127.0.0.1:7447", "tcp/:1", "tcp/host", "tcp/host:70000", "udp/host:1", "tcp/a b:1", "tcp/::1:1"] {
+        for text in
+            ["", "127.0.0.1:7447", "tcp/:1", "tcp/host", "tcp/host:70000", "udp/host:1", "tcp/a b:1", "tcp/::1:1"]
+        {
             let error = Endpoint::new(text).unwrap_err();
             assert!(error.to_string().contains("tcp/HOST:PORT"), "{text}: {error}");
         }
