@@ -1,6 +1,15 @@
 //! Bird's-eye-view feature maps and the lattice they lie on.
 
+use std::fmt;
+
 use serde::{Deserialize, Serialize};
+
+use crate::{Limits, WireError};
+
+/// Bounds of a lattice's edges, metres: far beyond any sensor.
+const MAX_EDGE_M: f64 = 1e4;
+/// Bounds of a cell's edge, metres.
+const CELL_RANGE_M: (f64, f64) = (1e-3, 1e3);
 
 /// The lattice of a BEV map in a LiDAR frame: where its first cell begins, how large cells are, how many there are.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -33,6 +42,39 @@ impl BevGrid {
             height: self.height.div_ceil(factor),
             ..*self
         }
+    }
+
+    /// Checks a lattice from outside.
+    ///
+    /// # Errors
+    /// [`WireError::Value`] for an edge that is not a finite number of plausible size, [`WireError::Limit`] for more
+    /// cells than are taken, [`WireError::Shape`] for none.
+    pub fn check(&self, limits: &Limits) -> Result<(), WireError> {
+        let Self { x_min_m, y_min_m, cell_m, width, height } = *self;
+        let (cell_min, cell_max) = CELL_RANGE_M;
+        for (what, value, min, max) in [
+            ("grid x_min_m", x_min_m, -MAX_EDGE_M, MAX_EDGE_M),
+            ("grid y_min_m", y_min_m, -MAX_EDGE_M, MAX_EDGE_M),
+            ("grid cell_m", cell_m, cell_min, cell_max),
+        ] {
+            if !(min..=max).contains(&value) {
+                return Err(WireError::Value { what, index: 0, value, min, max });
+            }
+        }
+        let cells = u64::from(width) * u64::from(height);
+        let max = limits.max_cells.min(u32::MAX.into());
+        match cells {
+            0 => Err(WireError::Shape { what: "grid cells", expected: 1, found: 0 }),
+            _ if cells > max => Err(WireError::Limit { what: "grid cells", max, found: cells }),
+            _ => Ok(()),
+        }
+    }
+}
+
+impl fmt::Display for BevGrid {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { x_min_m, y_min_m, cell_m, width, height } = self;
+        write!(f, "{width} x {height} cells of {cell_m} m from ({x_min_m}, {y_min_m}) m")
     }
 }
 

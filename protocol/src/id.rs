@@ -5,41 +5,62 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
-/// Longest identifier, in bytes.
-const MAX_LEN: usize = 32;
+/// Words that stand in a key where a CAV could: a vehicle of that name would publish onto somebody else's key.
+pub(crate) const RESERVED_CAV_IDS: [&str; 5] = ["alive", "control", "rx", "stats", "truth"];
 
 /// Why a text is not an identifier.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("{kind} {text:?} is not an identifier: 1 to 32 characters of a-z, 0-9, '_' and '-'")]
-pub struct IdError {
-    kind: &'static str,
-    text: String,
+pub enum IdError {
+    /// Empty, too long, or a character outside the alphabet.
+    #[error("{kind} {text:?} is not an identifier: 1 to {max_len} characters of a-z, 0-9, '_' and '-'")]
+    Malformed {
+        /// What the text was to name.
+        kind: &'static str,
+        /// Its beginning.
+        text: String,
+        /// Longest identifier of this kind, bytes.
+        max_len: usize,
+    },
+    /// A word that has another meaning in keys.
+    #[error("{kind} {text:?} is a reserved word of the key space: one of {RESERVED_CAV_IDS:?}")]
+    Reserved {
+        /// What the text was to name.
+        kind: &'static str,
+        /// The word.
+        text: String,
+    },
 }
 
-fn check(kind: &'static str, text: &str) -> Result<Box<str>, IdError> {
+fn check(kind: &'static str, text: &str, max_len: usize, reserved: &[&str]) -> Result<Box<str>, IdError> {
     let allowed = |byte: u8| byte.is_ascii_lowercase() || byte.is_ascii_digit() || byte == b'_' || byte == b'-';
-    if (1..=MAX_LEN).contains(&text.len()) && text.bytes().all(allowed) {
-        return Ok(text.into());
+    if !(1..=max_len).contains(&text.len()) || !text.bytes().all(allowed) {
+        // A hostile name must not fill the log.
+        let text = text.chars().take(2 * max_len).collect();
+        return Err(IdError::Malformed { kind, text, max_len });
     }
-    // A hostile name must not fill the log.
-    let text = text.chars().take(2 * MAX_LEN).collect();
-    Err(IdError { kind, text })
+    if reserved.contains(&text) {
+        return Err(IdError::Reserved { kind, text: text.into() });
+    }
+    Ok(text.into())
 }
 
 macro_rules! identifier {
-    ($(#[$doc:meta])* $name:ident, $kind:literal) => {
+    ($(#[$doc:meta])* $name:ident, $kind:literal, $max_len:literal, $reserved:expr) => {
         $(#[$doc])*
         #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
         #[serde(try_from = "String", into = "String")]
         pub struct $name(Box<str>);
 
         impl $name {
-            /// Checks `text`: 1 to 32 characters of `a-z`, `0-9`, `_` and `-`.
+            /// Longest identifier, bytes.
+            pub const MAX_LEN: usize = $max_len;
+
+            /// Checks `text`: 1 to [`Self::MAX_LEN`] characters of `a-z`, `0-9`, `_` and `-`.
             ///
             /// # Errors
             /// [`IdError`] names the text that is no identifier.
             pub fn new(text: &str) -> Result<Self, IdError> {
-                check($kind, text).map(Self)
+                check($kind, text, $max_len, $reserved).map(Self)
             }
 
             /// The identifier as text.
@@ -81,11 +102,15 @@ macro_rules! identifier {
 
 identifier! {
     /// One connected vehicle (or roadside unit), for example `4279` or `-1`.
-    CavId, "CAV id"
+    CavId, "CAV id", 32, &RESERVED_CAV_IDS
 }
 identifier! {
     /// One run of the fleet: the second chunk of every key.
-    RunId, "run name"
+    RunId, "run name", 32, &[]
+}
+identifier! {
+    /// One process of a run, for example `agent-4279`: who answers for a ledger.
+    ProcessId, "process name", 64, &[]
 }
 
 #[cfg(test)]
@@ -103,6 +128,14 @@ mod tests {
     fn refuses_what_could_steer_a_key() {
         for text in ["", "a/b", "*", "**", "@x", "a$*", "A", "é", &"a".repeat(33)] {
             assert!(CavId::new(text).is_err(), "{text}");
+        }
+    }
+
+    #[test]
+    fn a_vehicle_cannot_take_the_place_of_a_reserved_key() {
+        for word in RESERVED_CAV_IDS {
+            assert!(matches!(CavId::new(word), Err(IdError::Reserved { .. })), "{word}");
+            assert!(ProcessId::new(word).is_ok() && RunId::new(word).is_ok());
         }
     }
 

@@ -16,13 +16,38 @@
 //! - Times are nanoseconds: capture times on the clock of the scene, everything else on the Unix clock.
 
 mod bev;
+mod body;
 mod box3d;
+pub mod codec;
+mod error;
+pub mod header;
 mod id;
+pub mod key;
+mod ledger;
+mod limits;
+pub mod message;
+mod metadata;
 mod point_cloud;
 mod pose;
+mod stream;
+pub mod wire;
 
 pub use bev::{BevFeatures, BevGrid};
+pub use body::{Body, BodyShape};
 pub use box3d::{Box3d, Detection};
-pub use id::{CavId, IdError, RunId};
+pub use codec::{Codec, CodecConfig, DecodedFeatures, Dtype, EncodedFeatures, Packing, Selection, encode_features};
+pub use error::WireError;
+pub use header::{HEADER_LEN, Header, Kind, Stamp, WIRE_VERSION};
+pub use id::{CavId, IdError, ProcessId, RunId};
+pub use key::{Key, KeyError, Role, Selector, Topic, Verb};
+pub use ledger::{Account, Balance, Counts, Difference, DropReason, Ledger, Unheard};
+pub use limits::Limits;
+pub use message::{
+    AgentTruth, Bev, Boxes, Control, Descriptor, Detections, DetectionsReport, FusedNeighbour, Gnss, GnssSource, Lidar,
+    Message, ModelHash, NoPoseReason, Payload, Points, PoseEstimate, Radar, SkippedNeighbour, StageSummary,
+    StageTiming, Stats, TopicCount, TrueObject, Truth,
+};
 pub use point_cloud::{Handedness, PointCloud};
 pub use pose::{Pose, PoseError};
+pub use stream::Stream;
+pub use wire::Encoded;

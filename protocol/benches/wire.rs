@@ -1,0 +1,3 @@
+//! Encode and decode, by size and codec.
+
+fn main() {}

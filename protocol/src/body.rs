@@ -1,0 +1,301 @@
+//! The large part of a message: raw little-endian tensor bytes.
+
+use bytemuck::Pod;
+use crc32fast::Hasher;
+
+use crate::{Limits, WireError};
+
+// Bodies are cast, not converted.
+#[cfg(target_endian = "big")]
+compile_error!("message bodies are little-endian in memory; a big-endian target would need a converting copy");
+
+/// Copied and checked at a time: small enough to be in the first-level cache for every pass over it.
+const BLOCK_BYTES: usize = 16 << 10;
+
+/// The body of one message, owned, in the type its values have.
+///
+/// As bytes (`AsRef<[u8]>`) it goes on the wire without a copy, for example through `bytes::Bytes::from_owner`.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub enum Body {
+    /// Nothing.
+    #[default]
+    Empty,
+    /// Bytes of a codec.
+    Bytes(Vec<u8>),
+    /// A tensor.
+    Floats(Vec<f32>),
+    /// Points: x, y, z in metres and one more value.
+    Points(Vec<[f32; 4]>),
+}
+
+impl Body {
+    /// The body's bytes as they are on the wire.
+    #[must_use]
+    pub fn as_bytes(&self) -> &[u8] {
+        match self {
+            Self::Empty => &[],
+            Self::Bytes(bytes) => bytes,
+            Self::Floats(values) => bytemuck::cast_slice(values),
+            Self::Points(points) => bytemuck::cast_slice(points),
+        }
+    }
+
+    /// Number of bytes.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.as_bytes().len()
+    }
+
+    /// Whether there are none.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Feeds the checksum and checks every value, in one pass over memory.
+    pub(crate) fn seal(&self, crc: &mut Hasher, limits: &Limits) -> Result<(), WireError> {
+        let checked = matches!(self, Self::Floats(_) | Self::Points(_));
+        let mut sound = true;
+        for block in self.as_bytes().chunks(BLOCK_BYTES) {
+            crc.update(block);
+            if checked {
+                sound &= all_bounded(bytemuck::cast_slice(block), limits.max_abs_value);
+            }
+        }
+        if sound { Ok(()) } else { check_body(self, limits.max_abs_value) }
+    }
+}
+
+impl AsRef<[u8]> for Body {
+    fn as_ref(&self) -> &[u8] {
+        self.as_bytes()
+    }
+}
+
+/// What metadata demand of the body, before a byte of it is read.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum BodyShape {
+    /// No body.
+    Empty,
+    /// Between `min` and `max` bytes.
+    Bytes {
+        /// Least bytes.
+        min: u64,
+        /// Most bytes.
+        max: u64,
+    },
+    /// This many `f32`.
+    Floats(u64),
+    /// This many points.
+    Points(u64),
+}
+
+impl BodyShape {
+    /// Checks a length in bytes against the shape.
+    pub(crate) fn check(self, body_len: u64) -> Result<(), WireError> {
+        let (min, max) = match self {
+            Self::Empty => (0, 0),
+            Self::Bytes { min, max } => (min, max),
+            Self::Floats(count) => exactly(count, 4),
+            Self::Points(count) => exactly(count, 16),
+        };
+        if (min..=max).contains(&body_len) {
+            return Ok(());
+        }
+        let expected = if body_len < min { min } else { max };
+        Err(WireError::Shape { what: "body bytes", expected, found: body_len })
+    }
+}
+
+/// A count that overflows matches no length.
+fn exactly(count: u64, size: u64) -> (u64, u64) {
+    count.checked_mul(size).map_or((u64::MAX, 0), |bytes| (bytes, bytes))
+}
+
+/// Reads a payload that lies in many pieces, front to back, feeding the checksum.
+pub(crate) struct PayloadReader<'a> {
+    pieces: std::vec::IntoIter<&'a [u8]>,
+    piece: &'a [u8],
+    crc: Hasher,
+}
+
+impl<'a> PayloadReader<'a> {
+    /// Begins after the first `skip` bytes.
+    pub(crate) fn new(pieces: Vec<&'a [u8]>, skip: usize) -> Self {
+        let mut reader = Self { pieces: pieces.into_iter(), piece: &[], crc: Hasher::new() };
+        let mut left = skip;
+        while left > 0 {
+            let Some(run) = reader.next_run(left) else { break };
+            left -= run.len();
+        }
+        reader
+    }
+
+    /// The next bytes that lie together, at most `max`; `None` at the end.
+    fn next_run(&mut self, max: usize) -> Option<&'a [u8]> {
+        while self.piece.is_empty() {
+            self.piece = self.pieces.next()?;
+        }
+        let (run, rest) = self.piece.split_at(max.min(self.piece.len()));
+        self.piece = rest;
+        Some(run)
+    }
+
+    /// The next `len` bytes, which the caller knows to be there.
+    pub(crate) fn read_bytes(&mut self, len: usize) -> Vec<u8> {
+        let mut out = Vec::with_capacity(len);
+        while out.len() < len {
+            let Some(run) = self.next_run(BLOCK_BYTES.min(len - out.len())) else { break };
+            self.crc.update(run);
+            out.extend_from_slice(run);
+        }
+        out
+    }
+
+    /// The body, `len` bytes that the caller knows to be there, as `shape` says, and whether all its values are sound.
+    ///
+    /// # Errors
+    /// [`WireError::Shape`] when the length is not the shape's.
+    pub(crate) fn read_body(&mut self, len: u64, shape: BodyShape, max_abs: f32) -> Result<(Body, bool), WireError> {
+        shape.check(len)?;
+        let len = len as usize;
+        Ok(match shape {
+            BodyShape::Empty => (Body::Empty, true),
+            BodyShape::Bytes { .. } => (Body::Bytes(self.read_bytes(len)), true),
+            BodyShape::Floats(_) => {
+                let (values, sound) = self.read_values::<f32>(len / 4, |new| all_bounded(new, max_abs));
+                (Body::Floats(values), sound)
+            }
+            BodyShape::Points(_) => {
+                let (points, sound) =
+                    self.read_values::<[f32; 4]>(len / 16, |new| all_bounded(new.as_flattened(), max_abs));
+                (Body::Points(points), sound)
+            }
+        })
+    }
+
+    /// The one copy from the network's pieces into aligned memory. Pieces end anywhere, inside a value too.
+    fn read_values<T: Pod>(&mut self, count: usize, is_sound: impl Fn(&[T]) -> bool) -> (Vec<T>, bool) {
+        let size = size_of::<T>();
+        let mut values = Vec::<T>::with_capacity(count);
+        let mut sound = true;
+        while values.len() < count {
+            let known = values.len();
+            let missing = (count - known).saturating_mul(size);
+            let Some(run) = self.next_run(BLOCK_BYTES.min(missing)) else { break };
+            self.crc.update(run);
+            let whole = run.chunks_exact(size);
+            let split = whole.remainder();
+            values.extend(whole.map(bytemuck::pod_read_unaligned::<T>));
+            if !split.is_empty() {
+                values.push(self.read_split_value(split));
+            }
+            sound &= is_sound(&values[known..]);
+        }
+        (values, sound)
+    }
+
+    /// A value of which `begin` ends one piece and the rest begins the next.
+    fn read_split_value<T: Pod>(&mut self, begin: &[u8]) -> T {
+        let mut value = T::zeroed();
+        let bytes = bytemuck::bytes_of_mut(&mut value);
+        bytes[..begin.len()].copy_from_slice(begin);
+        let mut filled = begin.len();
+        while filled < bytes.len() {
+            let Some(run) = self.next_run(bytes.len() - filled) else { break };
+            self.crc.update(run);
+            bytes[filled..filled + run.len()].copy_from_slice(run);
+            filled += run.len();
+        }
+        value
+    }
+
+    /// The checksum over all bytes of the payload, those not yet read included.
+    pub(crate) fn finish(mut self) -> u32 {
+        while let Some(run) = self.next_run(usize::MAX) {
+            self.crc.update(run);
+        }
+        self.crc.finalize()
+    }
+}
+
+/// Names the first value of a tensor that is not finite or larger than `max_abs`.
+pub(crate) fn check_body(body: &Body, max_abs: f32) -> Result<(), WireError> {
+    match body {
+        Body::Floats(values) => check_values("feature", values, max_abs),
+        Body::Points(points) => check_values("point value", points.as_flattened(), max_abs),
+        Body::Empty | Body::Bytes(_) => Ok(()),
+    }
+}
+
+/// Whether every value is finite and at most `max_abs` in size. Compares bit patterns: those of infinity and NaN are
+/// larger than any number's, so that one integer comparison tells all three, and the loop vectorises.
+pub(crate) fn all_bounded(values: &[f32], max_abs: f32) -> bool {
+    let bound = max_abs.to_bits();
+    values.iter().fold(true, |sound, value| sound & (value.to_bits() & 0x7fff_ffff <= bound))
+}
+
+/// [`all_bounded`], naming the first value that is not.
+pub(crate) fn check_values(what: &'static str, values: &[f32], max_abs: f32) -> Result<(), WireError> {
+    if all_bounded(values, max_abs) {
+        return Ok(());
+    }
+    let bound = max_abs.to_bits();
+    match values.iter().position(|value| value.to_bits() & 0x7fff_ffff > bound) {
+        None => Ok(()),
+        Some(index) => Err(WireError::Value {
+            what,
+            index,
+            value: f64::from(values[index]),
+            min: f64::from(-max_abs),
+            max: f64::from(max_abs),
+        }),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn split(bytes: &[u8], size: usize) -> PayloadReader<'_> {
+        PayloadReader::new(bytes.chunks(size).collect(), 0)
+    }
+
+    #[test]
+    fn pieces_of_any_size_give_the_same_values() {
+        let values: Vec<f32> = (0..10_000u16).map(f32::from).collect();
+        let body = Body::Floats(values);
+        let bytes = body.as_bytes().to_vec();
+        for size in [1, 2, 3, 5, 7, 16, 4095, 16 << 10, 65_535, 1 << 20] {
+            let mut reader = split(&bytes, size);
+            let (read, sound) = reader.read_body(40_000, BodyShape::Floats(10_000), 1e6).unwrap();
+            assert!(sound && read == body, "pieces of {size}");
+            assert_eq!(reader.finish(), crc32fast::hash(&bytes));
+            let (read, _) = split(&bytes, size).read_body(40_000, BodyShape::Points(2_500), 1e6).unwrap();
+            assert_eq!(read.as_bytes(), bytes);
+        }
+    }
+
+    #[test]
+    fn a_length_that_is_not_the_shape_s_is_refused() {
+        for (shape, len) in [
+            (BodyShape::Empty, 1),
+            (BodyShape::Floats(2), 7),
+            (BodyShape::Floats(1 << 62), 0),
+            (BodyShape::Points(1), 15),
+            (BodyShape::Bytes { min: 2, max: 3 }, 4),
+        ] {
+            assert!(matches!(split(&[0; 64], 64).read_body(len, shape, 1.0), Err(WireError::Shape { .. })));
+        }
+    }
+
+    #[test]
+    fn values_out_of_bounds_are_named() {
+        for bad in [f32::NAN, -f32::NAN, f32::INFINITY, f32::NEG_INFINITY, 1e30, -1.1e6] {
+            let values = [0.0, -0.0, 1e6, -1e6, f32::MIN_POSITIVE / 2.0, bad];
+            assert!(all_bounded(&values[..5], 1e6) && !all_bounded(&values, 1e6));
+            let error = check_values("feature", &values, 1e6).unwrap_err();
+            assert!(matches!(error, WireError::Value { index: 5, .. }), "{error}");
+        }
+    }
+}

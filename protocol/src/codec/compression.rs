@@ -1,0 +1,79 @@
+//! zstd around a body.
+
+use super::Packing;
+use crate::WireError;
+
+/// Packs `bytes`, or leaves them as they are where that would not make them fewer.
+///
+/// # Errors
+/// [`WireError::Compression`] when zstd refuses, for example for lack of memory.
+pub(super) fn pack(bytes: Vec<u8>, level: i32) -> Result<(Packing, Vec<u8>), WireError> {
+    let packed = zstd::bulk::compress(&bytes, level).map_err(|error| WireError::Compression {
+        bytes: 0,
+        expected: bytes.len() as u64,
+        detail: error.to_string(),
+    })?;
+    Ok(if packed.len() < bytes.len() { (Packing::Zstd, packed) } else { (Packing::Raw, bytes) })
+}
+
+/// Unpacks to exactly `expected` bytes, a size the caller has checked against its limits. The decoder writes into a
+/// buffer of that size and fails at its end, whatever the frame claims: a bomb has nowhere to go off.
+///
+/// # Errors
+/// [`WireError::Compression`] when the frame is broken, or unpacks to more or fewer bytes.
+pub(super) fn unpack(packed: Vec<u8>, expected: usize) -> Result<Vec<u8>, WireError> {
+    let refuse =
+        |detail: String| WireError::Compression { bytes: packed.len() as u64, expected: expected as u64, detail };
+    // A frame says how much it holds; believing a smaller claim saves the buffer of a message that lies.
+    let claimed = zstd::zstd_safe::get_frame_content_size(&packed).map_err(|_| refuse("no zstd frame".into()))?;
+    if let Some(claimed) = claimed.filter(|claimed| *claimed != expected as u64) {
+        return Err(refuse(format!("the frame holds {claimed}")));
+    }
+    let mut bytes = Vec::with_capacity(expected);
+    let found = zstd::bulk::Decompressor::new()
+        .and_then(|mut decompressor| decompressor.decompress_to_buffer(&packed, &mut bytes))
+        .map_err(|error| refuse(error.to_string()))?;
+    if found == expected { Ok(bytes) } else { Err(refuse(format!("the frame holds {found}"))) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn round_trip_and_exact_size() {
+        let bytes: Vec<u8> = (0..10_000u32).map(|n| (n / 100) as u8).collect();
+        let (packing, packed) = pack(bytes.clone(), 3).unwrap();
+        assert_eq!(packing, Packing::Zstd);
+        assert_eq!(unpack(packed.clone(), bytes.len()).unwrap(), bytes);
+        for wrong in [0, 1, bytes.len() - 1, bytes.len() + 1] {
+            assert!(matches!(unpack(packed.clone(), wrong), Err(WireError::Compression { .. })), "{wrong}");
+        }
+        for cut in 0..packed.len() {
+            assert!(unpack(packed[..cut].to_vec(), bytes.len()).is_err(), "cut at {cut}");
+        }
+    }
+
+    #[test]
+    fn noise_is_left_unpacked() {
+        let mut state = 1u64;
+        let bytes: Vec<u8> = std::iter::repeat_with(|| {
+            state = state.wrapping_mul(6_364_136_223_846_793_005).wrapping_add(1_442_695_040_888_963_407);
+            (state >> 56) as u8
+        })
+        .take(4096)
+        .collect();
+        assert_eq!(pack(bytes.clone(), 3).unwrap(), (Packing::Raw, bytes));
+    }
+
+    #[test]
+    fn a_bomb_goes_nowhere() {
+        let (_, bomb) = pack(vec![0; 64 << 20], 19).unwrap();
+        assert!(bomb.len() < 10_000);
+        assert!(matches!(unpack(bomb.clone(), 1000), Err(WireError::Compression { .. })));
+        // Two frames that together hold more than announced.
+        let mut twice = pack(vec![0; 1000], 3).unwrap().1;
+        twice.extend(bomb);
+        assert!(matches!(unpack(twice, 1000), Err(WireError::Compression { .. })));
+    }
+}

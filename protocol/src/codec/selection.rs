@@ -1,0 +1,146 @@
+//! Which cells of a map are sent.
+
+use super::Dtype;
+use crate::WireError;
+
+/// The cells with the highest confidence that fit into `budget` bytes, in row-major order.
+///
+/// # Errors
+/// [`WireError`] when `confidence` has not one finite value per cell or the budget cannot hold scales and mask.
+pub(super) fn within_budget(
+    confidence: &[f32],
+    cells: usize,
+    channels: u32,
+    dtype: Dtype,
+    budget: u64,
+) -> Result<Vec<u32>, WireError> {
+    if confidence.len() != cells {
+        let (expected, found) = (cells as u64, confidence.len() as u64);
+        return Err(WireError::Shape { what: "confidence map", expected, found });
+    }
+    if let Some(index) = confidence.iter().position(|value| !value.is_finite()) {
+        let (value, min, max) = (confidence[index].into(), f32::MIN.into(), f32::MAX.into());
+        return Err(WireError::Value { what: "confidence", index, value, min, max });
+    }
+    let scale_bytes = if dtype == Dtype::I8 { 4 * u64::from(channels) } else { 0 };
+    let needed = scale_bytes + cells.div_ceil(8) as u64;
+    let for_cells = budget.checked_sub(needed).ok_or(WireError::Budget { budget, needed })?;
+    let fitting = for_cells / (u64::from(channels) * dtype.size());
+    Ok(most_confident(confidence, usize::try_from(fitting).unwrap_or(cells).min(cells)))
+}
+
+/// The `count` most confident cells in row-major order; of equals, the first.
+fn most_confident(confidence: &[f32], count: usize) -> Vec<u32> {
+    // A lattice has at most 2^32 - 1 cells.
+    let mut cells: Vec<u32> = (0..confidence.len() as u32).collect();
+    if count < cells.len() {
+        let descending = |a: &u32, b: &u32| confidence[*b as usize].total_cmp(&confidence[*a as usize]).then(a.cmp(b));
+        cells.select_nth_unstable_by(count, descending);
+        cells.truncate(count);
+        cells.sort_unstable();
+    }
+    cells
+}
+
+/// `[C, K]` values of the selected cells out of `[C, H W]`.
+pub(super) fn gather(values: &[f32], cells: usize, selected: &[u32]) -> Vec<f32> {
+    let mut gathered = Vec::with_capacity(values.len() / cells * selected.len());
+    for channel in values.chunks_exact(cells) {
+        gathered.extend(selected.iter().map(|cell| channel[*cell as usize]));
+    }
+    gathered
+}
+
+/// Appends the mask of the selected cells.
+pub(super) fn append_mask(bytes: &mut Vec<u8>, cells: usize, selected: &[u32]) {
+    let begin = bytes.len();
+    bytes.resize(begin + cells.div_ceil(8), 0);
+    for cell in selected {
+        bytes[begin + *cell as usize / 8] |= 1 << (cell % 8);
+    }
+}
+
+/// The selected cells in row-major order.
+///
+/// # Errors
+/// [`WireError::Shape`] when the mask selects another number of cells than announced, or any beyond the last.
+pub(super) fn read_mask(mask: &[u8], cells: usize, announced: usize) -> Result<Vec<u32>, WireError> {
+    let found: u64 = mask.iter().map(|byte| u64::from(byte.count_ones())).sum();
+    if found != announced as u64 {
+        return Err(WireError::Shape { what: "cells in the mask", expected: announced as u64, found });
+    }
+    let mut selected = Vec::with_capacity(announced);
+    for (index, byte) in mask.iter().enumerate().filter(|(_, byte)| **byte != 0) {
+        selected.extend((0..8u32).filter(|bit| byte & (1 << bit) != 0).map(|bit| index as u32 * 8 + bit));
+    }
+    match selected.last() {
+        Some(last) if *last as usize >= cells => {
+            Err(WireError::Shape { what: "last cell in the mask", expected: cells as u64 - 1, found: (*last).into() })
+        }
+        _ => Ok(selected),
+    }
+}
+
+/// The map `[C, H W]` with zeros where nothing was sent, and which cells were.
+pub(super) fn scatter(values: &[f32], channels: usize, cells: usize, selected: &[u32]) -> (Vec<f32>, Vec<bool>) {
+    let mut map = vec![0f32; channels * cells];
+    let mut sent = vec![false; cells];
+    for cell in selected {
+        sent[*cell as usize] = true;
+    }
+    if !selected.is_empty() {
+        for (plane, values) in map.chunks_exact_mut(cells).zip(values.chunks_exact(selected.len())) {
+            for (cell, value) in selected.iter().zip(values) {
+                plane[*cell as usize] = *value;
+            }
+        }
+    }
+    (map, sent)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_most_confident_win_and_ties_go_to_the_first() {
+        let confidence = [0.1, 0.9, 0.5, 0.5, 0.5, 0.0, -0.0];
+        assert!(most_confident(&confidence, 0).is_empty());
+        assert_eq!(most_confident(&confidence, 1), [1]);
+        assert_eq!(most_confident(&confidence, 3), [1, 2, 3]);
+        assert_eq!(most_confident(&confidence, 7), [0, 1, 2, 3, 4, 5, 6]);
+    }
+
+    #[test]
+    fn the_budget_is_filled_and_kept() {
+        let confidence: Vec<f32> = (0..100u8).map(f32::from).collect();
+        // Scales 4 * 3, mask 13, then 3 bytes a cell.
+        let selected = within_budget(&confidence, 100, 3, Dtype::I8, 12 + 13 + 3 * 5 + 2).unwrap();
+        assert_eq!(selected, [95, 96, 97, 98, 99]);
+        let error = within_budget(&confidence, 100, 3, Dtype::I8, 24).unwrap_err();
+        assert_eq!(error, WireError::Budget { budget: 24, needed: 25 });
+        assert!(within_budget(&confidence[1..], 100, 3, Dtype::F16, 1000).is_err());
+        assert!(within_budget(&[f32::NAN; 100], 100, 3, Dtype::F16, 1000).is_err());
+    }
+
+    #[test]
+    fn a_mask_that_lies_is_refused() {
+        let mut mask = Vec::new();
+        append_mask(&mut mask, 12, &[0, 9, 11]);
+        assert_eq!(mask, [0b0000_0001, 0b0000_1010]);
+        assert_eq!(read_mask(&mask, 12, 3).unwrap(), [0, 9, 11]);
+        assert!(matches!(read_mask(&mask, 12, 2), Err(WireError::Shape { expected: 2, found: 3, .. })));
+        assert!(matches!(read_mask(&mask, 11, 3), Err(WireError::Shape { expected: 10, found: 11, .. })));
+    }
+
+    #[test]
+    fn scatter_undoes_gather() {
+        let values: Vec<f32> = (1..=8u8).map(f32::from).collect();
+        let gathered = gather(&values, 4, &[1, 3]);
+        assert_eq!(gathered, [2.0, 4.0, 6.0, 8.0]);
+        let (map, sent) = scatter(&gathered, 2, 4, &[1, 3]);
+        assert_eq!(map, [0.0, 2.0, 0.0, 4.0, 0.0, 6.0, 0.0, 8.0]);
+        assert_eq!(sent, [false, true, false, true]);
+        assert_eq!(scatter(&[], 2, 4, &[]), (vec![0.0; 8], vec![false; 4]));
+    }
+}

@@ -1,0 +1,298 @@
+//! The fixed-size header every message starts with.
+//!
+//! It can be read, and trusted, without touching what follows: it carries its own checksum beside that of the payload.
+//!
+//! | offset | bytes | field |
+//! | ---: | ---: | --- |
+//! | 0 | 4 | magic `V2VL` |
+//! | 4 | 2 | wire version |
+//! | 6 | 1 | kind |
+//! | 7 | 1 | length of the CAV id |
+//! | 8 | 32 | CAV id, padded with zeros |
+//! | 40 | 8 | epoch |
+//! | 48 | 8 | sequence |
+//! | 56 | 8 | capture time, nanoseconds on the scene's clock |
+//! | 64 | 8 | publish time, nanoseconds on the Unix clock (stepped runs: the scene's) |
+//! | 72 | 8 | body length, bytes |
+//! | 80 | 4 | metadata length, bytes |
+//! | 84 | 4 | CRC-32 of metadata and body |
+//! | 88 | 4 | CRC-32 of the 88 bytes above |
+//!
+//! All numbers are little-endian. Metadata follow, then the body, then nothing.
+
+use std::fmt;
+
+use serde::{Deserialize, Serialize};
+
+use crate::{CavId, IdError, WireError};
+
+/// First four bytes of every message.
+pub const MAGIC: [u8; 4] = *b"V2VL";
+/// Version of everything on the wire; any change of layout or metadata raises it.
+pub const WIRE_VERSION: u16 = 1;
+/// Bytes of a header.
+pub const HEADER_LEN: usize = 92;
+
+const CRC_OFFSET: usize = HEADER_LEN - 4;
+
+/// What a message is. The numbers are on the wire: never reuse one.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+#[repr(u8)]
+pub enum Kind {
+    /// A LiDAR sweep, replay to agent.
+    Lidar = 1,
+    /// A radar sweep, replay to agent.
+    Radar = 2,
+    /// A recorded or GNSS pose, replay to agent.
+    Gnss = 3,
+    /// A pose estimate, agent to ego.
+    Pose = 4,
+    /// A BEV feature map, agent to ego (intermediate fusion).
+    Bev = 5,
+    /// Detections of one agent, agent to ego (late fusion).
+    Boxes = 6,
+    /// Points of one agent, agent to ego (early fusion).
+    Points = 7,
+    /// What an agent is going to send, agent to ego.
+    Descriptor = 8,
+    /// What the ego detected, ego to anyone.
+    Detections = 9,
+    /// True poses and objects, replay to scorer.
+    Truth = 10,
+    /// Start, stop, readiness, operator to all.
+    Control = 11,
+    /// Ledger and stage timings, any process to the operator.
+    Stats = 12,
+}
+
+impl Kind {
+    /// Every kind, by number.
+    pub const ALL: [Self; 12] = [
+        Self::Lidar,
+        Self::Radar,
+        Self::Gnss,
+        Self::Pose,
+        Self::Bev,
+        Self::Boxes,
+        Self::Points,
+        Self::Descriptor,
+        Self::Detections,
+        Self::Truth,
+        Self::Control,
+        Self::Stats,
+    ];
+
+    fn from_wire(found: u8) -> Result<Self, WireError> {
+        Self::ALL.into_iter().find(|kind| *kind as u8 == found).ok_or(WireError::UnknownKind { found })
+    }
+}
+
+impl fmt::Display for Kind {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(match self {
+            Self::Lidar => "lidar",
+            Self::Radar => "radar",
+            Self::Gnss => "gnss",
+            Self::Pose => "pose",
+            Self::Bev => "bev",
+            Self::Boxes => "boxes",
+            Self::Points => "points",
+            Self::Descriptor => "descriptor",
+            Self::Detections => "detections",
+            Self::Truth => "truth",
+            Self::Control => "control",
+            Self::Stats => "stats",
+        })
+    }
+}
+
+/// Who sends a message, which one it is, and when: what the sender has to say beside the message itself.
+#[derive(Debug, Clone, PartialEq, Eq, Hash, Serialize, Deserialize)]
+pub struct Stamp {
+    /// The vehicle that speaks, or that a sensor message belongs to. Processes without a vehicle use a name of their
+    /// own, for example `replay`.
+    pub cav: CavId,
+    /// Chosen at random when the sender started: tells a restarted sender from an old one.
+    pub epoch: u64,
+    /// Strictly rising within an epoch and stream.
+    pub sequence: u64,
+    /// When what it tells of was measured, nanoseconds on the scene's clock.
+    pub capture_nanos: u64,
+    /// When it was handed to the network, nanoseconds: Unix clock, or the scene's in stepped runs.
+    pub publish_nanos: u64,
+}
+
+/// The decoded header.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Header {
+    /// What the message is.
+    pub kind: Kind,
+    /// Who, which and when.
+    pub stamp: Stamp,
+    /// Bytes of metadata.
+    pub metadata_len: u32,
+    /// Bytes of body.
+    pub body_len: u64,
+    /// CRC-32 of metadata and body.
+    pub payload_crc: u32,
+}
+
+impl Header {
+    /// The header as it goes on the wire.
+    #[must_use]
+    pub fn to_bytes(&self) -> [u8; HEADER_LEN] {
+        // Destructured in full, so that a new field stops the build here.
+        let Self { kind, stamp, metadata_len, body_len, payload_crc } = self;
+        let Stamp { cav, epoch, sequence, capture_nanos, publish_nanos } = stamp;
+        let cav = cav.as_str().as_bytes();
+        let mut bytes = [0; HEADER_LEN];
+        bytes[..4].copy_from_slice(&MAGIC);
+        bytes[4..6].copy_from_slice(&WIRE_VERSION.to_le_bytes());
+        bytes[6] = *kind as u8;
+        // An identifier has at most 32 bytes.
+        bytes[7] = cav.len() as u8;
+        bytes[8..8 + cav.len()].copy_from_slice(cav);
+        for (offset, number) in [(40, epoch), (48, sequence), (56, capture_nanos), (64, publish_nanos), (72, body_len)]
+        {
+            bytes[offset..offset + 8].copy_from_slice(&number.to_le_bytes());
+        }
+        bytes[80..84].copy_from_slice(&metadata_len.to_le_bytes());
+        bytes[84..88].copy_from_slice(&payload_crc.to_le_bytes());
+        let crc = crc32fast::hash(&bytes[..CRC_OFFSET]);
+        bytes[CRC_OFFSET..].copy_from_slice(&crc.to_le_bytes());
+        bytes
+    }
+
+    /// Reads a header; says nothing yet of the payload.
+    ///
+    /// # Errors
+    /// [`WireError`] when it is no header of this version, was changed on the way, or names no kind or vehicle.
+    pub fn from_bytes(bytes: &[u8; HEADER_LEN]) -> Result<Self, WireError> {
+        let magic = take::<4>(bytes, 0);
+        if magic != MAGIC {
+            return Err(WireError::Magic { found: magic });
+        }
+        // Before the checksum: another version may keep its checksum elsewhere.
+        let version = u16::from_le_bytes(take(bytes, 4));
+        if version != WIRE_VERSION {
+            return Err(WireError::Version { found: version });
+        }
+        let found = u32::from_le_bytes(take(bytes, CRC_OFFSET));
+        let expected = crc32fast::hash(&bytes[..CRC_OFFSET]);
+        if found != expected {
+            return Err(WireError::HeaderChecksum { expected, found });
+        }
+        let number = |offset| u64::from_le_bytes(take(bytes, offset));
+        Ok(Self {
+            kind: Kind::from_wire(bytes[6])?,
+            stamp: Stamp {
+                cav: cav_from_wire(bytes[7], &take(bytes, 8))?,
+                epoch: number(40),
+                sequence: number(48),
+                capture_nanos: number(56),
+                publish_nanos: number(64),
+            },
+            body_len: number(72),
+            metadata_len: u32::from_le_bytes(take(bytes, 80)),
+            payload_crc: u32::from_le_bytes(take(bytes, 84)),
+        })
+    }
+
+    /// Checks that the message speaks for the vehicle under whose key it came.
+    ///
+    /// # Errors
+    /// [`WireError::Identity`] names both.
+    pub fn check_sender(&self, expected: &CavId) -> Result<(), WireError> {
+        if self.stamp.cav == *expected {
+            return Ok(());
+        }
+        Err(WireError::Identity { expected: expected.clone(), found: self.stamp.cav.clone() })
+    }
+}
+
+fn take<const N: usize>(bytes: &[u8; HEADER_LEN], offset: usize) -> [u8; N] {
+    std::array::from_fn(|index| bytes[offset + index])
+}
+
+/// One vehicle has exactly one spelling: what follows the name must be zero.
+fn cav_from_wire(len: u8, field: &[u8; CavId::MAX_LEN]) -> Result<CavId, WireError> {
+    let (name, padding) = field.split_at(usize::from(len).min(field.len()));
+    let text = String::from_utf8_lossy(name);
+    let malformed = || IdError::Malformed { kind: "CAV id", text: text.clone().into_owned(), max_len: CavId::MAX_LEN };
+    if usize::from(len) > field.len() || padding.iter().any(|byte| *byte != 0) {
+        return Err(WireError::Cav(malformed()));
+    }
+    CavId::new(&text).map_err(WireError::Cav)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn header() -> Header {
+        Header {
+            kind: Kind::Bev,
+            stamp: Stamp {
+                cav: CavId::new("4279").unwrap(),
+                epoch: 0x0102_0304_0506_0708,
+                sequence: 9,
+                capture_nanos: 1_000_000_000,
+                publish_nanos: 1_700_000_000_000_000_000,
+            },
+            metadata_len: 40,
+            body_len: 1 << 20,
+            payload_crc: 0xdead_beef,
+        }
+    }
+
+    fn resealed(change: impl FnOnce(&mut [u8; HEADER_LEN])) -> Result<Header, WireError> {
+        let mut bytes = header().to_bytes();
+        change(&mut bytes);
+        let crc = crc32fast::hash(&bytes[..CRC_OFFSET]);
+        bytes[CRC_OFFSET..].copy_from_slice(&crc.to_le_bytes());
+        Header::from_bytes(&bytes)
+    }
+
+    #[test]
+    fn bytes_are_what_they_always_were() {
+        let mut golden = Vec::new();
+        golden.extend(b"V2VL");
+        golden.extend([1, 0, 5, 4]);
+        golden.extend(b"4279");
+        golden.extend([0; 28]);
+        golden.extend([8, 7, 6, 5, 4, 3, 2, 1]);
+        golden.extend([9, 0, 0, 0, 0, 0, 0, 0]);
+        golden.extend([0x00, 0xca, 0x9a, 0x3b, 0, 0, 0, 0]);
+        golden.extend([0x00, 0x00, 0x2a, 0x36, 0xfe, 0x9c, 0x97, 0x17]);
+        golden.extend([0, 0, 0x10, 0, 0, 0, 0, 0]);
+        golden.extend([40, 0, 0, 0]);
+        golden.extend([0xef, 0xbe, 0xad, 0xde]);
+        // zlib.crc32 of the above.
+        golden.extend([0x93, 0x0e, 0xab, 0xf0]);
+        assert_eq!(header().to_bytes().as_slice(), golden);
+        assert_eq!(Header::from_bytes(&header().to_bytes()).unwrap(), header());
+    }
+
+    #[test]
+    fn every_flipped_bit_is_noticed() {
+        for bit in 0..8 * HEADER_LEN {
+            let mut bytes = header().to_bytes();
+            bytes[bit / 8] ^= 1 << (bit % 8);
+            assert!(Header::from_bytes(&bytes).is_err(), "bit {bit}");
+        }
+    }
+
+    #[test]
+    fn says_what_is_wrong() {
+        assert!(matches!(resealed(|b| b[0] = b'X'), Err(WireError::Magic { found: [b'X', ..] })));
+        assert!(matches!(resealed(|b| b[4] = 7), Err(WireError::Version { found: 7 })));
+        assert!(matches!(resealed(|b| b[6] = 99), Err(WireError::UnknownKind { found: 99 })));
+        assert!(matches!(resealed(|b| b[7] = 33), Err(WireError::Cav(_))));
+        assert!(matches!(resealed(|b| b[7] = 0), Err(WireError::Cav(_))));
+        assert!(matches!(resealed(|b| b[8] = b'*'), Err(WireError::Cav(_))));
+        assert!(matches!(resealed(|b| b[20] = b'x'), Err(WireError::Cav(_))));
+        let other = CavId::new("4288").unwrap();
+        assert!(matches!(header().check_sender(&other), Err(WireError::Identity { .. })));
+    }
+}

@@ -1,0 +1,485 @@
+//! Every key of a run: built here, parsed here, nowhere else.
+//!
+//! | key | from | to | message |
+//! | --- | --- | --- | --- |
+//! | `v2v/<run>/<cav>/<stream>` | replay, agent | that vehicle's agent, link | by [`Stream`] |
+//! | `v2v/<run>/rx/<ego>/<cav>/<stream>` | link | the ego-fuser of `<ego>` | the same, after the link |
+//! | `v2v/<run>/<ego>/detections[/json]` | ego-fuser | anyone | detections |
+//! | `v2v/<run>/truth` | replay | scorer | truth |
+//! | `v2v/<run>/control/<verb>` | operator, processes | replay, operator | control |
+//! | `v2v/<run>/stats/<process>` | every process | operator | stats |
+//! | `v2v/<run>/alive/<role>/<cav>` | every process | anyone | none: a liveliness token |
+//!
+//! A vehicle cannot be called `rx`, `truth`, `control`, `stats` or `alive` ([`CavId`] refuses it), so each key has one
+//! reading. A [`Key`] never holds a wildcard; what subscribes to several keys is a [`Selector`].
+
+use std::fmt;
+use std::str::FromStr;
+
+use serde::{Deserialize, Serialize};
+
+use crate::{CavId, IdError, ProcessId, RunId, Stream};
+
+/// First chunk of every key.
+pub const KEY_ROOT: &str = "v2v";
+/// Longer texts are no keys, whatever they say.
+const MAX_KEY_BYTES: usize = 256;
+
+/// Why a text is not a key.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum KeyError {
+    /// No key of this program has that form.
+    #[error("{text:?} is no key of the form {KEY_ROOT}/<run>/...")]
+    Unknown {
+        /// The beginning of the text.
+        text: String,
+    },
+    /// Wildcards name many keys, a message has one.
+    #[error("{text:?} holds a wildcard")]
+    Wildcard {
+        /// The beginning of the text.
+        text: String,
+    },
+    /// A chunk of the key is not an identifier.
+    #[error("key {text:?}: {source}")]
+    Id {
+        /// The beginning of the key.
+        text: String,
+        /// What is wrong with the chunk.
+        source: IdError,
+    },
+}
+
+impl KeyError {
+    pub(crate) fn unknown(text: &str) -> Self {
+        Self::Unknown { text: beginning(text) }
+    }
+}
+
+fn beginning(text: &str) -> String {
+    text.chars().take(MAX_KEY_BYTES).collect()
+}
+
+/// What a process does in a run: the part of a liveliness token that says whom one can expect what from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Role {
+    /// Publishes one vehicle's poses and features.
+    Agent,
+    /// Fuses and detects for one vehicle.
+    Ego,
+    /// Streams a scene.
+    Replay,
+    /// Emulates the air.
+    Link,
+    /// Compares detections with the truth.
+    Scorer,
+}
+
+impl Role {
+    const ALL: [Self; 5] = [Self::Agent, Self::Ego, Self::Replay, Self::Link, Self::Scorer];
+
+    fn as_str(self) -> &'static str {
+        match self {
+            Self::Agent => "agent",
+            Self::Ego => "ego",
+            Self::Replay => "replay",
+            Self::Link => "link",
+            Self::Scorer => "scorer",
+        }
+    }
+}
+
+impl fmt::Display for Role {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.as_str())
+    }
+}
+
+/// What a control message asks for or says: one key each, so that a process hears only what concerns it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Verb {
+    /// Start the scene's clock.
+    Start,
+    /// Halt it.
+    Pause,
+    /// Let it run on.
+    Resume,
+    /// Move on by some ticks and halt.
+    Step,
+    /// Go to a tick.
+    Seek,
+    /// The scene is over.
+    End,
+    /// A process is ready, or has heard a route's probe.
+    Ready,
+    /// A process has finished a tick (stepped runs).
+    Done,
+}
+
+impl Verb {
+    const ALL: [Self; 8] =
+        [Self::Start, Self::Pause, Self::Resume, Self::Step, Self::Seek, Self::End, Self::Ready, Self::Done];
+
+    fn as_str(self) -> &'static str {
+        match self {
+            Self::Start => "start",
+            Self::Pause => "pause",
+            Self::Resume => "resume",
+            Self::Step => "step",
+            Self::Seek => "seek",
+            Self::End => "end",
+            Self::Ready => "ready",
+            Self::Done => "done",
+        }
+    }
+}
+
+impl fmt::Display for Verb {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.as_str())
+    }
+}
+
+/// A key below its run: `4279/bev`, `truth`.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub enum Topic {
+    /// `<cav>/<stream>`: what a vehicle, or the replay on its behalf, publishes.
+    Stream {
+        /// The vehicle.
+        cav: CavId,
+        /// What of it.
+        stream: Stream,
+    },
+    /// `rx/<ego>/<cav>/<stream>`: the same as it reaches an ego over the emulated air.
+    Received {
+        /// Who receives.
+        ego: CavId,
+        /// Who sent.
+        cav: CavId,
+        /// What of it.
+        stream: Stream,
+    },
+    /// `truth`.
+    Truth,
+    /// `control/<verb>`.
+    Control(Verb),
+    /// `stats/<process>`.
+    Stats(ProcessId),
+    /// `alive/<role>/<cav>`: a liveliness token.
+    Alive {
+        /// What the process does.
+        role: Role,
+        /// For which vehicle; a process without one uses a name of its own.
+        cav: CavId,
+    },
+}
+
+impl Topic {
+    /// The key of this topic in `run`.
+    #[must_use]
+    pub fn in_run(self, run: &RunId) -> Key {
+        Key { run: run.clone(), topic: self }
+    }
+
+    fn from_chunks(chunks: &[&str]) -> Result<Option<Self>, IdError> {
+        Ok(match chunks {
+            ["truth"] => Some(Self::Truth),
+            ["control", verb] => Verb::ALL.into_iter().find(|known| known.as_str() == *verb).map(Self::Control),
+            ["stats", process] => Some(Self::Stats(ProcessId::new(process)?)),
+            ["alive", role, cav] => match Role::ALL.into_iter().find(|known| known.as_str() == *role) {
+                Some(role) => Some(Self::Alive { role, cav: CavId::new(cav)? }),
+                None => None,
+            },
+            ["rx", ego, cav, stream @ ..] => match Stream::from_chunks(stream) {
+                Some(stream) => Some(Self::Received { ego: CavId::new(ego)?, cav: CavId::new(cav)?, stream }),
+                None => None,
+            },
+            [cav, stream @ ..] => match Stream::from_chunks(stream) {
+                Some(stream) => Some(Self::Stream { cav: CavId::new(cav)?, stream }),
+                None => None,
+            },
+            [] => None,
+        })
+    }
+}
+
+impl fmt::Display for Topic {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Stream { cav, stream } => write!(f, "{cav}/{stream}"),
+            Self::Received { ego, cav, stream } => write!(f, "rx/{ego}/{cav}/{stream}"),
+            Self::Truth => f.write_str("truth"),
+            Self::Control(verb) => write!(f, "control/{verb}"),
+            Self::Stats(process) => write!(f, "stats/{process}"),
+            Self::Alive { role, cav } => write!(f, "alive/{role}/{cav}"),
+        }
+    }
+}
+
+impl FromStr for Topic {
+    type Err = KeyError;
+
+    fn from_str(text: &str) -> Result<Self, KeyError> {
+        if text.len() > MAX_KEY_BYTES {
+            return Err(KeyError::unknown(text));
+        }
+        // `$` and `#` mean something to zenoh too.
+        if text.contains(['*', '$', '#', '?']) {
+            return Err(KeyError::Wildcard { text: beginning(text) });
+        }
+        let chunks: Vec<&str> = text.split('/').collect();
+        Self::from_chunks(&chunks)
+            .map_err(|source| KeyError::Id { text: beginning(text), source })?
+            .ok_or_else(|| KeyError::unknown(text))
+    }
+}
+
+impl TryFrom<String> for Topic {
+    type Error = KeyError;
+
+    fn try_from(text: String) -> Result<Self, KeyError> {
+        text.parse()
+    }
+}
+
+impl From<Topic> for String {
+    fn from(topic: Topic) -> Self {
+        topic.to_string()
+    }
+}
+
+/// One key: a run and a topic in it.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct Key {
+    /// The run.
+    pub run: RunId,
+    /// The rest of the key.
+    pub topic: Topic,
+}
+
+impl Key {
+    /// `v2v/<run>/<cav>/<stream>`.
+    #[must_use]
+    pub fn stream(run: &RunId, cav: &CavId, stream: Stream) -> Self {
+        Topic::Stream { cav: cav.clone(), stream }.in_run(run)
+    }
+
+    /// `v2v/<run>/rx/<ego>/<cav>/<stream>`.
+    #[must_use]
+    pub fn received(run: &RunId, ego: &CavId, cav: &CavId, stream: Stream) -> Self {
+        Topic::Received { ego: ego.clone(), cav: cav.clone(), stream }.in_run(run)
+    }
+
+    /// `v2v/<run>/truth`.
+    #[must_use]
+    pub fn truth(run: &RunId) -> Self {
+        Topic::Truth.in_run(run)
+    }
+
+    /// `v2v/<run>/control/<verb>`.
+    #[must_use]
+    pub fn control(run: &RunId, verb: Verb) -> Self {
+        Topic::Control(verb).in_run(run)
+    }
+
+    /// `v2v/<run>/stats/<process>`.
+    #[must_use]
+    pub fn stats(run: &RunId, process: &ProcessId) -> Self {
+        Topic::Stats(process.clone()).in_run(run)
+    }
+
+    /// `v2v/<run>/alive/<role>/<cav>`.
+    #[must_use]
+    pub fn alive(run: &RunId, role: Role, cav: &CavId) -> Self {
+        Topic::Alive { role, cav: cav.clone() }.in_run(run)
+    }
+}
+
+impl fmt::Display for Key {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{KEY_ROOT}/{}/{}", self.run, self.topic)
+    }
+}
+
+impl FromStr for Key {
+    type Err = KeyError;
+
+    fn from_str(text: &str) -> Result<Self, KeyError> {
+        let mut parts = text.splitn(3, '/');
+        let (Some(KEY_ROOT), Some(run), Some(topic)) = (parts.next(), parts.next(), parts.next()) else {
+            return Err(KeyError::unknown(text));
+        };
+        let topic = topic.parse()?;
+        let run = RunId::new(run).map_err(|source| KeyError::Id { text: beginning(text), source })?;
+        Ok(Self { run, topic })
+    }
+}
+
+/// A key expression to subscribe to; never one to publish on.
+#[derive(Debug, Clone, PartialEq, Eq, Hash)]
+pub struct Selector(String);
+
+impl Selector {
+    /// Everything of a run.
+    #[must_use]
+    pub fn run(run: &RunId) -> Self {
+        Self(format!("{KEY_ROOT}/{run}/**"))
+    }
+
+    /// One stream of every vehicle, before the link.
+    #[must_use]
+    pub fn stream(run: &RunId, stream: Stream) -> Self {
+        Self(format!("{KEY_ROOT}/{run}/*/{stream}"))
+    }
+
+    /// One stream of every vehicle as it reaches `ego` over the link.
+    #[must_use]
+    pub fn received(run: &RunId, ego: &CavId, stream: Stream) -> Self {
+        Self(format!("{KEY_ROOT}/{run}/rx/{ego}/*/{stream}"))
+    }
+
+    /// Every control message.
+    #[must_use]
+    pub fn control(run: &RunId) -> Self {
+        Self(format!("{KEY_ROOT}/{run}/control/*"))
+    }
+
+    /// The statistics of every process.
+    #[must_use]
+    pub fn stats(run: &RunId) -> Self {
+        Self(format!("{KEY_ROOT}/{run}/stats/*"))
+    }
+
+    /// The liveliness tokens of one role.
+    #[must_use]
+    pub fn alive(run: &RunId, role: Role) -> Self {
+        Self(format!("{KEY_ROOT}/{run}/alive/{role}/*"))
+    }
+
+    /// The liveliness tokens of every process.
+    #[must_use]
+    pub fn everyone_alive(run: &RunId) -> Self {
+        Self(format!("{KEY_ROOT}/{run}/alive/*/*"))
+    }
+
+    /// The key expression.
+    #[must_use]
+    pub fn as_str(&self) -> &str {
+        &self.0
+    }
+}
+
+impl fmt::Display for Selector {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn cav(text: &str) -> CavId {
+        CavId::new(text).unwrap()
+    }
+
+    fn every_key() -> Vec<(Key, &'static str)> {
+        let run = &RunId::new("r1").unwrap();
+        let (ego, other) = (&cav("4279"), &cav("-1"));
+        vec![
+            (Key::stream(run, ego, Stream::Lidar), "v2v/r1/4279/lidar"),
+            (Key::stream(run, ego, Stream::Gnss), "v2v/r1/4279/gnss"),
+            (Key::stream(run, ego, Stream::Camera(2)), "v2v/r1/4279/camera/2"),
+            (Key::stream(run, ego, Stream::Radar), "v2v/r1/4279/radar"),
+            (Key::stream(run, ego, Stream::Pose), "v2v/r1/4279/pose"),
+            (Key::stream(run, ego, Stream::Bev), "v2v/r1/4279/bev"),
+            (Key::stream(run, ego, Stream::Boxes), "v2v/r1/4279/boxes"),
+            (Key::stream(run, ego, Stream::Points), "v2v/r1/4279/points"),
+            (Key::stream(run, ego, Stream::Descriptor), "v2v/r1/4279/descriptor"),
+            (Key::stream(run, ego, Stream::Detections), "v2v/r1/4279/detections"),
+            (Key::stream(run, ego, Stream::DetectionsJson), "v2v/r1/4279/detections/json"),
+            (Key::received(run, ego, other, Stream::Bev), "v2v/r1/rx/4279/-1/bev"),
+            (Key::truth(run), "v2v/r1/truth"),
+            (Key::control(run, Verb::Start), "v2v/r1/control/start"),
+            (Key::stats(run, &ProcessId::new("agent-4279").unwrap()), "v2v/r1/stats/agent-4279"),
+            (Key::alive(run, Role::Agent, other), "v2v/r1/alive/agent/-1"),
+        ]
+    }
+
+    #[test]
+    fn every_key_is_written_and_read_back() {
+        for (key, text) in every_key() {
+            assert_eq!(key.to_string(), text);
+            assert_eq!(text.parse::<Key>().unwrap(), key);
+        }
+        for verb in Verb::ALL {
+            let key = Key::control(&RunId::new("r").unwrap(), verb);
+            assert_eq!(key.to_string().parse::<Key>().unwrap(), key);
+        }
+        for role in Role::ALL {
+            let key = Key::alive(&RunId::new("r").unwrap(), role, &cav("1"));
+            assert_eq!(key.to_string().parse::<Key>().unwrap(), key);
+        }
+    }
+
+    #[test]
+    fn refuses_wildcards() {
+        for text in ["v2v/*/4279/bev", "v2v/r1/*/bev", "v2v/r1/**", "v2v/r1/a$*/bev", "v2v/r1/4279/camera/*"] {
+            assert!(text.parse::<Key>().is_err(), "{text}");
+        }
+        assert!(matches!("v2v/r1/*/bev".parse::<Key>(), Err(KeyError::Wildcard { .. })));
+    }
+
+    #[test]
+    fn refuses_what_is_no_key() {
+        let long = format!("v2v/r1/{}", "a/".repeat(100_000));
+        for text in [
+            "",
+            "v2v",
+            "v2v/r1",
+            "v2v/r1/",
+            "v2v//4279/bev",
+            "v2x/r1/4279/bev",
+            "v2v/r1/4279/sonar",
+            "v2v/r1/4279/bev/",
+            "v2v/r1/4279/camera/007",
+            "v2v/r1/4279/camera/256",
+            "v2v/r1/4279/camera/+1",
+            "v2v/r1/control/explode",
+            "v2v/r1/rx/4279/bev",
+            "v2v/r1/rx/4279/truth/bev",
+            "v2v/r1/alive/agent/@x",
+            "V2V/r1/truth",
+            &long,
+        ] {
+            let error = text.parse::<Key>().unwrap_err();
+            assert!(error.to_string().len() < 1000);
+        }
+    }
+
+    #[test]
+    fn selectors_name_the_keys_they_are_for() {
+        let run = RunId::new("r1").unwrap();
+        assert_eq!(Selector::stream(&run, Stream::Bev).as_str(), "v2v/r1/*/bev");
+        assert_eq!(Selector::received(&run, &cav("4279"), Stream::Pose).as_str(), "v2v/r1/rx/4279/*/pose");
+        assert_eq!(Selector::alive(&run, Role::Agent).as_str(), "v2v/r1/alive/agent/*");
+        assert_eq!(Selector::control(&run).as_str(), "v2v/r1/control/*");
+        assert_eq!(Selector::stats(&run).as_str(), "v2v/r1/stats/*");
+        assert_eq!(Selector::run(&run).as_str(), "v2v/r1/**");
+        assert!(Selector::run(&run).as_str().parse::<Key>().is_err());
+    }
+
+    proptest! {
+        #[test]
+        fn any_text_is_refused_or_is_its_own_spelling(text in "(v2v/)?[a-z0-9/*_-]{0,40}") {
+            if let Ok(key) = text.parse::<Key>() {
+                prop_assert_eq!(key.to_string(), text);
+            }
+        }
+    }
+}

@@ -1,0 +1,52 @@
+//! A feature map with everything needed to use it.
+
+use serde::{Deserialize, Serialize};
+
+use super::{Payload, PoseEstimate, private};
+use crate::{BevGrid, Body, BodyShape, Codec, EncodedFeatures, Kind, Limits, WireError};
+
+/// A BEV feature map: agent to ego, for intermediate fusion.
+///
+/// Body: the map as its codec says, see [`crate::codec`].
+#[derive(Debug, Clone, PartialEq)]
+pub struct Bev {
+    /// Where the sender is: repeated from its `pose` message, so that each is complete alone.
+    pub pose: PoseEstimate,
+    /// The map, in the frame of the sender's LiDAR.
+    pub features: EncodedFeatures,
+}
+
+/// Metadata of [`Bev`].
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct BevMetadata {
+    /// Where the sender is.
+    pub pose: PoseEstimate,
+    /// Lattice of the map.
+    pub grid: BevGrid,
+    /// Channels of the map.
+    pub channels: u32,
+    /// What the body is.
+    pub codec: Codec,
+}
+
+impl private::Sealed for Bev {}
+
+impl Payload for Bev {
+    const KIND: Kind = Kind::Bev;
+    type Metadata = BevMetadata;
+
+    fn into_parts(self) -> (BevMetadata, Body) {
+        let Self { pose, features: EncodedFeatures { grid, channels, codec, body } } = self;
+        (BevMetadata { pose, grid, channels, codec }, body)
+    }
+
+    fn check(metadata: &BevMetadata, limits: &Limits) -> Result<BodyShape, WireError> {
+        metadata.pose.check_values(limits)?;
+        EncodedFeatures::body_shape(&metadata.grid, metadata.channels, &metadata.codec, limits)
+    }
+
+    fn from_parts(metadata: BevMetadata, body: Body) -> Result<Self, WireError> {
+        let BevMetadata { pose, grid, channels, codec } = metadata;
+        Ok(Self { pose, features: EncodedFeatures { grid, channels, codec, body } })
+    }
+}

@@ -1,0 +1,104 @@
+//! What an agent is going to send.
+
+use std::fmt;
+use std::str::FromStr;
+
+use serde::{Deserialize, Serialize};
+
+use super::{check_count, metadata_only};
+use crate::{BevGrid, Dtype, Limits, Stream, WireError};
+
+/// What an agent is and sends: agent to ego, once it is ready and to every late joiner.
+///
+/// An ego can tell from it whether a neighbour's features are its own network's, before any of them comes.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Descriptor {
+    /// Hash of the weights its features come from.
+    pub model_hash: ModelHash,
+    /// Lattice of its maps.
+    pub grid: BevGrid,
+    /// Channels of its maps.
+    pub channels: u32,
+    /// How exactly it writes them.
+    pub dtype: Dtype,
+    /// What it publishes.
+    pub streams: Vec<Stream>,
+}
+
+impl Descriptor {
+    fn check_values(&self, limits: &Limits) -> Result<(), WireError> {
+        self.grid.check(limits)?;
+        let (max, found) = (limits.max_channels.into(), self.channels.into());
+        if found > max {
+            return Err(WireError::Limit { what: "channels", max, found });
+        }
+        check_count("streams", self.streams.len(), limits.max_entries)
+    }
+}
+
+metadata_only!(Descriptor, Descriptor);
+
+/// SHA-256 (or any other 256-bit hash) of a weights file; as text, and in metadata, 64 lower-case hexadecimal digits.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub struct ModelHash(pub [u8; 32]);
+
+/// A text that is not 64 lower-case hexadecimal digits.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{0:?} is no model hash: 64 lower-case hexadecimal digits")]
+pub struct ModelHashError(String);
+
+impl fmt::Display for ModelHash {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.0.iter().try_for_each(|byte| write!(f, "{byte:02x}"))
+    }
+}
+
+impl FromStr for ModelHash {
+    type Err = ModelHashError;
+
+    fn from_str(text: &str) -> Result<Self, ModelHashError> {
+        let refuse = || ModelHashError(text.chars().take(80).collect());
+        let digit = |byte: u8| match byte {
+            b'0'..=b'9' => Ok(byte - b'0'),
+            b'a'..=b'f' => Ok(byte - b'a' + 10),
+            _ => Err(refuse()),
+        };
+        if text.len() != 64 {
+            return Err(refuse());
+        }
+        let mut hash = [0; 32];
+        for (byte, pair) in hash.iter_mut().zip(text.as_bytes().chunks_exact(2)) {
+            *byte = digit(pair[0])? << 4 | digit(pair[1])?;
+        }
+        Ok(Self(hash))
+    }
+}
+
+impl TryFrom<String> for ModelHash {
+    type Error = ModelHashError;
+
+    fn try_from(text: String) -> Result<Self, ModelHashError> {
+        text.parse()
+    }
+}
+
+impl From<ModelHash> for String {
+    fn from(hash: ModelHash) -> Self {
+        hash.to_string()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_hash_is_its_own_spelling() {
+        let text = "00ff".repeat(16);
+        assert_eq!(text.parse::<ModelHash>().unwrap().to_string(), text);
+        for bad in ["", "00", &"0".repeat(63), &"0".repeat(65), &"G".repeat(64), &"F".repeat(64), &"é".repeat(32)] {
+            assert!(bad.parse::<ModelHash>().is_err(), "{bad}");
+        }
+    }
+}

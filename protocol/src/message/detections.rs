@@ -1,0 +1,98 @@
+//! What the ego detected, and from whose data.
+
+use serde::{Deserialize, Serialize};
+
+use super::{PoseEstimate, StageTiming, check_count, check_detections, check_name, check_nanos, metadata_only};
+use crate::{CavId, Detection, DropReason, Limits, Stamp, WireError};
+
+/// The result of one ego frame: ego-fuser to anyone, also as JSON.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Detections {
+    /// The vehicle that fused, whose LiDAR frame the boxes are in.
+    pub ego: CavId,
+    /// Which frame of the scene, counted from 0.
+    pub frame_index: u64,
+    /// Fusion method, as in the configuration.
+    pub method: String,
+    /// Where the ego believes to be.
+    pub pose: PoseEstimate,
+    /// What it detects, best first.
+    pub detections: Vec<Detection>,
+    /// Whose data were fused, the ego not counted.
+    pub fused: Vec<FusedNeighbour>,
+    /// Whose data could not be.
+    pub skipped: Vec<SkippedNeighbour>,
+    /// How long each stage took.
+    pub stages: Vec<StageTiming>,
+}
+
+/// A neighbour whose data are in a result.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct FusedNeighbour {
+    /// Who.
+    pub cav: CavId,
+    /// Capture time of the ego's sweep less that of the neighbour's, nanoseconds; negative where the neighbour's is the
+    /// younger.
+    pub age_nanos: i64,
+    /// How sure the neighbour is of its pose, 0..=1.
+    pub confidence: f32,
+}
+
+/// A neighbour that is known but not in a result.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+pub struct SkippedNeighbour {
+    /// Who.
+    pub cav: CavId,
+    /// Why; `None`: nothing has come from it for this frame.
+    pub reason: Option<DropReason>,
+}
+
+impl Detections {
+    fn check_values(&self, limits: &Limits) -> Result<(), WireError> {
+        check_name("method", &self.method)?;
+        self.pose.check_values(limits)?;
+        check_detections(&self.detections, limits)?;
+        check_count("fused neighbours", self.fused.len(), limits.max_entries)?;
+        check_count("skipped neighbours", self.skipped.len(), limits.max_entries)?;
+        for neighbour in &self.fused {
+            super::check_within("confidence", neighbour.confidence.into(), 0.0, 1.0)?;
+            check_nanos("age_nanos", neighbour.age_nanos.unsigned_abs())?;
+        }
+        StageTiming::check_all(&self.stages, limits)
+    }
+}
+
+metadata_only!(Detections, Detections);
+
+/// [`Detections`] together with who, which and when, as written to `detections/json` and `detections.jsonl`: one flat
+/// JSON object.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct DetectionsReport {
+    /// See [`Stamp::epoch`].
+    pub epoch: u64,
+    /// See [`Stamp::sequence`].
+    pub sequence: u64,
+    /// See [`Stamp::capture_nanos`].
+    pub capture_nanos: u64,
+    /// See [`Stamp::publish_nanos`].
+    pub publish_nanos: u64,
+    /// The result.
+    #[serde(flatten)]
+    pub result: Detections,
+}
+
+impl DetectionsReport {
+    /// The result of `stamp`'s frame.
+    #[must_use]
+    pub fn new(stamp: &Stamp, result: Detections) -> Self {
+        let Stamp { cav: _, epoch, sequence, capture_nanos, publish_nanos } = *stamp;
+        Self { epoch, sequence, capture_nanos, publish_nanos, result }
+    }
+
+    /// As JSON, on one line.
+    #[must_use]
+    pub fn to_json(&self) -> String {
+        // Neither a map with keys that are no strings nor a failing `Serialize` is in here: the only errors there are.
+        serde_json::to_string(self).unwrap_or_default()
+    }
+}

@@ -1,0 +1,39 @@
+//! Poses from outside the method: recorded ones, and a receiver's.
+
+use serde::{Deserialize, Serialize};
+
+use super::{check_pose, check_within, metadata_only};
+use crate::{Limits, Pose, WireError};
+
+/// A pose that came with the recording: replay to that vehicle's agent.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+pub struct Gnss {
+    /// Pose of the LiDAR.
+    pub world_from_lidar: Pose,
+    /// Standard deviation of each coordinate, metres; 0 where the source claims to be exact.
+    pub position_std_m: f64,
+    /// Standard deviation of the heading, radians.
+    pub heading_std_rad: f64,
+    /// Where the pose comes from.
+    pub source: GnssSource,
+}
+
+/// Where a recorded pose comes from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum GnssSource {
+    /// The data set's own pose, as good as it has.
+    Recorded,
+    /// A satellite receiver, with its noise.
+    Gnss,
+}
+
+impl Gnss {
+    fn check_values(&self, _: &Limits) -> Result<(), WireError> {
+        check_pose("world_from_lidar", &self.world_from_lidar)?;
+        check_within("position_std_m", self.position_std_m, 0.0, 1e6)?;
+        check_within("heading_std_rad", self.heading_std_rad, 0.0, 10.0)
+    }
+}
+
+metadata_only!(Gnss, Gnss);

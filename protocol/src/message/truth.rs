@@ -1,0 +1,71 @@
+//! What really was there.
+
+use serde::{Deserialize, Serialize};
+
+use super::{check_box, check_count, check_name, check_pose, check_within, metadata_only};
+use crate::{Box3d, CavId, Limits, Pose, WireError};
+
+/// The truth of one tick: replay to scorer, on a key of its own, so that no pipeline can lean on it by accident.
+///
+/// Objects are kept as each agent annotates them: which of them count for an ego is the scorer's rule.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Truth {
+    /// Which frame of the scene, counted from 0.
+    pub frame_index: u64,
+    /// Every vehicle of the scene, in the scene's order.
+    pub agents: Vec<AgentTruth>,
+}
+
+/// The truth about one vehicle, and what it annotates.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct AgentTruth {
+    /// Who.
+    pub cav: CavId,
+    /// Where its LiDAR really is.
+    pub world_from_lidar: Pose,
+    /// What it annotates.
+    pub objects: Vec<TrueObject>,
+}
+
+/// One annotated object.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct TrueObject {
+    /// The data set's id, the same for all agents of a scene.
+    pub id: i64,
+    /// Class, as `sim-replay` names it.
+    pub class: String,
+    /// Pose of the box's centre.
+    pub world_from_object: Pose,
+    /// Full length, width and height, metres.
+    pub size_m: [f64; 3],
+    /// Speed, metres per second, where the data set has it.
+    pub speed_mps: Option<f64>,
+}
+
+impl Truth {
+    fn check_values(&self, limits: &Limits) -> Result<(), WireError> {
+        check_count("agents", self.agents.len(), limits.max_entries)?;
+        let objects = self.agents.iter().map(|agent| agent.objects.len()).sum();
+        check_count("objects", objects, limits.max_boxes)?;
+        for agent in &self.agents {
+            check_pose("world_from_lidar", &agent.world_from_lidar)?;
+            agent.objects.iter().try_for_each(TrueObject::check_values)?;
+        }
+        Ok(())
+    }
+}
+
+impl TrueObject {
+    fn check_values(&self) -> Result<(), WireError> {
+        check_name("class", &self.class)?;
+        check_pose("world_from_object", &self.world_from_object)?;
+        check_box(&Box3d {
+            center_m: self.world_from_object.translation_m,
+            size_m: self.size_m,
+            heading_rad: self.world_from_object.yaw_rad(),
+        })?;
+        self.speed_mps.map_or(Ok(()), |speed| check_within("speed_mps", speed, -1e3, 1e3))
+    }
+}
+
+metadata_only!(Truth, Truth);

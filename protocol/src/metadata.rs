@@ -1,0 +1,86 @@
+//! The small structured part of a message as bytes.
+//!
+//! The only file that knows how: bincode 2.0.1, little-endian, variable-length integers, a hard limit on what a decoder
+//! reads. bincode has no maintainer any more, so this door stays as narrow as two functions.
+
+use bincode::config::{Configuration, Limit, LittleEndian, Varint};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+
+use crate::{Kind, Limits, WireError};
+
+const HARD_LIMIT: usize = Limits::HARD_METADATA_BYTES as usize;
+
+const CONFIG: Configuration<LittleEndian, Varint, Limit<HARD_LIMIT>> = bincode::config::standard().with_limit();
+
+/// Appends `metadata` to `head`.
+///
+/// # Errors
+/// [`WireError::Metadata`] when a value cannot be written, [`WireError::Limit`] when it is larger than any receiver takes.
+pub(crate) fn append<T: Serialize>(kind: Kind, metadata: &T, head: &mut Vec<u8>) -> Result<u32, WireError> {
+    let len = bincode::serde::encode_into_std_write(metadata, head, CONFIG)
+        .map_err(|error| WireError::Metadata { kind, detail: error.to_string() })?;
+    if len > HARD_LIMIT {
+        return Err(WireError::Limit { what: "metadata bytes", max: HARD_LIMIT as u64, found: len as u64 });
+    }
+    Ok(len as u32)
+}
+
+/// Reads metadata that fill `bytes` to the last one.
+///
+/// A list's claimed length reserves at most 1 MiB before its elements are read, so memory follows the bytes that are
+/// there rather than those that are claimed.
+///
+/// # Errors
+/// [`WireError::Metadata`] when they do not decode or leave bytes over.
+pub(crate) fn decode<T: DeserializeOwned>(kind: Kind, bytes: &[u8]) -> Result<T, WireError> {
+    let refuse = |detail: String| WireError::Metadata { kind, detail };
+    let (metadata, used) =
+        bincode::serde::decode_from_slice(bytes, CONFIG).map_err(|error| refuse(beginning(&error.to_string())))?;
+    if used != bytes.len() {
+        return Err(refuse(format!("{} of {} bytes are left over", bytes.len() - used, bytes.len())));
+    }
+    Ok(metadata)
+}
+
+/// A hostile text inside an error must not fill the log.
+fn beginning(text: &str) -> String {
+    text.chars().take(200).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn round_trip<T: Serialize + DeserializeOwned>(value: &T) -> (Vec<u8>, T) {
+        let mut bytes = Vec::new();
+        let len = append(Kind::Control, value, &mut bytes).unwrap();
+        assert_eq!(len as usize, bytes.len());
+        let back = decode(Kind::Control, &bytes).unwrap();
+        (bytes, back)
+    }
+
+    #[test]
+    fn bytes_are_what_they_always_were() {
+        let (bytes, back) = round_trip(&(7u32, 1.5f64, Some("ab".to_owned()), vec![300u64]));
+        assert_eq!(bytes, [7, 0, 0, 0, 0, 0, 0, 0xf8, 0x3f, 1, 2, b'a', b'b', 1, 251, 44, 1]);
+        assert_eq!(back, (7, 1.5, Some("ab".to_owned()), vec![300]));
+    }
+
+    #[test]
+    fn leftover_bytes_are_refused() {
+        let (mut bytes, _) = round_trip(&1u64);
+        bytes.push(0);
+        assert!(matches!(decode::<u64>(Kind::Control, &bytes), Err(WireError::Metadata { .. })));
+    }
+
+    #[test]
+    fn an_absurd_length_is_refused_without_its_memory() {
+        // 253: a u64 follows, here 2^42.
+        let mut bytes = vec![253];
+        bytes.extend((1u64 << 42).to_le_bytes());
+        assert!(decode::<Vec<f64>>(Kind::Control, &bytes).is_err());
+        assert!(decode::<Vec<String>>(Kind::Control, &bytes).is_err());
+        assert!(decode::<String>(Kind::Control, &bytes).is_err());
+    }
+}

@@ -1,0 +1,120 @@
+//! What one vehicle publishes: the last chunks of its keys.
+
+use std::fmt;
+use std::str::FromStr;
+
+use serde::{Deserialize, Serialize};
+
+use crate::{KeyError, Kind};
+
+/// A stream of one vehicle.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub enum Stream {
+    /// `lidar`: sweeps.
+    Lidar,
+    /// `gnss`: recorded or GNSS poses.
+    Gnss,
+    /// `camera/<k>`: images of camera `k`.
+    Camera(u8),
+    /// `radar`: radar sweeps.
+    Radar,
+    /// `pose`: pose estimates.
+    Pose,
+    /// `bev`: feature maps.
+    Bev,
+    /// `boxes`: detections of one vehicle alone.
+    Boxes,
+    /// `points`: raw points, for the early-fusion baseline only.
+    Points,
+    /// `descriptor`: what the vehicle is going to send.
+    Descriptor,
+    /// `detections`: what an ego detected.
+    Detections,
+    /// `detections/json`: the same as JSON.
+    DetectionsJson,
+}
+
+impl Stream {
+    /// The kind of the messages on this stream; `None` where they are not of this wire format.
+    #[must_use]
+    pub fn kind(self) -> Option<Kind> {
+        Some(match self {
+            Self::Lidar => Kind::Lidar,
+            Self::Gnss => Kind::Gnss,
+            Self::Radar => Kind::Radar,
+            Self::Pose => Kind::Pose,
+            Self::Bev => Kind::Bev,
+            Self::Boxes => Kind::Boxes,
+            Self::Points => Kind::Points,
+            Self::Descriptor => Kind::Descriptor,
+            Self::Detections => Kind::Detections,
+            Self::Camera(_) | Self::DetectionsJson => return None,
+        })
+    }
+
+    /// Reads the chunks of a key that name a stream.
+    pub(crate) fn from_chunks(chunks: &[&str]) -> Option<Self> {
+        Some(match chunks {
+            ["lidar"] => Self::Lidar,
+            ["gnss"] => Self::Gnss,
+            ["camera", index] => Self::Camera(camera_index(index)?),
+            ["radar"] => Self::Radar,
+            ["pose"] => Self::Pose,
+            ["bev"] => Self::Bev,
+            ["boxes"] => Self::Boxes,
+            ["points"] => Self::Points,
+            ["descriptor"] => Self::Descriptor,
+            ["detections"] => Self::Detections,
+            ["detections", "json"] => Self::DetectionsJson,
+            _ => return None,
+        })
+    }
+}
+
+/// One camera has one spelling: no sign, no leading zero.
+fn camera_index(text: &str) -> Option<u8> {
+    let index: u8 = text.parse().ok()?;
+    (index.to_string() == text).then_some(index)
+}
+
+impl fmt::Display for Stream {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Lidar => f.write_str("lidar"),
+            Self::Gnss => f.write_str("gnss"),
+            Self::Camera(index) => write!(f, "camera/{index}"),
+            Self::Radar => f.write_str("radar"),
+            Self::Pose => f.write_str("pose"),
+            Self::Bev => f.write_str("bev"),
+            Self::Boxes => f.write_str("boxes"),
+            Self::Points => f.write_str("points"),
+            Self::Descriptor => f.write_str("descriptor"),
+            Self::Detections => f.write_str("detections"),
+            Self::DetectionsJson => f.write_str("detections/json"),
+        }
+    }
+}
+
+impl FromStr for Stream {
+    type Err = KeyError;
+
+    fn from_str(text: &str) -> Result<Self, KeyError> {
+        let chunks: Vec<&str> = text.splitn(3, '/').collect();
+        Self::from_chunks(&chunks).ok_or_else(|| KeyError::unknown(text))
+    }
+}
+
+impl TryFrom<String> for Stream {
+    type Error = KeyError;
+
+    fn try_from(text: String) -> Result<Self, KeyError> {
+        text.parse()
+    }
+}
+
+impl From<Stream> for String {
+    fn from(stream: Stream) -> Self {
+        stream.to_string()
+    }
+}

@@ -1,0 +1,156 @@
+//! One message of every kind, with every field set.
+#![allow(dead_code, reason = "not every test file uses all of it")]
+
+use std::time::Duration;
+
+use protocol::*;
+
+pub(crate) fn cav(text: &str) -> CavId {
+    CavId::new(text).unwrap()
+}
+
+pub(crate) fn stamp() -> Stamp {
+    Stamp { cav: cav("4279"), epoch: 77, sequence: 12, capture_nanos: 1_500_000_000, publish_nanos: 1_600_000_000 }
+}
+
+pub(crate) fn grid() -> BevGrid {
+    BevGrid { x_min_m: -51.2, y_min_m: -38.4, cell_m: 0.8, width: 16, height: 12 }
+}
+
+/// `[3, 12, 16]` with values of both signs and different sizes per channel.
+pub(crate) fn features() -> BevFeatures {
+    let values = (0..3 * 12 * 16).map(|index| ((index * 37 % 101) as f32 - 50.0) * 0.1 * (1 + index / 192) as f32);
+    BevFeatures { grid: grid(), channels: 3, values: values.collect() }
+}
+
+pub(crate) fn confidence() -> Vec<f32> {
+    (0..12 * 16).map(|cell| (cell * 29 % 97) as f32 / 97.0).collect()
+}
+
+pub(crate) fn pose() -> PoseEstimate {
+    PoseEstimate::new(Pose::from_xyz_yaw([120.5, -30.25, 1.75], 0.7), 0.875)
+}
+
+pub(crate) fn points() -> PointCloud {
+    PointCloud { xyzi: (0..100u8).map(|n| [f32::from(n), -0.5 * f32::from(n), 0.25, f32::from(n) / 255.0]).collect() }
+}
+
+fn detection(score: f32) -> Detection {
+    let box3d = Box3d { center_m: [10.0, -3.5, 0.4], size_m: [4.2, 1.8, 1.5], heading_rad: -0.3 };
+    Detection { box3d, score, source: Some(cav("-1")) }
+}
+
+/// A map in every codec: dtype times selection times packing.
+pub(crate) fn every_codec() -> Vec<CodecConfig> {
+    let mut configs = Vec::new();
+    for dtype in [Dtype::F32, Dtype::F16, Dtype::I8] {
+        for budget_bytes in [None, Some(400)] {
+            for zstd_level in [None, Some(3)] {
+                configs.push(CodecConfig { dtype, budget_bytes, zstd_level });
+            }
+        }
+    }
+    configs
+}
+
+pub(crate) fn bev(config: &CodecConfig) -> Bev {
+    Bev { pose: pose(), features: encode_features(features(), config, Some(&confidence())).unwrap() }
+}
+
+pub(crate) fn ledger() -> Ledger {
+    let mut ledger = Ledger::default();
+    let topic: Topic = "4279/bev".parse().unwrap();
+    ledger.sent(&Account::published(topic.clone()));
+    let account = Account::towards(topic, &ProcessId::new("ego-4279").unwrap());
+    ledger.received(&account);
+    ledger.dropped(&account, DropReason::Stale);
+    ledger.set_in_flight(&account, 2);
+    ledger
+}
+
+pub(crate) fn detections() -> Detections {
+    Detections {
+        ego: cav("4279"),
+        frame_index: 3,
+        method: "attention".into(),
+        pose: pose(),
+        detections: vec![detection(0.5), detection(1.0)],
+        fused: vec![FusedNeighbour { cav: cav("4288"), age_nanos: -5_000_000, confidence: 0.5 }],
+        skipped: vec![
+            SkippedNeighbour { cav: cav("-1"), reason: None },
+            SkippedNeighbour { cav: cav("7"), reason: Some(DropReason::Stale) },
+        ],
+        stages: vec![StageTiming::new("fuse", Duration::from_millis(12))],
+    }
+}
+
+fn truth() -> Truth {
+    let object = TrueObject {
+        id: -17,
+        class: "car".into(),
+        world_from_object: Pose::from_xyz_yaw([1.0, 2.0, 0.5], 1.2),
+        size_m: [4.0, 2.0, 1.5],
+        speed_mps: Some(8.5),
+    };
+    let agent = |name| AgentTruth {
+        cav: cav(name),
+        world_from_lidar: Pose::from_xyz_yaw([5.0, 5.0, 2.0], -2.0),
+        objects: vec![object.clone(), TrueObject { id: 18, speed_mps: None, ..object.clone() }],
+    };
+    Truth { frame_index: 9, agents: vec![agent("4279"), agent("-1")] }
+}
+
+pub(crate) fn every_kind() -> Vec<Message> {
+    let process = ProcessId::new("agent-4279").unwrap();
+    let topic: Topic = "4279/lidar".parse().unwrap();
+    let mut messages = vec![
+        Message::Lidar(Lidar { points: points() }),
+        Message::Lidar(Lidar::default()),
+        Message::Radar(Radar { points: points() }),
+        Message::Gnss(Gnss {
+            world_from_lidar: Pose::from_xyz_yaw([1.0, 2.0, 3.0], 0.1),
+            position_std_m: 0.4,
+            heading_std_rad: 0.02,
+            source: GnssSource::Gnss,
+        }),
+        Message::Pose(pose()),
+        Message::Pose(PoseEstimate::NoPose { reason: NoPoseReason::TooFewInliers, inlier_count: 4 }),
+        Message::Boxes(Boxes { pose: pose(), detections: vec![detection(0.25); 5] }),
+        Message::Points(Points { pose: pose(), points: points() }),
+        Message::Descriptor(Descriptor {
+            model_hash: ModelHash(std::array::from_fn(|index| index as u8)),
+            grid: grid(),
+            channels: 3,
+            dtype: Dtype::F16,
+            streams: vec![Stream::Pose, Stream::Bev, Stream::Camera(1)],
+        }),
+        Message::Detections(detections()),
+        Message::Truth(truth()),
+        Message::Stats(Stats {
+            process: process.clone(),
+            ledger: ledger(),
+            stages: vec![StageSummary {
+                stage: "encode".into(),
+                count: 10,
+                p50_ms: 1.0,
+                p95_ms: 2.0,
+                p99_ms: 3.0,
+                max_ms: 4.0,
+            }],
+        }),
+    ];
+    messages.extend(every_codec().iter().map(|config| Message::Bev(bev(config))));
+    let controls = [
+        Control::Start { rate: 1.0 },
+        Control::Pause,
+        Control::Resume,
+        Control::Step { ticks: 2 },
+        Control::Seek { frame_index: 5 },
+        Control::End { ticks: 100, sent: vec![TopicCount { topic: topic.clone(), messages: 100 }] },
+        Control::Ready { process: process.clone(), heard: vec![topic] },
+        Control::Probe,
+        Control::Done { process, frame_index: 4 },
+    ];
+    messages.extend(controls.map(Message::Control));
+    messages
+}
