@@ -9,4 +9,5 @@ pub mod carla_pose;
 pub mod dataset;
 pub mod frame;
 pub mod ground_truth;
+pub mod pcd;
 pub mod town;

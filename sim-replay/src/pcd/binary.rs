@@ -1,0 +1,202 @@
+//! Points as little-endian numbers, plain or packed.
+
+use super::header::{Field, Header, IntensitySource, Kind};
+use super::{Collector, PcdCloud, PcdError, Place, lzf, unpack_rgb};
+
+/// Where a field's numbers lie: that of point `i` at `first + i * step`.
+#[derive(Debug, Clone, Copy)]
+struct Column {
+    first: usize,
+    step: usize,
+    kind: Kind,
+    size: usize,
+}
+
+/// Points one after another.
+pub(super) fn decode(header: &Header, body: &[u8]) -> Result<PcdCloud, PcdError> {
+    check_len("POINTS", body.len(), header)?;
+    let stride = header.stride();
+    let column = |index: usize| {
+        let first = header.fields[..index].iter().map(|field| field.size * field.count).sum();
+        column_of(&header.fields[index], first, stride)
+    };
+    Ok(gather(header, body, column))
+}
+
+/// Two lengths, then LZF; once unpacked, fields one after another, each for all points.
+pub(super) fn decode_compressed(header: &Header, body: &[u8]) -> Result<PcdCloud, PcdError> {
+    let Some((lengths, packed)) = body.split_first_chunk::<8>() else {
+        return Err(PcdError::of("DATA", format!("{} bytes after the header, expected two lengths", body.len())));
+    };
+    let [a, b, c, d, e, f, g, h] = *lengths;
+    let packed_len = u32::from_le_bytes([a, b, c, d]) as usize;
+    let unpacked_len = u32::from_le_bytes([e, f, g, h]) as usize;
+    if packed.len() != packed_len {
+        let reason = format!("{packed_len} packed bytes stated, {} found: the file is cut off", packed.len());
+        return Err(PcdError::of("DATA", reason));
+    }
+    check_len("DATA", unpacked_len, header)?;
+    let unpacked = lzf::decompress(packed, unpacked_len).map_err(|error| PcdError::of("DATA", error.to_string()))?;
+    let column = |index: usize| {
+        let field = &header.fields[index];
+        let first: usize = header.fields[..index].iter().map(|field| field.size * field.count).sum();
+        column_of(field, first * header.points, field.size * field.count)
+    };
+    Ok(gather(header, &unpacked, column))
+}
+
+fn column_of(field: &Field, first: usize, step: usize) -> Column {
+    Column { first, step, kind: field.kind, size: field.size }
+}
+
+fn check_len(field: &str, found: usize, header: &Header) -> Result<(), PcdError> {
+    let (points, stride) = (header.points, header.stride());
+    let expected = points.checked_mul(stride);
+    if expected == Some(found) {
+        return Ok(());
+    }
+    let fate = if expected.is_none_or(|expected| found < expected) { ": the file is cut off" } else { "" };
+    let reason = format!("{points} points of {stride} bytes stated, {found} bytes found{fate}");
+    Err(PcdError::of(field, reason))
+}
+
+/// `data` holds every number that `column` points at; [`check_len`] has seen to that.
+fn gather(header: &Header, data: &[u8], column: impl Fn(usize) -> Column) -> PcdCloud {
+    let xyz = header.xyz.map(&column);
+    let intensity = match header.intensity {
+        IntensitySource::Value(index) | IntensitySource::Red(index) => Some(column(index)),
+        IntensitySource::None => None,
+    };
+    let labelled = matches!(header.intensity, IntensitySource::Red(_));
+    let mut collector = Collector::with_capacity(header.points, labelled);
+    for point in 0..header.points {
+        let [x, y, z] = xyz.map(|column| column.number(data, point));
+        let (fourth, label) = match intensity {
+            Some(column) if labelled => unpack_rgb(column.word(data, point)),
+            Some(column) => (column.number(data, point), 0),
+            None => (0.0, 0),
+        };
+        collector.push([x, y, z, fourth], labelled.then_some(label), Place::Point(point as u64));
+    }
+    collector.finish()
+}
+
+impl Column {
+    fn bytes<const N: usize>(self, data: &[u8], point: usize) -> [u8; N] {
+        let start = self.first + point * self.step;
+        let mut bytes = [0; N];
+        bytes.copy_from_slice(&data[start..start + N]);
+        bytes
+    }
+
+    /// A number as `f32`. Integers beyond 2^24 and doubles are rounded.
+    fn number(self, data: &[u8], point: usize) -> f32 {
+        match (self.kind, self.size) {
+            (Kind::Float, 4) => f32::from_le_bytes(self.bytes(data, point)),
+            (Kind::Float, _) => f64::from_le_bytes(self.bytes(data, point)) as f32,
+            (Kind::Unsigned, 1) => f32::from(u8::from_le_bytes(self.bytes(data, point))),
+            (Kind::Unsigned, 2) => f32::from(u16::from_le_bytes(self.bytes(data, point))),
+            (Kind::Unsigned, 4) => u32::from_le_bytes(self.bytes(data, point)) as f32,
+            (Kind::Unsigned, _) => u64::from_le_bytes(self.bytes(data, point)) as f32,
+            (Kind::Signed, 1) => f32::from(i8::from_le_bytes(self.bytes(data, point))),
+            (Kind::Signed, 2) => f32::from(i16::from_le_bytes(self.bytes(data, point))),
+            (Kind::Signed, 4) => i32::from_le_bytes(self.bytes(data, point)) as f32,
+            (Kind::Signed, _) => i64::from_le_bytes(self.bytes(data, point)) as f32,
+        }
+    }
+
+    /// The four bytes of a packed colour; whether they are called a float or an integer does not matter.
+    fn word(self, data: &[u8], point: usize) -> u32 {
+        u32::from_le_bytes(self.bytes(data, point))
+    }
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use protocol::PointCloud;
+
+    use crate::pcd::{Place, decode, lzf};
+
+    fn header(fields: &str, sizes: &str, types: &str, counts: &str, points: usize, data: &str) -> Vec<u8> {
+        format!(
+            "VERSION 0.7\nFIELDS {fields}\nSIZE {sizes}\nTYPE {types}\nCOUNT {counts}\nWIDTH {points}\nHEIGHT 1\n\
+             VIEWPOINT 0 0 0 1 0 0 0\nPOINTS {points}\nDATA {data}\n"
+        )
+        .into_bytes()
+    }
+
+    /// The cloud as PCL packs it: fields one after another.
+    pub(in crate::pcd) fn compressed(cloud: &PointCloud) -> Vec<u8> {
+        let columns: Vec<u8> =
+            (0..4).flat_map(|field| cloud.xyzi.iter().flat_map(move |point| point[field].to_le_bytes())).collect();
+        let packed = lzf::tests::compress(&columns);
+        let mut file = header("x y z intensity", "4 4 4 4", "F F F F", "1 1 1 1", cloud.len(), "binary_compressed");
+        file.extend((packed.len() as u32).to_le_bytes());
+        file.extend((columns.len() as u32).to_le_bytes());
+        file.extend(packed);
+        file
+    }
+
+    #[test]
+    fn compressed_fields_come_back_as_points() {
+        let cloud = PointCloud { xyzi: (0..500).map(|i| [i as f32, 0.0, -(i as f32), 0.5]).collect() };
+        let file = compressed(&cloud);
+        assert!(file.len() < 500 * 16, "something was packed");
+        assert_eq!(decode(&file).unwrap().points, cloud);
+    }
+
+    #[test]
+    fn widths_types_and_padding_are_honoured() {
+        let mut file = header("x _ y z rgb ring", "8 1 2 4 4 2", "F U I F U U", "1 3 1 1 1 2", 1, "binary");
+        file.extend(1.5f64.to_le_bytes());
+        file.extend([9, 9, 9]);
+        file.extend((-7i16).to_le_bytes());
+        file.extend(2.5f32.to_le_bytes());
+        file.extend(0x0033_0000_u32.to_le_bytes());
+        file.extend([1, 0, 2, 0]);
+        assert_eq!(decode(&file).unwrap().points.xyzi, [[1.5, -7.0, 2.5, 51.0 / 255.0]]);
+    }
+
+    #[test]
+    fn a_body_of_the_wrong_length_is_named() {
+        let mut file = header("x y z", "4 4 4", "F F F", "1 1 1", 2, "binary");
+        file.extend([0; 20]);
+        assert_eq!(
+            decode(&file).unwrap_err().to_string(),
+            "POINTS: 2 points of 12 bytes stated, 20 bytes found: the file is cut off"
+        );
+        file.extend([0; 20]);
+        assert_eq!(decode(&file).unwrap_err().to_string(), "POINTS: 2 points of 12 bytes stated, 40 bytes found");
+    }
+
+    #[test]
+    fn not_a_number_is_counted_by_point() {
+        let mut file = header("x y z", "4 4 4", "F F F", "1 1 1", 3, "binary");
+        for value in [1.0, 2.0, 3.0, 1.0, f32::NAN, 3.0, 4.0, 5.0, 6.0f32] {
+            file.extend(value.to_le_bytes());
+        }
+        let cloud = decode(&file).unwrap();
+        assert_eq!((cloud.points.len(), cloud.dropped, cloud.first_dropped), (2, 1, Some(Place::Point(1))));
+    }
+
+    #[test]
+    fn lengths_of_a_packed_body_must_fit() {
+        let cloud = PointCloud { xyzi: vec![[1.0; 4]; 10] };
+        let file = compressed(&cloud);
+        let lengths_at = file.len() - decode_packed_len(&file) - 8;
+        let mut cut = file.clone();
+        cut.truncate(file.len() - 1);
+        assert!(decode(&cut).unwrap_err().reason.contains("packed bytes stated"));
+        let mut absurd = file.clone();
+        absurd[lengths_at + 4..lengths_at + 8].copy_from_slice(&u32::MAX.to_le_bytes());
+        assert_eq!(
+            decode(&absurd).unwrap_err().to_string(),
+            "DATA: 10 points of 16 bytes stated, 4294967295 bytes found"
+        );
+    }
+
+    fn decode_packed_len(file: &[u8]) -> usize {
+        let start = file.windows(18).position(|window| window == b"binary_compressed\n").unwrap() + 18;
+        u32::from_le_bytes(file[start..start + 4].try_into().unwrap()) as usize
+    }
+}

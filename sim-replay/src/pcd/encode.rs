@@ -1,0 +1,108 @@
+//! Writing PCD files.
+
+use std::fmt::Write;
+
+use protocol::PointCloud;
+
+/// How points are written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Encoding {
+    /// A line of shortest decimal numbers per point: every `f32` comes back bit by bit.
+    Ascii,
+    /// Little-endian numbers.
+    Binary,
+}
+
+/// Where intensity is written.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum IntensityField {
+    /// A float field `intensity`, exact.
+    Intensity,
+    /// The red byte of a float field `rgb`, as OPV2V's tools expect it: 0..1 in steps of 1/255.
+    Red,
+}
+
+/// A PCD file of these points, in the frame and handedness they are in.
+#[must_use]
+pub fn encode(cloud: &PointCloud, encoding: Encoding, intensity: IntensityField) -> Vec<u8> {
+    let (data, bytes_per_point) = match encoding {
+        Encoding::Ascii => ("ascii", 48),
+        Encoding::Binary => ("binary", 16),
+    };
+    let field = match intensity {
+        IntensityField::Intensity => "intensity",
+        IntensityField::Red => "rgb",
+    };
+    let points = cloud.len();
+    let header = format!(
+        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z {field}\nSIZE 4 4 4 4\nTYPE F F F F\n\
+         COUNT 1 1 1 1\nWIDTH {points}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {points}\nDATA {data}\n"
+    );
+    let stored = cloud.xyzi.iter().map(|&[x, y, z, fourth]| match intensity {
+        IntensityField::Intensity => [x, y, z, fourth],
+        IntensityField::Red => [x, y, z, f32::from_bits(red_byte(fourth) << 16)],
+    });
+    match encoding {
+        Encoding::Ascii => {
+            let mut text = header;
+            text.reserve(points * bytes_per_point);
+            for [x, y, z, fourth] in stored {
+                // Writing to a String does not fail.
+                let _ = writeln!(text, "{x:e} {y:e} {z:e} {fourth:e}");
+            }
+            text.into_bytes()
+        }
+        Encoding::Binary => {
+            let mut bytes = header.into_bytes();
+            bytes.reserve_exact(points * bytes_per_point);
+            bytes.extend(stored.flatten().flat_map(f32::to_le_bytes));
+            bytes
+        }
+    }
+}
+
+fn red_byte(intensity: f32) -> u32 {
+    // NaN becomes 0.
+    (intensity.clamp(0.0, 1.0) * 255.0).round() as u32
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+    use crate::pcd::decode;
+
+    proptest! {
+        #[test]
+        fn finite_points_come_back_bit_by_bit(
+            points in prop::collection::vec(prop::array::uniform4(any::<f32>()), 0..50),
+            encoding in prop::sample::select(vec![Encoding::Ascii, Encoding::Binary]),
+        ) {
+            let finite = |point: &[f32; 4]| point.iter().all(|value| value.is_finite());
+            let file = encode(&PointCloud { xyzi: points.clone() }, encoding, IntensityField::Intensity);
+            let back = decode(&file).unwrap();
+            let bits = |point: &[f32; 4]| point.map(f32::to_bits);
+            let expected: Vec<_> = points.iter().filter(|point| finite(point)).map(bits).collect();
+            prop_assert_eq!(back.points.xyzi.iter().map(bits).collect::<Vec<_>>(), expected);
+            prop_assert_eq!(back.dropped, points.len() - back.points.len());
+        }
+
+        #[test]
+        fn a_red_byte_keeps_intensity_to_half_a_step(
+            intensity in 0.0..=1.0f32, encoding in prop::sample::select(vec![Encoding::Ascii, Encoding::Binary]),
+        ) {
+            let file = encode(&PointCloud { xyzi: vec![[1.0, 2.0, 3.0, intensity]] }, encoding, IntensityField::Red);
+            let back = decode(&file).unwrap().points.xyzi[0][3];
+            prop_assert!((back - intensity).abs() <= 0.5 / 255.0 + 1e-6);
+        }
+    }
+
+    #[test]
+    fn an_empty_sweep_is_a_file_too() {
+        for encoding in [Encoding::Ascii, Encoding::Binary] {
+            let file = encode(&PointCloud::default(), encoding, IntensityField::Red);
+            assert!(decode(&file).unwrap().points.is_empty());
+        }
+    }
+}

@@ -1,0 +1,144 @@
+//! LZF, the compression of `DATA binary_compressed`.
+//!
+//! The stream is a row of blocks. A control byte below 32 is followed by that many literal bytes plus one. Any other
+//! control byte repeats earlier output: its upper three bits are the length minus two (7: one more byte adds to it),
+//! its lower five bits and one more byte are the distance back minus one.
+
+/// Bytes that one byte of input can become at most: three bytes of input repeat up to 264.
+const MAX_RATIO: usize = 88;
+
+/// Why bytes are not an LZF stream of the stated length.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, thiserror::Error)]
+pub(super) enum LzfError {
+    #[error("{packed} packed bytes cannot become {unpacked}")]
+    Ratio { packed: usize, unpacked: usize },
+    #[error("the packed bytes end inside a block")]
+    CutOff,
+    #[error("a block repeats what lies {distance} bytes back, but only {len} bytes came before")]
+    Distance { distance: usize, len: usize },
+    #[error("{found} bytes unpacked, {stated} stated")]
+    Length { found: usize, stated: usize },
+}
+
+/// Unpacks exactly `unpacked_len` bytes.
+pub(super) fn decompress(packed: &[u8], unpacked_len: usize) -> Result<Vec<u8>, LzfError> {
+    if packed.len().saturating_mul(MAX_RATIO) < unpacked_len {
+        return Err(LzfError::Ratio { packed: packed.len(), unpacked: unpacked_len });
+    }
+    let mut output = Vec::with_capacity(unpacked_len);
+    let mut input = packed;
+    while let Some((&control, rest)) = input.split_first() {
+        let control = usize::from(control);
+        input =
+            if control < 32 { literals(&mut output, rest, control + 1)? } else { repeat(&mut output, rest, control)? };
+        if output.len() > unpacked_len {
+            break;
+        }
+    }
+    if output.len() == unpacked_len {
+        Ok(output)
+    } else {
+        Err(LzfError::Length { found: output.len(), stated: unpacked_len })
+    }
+}
+
+fn literals<'a>(output: &mut Vec<u8>, input: &'a [u8], count: usize) -> Result<&'a [u8], LzfError> {
+    let (literals, rest) = input.split_at_checked(count).ok_or(LzfError::CutOff)?;
+    output.extend_from_slice(literals);
+    Ok(rest)
+}
+
+fn repeat<'a>(output: &mut Vec<u8>, input: &'a [u8], control: usize) -> Result<&'a [u8], LzfError> {
+    let mut next = input.iter();
+    let mut byte = || next.next().map(|&byte| usize::from(byte)).ok_or(LzfError::CutOff);
+    let mut count = (control >> 5) + 2;
+    if count == 9 {
+        count += byte()?;
+    }
+    let distance = ((control & 31) << 8) + byte()? + 1;
+    let len = output.len();
+    let start = len.checked_sub(distance).ok_or(LzfError::Distance { distance, len })?;
+    // What is repeated may overlap what is written: byte by byte, unless it does not.
+    if distance >= count {
+        output.extend_from_within(start..start + count);
+    } else {
+        for at in start..start + count {
+            output.push(output[at]);
+        }
+    }
+    Ok(next.as_slice())
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    /// A plain packer: greedy over the last 8 KiB. Slow, and enough to make files to read.
+    pub(in crate::pcd) fn compress(data: &[u8]) -> Vec<u8> {
+        let mut packed = Vec::new();
+        let mut pending: Vec<u8> = Vec::new();
+        let flush = |packed: &mut Vec<u8>, pending: &mut Vec<u8>| {
+            for block in pending.chunks(32) {
+                packed.push(block.len() as u8 - 1);
+                packed.extend_from_slice(block);
+            }
+            pending.clear();
+        };
+        let mut at = 0;
+        while at < data.len() {
+            let match_len =
+                |start: usize| (0..264.min(data.len() - at)).take_while(|&i| data[start + i] == data[at + i]).count();
+            let best = (at.saturating_sub(512)..at).map(|start| (match_len(start), start)).max();
+            match best.filter(|&(length, _)| length >= 3) {
+                Some((length, start)) => {
+                    flush(&mut packed, &mut pending);
+                    let distance = at - start - 1;
+                    let code = length - 2;
+                    packed.push(((code.min(7) << 5) | (distance >> 8)) as u8);
+                    if code >= 7 {
+                        packed.push((code - 7) as u8);
+                    }
+                    packed.push(distance as u8);
+                    at += length;
+                }
+                None => {
+                    pending.push(data[at]);
+                    at += 1;
+                }
+            }
+        }
+        flush(&mut packed, &mut pending);
+        packed
+    }
+
+    proptest! {
+        #[test]
+        fn packed_bytes_come_back(data in prop::collection::vec(0..4u8, 0..1500)) {
+            let packed = compress(&data);
+            prop_assert_eq!(decompress(&packed, data.len()).unwrap(), data);
+        }
+
+        #[test]
+        fn random_bytes_never_panic(packed in prop::collection::vec(any::<u8>(), 0..200), stated in 0..20_000usize) {
+            if let Ok(output) = decompress(&packed, stated) {
+                prop_assert_eq!(output.len(), stated);
+            }
+        }
+    }
+
+    #[test]
+    fn an_overlapping_repeat_is_a_run() {
+        // Literal 'a', then 9 + 4 times what lies one byte back.
+        assert_eq!(decompress(&[0, b'a', 0xe0, 4, 0], 14).unwrap(), [b'a'; 14]);
+    }
+
+    #[test]
+    fn what_cannot_be_is_refused() {
+        assert_eq!(decompress(&[0, b'a'], 1_000_000), Err(LzfError::Ratio { packed: 2, unpacked: 1_000_000 }));
+        assert_eq!(decompress(&[3, b'a'], 4), Err(LzfError::CutOff));
+        assert_eq!(decompress(&[0, b'a', 0x20, 9], 4), Err(LzfError::Distance { distance: 10, len: 1 }));
+        assert_eq!(decompress(&[0, b'a'], 2), Err(LzfError::Length { found: 1, stated: 2 }));
+    }
+}

@@ -1,0 +1,190 @@
+//! PCD point files: ASCII, binary and LZF-compressed, as PCL, Open3D and the OPV2V family write them.
+//!
+//! Intensity comes from the field `intensity`, else from the red byte of `rgb`: OPV2V stores R / 255 there, in a word
+//! `0x00RRGGBB` whose bits are printed as a float. Every red below 128 is a subnormal number then, so the text is
+//! parsed exactly and only the bits are looked at.
+//!
+//! Points stay in the frame and handedness of the file; mirroring is the business of the datasets' readers.
+//!
+//! ```
+//! use protocol::PointCloud;
+//! use sim_replay::pcd::{self, Encoding, IntensityField};
+//!
+//! let cloud = PointCloud { xyzi: vec![[1.0, 2.0, 3.0, 0.5]] };
+//! let bytes = pcd::encode(&cloud, Encoding::Binary, IntensityField::Intensity);
+//! assert_eq!(pcd::decode(&bytes).unwrap().points, cloud);
+//! ```
+
+mod ascii;
+mod binary;
+mod encode;
+mod header;
+mod lzf;
+
+use protocol::PointCloud;
+
+pub use encode::{Encoding, IntensityField, encode};
+
+use header::{Data, Header};
+
+/// What a PCD file holds.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct PcdCloud {
+    /// The points whose coordinates and intensity are finite, in the order of the file.
+    pub points: PointCloud,
+    /// The green byte of `rgb` for each of `points`, where one is not zero: V2X-R labels weather clutter with it.
+    pub labels: Option<Vec<u8>>,
+    /// How many points were left out because a number is NaN or infinite.
+    pub dropped: usize,
+    /// Where the first of these stands.
+    pub first_dropped: Option<Place>,
+}
+
+/// Where in a file.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Place {
+    /// A line, from 1.
+    Line(u64),
+    /// A point, from 0.
+    Point(u64),
+}
+
+/// Why bytes are no PCD file that can be read.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{}{}{reason}", line.map(|line| format!("line {line}: ")).unwrap_or_default(), field.as_ref().map(|field| format!("{field}: ")).unwrap_or_default())]
+pub struct PcdError {
+    /// The line at fault, from 1, where the fault is in text.
+    pub line: Option<u64>,
+    /// The header key or the field of a point.
+    pub field: Option<String>,
+    /// What was found and what was expected.
+    pub reason: String,
+}
+
+impl PcdError {
+    fn at(line: u64, field: impl Into<String>, reason: impl Into<String>) -> Self {
+        Self { line: Some(line), field: Some(field.into()), reason: reason.into() }
+    }
+
+    fn of(field: impl Into<String>, reason: impl Into<String>) -> Self {
+        Self { line: None, field: Some(field.into()), reason: reason.into() }
+    }
+}
+
+/// Reads a PCD file that is in memory.
+///
+/// # Errors
+/// [`PcdError`] names line, field and both values of what does not fit. Nothing is allocated on the word of the header
+/// alone.
+pub fn decode(bytes: &[u8]) -> Result<PcdCloud, PcdError> {
+    let (header, body) = Header::parse(bytes)?;
+    match header.data {
+        Data::Ascii => ascii::decode(&header, body),
+        Data::Binary => binary::decode(&header, body),
+        Data::BinaryCompressed => binary::decode_compressed(&header, body),
+    }
+}
+
+/// Gathers points, leaving out those that are not finite.
+struct Collector {
+    cloud: PcdCloud,
+    labels: Vec<u8>,
+}
+
+impl Collector {
+    fn with_capacity(points: usize, labelled: bool) -> Self {
+        let mut cloud = PcdCloud::default();
+        cloud.points.xyzi.reserve_exact(points);
+        Self { cloud, labels: Vec::with_capacity(if labelled { points } else { 0 }) }
+    }
+
+    fn push(&mut self, point: [f32; 4], label: Option<u8>, place: Place) {
+        if point.iter().all(|value| value.is_finite()) {
+            self.cloud.points.xyzi.push(point);
+            self.labels.extend(label);
+        } else {
+            self.cloud.dropped += 1;
+            self.cloud.first_dropped.get_or_insert(place);
+        }
+    }
+
+    fn finish(mut self) -> PcdCloud {
+        if self.labels.iter().any(|&label| label != 0) {
+            self.cloud.labels = Some(self.labels);
+        }
+        self.cloud
+    }
+}
+
+/// Red and green of a packed `0x00RRGGBB`: intensity 0..1 and label.
+fn unpack_rgb(bits: u32) -> (f32, u8) {
+    let [_, red, green, _] = bits.to_be_bytes();
+    (f32::from(red) / 255.0, green)
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    /// A file of each kind to damage.
+    fn samples() -> Vec<Vec<u8>> {
+        let cloud = PointCloud { xyzi: (0..20).map(|i| [i as f32, -1.5, 0.25, 1.0 - i as f32 / 64.0]).collect() };
+        let mut files: Vec<Vec<u8>> = [Encoding::Ascii, Encoding::Binary]
+            .into_iter()
+            .flat_map(|encoding| [IntensityField::Intensity, IntensityField::Red].map(|field| (encoding, field)))
+            .map(|(encoding, field)| encode(&cloud, encoding, field))
+            .collect();
+        files.push(binary::tests::compressed(&cloud));
+        files
+    }
+
+    #[test]
+    fn every_truncation_is_an_error_and_never_a_panic() {
+        for file in samples() {
+            decode(&file).unwrap();
+            for length in 0..file.len() {
+                let result = decode(&file[..length]);
+                // Cutting the final line break, or digits of the last number, leaves a whole file.
+                let last_token = file.len() - file.iter().rev().skip(1).position(|&b| b == b' ').unwrap_or(0);
+                assert!(result.is_err() || length >= last_token - 1, "{length} of {}", file.len());
+            }
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn random_bytes_never_panic(bytes in prop::collection::vec(any::<u8>(), 0..600)) {
+            let _ = decode(&bytes);
+        }
+
+        #[test]
+        fn flipped_bytes_never_panic(which in 0..5usize, at in any::<prop::sample::Index>(), value in any::<u8>()) {
+            let mut file = samples().swap_remove(which);
+            let at = at.index(file.len());
+            file[at] = value;
+            let _ = decode(&file);
+        }
+
+        #[test]
+        fn any_body_under_a_sound_header_never_panics(
+            kind in prop::sample::select(vec!["ascii", "binary", "binary_compressed"]),
+            points in prop::sample::select(vec![0u64, 1, 7, 1 << 20, 1 << 40, u64::MAX]),
+            body in prop::collection::vec(any::<u8>(), 0..300),
+        ) {
+            let mut file = format!(
+                "VERSION 0.7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH {points}\nHEIGHT 1\n\
+                 VIEWPOINT 0 0 0 1 0 0 0\nPOINTS {points}\nDATA {kind}\n"
+            ).into_bytes();
+            file.extend(body);
+            let _ = decode(&file);
+        }
+    }
+
+    #[test]
+    fn the_message_names_line_and_field() {
+        let error = PcdError::at(9, "POINTS", "3, but WIDTH x HEIGHT is 4");
+        assert_eq!(error.to_string(), "line 9: POINTS: 3, but WIDTH x HEIGHT is 4");
+    }
+}
