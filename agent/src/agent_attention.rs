@@ -1,0 +1,66 @@
+//! Attention across agents at every cell, without learnt projections (AttFuse).
+
+use tch::{Kind, TchError, Tensor};
+
+/// Fuses the maps of all agents at each cell as the first agent, the ego, attends to them.
+///
+/// At a cell the ego's features are the query, everyone's features are keys and values:
+/// `softmax_j(x_0 . x_j / sqrt(C)) x_j`, summed over `j`.
+///
+/// # Shapes
+/// - `maps`: `[N, C, H, W]` on the ego's lattice, ego first
+/// - `valid`: `[N, H, W]` `bool`, cells that an agent knows something about; the ego's must be all true. `None`: all
+/// - returns: `[C, H, W]`
+///
+/// # Errors
+/// The tensor library's, when the shapes do not fit.
+pub fn attend_ego(maps: &Tensor, valid: Option<&Tensor>) -> Result<Tensor, TchError> {
+    let (_, channels, _, _) = maps.size4()?;
+    let query = maps.f_narrow(0, 0, 1)?;
+    let mut scores = (maps * query).f_sum_dim_intlist([1_i64].as_slice(), false, Kind::Float)?;
+    scores = scores / (channels as f64).sqrt();
+    if let Some(valid) = valid {
+        scores = scores.f_masked_fill(&valid.f_logical_not()?, f64::NEG_INFINITY)?;
+    }
+    let weights = scores.f_softmax(0, Kind::Float)?.f_unsqueeze(1)?;
+    (maps * weights).f_sum_dim_intlist([0_i64].as_slice(), false, Kind::Float)
+}
+
+/// [`attend_ego`] for several samples whose agents follow each other along dimension 0.
+///
+/// # Shapes
+/// - `maps`: `[sum of record_len, C, H, W]`
+/// - returns: `[B, C, H, W]`
+///
+/// # Errors
+/// The tensor library's, when `record_len` does not add up to the number of maps.
+pub fn attend_samples(maps: &Tensor, record_len: &[i64]) -> Result<Tensor, TchError> {
+    let samples = maps.f_split_with_sizes(record_len, 0)?;
+    let fused: Result<Vec<_>, _> = samples.iter().map(|sample| attend_ego(sample, None)).collect();
+    Tensor::f_stack(&fused?, 0)
+}
+
+#[cfg(test)]
+mod tests {
+    use tch::Device;
+
+    use super::*;
+
+    #[test]
+    fn alone_nothing_changes_and_a_masked_agent_does_not_count() {
+        let maps = Tensor::randn([2, 4, 3, 5], (Kind::Float, Device::Cpu));
+        let ego = maps.get(0);
+        assert!(attend_ego(&maps.narrow(0, 0, 1), None).unwrap().allclose(&ego, 1e-6, 1e-6, false));
+        let valid = Tensor::ones([2, 3, 5], (Kind::Bool, Device::Cpu));
+        let _ = valid.get(1).fill_(0);
+        assert!(attend_ego(&maps, Some(&valid)).unwrap().allclose(&ego, 1e-6, 1e-6, false));
+        assert!(!attend_ego(&maps, None).unwrap().allclose(&ego, 1e-3, 1e-3, false));
+    }
+
+    #[test]
+    fn wrong_sample_lengths_are_an_error() {
+        let maps = Tensor::zeros([3, 4, 2, 2], (Kind::Float, Device::Cpu));
+        assert!(attend_samples(&maps, &[2, 2]).is_err());
+        assert_eq!(attend_samples(&maps, &[2, 1]).unwrap().size(), [2, 4, 2, 2]);
+    }
+}

@@ -1,0 +1,172 @@
+//! A 2D convolution with what follows it: batch norm and ReLU.
+
+use tch::Tensor;
+use tch::nn::{self, BatchNormConfig, Init};
+
+/// Epsilon of every batch norm of PointPillars.
+pub const NORM_EPS: f64 = 1e-3;
+/// Weight of a new batch in the running statistics of PointPillars.
+pub const NORM_MOMENTUM: f64 = 0.01;
+
+/// Batch norm over `channels` with the parameter names of the reference.
+///
+/// `path` holds `weight`, `bias`, `running_mean`, `running_var`.
+#[derive(Debug)]
+pub struct Norm {
+    weight: Tensor,
+    bias: Tensor,
+    running_mean: Tensor,
+    running_var: Tensor,
+    eps: f64,
+    momentum: f64,
+}
+
+impl Norm {
+    /// A batch norm that changes nothing until it is trained; epsilon and momentum are those of PointPillars.
+    #[must_use]
+    pub fn new(path: &nn::Path<'_>, channels: i64) -> Self {
+        Self::with_eps(path, channels, NORM_EPS, NORM_MOMENTUM)
+    }
+
+    /// A batch norm with another epsilon and momentum.
+    #[must_use]
+    pub fn with_eps(path: &nn::Path<'_>, channels: i64, eps: f64, momentum: f64) -> Self {
+        let config = BatchNormConfig {
+            eps,
+            momentum,
+            ws_init: Init::Const(1.0),
+            bs_init: Init::Const(0.0),
+            ..Default::default()
+        };
+        let norm = nn::batch_norm2d(path, channels, config);
+        let affine = "an affine batch norm has weight and bias";
+        Self {
+            weight: norm.ws.expect(affine),
+            bias: norm.bs.expect(affine),
+            running_mean: norm.running_mean,
+            running_var: norm.running_var,
+            eps,
+            momentum,
+        }
+    }
+
+    /// Normalises `[N, C]` or `[N, C, H, W]`; with `train` by the statistics of this batch, which enter the running ones.
+    #[must_use]
+    pub fn forward(&self, x: &Tensor, train: bool) -> Tensor {
+        let (weight, bias) = (Some(&self.weight), Some(&self.bias));
+        let (mean, var) = (Some(&self.running_mean), Some(&self.running_var));
+        x.batch_norm(weight, bias, mean, var, train, self.momentum, self.eps, true)
+    }
+
+    /// What the norm does with the running statistics: `x * scale + shift`, both `[C]`.
+    #[must_use]
+    pub fn scale_shift(&self) -> (Tensor, Tensor) {
+        let scale = &self.weight / (&self.running_var + self.eps).sqrt();
+        let shift = &self.bias - &self.running_mean * &scale;
+        (scale, shift)
+    }
+}
+
+/// Which way a convolution goes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Direction {
+    /// `[out, in, k, k]` weights.
+    Down,
+    /// Transposed: `[in, out, k, k]` weights.
+    Up,
+}
+
+/// Convolution, batch norm where there is one, ReLU where asked for.
+#[derive(Debug)]
+pub struct ConvLayer {
+    weight: Tensor,
+    bias: Option<Tensor>,
+    stride: i64,
+    padding: i64,
+    direction: Direction,
+    norm: Option<Norm>,
+    relu: bool,
+}
+
+impl ConvLayer {
+    /// `kernel x kernel` convolution with zero padding that keeps the size at stride 1. No bias: a norm must follow.
+    #[must_use]
+    pub fn normed(conv: &nn::Path<'_>, norm: &nn::Path<'_>, io: [i64; 2], kernel: i64, stride: i64) -> Self {
+        let config = nn::ConvConfig { stride, padding: kernel / 2, bias: false, ..Default::default() };
+        Self::down(conv, io, kernel, config).with_norm(norm, io[1]).with_relu()
+    }
+
+    /// `kernel x kernel` convolution with bias and nothing after it.
+    #[must_use]
+    pub fn biased(conv: &nn::Path<'_>, io: [i64; 2], kernel: i64, stride: i64) -> Self {
+        Self::down(conv, io, kernel, nn::ConvConfig { stride, padding: kernel / 2, ..Default::default() })
+    }
+
+    /// Transposed convolution whose kernel is its stride, so that outputs do not overlap; batch norm, ReLU.
+    #[must_use]
+    pub fn upsampling(conv: &nn::Path<'_>, norm: &nn::Path<'_>, io: [i64; 2], stride: i64) -> Self {
+        let weight = conv.var("weight", &[io[0], io[1], stride, stride], nn::init::DEFAULT_KAIMING_UNIFORM);
+        let layer = Self { weight, bias: None, stride, padding: 0, direction: Direction::Up, norm: None, relu: false };
+        layer.with_norm(norm, io[1]).with_relu()
+    }
+
+    fn down(path: &nn::Path<'_>, [input, output]: [i64; 2], kernel: i64, config: nn::ConvConfig) -> Self {
+        let (stride, padding) = (config.stride, config.padding);
+        let conv = nn::conv2d(path, input, output, kernel, config);
+        Self { weight: conv.ws, bias: conv.bs, stride, padding, direction: Direction::Down, norm: None, relu: false }
+    }
+
+    /// The same with a batch norm after the convolution.
+    #[must_use]
+    pub fn with_norm(self, norm: &nn::Path<'_>, channels: i64) -> Self {
+        Self { norm: Some(Norm::new(norm, channels)), ..self }
+    }
+
+    /// The same with a ReLU at the end.
+    #[must_use]
+    pub fn with_relu(self) -> Self {
+        Self { relu: true, ..self }
+    }
+
+    /// `[N, C_in, H, W]` to `[N, C_out, H', W']`.
+    #[must_use]
+    pub fn forward(&self, x: &Tensor, train: bool) -> Tensor {
+        let (stride, padding) = ([self.stride; 2], [self.padding; 2]);
+        let bias = self.bias.as_ref();
+        let x = match self.direction {
+            Direction::Down => x.conv2d(&self.weight, bias, stride, padding, [1, 1], 1),
+            Direction::Up => x.conv_transpose2d(&self.weight, bias, stride, padding, [0, 0], 1, [1, 1]),
+        };
+        let mut x = match &self.norm {
+            Some(norm) => norm.forward(&x, train),
+            None => x,
+        };
+        if self.relu { x.relu_() } else { x }
+    }
+
+    /// The same layer for inference: the norm's running statistics go into weight and bias, so one pass over the map
+    /// is saved; weights lie channels-last, as the maps do.
+    #[must_use]
+    pub fn folded(&self) -> Self {
+        let output_dim = if self.direction == Direction::Down { 0 } else { 1 };
+        let mut weight = self.weight.detach();
+        let mut bias = self.bias.as_ref().map(Tensor::detach);
+        if let Some(norm) = &self.norm {
+            let (scale, shift) = norm.scale_shift();
+            let mut shape = [1_i64; 4];
+            shape[output_dim] = -1;
+            weight = weight * scale.view(shape);
+            bias = Some(match bias {
+                Some(bias) => bias * scale + shift,
+                None => shift,
+            });
+        }
+        Self { weight: channels_last(&weight.detach()), bias: bias.map(|bias| bias.detach()), norm: None, ..*self }
+    }
+}
+
+/// The same values with the channels innermost in memory.
+#[must_use]
+pub fn channels_last(x: &Tensor) -> Tensor {
+    x.permute([0, 2, 3, 1]).contiguous().permute([0, 3, 1, 2])
+}

@@ -1,0 +1,237 @@
+//! Points to pillars: which points stand on which cell of the ground.
+//!
+//! The order and the caps are those of the reference library (spconv's CPU generator): pillars are numbered by the
+//! first point that falls on them, the first points of a pillar win, the first pillars of a sweep win.
+
+use crate::model_config::DetectorConfig;
+
+/// Mark of a cell that has no pillar yet, and of a point that was dropped.
+const NONE: u32 = u32::MAX;
+
+/// Pillars of one sweep: the points of a pillar lie together, in the order of the sweep.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct Pillars {
+    /// `[P]` of x, y, z (metres) and intensity: pillar after pillar.
+    pub points: Vec<[f32; 4]>,
+    /// `[M]`: points of each pillar, at least 1.
+    pub counts: Vec<u32>,
+    /// `[M]` of cell indices z, y, x.
+    pub coords: Vec<[i32; 3]>,
+}
+
+impl Pillars {
+    /// Number of pillars `M`.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.counts.len()
+    }
+
+    /// Whether no point was inside the area.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.counts.is_empty()
+    }
+
+    /// The points of each pillar, in the order of the pillars.
+    pub fn iter(&self) -> impl Iterator<Item = (&[[f32; 4]], [i32; 3])> {
+        let mut rest = self.points.as_slice();
+        self.counts.iter().zip(&self.coords).map(move |(&count, &coord)| {
+            let (points, tail) = rest.split_at(count as usize);
+            rest = tail;
+            (points, coord)
+        })
+    }
+
+    /// The reference's layout: `[M, slots, 4]` row-major, unused slots zero.
+    ///
+    /// `slots` below the largest count cuts points off.
+    #[must_use]
+    pub fn padded(&self, slots: usize) -> Vec<f32> {
+        let mut padded = Vec::with_capacity(self.len() * slots * 4);
+        for (points, _) in self.iter() {
+            let used = points.len().min(slots);
+            padded.extend(points[..used].iter().flatten());
+            padded.resize(padded.len() + (slots - used) * 4, 0.0);
+        }
+        padded
+    }
+}
+
+/// Sorts sweeps into pillars; keeps its tables between calls.
+#[derive(Debug, Clone)]
+pub struct Voxeliser {
+    low: [f32; 3],
+    size: [f32; 3],
+    /// Cells along x, y, z.
+    grid: [usize; 3],
+    max_points: u32,
+    max_pillars: usize,
+    /// Pillar on each cell, [`NONE`] between calls.
+    pillar_of_cell: Vec<u32>,
+    /// Pillar of each point of the sweep.
+    pillar_of_point: Vec<u32>,
+}
+
+impl Voxeliser {
+    /// A voxeliser for cells of `voxel_size_m` from the lower corner of `lidar_range_m` on.
+    ///
+    /// `grid` is the number of cells along x, y, z; the caps are per pillar and per sweep.
+    #[must_use]
+    pub fn new(
+        lidar_range_m: [f64; 6],
+        voxel_size_m: [f64; 3],
+        grid: [usize; 3],
+        max_points: usize,
+        max_pillars: usize,
+    ) -> Self {
+        Self {
+            low: std::array::from_fn(|axis| lidar_range_m[axis] as f32),
+            size: voxel_size_m.map(|size| size as f32),
+            grid,
+            max_points: u32::try_from(max_points).unwrap_or(u32::MAX),
+            max_pillars,
+            pillar_of_cell: vec![NONE; grid.iter().product()],
+            pillar_of_point: Vec::new(),
+        }
+    }
+
+    /// The voxeliser of a detector.
+    #[must_use]
+    pub fn for_detector(config: &DetectorConfig) -> Self {
+        Self::new(
+            config.lidar_range_m,
+            config.voxel_size_m,
+            config.pillar_grid(),
+            config.max_points_per_pillar,
+            config.max_pillars,
+        )
+    }
+
+    /// Sorts the points of one sweep into pillars; points outside the area and points that are not finite are dropped.
+    #[must_use]
+    pub fn voxelise(&mut self, points: &[[f32; 4]]) -> Pillars {
+        let mut pillars = self.assign(points);
+        let starts = self.gather(points, &mut pillars);
+        debug_assert_eq!(starts, pillars.points.len());
+        for coord in &pillars.coords {
+            let [z, y, x] = coord.map(|index| index as usize);
+            self.pillar_of_cell[(z * self.grid[1] + y) * self.grid[0] + x] = NONE;
+        }
+        pillars
+    }
+
+    /// First pass: the pillar of every point, and the counts and coordinates of the pillars.
+    fn assign(&mut self, points: &[[f32; 4]]) -> Pillars {
+        let mut pillars = Pillars::default();
+        self.pillar_of_point.clear();
+        self.pillar_of_point.reserve(points.len());
+        for point in points {
+            let pillar = match self.cell(point) {
+                Some(coord) => self.admit(coord, &mut pillars),
+                None => NONE,
+            };
+            self.pillar_of_point.push(pillar);
+        }
+        pillars
+    }
+
+    /// Indices x, y, z of the cell under a point.
+    ///
+    /// The division is done in `f32` as in the reference: in `f64` some points on a border change sides. Truncation
+    /// is the floor of a number that is not negative, and the comparison refuses NaN.
+    fn cell(&self, point: &[f32; 4]) -> Option<[u32; 3]> {
+        let mut cell = [0; 3];
+        for axis in 0..3 {
+            let index = (point[axis] - self.low[axis]) / self.size[axis];
+            if !(index >= 0.0 && index < self.grid[axis] as f32) {
+                return None;
+            }
+            cell[axis] = index as u32;
+        }
+        Some(cell)
+    }
+
+    /// Counts one point on a cell; [`NONE`] when its pillar is full or there are enough pillars.
+    fn admit(&mut self, [x, y, z]: [u32; 3], pillars: &mut Pillars) -> u32 {
+        let cell = (z as usize * self.grid[1] + y as usize) * self.grid[0] + x as usize;
+        let mut pillar = self.pillar_of_cell[cell];
+        if pillar == NONE {
+            if pillars.len() >= self.max_pillars {
+                return NONE;
+            }
+            pillar = pillars.len() as u32;
+            self.pillar_of_cell[cell] = pillar;
+            pillars.counts.push(0);
+            pillars.coords.push([z as i32, y as i32, x as i32]);
+        }
+        let count = &mut pillars.counts[pillar as usize];
+        if *count >= self.max_points {
+            return NONE;
+        }
+        *count += 1;
+        pillar
+    }
+
+    /// Second pass: brings the points of a pillar together. Returns the number of points placed.
+    fn gather(&self, points: &[[f32; 4]], pillars: &mut Pillars) -> usize {
+        let mut next = Vec::with_capacity(pillars.len());
+        let mut total = 0;
+        for &count in &pillars.counts {
+            next.push(total);
+            total += count as usize;
+        }
+        pillars.points = vec![[0.0; 4]; total];
+        for (point, &pillar) in points.iter().zip(&self.pillar_of_point) {
+            if pillar != NONE {
+                let slot = &mut next[pillar as usize];
+                pillars.points[*slot] = *point;
+                *slot += 1;
+            }
+        }
+        total
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn voxeliser(max_points: usize, max_pillars: usize) -> Voxeliser {
+        Voxeliser::new([0.0, 0.0, -3.0, 4.0, 2.0, 1.0], [1.0, 1.0, 4.0], [4, 2, 1], max_points, max_pillars)
+    }
+
+    #[test]
+    fn points_of_a_pillar_lie_together_in_order_of_appearance() {
+        let points = [[3.5, 1.5, 0.0, 0.1], [0.5, 0.5, 0.0, 0.2], [3.2, 1.1, 0.0, 0.3]];
+        let pillars = voxeliser(8, 8).voxelise(&points);
+        assert_eq!(pillars.coords, [[0, 1, 3], [0, 0, 0]]);
+        assert_eq!(pillars.counts, [2, 1]);
+        assert_eq!(pillars.points, [points[0], points[2], points[1]]);
+        assert_eq!(pillars.padded(2)[8..], [0.5, 0.5, 0.0, 0.2, 0.0, 0.0, 0.0, 0.0]);
+    }
+
+    #[test]
+    fn the_lower_border_is_in_and_the_upper_is_out() {
+        let points = [[0.0, 0.0, -3.0, 0.0], [4.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [-1e-6, 0.0, 0.0, 0.0]];
+        assert_eq!(voxeliser(8, 8).voxelise(&points).counts, [1]);
+    }
+
+    #[test]
+    fn full_pillars_and_full_sweeps_drop_the_late_points() {
+        let a = [0.5, 0.5, 0.0, 0.0];
+        let b = [1.5, 0.5, 0.0, 0.0];
+        let pillars = voxeliser(2, 1).voxelise(&[a, b, a, a]);
+        assert_eq!((pillars.counts.as_slice(), pillars.points.len()), ([2].as_slice(), 2));
+    }
+
+    #[test]
+    fn points_that_are_no_numbers_are_dropped_and_tables_are_clean_afterwards() {
+        let mut voxeliser = voxeliser(2, 8);
+        let good = [0.5, 0.5, 0.0, 0.0];
+        let bad = [[f32::NAN, 0.5, 0.0, 0.0], [0.5, f32::INFINITY, 0.0, 0.0], [0.5, 0.5, f32::NEG_INFINITY, 0.0]];
+        for _ in 0..2 {
+            assert!(voxeliser.voxelise(&bad).is_empty());
+            assert_eq!(voxeliser.voxelise(&[good]).points, [good]);
+        }
+    }
+}

@@ -1,0 +1,446 @@
+//! Trained parameters on disk: safetensors in `f32` or `f16`, with the configuration beside them.
+//!
+//! A file is complete alone: the key `config` of its metadata holds the JSON of the configuration that the network is
+//! built from. Names of the tensors are those of the reference's state dictionary.
+
+use std::collections::{BTreeMap, HashMap};
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+
+use half::f16;
+use safetensors::tensor::{Dtype, SafeTensorError, SafeTensors, TensorView};
+use serde::de::DeserializeOwned;
+use sha2::{Digest, Sha256};
+use tch::nn::VarStore;
+use tch::{Kind, TchError, Tensor};
+
+/// Metadata key of the configuration.
+pub const CONFIG_KEY: &str = "config";
+
+/// Why parameters could not be read or written. Every message begins with the file.
+#[derive(Debug, thiserror::Error)]
+pub enum WeightsError {
+    /// The file is missing or not readable, or the folder not writable.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// The file is cut off or no safetensors file.
+    #[error("{}: not a whole safetensors file ({size} bytes): {source}", path.display())]
+    Format {
+        /// The file.
+        path: PathBuf,
+        /// Its size.
+        size: usize,
+        /// What is wrong.
+        source: SafeTensorError,
+    },
+    /// The metadata has no such key.
+    #[error("{}: metadata has no key {key:?}; it has {found:?}", path.display())]
+    NoMetadata {
+        /// The file.
+        path: PathBuf,
+        /// The key looked for.
+        key: String,
+        /// The keys there are.
+        found: Vec<String>,
+    },
+    /// The JSON under a metadata key does not say what is needed.
+    #[error("{}: metadata {key:?}: {source}", path.display())]
+    Metadata {
+        /// The file.
+        path: PathBuf,
+        /// The key.
+        key: String,
+        /// What is wrong.
+        source: serde_json::Error,
+    },
+    /// The network has a parameter that the file lacks.
+    #[error("{}: tensor {name:?} is missing (the network expects shape {expected:?})", path.display())]
+    MissingTensor {
+        /// The file.
+        path: PathBuf,
+        /// Name of the tensor.
+        name: String,
+        /// Shape in the network.
+        expected: Vec<i64>,
+    },
+    /// A tensor of the file was made for another configuration.
+    #[error("{}: tensor {name:?} has shape {found:?}, the network expects {expected:?}", path.display())]
+    Shape {
+        /// The file.
+        path: PathBuf,
+        /// Name of the tensor.
+        name: String,
+        /// Shape in the file.
+        found: Vec<i64>,
+        /// Shape in the network.
+        expected: Vec<i64>,
+    },
+    /// A tensor is of a type that parameters are not stored in.
+    #[error("{}: tensor {name:?} is of type {dtype:?}; parameters are F16, BF16, F32 or F64", path.display())]
+    Dtype {
+        /// The file.
+        path: PathBuf,
+        /// Name of the tensor.
+        name: String,
+        /// Its type.
+        dtype: Dtype,
+    },
+    /// A parameter is NaN or infinite.
+    #[error("{}: tensor {name:?} holds {value} at index {index}", path.display())]
+    NotFinite {
+        /// The file.
+        path: PathBuf,
+        /// Name of the tensor.
+        name: String,
+        /// Where.
+        index: usize,
+        /// What.
+        value: f32,
+    },
+    /// The tensor library refused.
+    #[error("{}: tensor {name:?}: {source}", path.display())]
+    Tensor {
+        /// The file.
+        path: PathBuf,
+        /// Name of the tensor.
+        name: String,
+        /// What it said.
+        source: TchError,
+    },
+}
+
+/// How parameters lie on disk.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Precision {
+    /// Every bit: checkpoints.
+    Single,
+    /// Half the size: shipped weights. Vectors (norms, biases) and what does not fit into `f16` stay `f32`.
+    Half,
+}
+
+/// One file of parameters, read and checked.
+#[derive(Debug)]
+pub struct Weights {
+    path: PathBuf,
+    metadata: BTreeMap<String, String>,
+    tensors: BTreeMap<String, Values>,
+    sha256: String,
+}
+
+#[derive(Debug)]
+struct Values {
+    shape: Vec<i64>,
+    values: Vec<f32>,
+}
+
+impl Weights {
+    /// Reads a whole file.
+    ///
+    /// Integer tensors, which only count batches in the reference, are passed over.
+    ///
+    /// # Errors
+    /// [`WeightsError`] when the file is missing, cut off, or holds values that are no parameters.
+    pub fn load(path: &Path) -> Result<Self, WeightsError> {
+        let io = |source| WeightsError::Io { path: path.to_owned(), source };
+        let bytes = fs::read(path).map_err(io)?;
+        let format = |source| WeightsError::Format { path: path.to_owned(), size: bytes.len(), source };
+        let (_, header) = SafeTensors::read_metadata(&bytes).map_err(format)?;
+        let file = SafeTensors::deserialize(&bytes).map_err(format)?;
+        let mut tensors = BTreeMap::new();
+        for (name, view) in file.iter() {
+            if let Some(values) = read_values(path, name, &view)? {
+                let shape = view.shape().iter().map(|&size| size as i64).collect();
+                tensors.insert(name.to_owned(), Values { shape, values });
+            }
+        }
+        let metadata = header.metadata().clone().unwrap_or_default().into_iter().collect();
+        Ok(Self { path: path.to_owned(), metadata, tensors, sha256: hex(&Sha256::digest(&bytes)) })
+    }
+
+    /// SHA-256 of the file, 64 hexadecimal digits: which model it was, for run records and descriptors.
+    #[must_use]
+    pub fn sha256(&self) -> &str {
+        &self.sha256
+    }
+
+    /// The file.
+    #[must_use]
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Names of the tensors, in order.
+    pub fn names(&self) -> impl Iterator<Item = &str> {
+        self.tensors.keys().map(String::as_str)
+    }
+
+    /// Number of parameters.
+    #[must_use]
+    pub fn parameters(&self) -> usize {
+        self.tensors.values().map(|tensor| tensor.values.len()).sum()
+    }
+
+    /// The text under a metadata key.
+    #[must_use]
+    pub fn metadata(&self, key: &str) -> Option<&str> {
+        self.metadata.get(key).map(String::as_str)
+    }
+
+    /// The configuration under the key `config`.
+    ///
+    /// # Errors
+    /// See [`Self::metadata_json`].
+    pub fn config<T: DeserializeOwned>(&self) -> Result<T, WeightsError> {
+        self.metadata_json(CONFIG_KEY)
+    }
+
+    /// The JSON under a metadata key.
+    ///
+    /// # Errors
+    /// [`WeightsError::NoMetadata`] when the key is not there, [`WeightsError::Metadata`] when it says something else.
+    pub fn metadata_json<T: DeserializeOwned>(&self, key: &str) -> Result<T, WeightsError> {
+        let text = self.metadata.get(key).ok_or_else(|| WeightsError::NoMetadata {
+            path: self.path.clone(),
+            key: key.to_owned(),
+            found: self.metadata.keys().cloned().collect(),
+        })?;
+        serde_json::from_str(text).map_err(|source| WeightsError::Metadata {
+            path: self.path.clone(),
+            key: key.to_owned(),
+            source,
+        })
+    }
+
+    /// Copies the parameters into a network; tensors that the network does not have are left alone.
+    ///
+    /// # Errors
+    /// [`WeightsError::MissingTensor`] or [`WeightsError::Shape`] name what does not fit; nothing is copied then.
+    pub fn copy_into(&self, network: &VarStore) -> Result<(), WeightsError> {
+        let variables: BTreeMap<String, Tensor> = network.variables().into_iter().collect();
+        for (name, variable) in &variables {
+            self.checked(name, variable.size())?;
+        }
+        for (name, mut variable) in variables {
+            let source = self.checked(&name, variable.size())?;
+            let copied = tch::no_grad(|| {
+                let values = Tensor::f_from_slice(&source.values)?.f_view(source.shape.as_slice())?;
+                variable.f_copy_(&values)
+            });
+            copied.map_err(|source| WeightsError::Tensor { path: self.path.clone(), name, source })?;
+        }
+        Ok(())
+    }
+
+    fn checked(&self, name: &str, expected: Vec<i64>) -> Result<&Values, WeightsError> {
+        let missing = || WeightsError::MissingTensor {
+            path: self.path.clone(),
+            name: name.to_owned(),
+            expected: expected.clone(),
+        };
+        let tensor = self.tensors.get(name).ok_or_else(missing)?;
+        if tensor.shape == expected {
+            return Ok(tensor);
+        }
+        Err(WeightsError::Shape {
+            path: self.path.clone(),
+            name: name.to_owned(),
+            found: tensor.shape.clone(),
+            expected,
+        })
+    }
+}
+
+/// Writes all variables of a network.
+///
+/// `metadata` holds texts for the header; the configuration belongs under [`CONFIG_KEY`]. The file appears under its
+/// name only when it is whole.
+///
+/// Returns the SHA-256 of the file.
+///
+/// # Errors
+/// [`WeightsError`] when a parameter is not finite or the file cannot be written.
+pub fn save(
+    path: &Path,
+    network: &VarStore,
+    metadata: &BTreeMap<String, String>,
+    precision: Precision,
+) -> Result<String, WeightsError> {
+    let mut stored = Vec::new();
+    for (name, variable) in network.variables() {
+        stored.push(store(path, name, &variable, precision)?);
+    }
+    let size = stored.iter().map(|tensor| tensor.bytes.len()).sum();
+    let format = |source| WeightsError::Format { path: path.to_owned(), size, source };
+    let views: Result<Vec<_>, _> = (stored.iter())
+        .map(|tensor| Ok((&tensor.name, TensorView::new(tensor.dtype, tensor.shape.clone(), &tensor.bytes)?)))
+        .collect();
+    let header: HashMap<_, _> = metadata.clone().into_iter().collect();
+    let bytes = safetensors::serialize(views.map_err(format)?, Some(header)).map_err(format)?;
+    let io = |source| WeightsError::Io { path: path.to_owned(), source };
+    let unfinished = path.with_extension("unfinished");
+    fs::write(&unfinished, &bytes).and_then(|()| fs::rename(&unfinished, path)).map_err(io)?;
+    Ok(hex(&Sha256::digest(&bytes)))
+}
+
+struct Stored {
+    name: String,
+    dtype: Dtype,
+    shape: Vec<usize>,
+    bytes: Vec<u8>,
+}
+
+fn store(path: &Path, name: String, variable: &Tensor, precision: Precision) -> Result<Stored, WeightsError> {
+    let shape: Vec<usize> = variable.size().iter().map(|&size| size as usize).collect();
+    let flat = tch::no_grad(|| variable.f_to_kind(Kind::Float).and_then(|values| values.f_reshape([-1])));
+    let values = flat.and_then(|flat| Vec::<f32>::try_from(&flat));
+    let values = match values {
+        Ok(values) => values,
+        Err(source) => return Err(WeightsError::Tensor { path: path.to_owned(), name, source }),
+    };
+    check_finite(path, &name, &values)?;
+    let fits = values.iter().all(|value| value.abs() <= f16::MAX.to_f32());
+    let (dtype, bytes) = if precision == Precision::Half && shape.len() > 1 && fits {
+        (Dtype::F16, values.iter().flat_map(|&value| f16::from_f32(value).to_le_bytes()).collect())
+    } else {
+        (Dtype::F32, values.iter().flat_map(|value| value.to_le_bytes()).collect())
+    };
+    Ok(Stored { name, dtype, shape, bytes })
+}
+
+/// The values of one tensor as `f32`; `None` for integers.
+fn read_values(path: &Path, name: &str, view: &TensorView<'_>) -> Result<Option<Vec<f32>>, WeightsError> {
+    let data = view.data();
+    let values: Vec<f32> = match view.dtype() {
+        Dtype::F16 => data.as_chunks().0.iter().map(|&bytes| f16::from_le_bytes(bytes).to_f32()).collect(),
+        Dtype::BF16 => data.as_chunks().0.iter().map(|&bytes| half::bf16::from_le_bytes(bytes).to_f32()).collect(),
+        Dtype::F32 => data.as_chunks().0.iter().map(|&bytes| f32::from_le_bytes(bytes)).collect(),
+        Dtype::F64 => data.as_chunks().0.iter().map(|&bytes| f64::from_le_bytes(bytes) as f32).collect(),
+        Dtype::I64 | Dtype::I32 => return Ok(None),
+        dtype => return Err(WeightsError::Dtype { path: path.to_owned(), name: name.to_owned(), dtype }),
+    };
+    check_finite(path, name, &values)?;
+    Ok(Some(values))
+}
+
+fn check_finite(path: &Path, name: &str, values: &[f32]) -> Result<(), WeightsError> {
+    match values.iter().position(|value| !value.is_finite()) {
+        None => Ok(()),
+        Some(index) => {
+            let value = values[index];
+            Err(WeightsError::NotFinite { path: path.to_owned(), name: name.to_owned(), index, value })
+        }
+    }
+}
+
+fn hex(digest: &[u8]) -> String {
+    digest.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use tch::Device;
+
+    use super::*;
+    use crate::model_config::DetectorConfig;
+    use crate::point_pillars::PointPillars;
+
+    fn small() -> DetectorConfig {
+        DetectorConfig {
+            lidar_range_m: [-6.4, -6.4, -3.0, 6.4, 6.4, 1.0],
+            pillar_channels: 8,
+            num_filters: vec![8; 3],
+            num_upsample_filters: vec![8; 3],
+            ..DetectorConfig::lean()
+        }
+    }
+
+    fn network(config: &DetectorConfig) -> VarStore {
+        let network = VarStore::new(Device::Cpu);
+        PointPillars::new(&network.root(), config).unwrap();
+        network
+    }
+
+    fn metadata(config: &DetectorConfig) -> BTreeMap<String, String> {
+        [(CONFIG_KEY.to_owned(), serde_json::to_string(config).unwrap())].into()
+    }
+
+    #[test]
+    fn a_saved_network_comes_back_with_its_configuration() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("net.safetensors");
+        let config = small();
+        let first = network(&config);
+        let sha256 = save(&path, &first, &metadata(&config), Precision::Single).unwrap();
+        let weights = Weights::load(&path).unwrap();
+        assert_eq!(weights.sha256(), sha256);
+        assert_eq!(weights.config::<DetectorConfig>().unwrap(), config);
+        let second = network(&config);
+        weights.copy_into(&second).unwrap();
+        let copies = second.variables();
+        assert!(first.variables().iter().all(|(name, tensor)| tensor.equal(&copies[name])));
+    }
+
+    #[test]
+    fn half_precision_halves_matrices_and_keeps_vectors() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("net.safetensors");
+        let first = network(&small());
+        save(&path, &first, &metadata(&small()), Precision::Half).unwrap();
+        let second = network(&small());
+        Weights::load(&path).unwrap().copy_into(&second).unwrap();
+        let copies = second.variables();
+        for (name, tensor) in first.variables() {
+            let tolerance = if tensor.dim() > 1 { 1e-3 } else { 0.0 };
+            assert!(tensor.allclose(&copies[&name], tolerance, 1e-6, false), "{name}");
+        }
+    }
+
+    #[test]
+    fn a_file_of_another_configuration_is_named_with_both_shapes() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("other.safetensors");
+        save(&path, &network(&small()), &metadata(&small()), Precision::Single).unwrap();
+        let weights = Weights::load(&path).unwrap();
+        let wide = DetectorConfig { pillar_channels: 16, ..small() };
+        let message = weights.copy_into(&network(&wide)).unwrap_err().to_string();
+        for part in ["other.safetensors", "backbone.blocks.0.1.weight", "[8, 8, 3, 3]", "[8, 16, 3, 3]"] {
+            assert!(message.contains(part), "{message}");
+        }
+        let deep = DetectorConfig { layer_nums: vec![2, 3, 4], ..small() };
+        let message = weights.copy_into(&network(&deep)).unwrap_err().to_string();
+        assert!(message.contains("backbone.blocks.2.13.weight") && message.contains("missing"), "{message}");
+        let message = weights.metadata_json::<DetectorConfig>("fusion").unwrap_err().to_string();
+        assert!(message.contains("fusion") && message.contains("config"), "{message}");
+    }
+
+    #[test]
+    fn missing_and_cut_files_are_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("cut.safetensors");
+        assert!(matches!(Weights::load(&path), Err(WeightsError::Io { .. })));
+        save(&path, &network(&small()), &metadata(&small()), Precision::Single).unwrap();
+        let bytes = fs::read(&path).unwrap();
+        for length in [0, 7, 100, bytes.len() - 1] {
+            fs::write(&path, &bytes[..length]).unwrap();
+            let message = Weights::load(&path).unwrap_err().to_string();
+            assert!(message.contains("cut.safetensors") && message.contains(&length.to_string()), "{message}");
+        }
+    }
+
+    #[test]
+    fn values_that_are_no_numbers_are_neither_written_nor_read() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("nan.safetensors");
+        let network = network(&small());
+        let _ = tch::no_grad(|| network.variables()["cls_head.bias"].get(1).fill_(f64::NAN));
+        let message = save(&path, &network, &metadata(&small()), Precision::Half).unwrap_err().to_string();
+        assert!(message.contains("cls_head.bias") && message.contains("index 1"), "{message}");
+        assert!(!path.exists());
+    }
+}
