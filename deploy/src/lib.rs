@@ -1,5 +1,6 @@
 //! The operator's side of the fleet: reads a scenario, starts and supervises the processes, scores what the ego
 //! reports and writes it down.
 
+pub mod picture;
 pub mod scenario;
 pub mod supervise;
