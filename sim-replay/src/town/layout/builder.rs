@@ -1,0 +1,190 @@
+//! Puts roads and junctions together.
+
+use super::super::clothoid;
+use super::super::curve::{Curve, CurveShape, Pose2};
+use super::super::road::{
+    Connection, Contact, Junction, LaneKind, LaneSection, Profile, Road, RoadLane, RoadLink, RoadNetwork,
+};
+
+/// Lanes across a road, each outwards from the reference line: kind and width in metres.
+#[derive(Debug, Clone, Default)]
+pub(super) struct CrossProfile {
+    pub left: Vec<(LaneKind, f64)>,
+    pub right: Vec<(LaneKind, f64)>,
+}
+
+/// One end of a road.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct RoadEnd {
+    pub road: usize,
+    pub contact: Contact,
+}
+
+/// A lane that leads into or out of a junction.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct LaneEnd {
+    pub end: RoadEnd,
+    pub lane: i32,
+}
+
+/// A road network in the making.
+#[derive(Default)]
+pub(super) struct Builder {
+    pub network: RoadNetwork,
+}
+
+/// Left edge of a lane seen in driving direction: place, height, slope in driving direction, lane width.
+struct LaneEdge {
+    pose: Pose2,
+    height_m: f64,
+    slope: f64,
+    width_m: f64,
+}
+
+impl CrossProfile {
+    /// The same lanes on both sides.
+    pub(super) fn both(side: Vec<(LaneKind, f64)>) -> Self {
+        Self { left: side.clone(), right: side }
+    }
+
+    /// Width of the wider side, metres.
+    pub(super) fn half_width_m(&self) -> f64 {
+        let width = |side: &[(LaneKind, f64)]| side.iter().map(|&(_, width)| width).sum::<f64>();
+        width(&self.left).max(width(&self.right))
+    }
+}
+
+/// A line of clothoids through `poses`.
+pub(super) fn path(poses: &[Pose2]) -> Vec<Curve> {
+    let mut curves: Vec<Curve> = Vec::new();
+    for pair in poses.windows(2) {
+        let s_m = curves.last().map_or(0.0, |curve| curve.s_m + curve.length_m);
+        curves.push(clothoid::between(pair[0], pair[1], s_m));
+    }
+    curves
+}
+
+/// Length of a line of curves, metres.
+pub(super) fn path_length_m(curves: &[Curve]) -> f64 {
+    curves.last().map_or(0.0, |curve| curve.s_m + curve.length_m)
+}
+
+impl Builder {
+    /// Adds a road; its links follow when its ends are joined.
+    pub(super) fn road(
+        &mut self,
+        plan_view: Vec<Curve>,
+        elevation: Profile,
+        profile: &CrossProfile,
+        limit_mps: f64,
+    ) -> usize {
+        let lanes = |side: &[(LaneKind, f64)]| side.iter().map(|&(kind, width)| lane(kind, Profile::constant(width))).collect();
+        let section = LaneSection { s_m: 0.0, left: lanes(&profile.left), right: lanes(&profile.right) };
+        self.push(plan_view, elevation, section, limit_mps)
+    }
+
+    /// Adds a junction without connections.
+    pub(super) fn junction(&mut self) -> usize {
+        let id = self.network.junctions.len();
+        self.network.junctions.push(Junction { id: format!("j{id}"), connections: Vec::new() });
+        id
+    }
+
+    /// Adds a one-lane road through `junction` from one lane to another.
+    pub(super) fn connect(&mut self, junction: usize, from: LaneEnd, to: LaneEnd, limit_mps: f64) {
+        let (exit, entry) = (self.lane_edge(from, true), self.lane_edge(to, false));
+        let curve = clothoid::between(exit.pose, entry.pose, 0.0);
+        let length_m = curve.length_m;
+        let cubic = |from, to| Profile { records: vec![Profile::hermite(0.0, length_m, from, to)] };
+        let elevation = cubic([exit.height_m, exit.slope], [entry.height_m, entry.slope]);
+        let width = cubic([exit.width_m, 0.0], [entry.width_m, 0.0]);
+        let mut only = lane(LaneKind::Driving, width);
+        (only.predecessor, only.successor) = (Some(from.lane), Some(to.lane));
+        let section = LaneSection { s_m: 0.0, left: Vec::new(), right: vec![only] };
+        let connecting = self.push(vec![curve], elevation, section, limit_mps);
+        let link = |end: RoadEnd| Some(RoadLink::Road { road: end.road, contact: end.contact });
+        let road = &mut self.network.roads[connecting];
+        (road.junction, road.predecessor, road.successor) = (Some(junction), link(from.end), link(to.end));
+        self.network.junctions[junction].connections.push(Connection {
+            incoming: from.end.road,
+            connecting,
+            contact: Contact::Start,
+            lane_links: vec![(from.lane, -1)],
+        });
+        for end in [from.end, to.end] {
+            let road = &mut self.network.roads[end.road];
+            let link = match end.contact {
+                Contact::Start => &mut road.predecessor,
+                Contact::End => &mut road.successor,
+            };
+            *link = Some(RoadLink::Junction(junction));
+        }
+    }
+
+    /// Lanes that lead into the junction at `end`, from the leftmost in driving direction.
+    pub(super) fn incoming(&self, end: RoadEnd) -> Vec<LaneEnd> {
+        self.driving_lanes(end, end.contact == Contact::End)
+    }
+
+    /// Lanes that lead out of the junction at `end`, from the leftmost in driving direction.
+    pub(super) fn outgoing(&self, end: RoadEnd) -> Vec<LaneEnd> {
+        self.driving_lanes(end, end.contact == Contact::Start)
+    }
+
+    /// Where the reference line ends, looking away from the road.
+    pub(super) fn outward_pose(&self, end: RoadEnd) -> Pose2 {
+        let road = &self.network.roads[end.road];
+        match end.contact {
+            Contact::Start => road.pose_at(0.0).reversed(),
+            Contact::End => road.pose_at(road.length_m),
+        }
+    }
+
+    fn driving_lanes(&self, end: RoadEnd, along: bool) -> Vec<LaneEnd> {
+        let section = &self.network.roads[end.road].sections[0];
+        let (side, sign) = if along { (&section.right, -1) } else { (&section.left, 1) };
+        let driving = side.iter().enumerate().filter(|(_, lane)| lane.kind == LaneKind::Driving);
+        driving.map(|(place, _)| LaneEnd { end, lane: sign * (place as i32 + 1) }).collect()
+    }
+
+    /// The left edge of a lane where it leaves its road (`exit`) or enters it.
+    fn lane_edge(&self, LaneEnd { end, lane }: LaneEnd, exit: bool) -> LaneEdge {
+        let road = &self.network.roads[end.road];
+        debug_assert_eq!(lane < 0, (end.contact == Contact::End) == exit, "lane {lane} does not lead this way");
+        let s = if end.contact == Contact::End { road.length_m } else { 0.0 };
+        let [low, high] = road.lane_span_m(0, lane, s);
+        let pose = road.pose_at(s);
+        let (pose, sign) =
+            if lane < 0 { (pose.moved(0.0, high, 0.0), 1.0) } else { (pose.moved(0.0, low, 0.0).reversed(), -1.0) };
+        LaneEdge { pose, height_m: road.elevation.at(s), slope: sign * road.elevation.slope_at(s), width_m: high - low }
+    }
+
+    fn push(&mut self, plan_view: Vec<Curve>, elevation: Profile, section: LaneSection, limit_mps: f64) -> usize {
+        let place = self.network.roads.len();
+        self.network.roads.push(Road {
+            id: format!("r{place}"),
+            length_m: path_length_m(&plan_view),
+            junction: None,
+            predecessor: None,
+            successor: None,
+            plan_view,
+            elevation,
+            lane_offset: Profile::default(),
+            sections: vec![section],
+            speed_limits: vec![(0.0, limit_mps)],
+            objects: Vec::new(),
+            signals: Vec::new(),
+            structures: Vec::new(),
+        });
+        place
+    }
+}
+
+/// An arc of a circle as a road's whole reference line.
+pub(super) fn arc(start: Pose2, curvature: f64, length_m: f64) -> Vec<Curve> {
+    vec![Curve { s_m: 0.0, start, length_m, shape: CurveShape::Arc { curvature } }]
+}
+
+fn lane(kind: LaneKind, width: Profile) -> RoadLane {
+    RoadLane { kind, width, predecessor: None, successor: None, speed_limit_mps: None }
+}

@@ -1,0 +1,98 @@
+//! Street graphs: a grid with some streets left out and everything a little out of line.
+
+use rand::Rng;
+use rand::seq::SliceRandom;
+use rand_chacha::ChaCha8Rng;
+
+use super::streets::{Node, StreetGraph};
+
+/// What a grid of streets is made from.
+pub(super) struct GridPlan {
+    /// x of the columns, metres, rising.
+    pub columns_m: Vec<f64>,
+    /// Number of rows.
+    pub rows: usize,
+    /// Share of the streets to leave out.
+    pub left_out: f64,
+    /// Largest shift of a crossing, metres.
+    pub jitter_m: f64,
+}
+
+/// Spreads `count` values over `low..=high`, the inner ones shifted by up to `share` of their distance.
+pub(super) fn spread(low: f64, high: f64, count: usize, share: f64, rng: &mut ChaCha8Rng) -> Vec<f64> {
+    let step = (high - low) / (count - 1) as f64;
+    let value = |place: usize| {
+        let shift = if place == 0 || place + 1 == count { 0.0 } else { rng.random_range(-share..share) };
+        low + (place as f64 + shift) * step
+    };
+    (0..count).map(value).collect()
+}
+
+/// A grid whose column at `x` reaches over `y_range(x)`. Every street can be left at both ends: no place has just one
+/// street, and all hang together.
+pub(super) fn grid(plan: &GridPlan, y_range: impl Fn(f64) -> [f64; 2], rng: &mut ChaCha8Rng) -> StreetGraph {
+    let rows = spread(0.0, 1.0, plan.rows, 0.2, rng);
+    let mut graph = StreetGraph::default();
+    for &x in &plan.columns_m {
+        let [low, high] = y_range(x);
+        for &row in &rows {
+            let [dx, dy] = [(); 2].map(|()| rng.random_range(-plan.jitter_m..plan.jitter_m));
+            graph.nodes.push(Node { x: x + dx, y: low + row * (high - low) + dy, port: None });
+        }
+    }
+    let at = |column: usize, row: usize| column * plan.rows + row;
+    for column in 0..plan.columns_m.len() {
+        for row in 0..plan.rows {
+            if row + 1 < plan.rows {
+                graph.edges.push([at(column, row), at(column, row + 1)]);
+            }
+            if column + 1 < plan.columns_m.len() {
+                graph.edges.push([at(column, row), at(column + 1, row)]);
+            }
+        }
+    }
+    leave_out(&mut graph, plan.left_out, rng);
+    graph
+}
+
+fn leave_out(graph: &mut StreetGraph, share: f64, rng: &mut ChaCha8Rng) {
+    let wanted = (graph.edges.len() as f64 * share).round() as usize;
+    let mut order = graph.edges.clone();
+    order.shuffle(rng);
+    let mut removed = 0;
+    for edge in order {
+        if removed == wanted {
+            break;
+        }
+        if edge.iter().any(|&node| graph.degree(node) <= 2) {
+            continue;
+        }
+        let mut without = graph.clone();
+        without.edges.retain(|other| *other != edge);
+        if two_ways_everywhere(&without) {
+            *graph = without;
+            removed += 1;
+        }
+    }
+}
+
+/// Whether everything stays connected with any one street closed: then no street is a dead end.
+fn two_ways_everywhere(graph: &StreetGraph) -> bool {
+    (0..graph.edges.len()).all(|closed| {
+        let mut reached = vec![false; graph.nodes.len()];
+        let mut open = vec![0];
+        reached[0] = true;
+        while let Some(node) = open.pop() {
+            for (index, &[a, b]) in graph.edges.iter().enumerate() {
+                if index != closed && (a == node || b == node) {
+                    let next = if a == node { b } else { a };
+                    if !reached[next] {
+                        reached[next] = true;
+                        open.push(next);
+                    }
+                }
+            }
+        }
+        reached.into_iter().all(|reached| reached)
+    })
+}

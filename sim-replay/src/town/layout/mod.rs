@@ -1,0 +1,18 @@
+//! Procedural road networks: the same structures that a map gives, laid out from a seed.
+
+mod builder;
+mod grid;
+mod streets;
+mod town1;
+
+use super::road::RoadNetwork;
+
+pub(super) use town1::lay_out as town1;
+
+/// A road network, and what belongs to its shape but to no road.
+pub(super) struct Layout {
+    /// Roads and junctions.
+    pub network: RoadNetwork,
+    /// Middles of roundabouts: x, y and the radius free of traffic, metres.
+    pub islands: Vec<[f64; 3]>,
+}

@@ -1,0 +1,207 @@
+//! Streets of a town: from a graph of places and edges to roads, corners and junctions.
+
+use rand::Rng;
+use rand_chacha::ChaCha8Rng;
+
+use super::super::curve::Pose2;
+use super::super::lane::wrap_angle;
+use super::super::road::{Contact, LaneKind, Profile};
+use super::builder::{Builder, CrossProfile, RoadEnd, path};
+
+/// Half of the largest angle by which a street leaves its edge's direction, radians.
+const WIGGLE_RAD: f64 = 0.16;
+/// Shortest straight distance between two ends of a street that may wiggle, metres.
+const WIGGLE_MIN_M: f64 = 55.0;
+/// Kerb radius at junctions, metres.
+const KERB_RADIUS_M: f64 = 5.0;
+
+/// A place where streets meet, turn or end.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Node {
+    pub x: f64,
+    pub y: f64,
+    /// Set where the one street of this node ends at something already laid out: the pose there, looking outwards, into
+    /// the street.
+    pub port: Option<Pose2>,
+}
+
+/// Places and the streets between them.
+#[derive(Debug, Clone, Default)]
+pub(super) struct StreetGraph {
+    pub nodes: Vec<Node>,
+    pub edges: Vec<[usize; 2]>,
+}
+
+/// A street from junction to junction (or port), past corners.
+struct Chain {
+    /// Nodes in order.
+    nodes: Vec<usize>,
+    profile: CrossProfile,
+    /// Angles by which it leaves its first and its last edge's direction, radians.
+    wiggle_rad: [f64; 2],
+}
+
+impl StreetGraph {
+    pub(super) fn degree(&self, node: usize) -> usize {
+        self.edges.iter().flatten().filter(|&&end| end == node).count()
+    }
+
+    fn angle(&self, from: usize, to: usize) -> f64 {
+        (self.nodes[to].y - self.nodes[from].y).atan2(self.nodes[to].x - self.nodes[from].x)
+    }
+
+    fn distance_m(&self, a: usize, b: usize) -> f64 {
+        (self.nodes[b].x - self.nodes[a].x).hypot(self.nodes[b].y - self.nodes[a].y)
+    }
+
+    /// A node at which streets end: three or more meet there, or it is a port.
+    fn is_end(&self, node: usize) -> bool {
+        self.nodes[node].port.is_some() || self.degree(node) != 2
+    }
+}
+
+/// Lays out the streets of `graph`. Returns the road ends at ports, as (node, end).
+pub(super) fn lay_out(
+    builder: &mut Builder,
+    graph: &StreetGraph,
+    limit_mps: f64,
+    rng: &mut ChaCha8Rng,
+) -> Vec<(usize, RoadEnd)> {
+    let chains = chains(graph, rng);
+    let radii = junction_radii(graph, &chains);
+    // Road ends by node, in the order of the chains.
+    let mut ends: Vec<Vec<RoadEnd>> = vec![Vec::new(); graph.nodes.len()];
+    for chain in &chains {
+        let road = builder.road(path(&poses(graph, chain, &radii)), Profile::default(), &chain.profile, limit_mps);
+        ends[chain.nodes[0]].push(RoadEnd { road, contact: Contact::Start });
+        ends[chain.nodes[chain.nodes.len() - 1]].push(RoadEnd { road, contact: Contact::End });
+    }
+    let mut ports = Vec::new();
+    for (node, ends) in ends.iter().enumerate() {
+        if graph.nodes[node].port.is_some() {
+            ports.extend(ends.iter().map(|&end| (node, end)));
+        } else if ends.len() > 1 {
+            let junction = builder.junction();
+            join(builder, junction, ends, limit_mps);
+        }
+    }
+    ports
+}
+
+/// Connects every lane into a junction with a lane out of every other road.
+fn join(builder: &mut Builder, junction: usize, ends: &[RoadEnd], limit_mps: f64) {
+    for &from in ends {
+        for &to in ends {
+            if from == to {
+                continue;
+            }
+            let turn =
+                wrap_angle(builder.outward_pose(to).heading_rad + std::f64::consts::PI - builder.outward_pose(from).heading_rad);
+            // Turning traffic slows down.
+            let limit = if turn.abs() > 0.5 { limit_mps.min(7.0) } else { limit_mps };
+            let (incoming, outgoing) = (builder.incoming(from), builder.outgoing(to));
+            for (&lane_in, &lane_out) in incoming.iter().zip(&outgoing) {
+                builder.connect(junction, lane_in, lane_out, limit);
+            }
+        }
+    }
+}
+
+fn chains(graph: &StreetGraph, rng: &mut ChaCha8Rng) -> Vec<Chain> {
+    let mut used = vec![false; graph.edges.len()];
+    let mut chains = Vec::new();
+    for start in 0..graph.nodes.len() {
+        if !graph.is_end(start) {
+            continue;
+        }
+        while let Some(first) = (0..used.len()).find(|&edge| !used[edge] && graph.edges[edge].contains(&start)) {
+            let mut nodes = vec![start];
+            let mut edge = Some(first);
+            while let Some(current) = edge {
+                used[current] = true;
+                let [a, b] = graph.edges[current];
+                let next = if a == nodes[nodes.len() - 1] { b } else { a };
+                nodes.push(next);
+                let ends_here = graph.is_end(next);
+                edge = (0..used.len()).find(|&edge| !ends_here && !used[edge] && graph.edges[edge].contains(&next));
+            }
+            let wiggle_rad = [(); 2].map(|()| rng.random_range(-WIGGLE_RAD..WIGGLE_RAD));
+            chains.push(Chain { nodes, profile: street_profile(rng), wiggle_rad });
+        }
+    }
+    chains
+}
+
+/// Lanes of one street: a lane each way, with or without parking, verge and broad pavements.
+fn street_profile(rng: &mut ChaCha8Rng) -> CrossProfile {
+    let verge_m = if rng.random_bool(0.3) { rng.random_range(1.2..2.4) } else { 0.0 };
+    let sidewalk_m = rng.random_range(1.6..3.4);
+    let mut side = || {
+        let mut lanes = vec![(LaneKind::Driving, 3.5)];
+        if rng.random_bool(0.6) {
+            lanes.push((LaneKind::Parking, 2.3));
+        } else {
+            lanes.push((LaneKind::Shoulder, 0.5));
+        }
+        if verge_m > 0.0 {
+            lanes.push((LaneKind::Other, verge_m));
+        }
+        lanes.push((LaneKind::Sidewalk, sidewalk_m));
+        lanes
+    };
+    CrossProfile { left: side(), right: side() }
+}
+
+/// Distance from each junction's middle at which its roads begin, metres: far enough that their edges do not overlap.
+fn junction_radii(graph: &StreetGraph, chains: &[Chain]) -> Vec<f64> {
+    let mut arms: Vec<Vec<(f64, f64)>> = vec![Vec::new(); graph.nodes.len()];
+    for chain in chains {
+        let last = chain.nodes.len() - 1;
+        let half = chain.profile.half_width_m();
+        arms[chain.nodes[0]].push((graph.angle(chain.nodes[0], chain.nodes[1]), half));
+        arms[chain.nodes[last]].push((graph.angle(chain.nodes[last], chain.nodes[last - 1]), half));
+    }
+    let radius = |arms: &Vec<(f64, f64)>| {
+        let mut radius = arms.iter().map(|&(_, half)| half).fold(0.0, f64::max) + KERB_RADIUS_M;
+        for (i, &(angle_a, half_a)) in arms.iter().enumerate() {
+            for &(angle_b, half_b) in &arms[i + 1..] {
+                let between = wrap_angle(angle_b - angle_a).abs() - 2.0 * WIGGLE_RAD;
+                if between < 1.5 {
+                    let corner = (half_a.max(half_b) * (1.0 + between.cos())) / between.max(0.4).sin();
+                    radius = radius.max(corner + 2.0);
+                }
+            }
+        }
+        radius
+    };
+    arms.iter().map(radius).collect()
+}
+
+/// Poses through which a street's reference line leads.
+fn poses(graph: &StreetGraph, chain: &Chain, radii: &[f64]) -> Vec<Pose2> {
+    let last = chain.nodes.len() - 1;
+    let mut poses = vec![end_pose(graph, chain, radii, 0)];
+    for place in 1..last {
+        let [before, corner, after] = [chain.nodes[place - 1], chain.nodes[place], chain.nodes[place + 1]];
+        let reach = 0.4 * graph.distance_m(before, corner).min(graph.distance_m(corner, after));
+        let reach = reach.min(22.0);
+        let middle = |heading| Pose2::new(graph.nodes[corner].x, graph.nodes[corner].y, heading);
+        poses.push(middle(graph.angle(before, corner)).moved(-reach, 0.0, 0.0));
+        poses.push(middle(graph.angle(corner, after)).moved(reach, 0.0, 0.0));
+    }
+    poses.push(end_pose(graph, chain, radii, 1).reversed());
+    poses
+}
+
+/// Where a street begins at its first (0) or last (1) node, looking into the street.
+fn end_pose(graph: &StreetGraph, chain: &Chain, radii: &[f64], which: usize) -> Pose2 {
+    let last = chain.nodes.len() - 1;
+    let (node, next) =
+        if which == 0 { (chain.nodes[0], chain.nodes[1]) } else { (chain.nodes[last], chain.nodes[last - 1]) };
+    if let Some(port) = graph.nodes[node].port {
+        return port;
+    }
+    let wiggle = if graph.distance_m(node, next) > WIGGLE_MIN_M { chain.wiggle_rad[which] } else { 0.0 };
+    let middle = Pose2::new(graph.nodes[node].x, graph.nodes[node].y, graph.angle(node, next) + wiggle);
+    middle.moved(radii[node], 0.0, 0.0)
+}

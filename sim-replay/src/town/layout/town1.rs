@@ -1,0 +1,37 @@
+//! A small town of about 400 m x 340 m: two-lane streets, T-junctions and crossings on level ground.
+
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use super::Layout;
+use super::builder::Builder;
+use super::grid::{GridPlan, grid, spread};
+use super::streets;
+
+/// Speed limit: 25 mph, as in CARLA's Town01.
+const LIMIT_MPS: f64 = 11.176;
+
+/// Lays out the town of a seed.
+pub(crate) fn lay_out(seed: u64) -> Layout {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let (width, height) = (rng.random_range(385.0..415.0), rng.random_range(325.0..355.0));
+    let (columns, rows) = (rng.random_range(4..=5), rng.random_range(4..=5));
+    // Streets that are not at right angles: the rows' ends lie at different heights.
+    let (shear, taper) = (rng.random_range(-0.1..0.1), rng.random_range(-0.08..0.08));
+    let columns_m = spread(0.0, width, columns, 0.22, &mut rng);
+    // A denser grid loses more streets, so that towns of all grids are about as long.
+    let left_out = match columns + rows {
+        8 => 0.10,
+        9 => 0.2,
+        _ => 0.28,
+    };
+    let plan = GridPlan { columns_m, rows, left_out, jitter_m: 5.0 };
+    let y_range = |x: f64| {
+        let share = x / width - 0.5;
+        [shear * x + share * taper * height, height + shear * x - share * taper * height]
+    };
+    let graph = grid(&plan, y_range, &mut rng);
+    let mut builder = Builder::default();
+    streets::lay_out(&mut builder, &graph, LIMIT_MPS, &mut rng);
+    Layout { network: builder.network, islands: Vec::new() }
+}

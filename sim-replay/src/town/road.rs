@@ -1,0 +1,347 @@
+//! Road networks in the terms of OpenDRIVE, whether read from a map or laid out by a procedure.
+//!
+//! Places along a road are `s` along its reference line, places across it `t`, positive to the left; both in metres.
+//! Lane ids count outwards from the reference line, positive to the left, negative to the right.
+
+use super::curve::{Curve, Pose2, cubic, cubic_slope};
+
+/// Roads and junctions of a map.
+#[derive(Debug, Clone, Default)]
+pub struct RoadNetwork {
+    /// The roads; links refer to them by place.
+    pub roads: Vec<Road>,
+    /// The junctions; links refer to them by place.
+    pub junctions: Vec<Junction>,
+    /// What the map holds and this program leaves out.
+    pub ignored: Ignored,
+}
+
+/// What a map held and was left out.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Ignored {
+    /// Superelevation or lateral shape records that are not level.
+    pub superelevations: usize,
+    /// Lanes kept level by the map (`level="true"`) on roads that are not.
+    pub level_lanes: usize,
+}
+
+/// One road.
+#[derive(Debug, Clone)]
+pub struct Road {
+    /// Its id in the map.
+    pub id: String,
+    /// Length along the reference line, metres.
+    pub length_m: f64,
+    /// The junction that it leads through.
+    pub junction: Option<usize>,
+    /// What its start meets.
+    pub predecessor: Option<RoadLink>,
+    /// What its end meets.
+    pub successor: Option<RoadLink>,
+    /// Elements of the reference line, by rising `s`; at least one.
+    pub plan_view: Vec<Curve>,
+    /// Height along the road.
+    pub elevation: Profile,
+    /// Shift of the lanes' origin across the road.
+    pub lane_offset: Profile,
+    /// Lane sections, by rising `s`; at least one.
+    pub sections: Vec<LaneSection>,
+    /// Speed limits in metres per second, by rising `s` of their start.
+    pub speed_limits: Vec<(f64, f64)>,
+    /// Things beside or on the road that the map records.
+    pub objects: Vec<RoadObject>,
+    /// Traffic lights and signs that the map records.
+    pub signals: Vec<RoadSignal>,
+    /// Stretches on bridges and in tunnels that the map records.
+    pub structures: Vec<RoadStructure>,
+}
+
+/// What the end of a road meets.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum RoadLink {
+    /// Another road's start or end.
+    Road {
+        /// The other road.
+        road: usize,
+        /// Which of its ends.
+        contact: Contact,
+    },
+    /// A junction, whose connections say how to go on.
+    Junction(usize),
+}
+
+/// An end of a road.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Contact {
+    /// Where `s` is 0.
+    Start,
+    /// Where `s` is the road's length.
+    End,
+}
+
+/// A value along a road: cubics, each from its start on.
+#[derive(Debug, Clone, Default, PartialEq)]
+pub struct Profile {
+    /// Start `s` and coefficients a, b, c, d of each cubic, by rising `s`.
+    pub records: Vec<(f64, [f64; 4])>,
+}
+
+/// Lanes across a stretch of road.
+#[derive(Debug, Clone, Default)]
+pub struct LaneSection {
+    /// Where it starts, metres.
+    pub s_m: f64,
+    /// Lanes 1, 2, .. outwards.
+    pub left: Vec<RoadLane>,
+    /// Lanes -1, -2, .. outwards.
+    pub right: Vec<RoadLane>,
+}
+
+/// One lane of a section.
+#[derive(Debug, Clone)]
+pub struct RoadLane {
+    /// What it is for.
+    pub kind: LaneKind,
+    /// Width along the section, `s` counted from the section's start.
+    pub width: Profile,
+    /// Lane id that it continues, in the section or road before (in rising `s`).
+    pub predecessor: Option<i32>,
+    /// Lane id that continues it.
+    pub successor: Option<i32>,
+    /// Its own speed limit, metres per second.
+    pub speed_limit_mps: Option<f64>,
+}
+
+/// What a lane is for.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum LaneKind {
+    /// Motor traffic, ramps included.
+    Driving,
+    /// Parked vehicles.
+    Parking,
+    /// Hard strip beside the carriageway.
+    Shoulder,
+    /// Walking.
+    Sidewalk,
+    /// Between carriageways.
+    Median,
+    /// Anything else: cycle lanes, verges, kerbs.
+    Other,
+}
+
+/// A junction and the ways through it.
+#[derive(Debug, Clone, Default)]
+pub struct Junction {
+    /// Its id in the map.
+    pub id: String,
+    /// The ways through it.
+    pub connections: Vec<Connection>,
+}
+
+/// A way from an incoming road onto a connecting road.
+#[derive(Debug, Clone)]
+pub struct Connection {
+    /// The road that leads into the junction.
+    pub incoming: usize,
+    /// The road inside the junction.
+    pub connecting: usize,
+    /// The end at which the connecting road is entered.
+    pub contact: Contact,
+    /// Lane of the incoming road, lane of the connecting road.
+    pub lane_links: Vec<(i32, i32)>,
+}
+
+/// A thing that a map records beside or on a road.
+#[derive(Debug, Clone)]
+pub struct RoadObject {
+    /// Its type and name, as the map gives them.
+    pub label: String,
+    /// Place along the road, metres.
+    pub s_m: f64,
+    /// Place across the road, metres.
+    pub t_m: f64,
+    /// Height over the road's surface, metres.
+    pub z_offset_m: f64,
+    /// Heading against the road, radians.
+    pub heading_rad: f64,
+    /// Length, width, height, metres.
+    pub size_m: [f64; 3],
+}
+
+/// A traffic light or sign that a map records.
+#[derive(Debug, Clone)]
+pub struct RoadSignal {
+    /// Name, as the map gives it.
+    pub name: String,
+    /// Whether it changes: a traffic light.
+    pub dynamic: bool,
+    /// Place along the road, metres.
+    pub s_m: f64,
+    /// Place across the road, metres.
+    pub t_m: f64,
+    /// Height of its foot over the road's surface, metres.
+    pub z_offset_m: f64,
+    /// Heading against the road, radians.
+    pub heading_rad: f64,
+    /// Height, metres; 0 when the map does not say.
+    pub height_m: f64,
+}
+
+/// A stretch of road on a bridge or in a tunnel.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RoadStructure {
+    /// Whether it is a tunnel; else a bridge.
+    pub tunnel: bool,
+    /// Where it starts, metres.
+    pub s_m: f64,
+    /// Length, metres.
+    pub length_m: f64,
+}
+
+impl Profile {
+    /// The same value everywhere.
+    #[must_use]
+    pub fn constant(value: f64) -> Self {
+        Self { records: vec![(0.0, [value, 0.0, 0.0, 0.0])] }
+    }
+
+    /// The cubic that leads from one value and slope to another over `length` from `start` on.
+    #[must_use]
+    pub fn hermite(start: f64, length: f64, [from, slope]: [f64; 2], [to, end_slope]: [f64; 2]) -> (f64, [f64; 4]) {
+        let rise = (to - from) / length;
+        let c = (3.0 * rise - 2.0 * slope - end_slope) / length;
+        let d = (slope + end_slope - 2.0 * rise) / (length * length);
+        (start, [from, slope, c, d])
+    }
+
+    /// Value at `s`; the first cubic also holds before its start, and an empty profile is 0.
+    #[must_use]
+    pub fn at(&self, s: f64) -> f64 {
+        self.record_at(s).map_or(0.0, |(start, coefficients)| cubic(coefficients, s - start))
+    }
+
+    /// Slope at `s`.
+    #[must_use]
+    pub fn slope_at(&self, s: f64) -> f64 {
+        self.record_at(s).map_or(0.0, |(start, coefficients)| cubic_slope(coefficients, s - start))
+    }
+
+    fn record_at(&self, s: f64) -> Option<(f64, [f64; 4])> {
+        let after = self.records.partition_point(|&(start, _)| start <= s);
+        self.records.get(after.saturating_sub(1)).copied()
+    }
+}
+
+impl LaneSection {
+    /// The lane of an id, if the section has it; there is none for the centre, 0.
+    #[must_use]
+    pub fn lane(&self, id: i32) -> Option<&RoadLane> {
+        let side = if id > 0 { &self.left } else { &self.right };
+        side.get((id.unsigned_abs() as usize).checked_sub(1)?)
+    }
+
+    /// Ids of all lanes, from the rightmost to the leftmost.
+    pub fn lane_ids(&self) -> impl Iterator<Item = i32> + use<> {
+        let (right, left) = (self.right.len() as i32, self.left.len() as i32);
+        (-right..=left).filter(|&id| id != 0)
+    }
+}
+
+impl Road {
+    /// Place and heading of the reference line at `s_m`.
+    #[must_use]
+    pub fn pose_at(&self, s_m: f64) -> Pose2 {
+        let after = self.plan_view.partition_point(|curve| curve.s_m <= s_m);
+        let curve = &self.plan_view[after.saturating_sub(1)];
+        // A road's length and the sum of its elements differ by rounding: never run past an element's end.
+        curve.at((s_m - curve.s_m).clamp(0.0, curve.length_m))
+    }
+
+    /// Place at `s_m`, `t_m`, on the road's surface, metres.
+    #[must_use]
+    pub fn point_at(&self, s_m: f64, t_m: f64) -> [f64; 3] {
+        let pose = self.pose_at(s_m).moved(0.0, t_m, 0.0);
+        [pose.x, pose.y, self.elevation.at(s_m)]
+    }
+
+    /// End of section `index`, metres.
+    #[must_use]
+    pub fn section_end_m(&self, index: usize) -> f64 {
+        self.sections.get(index + 1).map_or(self.length_m, |next| next.s_m.min(self.length_m))
+    }
+
+    /// Place of the section at `s_m` in [`Road::sections`].
+    #[must_use]
+    pub fn section_at(&self, s_m: f64) -> usize {
+        self.sections.partition_point(|section| section.s_m <= s_m).saturating_sub(1)
+    }
+
+    /// Lower and upper `t` of lane `id` of section `section` at `s_m`, metres.
+    #[must_use]
+    pub fn lane_span_m(&self, section: usize, id: i32, s_m: f64) -> [f64; 2] {
+        let section = &self.sections[section];
+        let side = if id > 0 { &section.left } else { &section.right };
+        let width = |lane: &RoadLane| lane.width.at(s_m - section.s_m).max(0.0);
+        let place = id.unsigned_abs() as usize;
+        let inner: f64 = side.iter().take(place - 1).map(width).sum();
+        let outer = inner + side.get(place - 1).map_or(0.0, width);
+        let origin = self.lane_offset.at(s_m);
+        if id > 0 { [origin + inner, origin + outer] } else { [origin - outer, origin - inner] }
+    }
+
+    /// Speed limit at `s_m` where the road has one, metres per second.
+    #[must_use]
+    pub fn speed_limit_mps(&self, s_m: f64) -> Option<f64> {
+        let after = self.speed_limits.partition_point(|&(start, _)| start <= s_m);
+        self.speed_limits.get(after.saturating_sub(1)).map(|&(_, limit)| limit)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn profile_switches_cubics_and_hermite_meets_both_ends() {
+        let ramp = Profile::hermite(10.0, 20.0, [1.0, 0.0], [5.0, 0.1]);
+        let profile = Profile { records: vec![(0.0, [1.0, 0.0, 0.0, 0.0]), ramp, (30.0, [5.0, 0.1, 0.0, 0.0])] };
+        assert!((profile.at(-3.0) - 1.0).abs() < 1e-12);
+        assert!((profile.at(30.0 - 1e-9) - profile.at(30.0)).abs() < 1e-6);
+        assert!((profile.slope_at(30.0 - 1e-9) - 0.1).abs() < 1e-6);
+        assert!((profile.at(40.0) - 6.0).abs() < 1e-12);
+        assert_eq!(Profile::default().at(3.0), 0.0);
+    }
+
+    #[test]
+    fn lane_spans_stack_outwards_from_the_offset() {
+        let lane = |width: f64| RoadLane {
+            kind: LaneKind::Driving,
+            width: Profile::constant(width),
+            predecessor: None,
+            successor: None,
+            speed_limit_mps: None,
+        };
+        let section = LaneSection { s_m: 0.0, left: vec![lane(3.0)], right: vec![lane(3.5), lane(2.0)] };
+        assert_eq!(section.lane_ids().collect::<Vec<_>>(), [-2, -1, 1]);
+        assert!(section.lane(0).is_none() && section.lane(2).is_none() && section.lane(-2).is_some());
+        let road = Road {
+            id: "1".into(),
+            length_m: 10.0,
+            junction: None,
+            predecessor: None,
+            successor: None,
+            plan_view: vec![],
+            elevation: Profile::default(),
+            lane_offset: Profile::constant(0.5),
+            sections: vec![section],
+            speed_limits: vec![],
+            objects: vec![],
+            signals: vec![],
+            structures: vec![],
+        };
+        assert_eq!(road.lane_span_m(0, 1, 0.0), [0.5, 3.5]);
+        assert_eq!(road.lane_span_m(0, -1, 0.0), [-3.0, 0.5]);
+        assert_eq!(road.lane_span_m(0, -2, 0.0), [-5.0, -3.0]);
+        assert_eq!(road.speed_limit_mps(3.0), None);
+    }
+}
