@@ -40,9 +40,9 @@ fn in_conflict(a: &Lane, b: &Lane) -> bool {
 
 fn crosses(a: &Lane, b: &Lane) -> bool {
     let near = OVERLAP * (a.width_m + b.width_m) / 2.0;
-    a.centerline.iter().any(|p| {
-        b.centerline.iter().any(|q| (p[0] - q[0]).hypot(p[1] - q[1]) < near && (p[2] - q[2]).abs() < LEVEL_M)
-    })
+    a.centerline
+        .iter()
+        .any(|p| b.centerline.iter().any(|q| (p[0] - q[0]).hypot(p[1] - q[1]) < near && (p[2] - q[2]).abs() < LEVEL_M))
 }
 
 #[cfg(test)]

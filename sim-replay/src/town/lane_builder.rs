@@ -119,7 +119,7 @@ fn build_lane(road: &Road, origin: Origin, id: LaneId) -> Option<Lane> {
     Some(lane)
 }
 
-/// Even points of a lane's middle in driving direction, the widths there and the length; `None` for a lane of no length.
+/// Even points of a lane's middle in driving direction, the widths there and the length; `None` for a lane of no or of absurd length.
 fn center_line(road: &Road, origin: Origin, from: f64, to: f64) -> Option<(Vec<[f64; 3]>, Vec<f64>, f64)> {
     let fine = ((to - from) / FINE_STEP_M).ceil().max(1.0) as usize;
     let mut samples: Vec<([f64; 3], f64)> = (0..=fine)
@@ -138,7 +138,8 @@ fn center_line(road: &Road, origin: Origin, from: f64, to: f64) -> Option<(Vec<[
         lengths.push(lengths[lengths.len() - 1] + (b[0] - a[0]).hypot(b[1] - a[1]));
     }
     let total = lengths[fine];
-    if total < 1e-6 {
+    // Far longer than the road: polynomials of the map went astray between the places where the reader checks them.
+    if total < 1e-6 || total > 10.0 * (to - from) + 100.0 {
         return None;
     }
     let steps = (total / STEP_M).round().max(1.0) as usize;
@@ -166,12 +167,7 @@ fn link_neighbours(graph: &mut LaneGraph, origins: &[Origin], table: &LaneTable)
     }
 }
 
-fn link_successors(
-    graph: &mut LaneGraph,
-    network: &RoadNetwork,
-    origins: &[Origin],
-    table: &LaneTable,
-) -> LinkCounts {
+fn link_successors(graph: &mut LaneGraph, network: &RoadNetwork, origins: &[Origin], table: &LaneTable) -> LinkCounts {
     let mut counts = LinkCounts::default();
     for (index, &origin) in origins.iter().enumerate() {
         let mut successors: Vec<LaneId> = Vec::new();

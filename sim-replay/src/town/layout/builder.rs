@@ -78,7 +78,8 @@ impl Builder {
         profile: &CrossProfile,
         limit_mps: f64,
     ) -> usize {
-        let lanes = |side: &[(LaneKind, f64)]| side.iter().map(|&(kind, width)| lane(kind, Profile::constant(width))).collect();
+        let lanes =
+            |side: &[(LaneKind, f64)]| side.iter().map(|&(kind, width)| lane(kind, Profile::constant(width))).collect();
         let section = LaneSection { s_m: 0.0, left: lanes(&profile.left), right: lanes(&profile.right) };
         self.push(plan_view, elevation, section, limit_mps)
     }

@@ -95,8 +95,9 @@ fn join(builder: &mut Builder, junction: usize, ends: &[RoadEnd], limit_mps: f64
             if from == to {
                 continue;
             }
-            let turn =
-                wrap_angle(builder.outward_pose(to).heading_rad + std::f64::consts::PI - builder.outward_pose(from).heading_rad);
+            let turn = wrap_angle(
+                builder.outward_pose(to).heading_rad + std::f64::consts::PI - builder.outward_pose(from).heading_rad,
+            );
             // Turning traffic slows down.
             let limit = if turn.abs() > 0.5 { limit_mps.min(7.0) } else { limit_mps };
             let (incoming, outgoing) = (builder.incoming(from), builder.outgoing(to));

@@ -1,9 +1,12 @@
 //! `<lanes>`: sections and their lanes.
 
-use super::super::road::{Ignored, LaneKind, LaneSection, RoadLane};
+use super::super::road::{Ignored, LaneKind, LaneSection, Profile, RoadLane};
 use super::OpenDriveError;
 use super::element::{Element, MAX_LANES, children};
 use super::roads::{read_profile, read_speed};
+
+/// Widest lane, metres.
+const MAX_WIDTH_M: f64 = 100.0;
 
 pub(super) fn read_sections(
     lanes: Element,
@@ -18,10 +21,29 @@ pub(super) fn read_sections(
             let expected = format!("at least the section before, {}", before.s_m);
             return Err(element.error_value("s", &s_m.to_string(), &expected));
         }
+        if let Some(before) = sections.last() {
+            check_widths(element, before, s_m - before.s_m)?;
+        }
         let left = read_side(element, "left", 1, ignored)?;
         sections.push(LaneSection { s_m, left, right: read_side(element, "right", -1, ignored)? });
     }
-    if sections.is_empty() { Err(lanes.error_element("has no <laneSection>")) } else { Ok(sections) }
+    match sections.last() {
+        Some(last) => check_widths(lanes, last, road_length_m - last.s_m)?,
+        None => return Err(lanes.error_element("has no <laneSection>")),
+    }
+    Ok(sections)
+}
+
+/// Refuses sections whose width polynomials leave what a road can be.
+fn check_widths(element: Element, section: &LaneSection, length_m: f64) -> Result<(), OpenDriveError> {
+    let widest = |width: &Profile| (0..=20).map(|i| width.at(length_m * f64::from(i) / 20.0)).fold(0.0, f64::max);
+    match section.left.iter().chain(&section.right).map(|lane| widest(&lane.width)).find(|&width| width > MAX_WIDTH_M) {
+        Some(width) => {
+            let problem = format!("holds a lane that is {width:.1} m wide; expected at most {MAX_WIDTH_M}");
+            Err(element.error_element(&problem))
+        }
+        None => Ok(()),
+    }
 }
 
 /// Lanes of one side, from the reference line outwards.
@@ -65,6 +87,6 @@ fn read_lane(element: Element) -> Result<RoadLane, OpenDriveError> {
     let linked = |name| link.and_then(|link| link.child(name)).map(|end| end.lane_id("id")).transpose();
     // Several speed records may follow each other along a lane; the first is taken for all of it.
     let speed_limit_mps = element.child("speed").map(read_speed).transpose()?.flatten();
-    let width = read_profile(element, "width", "sOffset", 100.0)?;
+    let width = read_profile(element, "width", "sOffset", MAX_WIDTH_M)?;
     Ok(RoadLane { kind, width, predecessor: linked("predecessor")?, successor: linked("successor")?, speed_limit_mps })
 }

@@ -45,7 +45,8 @@ pub fn read(text: &str) -> Result<RoadNetwork, OpenDriveError> {
         return Err(OpenDriveError::TooLarge { bytes: text.len(), limit: MAX_BYTES });
     }
     let options = ParsingOptions { nodes_limit: MAX_NODES, ..ParsingOptions::default() };
-    let document = Document::parse_with_options(text, options).map_err(|error| OpenDriveError::Xml(error.to_string()))?;
+    let document =
+        Document::parse_with_options(text, options).map_err(|error| OpenDriveError::Xml(error.to_string()))?;
     let root = Element(document.root_element());
     if root.name() != "OpenDRIVE" {
         return Err(root.error_element("is the root; expected <OpenDRIVE>"));

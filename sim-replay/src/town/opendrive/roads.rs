@@ -13,6 +13,8 @@ const MAX_CURVATURE: f64 = 10.0;
 const MAX_TURN_RAD: f64 = 20.0;
 /// The elements' lengths may miss the road's length by this much, metres; rounding in the wild stays far below.
 const LENGTH_TOLERANCE_M: f64 = 1.0;
+/// Elements may miss each other by this much, metres.
+const JOINT_TOLERANCE_M: f64 = 2.0;
 /// Highest road over the map's zero, metres.
 const MAX_HEIGHT_M: f64 = 10_000.0;
 
@@ -83,6 +85,11 @@ fn read_plan_view(plan_view: Element, road_length_m: f64) -> Result<Vec<Curve>, 
         if curves.last().is_some_and(|before| curve.s_m < before.s_m) {
             return Err(element.error_value("s", &curve.s_m.to_string(), "the elements in rising order"));
         }
+        if let Some(gap_m) = curves.last().map(|before| before.end().distance_m(&curve.start)).filter(too_far) {
+            let problem =
+                format!("starts {gap_m:.2} m from the end of the one before; expected at most {JOINT_TOLERANCE_M}");
+            return Err(element.error_element(&problem));
+        }
         // An element of no length has no direction of its own and adds nothing.
         if curve.length_m > 0.0 || curves.is_empty() {
             curves.push(curve);
@@ -96,12 +103,23 @@ fn read_plan_view(plan_view: Element, road_length_m: f64) -> Result<Vec<Curve>, 
     Ok(curves)
 }
 
+fn too_far(gap_m: &f64) -> bool {
+    *gap_m > JOINT_TOLERANCE_M
+}
+
+/// Whether no tenth of a curve is longer than twice what its length says: polynomials can claim anything.
+fn keeps_its_length(curve: &Curve) -> bool {
+    let at = |tenth: u32| curve.at(curve.length_m * f64::from(tenth) / 10.0);
+    (0..10).all(|tenth| at(tenth).distance_m(&at(tenth + 1)) <= 0.2 * curve.length_m + 0.1)
+}
+
 fn read_curve(element: Element) -> Result<Curve, OpenDriveError> {
     let coordinate = |name| element.number(name, -MAX_COORDINATE_M, MAX_COORDINATE_M);
     let start = Pose2::new(coordinate("x")?, coordinate("y")?, element.number("hdg", -1e4, 1e4)?);
     let length_m = element.number("length", 0.0, MAX_LENGTH_M)?;
     let s_m = element.number("s", 0.0, MAX_LENGTH_M)?;
-    let Some(shape) = element.0.children().find(|node| node.is_element() && node.tag_name().name() != "userData") else {
+    let Some(shape) = element.0.children().find(|node| node.is_element() && node.tag_name().name() != "userData")
+    else {
         return Err(element.error_element("has no shape"));
     };
     let shape = Element(shape);
@@ -126,12 +144,17 @@ fn read_curve(element: Element) -> Result<Curve, OpenDriveError> {
             CurveShape::ParamPoly3 { u, v, normalized }
         }
         other => {
-            return Err(element.error_element(&format!(
-                "holds <{other}>; expected line, arc, spiral, poly3 or paramPoly3"
-            )));
+            return Err(
+                element.error_element(&format!("holds <{other}>; expected line, arc, spiral, poly3 or paramPoly3"))
+            );
         }
     };
-    Ok(Curve { s_m, start, length_m, shape })
+    let curve = Curve { s_m, start, length_m, shape };
+    if keeps_its_length(&curve) {
+        Ok(curve)
+    } else {
+        Err(element.error_value("length", &length_m.to_string(), "about the length of its curve"))
+    }
 }
 
 /// Cubics a, b, c, d from the elements `name` of `parent`, by rising `start`.

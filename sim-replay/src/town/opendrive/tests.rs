@@ -70,7 +70,10 @@ fn errors_name_line_element_attribute_and_values() {
         error_of(r#"length="50" junction"#, r#"length="fifty" junction"#),
         "line 4: <road> has length=\"fifty\"; expected a number"
     );
-    assert_eq!(error_of(r#" y="0" hdg="0" length="50""#, r#" hdg="0" length="50""#), "line 7: <geometry> has no attribute y");
+    assert_eq!(
+        error_of(r#" y="0" hdg="0" length="50""#, r#" hdg="0" length="50""#),
+        "line 7: <geometry> has no attribute y"
+    );
     assert_eq!(
         error_of(r#"x="0" y="0""#, r#"x="NaN" y="0""#),
         "line 7: <geometry> has x=\"NaN\"; expected a value from -10000000 to 10000000"
@@ -85,9 +88,12 @@ fn errors_name_line_element_attribute_and_values() {
     );
     assert_eq!(
         error_of(r#"<lane id="-2""#, r#"<lane id="-3""#),
-        "line 17: <lane> has id=\"-3\"; expected -2, without gaps or doubles"
+        "line 16: <lane> has id=\"-3\"; expected -2, without gaps or doubles"
     );
-    assert_eq!(error_of(r#"road id="b""#, r#"road id="a""#), "line 23: <road> has id=\"a\"; expected used by one element only");
+    assert_eq!(
+        error_of(r#"road id="b""#, r#"road id="a""#),
+        "line 22: <road> has id=\"a\"; expected used by one element only"
+    );
     assert!(error_of("<line/>", "<helix/>").contains("holds <helix>"));
     assert!(error_of(r#"curvature="0.05""#, r#"curvature="9.5""#).contains("expected a value from -6.3"));
     assert!(error_of("</OpenDRIVE>", "").contains("not well-formed XML"));
