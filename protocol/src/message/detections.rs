@@ -36,6 +36,10 @@ pub struct FusedNeighbour {
     pub age_nanos: i64,
     /// How sure the neighbour is of its pose, 0..=1.
     pub confidence: f32,
+    /// Bytes of metadata and body of the message that was fused: map, boxes or points as they crossed the air.
+    pub payload_bytes: u64,
+    /// Bytes of everything it sent for this frame, headers and the pose's own message included.
+    pub wire_bytes: u64,
 }
 
 /// A neighbour that is known but not in a result.

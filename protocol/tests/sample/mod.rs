@@ -75,7 +75,13 @@ pub(crate) fn detections() -> Detections {
         method: "attention".into(),
         pose: pose(),
         detections: vec![detection(0.5), detection(1.0)],
-        fused: vec![FusedNeighbour { cav: cav("4288"), age_nanos: -5_000_000, confidence: 0.5 }],
+        fused: vec![FusedNeighbour {
+            cav: cav("4288"),
+            age_nanos: -5_000_000,
+            confidence: 0.5,
+            payload_bytes: 24_576,
+            wire_bytes: 24_800,
+        }],
         skipped: vec![
             SkippedNeighbour { cav: cav("-1"), reason: None },
             SkippedNeighbour { cav: cav("7"), reason: Some(DropReason::Stale) },
