@@ -30,6 +30,13 @@ impl From<CarlaPose> for [f64; 6] {
 }
 
 impl CarlaPose {
+    /// The pose of a box from the actor it belongs to: `center_m`, the offset of the box's centre, is added to
+    /// `location_m` without turning it, as OpenCOOD does (`opencood/utils/box_utils.py`).
+    #[must_use]
+    pub fn of_box(location_m: [f64; 3], roll_yaw_pitch_deg: [f64; 3], center_m: [f64; 3]) -> Self {
+        Self { position_m: std::array::from_fn(|axis| location_m[axis] + center_m[axis]), roll_yaw_pitch_deg }
+    }
+
     /// Local-to-world matrix, still left-handed.
     #[must_use]
     pub fn left_handed_matrix(&self) -> Matrix4<f64> {
