@@ -98,6 +98,21 @@ impl Stop {
         Ok(())
     }
 
+    /// Makes the end of standard input a request: a supervisor that holds the other end of the pipe and writes nothing
+    /// takes its processes with it, however suddenly it dies.
+    ///
+    /// # Errors
+    /// When the thread that waits for it cannot be started.
+    pub fn on_end_of_input(&self) -> std::io::Result<()> {
+        let stop = self.clone();
+        thread::Builder::new().name("lifeline".into()).spawn(move || {
+            // A broken pipe is an end like any other.
+            let _ = std::io::copy(&mut std::io::stdin(), &mut std::io::sink());
+            stop.request();
+        })?;
+        Ok(())
+    }
+
     fn lock(&self) -> std::sync::MutexGuard<'_, State> {
         self.0.0.lock().unwrap_or_else(PoisonError::into_inner)
     }
