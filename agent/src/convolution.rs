@@ -129,13 +129,18 @@ impl ConvLayer {
     }
 
     /// `[N, C_in, H, W]` to `[N, C_out, H', W']`.
+    ///
+    /// The convolution is computed in the precision of `x`; the parameters stay `f32`, and so do the statistics of the
+    /// norm.
     #[must_use]
     pub fn forward(&self, x: &Tensor, train: bool) -> Tensor {
         let (stride, padding) = ([self.stride; 2], [self.padding; 2]);
-        let bias = self.bias.as_ref();
+        // In f32 both are the parameters themselves: a conversion to the same kind copies nothing.
+        let weight = self.weight.to_kind(x.kind());
+        let bias = self.bias.as_ref().map(|bias| bias.to_kind(x.kind()));
         let x = match self.direction {
-            Direction::Down => x.conv2d(&self.weight, bias, stride, padding, [1, 1], 1),
-            Direction::Up => x.conv_transpose2d(&self.weight, bias, stride, padding, [0, 0], 1, [1, 1]),
+            Direction::Down => x.conv2d(&weight, bias, stride, padding, [1, 1], 1),
+            Direction::Up => x.conv_transpose2d(&weight, bias, stride, padding, [0, 0], 1, [1, 1]),
         };
         let mut x = match &self.norm {
             Some(norm) => norm.forward(&x, train),

@@ -1,13 +1,18 @@
 //! What one connected vehicle does with its sweep: where am I, what do I see, what do I tell the others.
 
 pub mod agent_attention;
+pub mod anchors;
 pub mod backbone;
 pub mod convolution;
+pub mod decode;
 pub mod head;
 pub mod model_config;
+pub mod nms;
 pub mod pillar_batch;
 pub mod pillar_encoder;
 pub mod pillars;
 pub mod point_pillars;
+pub mod postprocess;
+pub mod rotated_iou;
 pub mod shrink;
 pub mod weights;

@@ -1,6 +1,6 @@
 //! PointPillars as one network, for training and for inference.
 
-use tch::{TchError, Tensor, nn};
+use tch::{Kind, TchError, Tensor, nn};
 
 use crate::backbone::BevBackbone;
 use crate::head::{DetectionHead, HeadOutput};
@@ -15,6 +15,9 @@ pub struct PointPillars {
     /// The numbers it was built from.
     pub config: DetectorConfig,
     lattice: PillarLattice,
+    /// Precision of the convolutions in training: `Float`, or `BFloat16` where the processor computes it several times
+    /// as fast. Parameters, norms, pillar features and heads are `f32` in any case.
+    pub compute: Kind,
     /// `pillar_vfe`: points to pillar features.
     pub encoder: PillarEncoder,
     /// `backbone`: the 2D convolutions.
@@ -37,6 +40,7 @@ impl PointPillars {
         let channels = config.feature_channels();
         Ok(Self {
             lattice: PillarLattice::new(config),
+            compute: Kind::Float,
             encoder: PillarEncoder::new(&(path / "pillar_vfe"), config.pillar_channels),
             backbone: BevBackbone::new(&(path / "backbone"), config),
             shrink: (config.shrink.as_ref())
@@ -61,14 +65,15 @@ impl PointPillars {
         self.features_of_canvas(&canvas, train)
     }
 
-    /// From the canvas `[B, C_pillar, H, W]` on: backbone and shrink.
+    /// From the canvas `[B, C_pillar, H, W]` on: backbone and shrink, `f32`.
     #[must_use]
     pub fn features_of_canvas(&self, canvas: &Tensor, train: bool) -> Tensor {
-        let wide = self.backbone.forward(canvas, train);
-        match &self.shrink {
+        let wide = self.backbone.forward(&canvas.to_kind(self.compute), train);
+        let features = match &self.shrink {
             Some(shrink) => shrink.forward(&wide, train),
             None => wide,
-        }
+        };
+        features.to_kind(Kind::Float)
     }
 
     /// What the compressor loses: `[B, C, H, W]` squeezed and widened again; unchanged without a compressor.

@@ -1,0 +1,110 @@
+//! Prior boxes of the head.
+
+use crate::model_config::{AnchorConfig, DetectorConfig};
+
+/// The anchors of a head: a regular lattice, the same few boxes at every point of it.
+///
+/// Anchor `a` of row `r` and column `c` has the index `(r * W + c) * A + a`: the order H, W, anchor of the reference.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Anchors {
+    /// Columns of the lattice, metres.
+    pub x_m: Vec<f64>,
+    /// Rows of the lattice, metres.
+    pub y_m: Vec<f64>,
+    /// Centre height, metres.
+    pub z_m: f64,
+    /// Length, width, height, metres.
+    pub size_lwh_m: [f64; 3],
+    /// Headings, radians.
+    pub yaws_rad: Vec<f64>,
+}
+
+impl Anchors {
+    /// The anchors of a detector.
+    #[must_use]
+    pub fn for_detector(config: &DetectorConfig) -> Self {
+        let stride = usize::try_from(config.feature_stride()).unwrap_or(1).max(1);
+        Self::new(config.lidar_range_m, config.voxel_size_m, config.pillar_grid(), stride, &config.anchors)
+    }
+
+    /// Anchors over an area with `grid` pillars (x, y, z) of which each cell of the head covers `stride` along an axis.
+    ///
+    /// As in the reference they spread evenly from one pillar inside the lower edge to one inside the upper. For stride
+    /// 2 these are the centres of the cells; for stride 4 they lie 1.6046 m apart on cells of 1.6 m. Trained weights
+    /// depend on it, so it is kept.
+    #[must_use]
+    pub fn new(
+        lidar_range_m: [f64; 6],
+        voxel_size_m: [f64; 3],
+        grid: [usize; 3],
+        stride: usize,
+        anchors: &AnchorConfig,
+    ) -> Self {
+        let along = |axis: usize| {
+            let low = lidar_range_m[axis] + voxel_size_m[axis];
+            linspace(low, lidar_range_m[axis + 3] - voxel_size_m[axis], grid[axis] / stride)
+        };
+        Self {
+            x_m: along(0),
+            y_m: along(1),
+            z_m: anchors.center_z_m,
+            size_lwh_m: anchors.size_lwh_m,
+            yaws_rad: anchors.yaws_deg.iter().map(|yaw| yaw.to_radians()).collect(),
+        }
+    }
+
+    /// Anchors in all.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.x_m.len() * self.y_m.len() * self.yaws_rad.len()
+    }
+
+    /// Whether there is none.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// x, y, z, h, w, l, yaw of the anchor with this index: metres and radians.
+    ///
+    /// # Panics
+    /// When `index` is not below [`Self::len`].
+    #[must_use]
+    pub fn get(&self, index: usize) -> [f64; 7] {
+        let (cell, anchor) = (index / self.yaws_rad.len(), index % self.yaws_rad.len());
+        let (row, column) = (cell / self.x_m.len(), cell % self.x_m.len());
+        let [l, w, h] = self.size_lwh_m;
+        [self.x_m[column], self.y_m[row], self.z_m, h, w, l, self.yaws_rad[anchor]]
+    }
+}
+
+/// `count` numbers from `low` to `high`, both included.
+fn linspace(low: f64, high: f64, count: usize) -> Vec<f64> {
+    let step = (high - low) / count.saturating_sub(1).max(1) as f64;
+    (0..count).map(|index| if index + 1 == count && index > 0 { high } else { low + step * index as f64 }).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn anchors_of_stride_two_are_the_centres_of_the_cells() {
+        let config = DetectorConfig::lean();
+        let (anchors, grid) = (Anchors::for_detector(&config), config.feature_grid());
+        assert_eq!((anchors.x_m.len(), anchors.y_m.len()), (grid.width as usize, grid.height as usize));
+        for (column, x) in anchors.x_m.iter().enumerate() {
+            assert!((x - (grid.x_min_m + (column as f64 + 0.5) * grid.cell_m)).abs() < 1e-9);
+        }
+    }
+
+    #[test]
+    fn the_anchor_runs_fastest_then_the_column() {
+        let anchors = Anchors::for_detector(&DetectorConfig::lean());
+        let second = anchors.get(1);
+        assert_eq!(second[..2], anchors.get(0)[..2]);
+        assert!((second[6] - std::f64::consts::FRAC_PI_2).abs() < 1e-12);
+        assert!((anchors.get(2)[0] - anchors.x_m[1]).abs() < 1e-12);
+        assert_eq!(anchors.len(), 96 * 128 * 2);
+    }
+}
