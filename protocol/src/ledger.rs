@@ -17,80 +17,7 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use crate::{ProcessId, Topic};
-
-/// Why a message was not used.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum DropReason {
-    /// Lost on the emulated air.
-    LinkLoss,
-    /// The emulated air's queue was full.
-    LinkQueue,
-    /// A newer one took its place before it was used.
-    Superseded,
-    /// Too old when it came.
-    Stale,
-    /// The same one had come before.
-    Duplicate,
-    /// Not a message, or not of this kind.
-    Decode,
-    /// Changed on the way.
-    Checksum,
-    /// Sizes that do not agree with each other, with what was announced, or with the limits.
-    Shape,
-    /// A value that is NaN, infinite or out of bounds.
-    NotFinite,
-    /// Sent under another's name.
-    Identity,
-    /// Of another wire version.
-    Version,
-    /// Sender or receiver does not know where it is.
-    NoPose,
-}
-
-impl DropReason {
-    /// Every reason.
-    pub const ALL: [Self; 12] = [
-        Self::LinkLoss,
-        Self::LinkQueue,
-        Self::Superseded,
-        Self::Stale,
-        Self::Duplicate,
-        Self::Decode,
-        Self::Checksum,
-        Self::Shape,
-        Self::NotFinite,
-        Self::Identity,
-        Self::Version,
-        Self::NoPose,
-    ];
-
-    /// Its name, as in reports: `link_loss`.
-    #[must_use]
-    pub fn as_str(self) -> &'static str {
-        match self {
-            Self::LinkLoss => "link_loss",
-            Self::LinkQueue => "link_queue",
-            Self::Superseded => "superseded",
-            Self::Stale => "stale",
-            Self::Duplicate => "duplicate",
-            Self::Decode => "decode",
-            Self::Checksum => "checksum",
-            Self::Shape => "shape",
-            Self::NotFinite => "not_finite",
-            Self::Identity => "identity",
-            Self::Version => "version",
-            Self::NoPose => "no_pose",
-        }
-    }
-}
-
-impl fmt::Display for DropReason {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.as_str())
-    }
-}
+use crate::{Balance, DropReason, ProcessId, Topic};
 
 /// What is counted separately: a topic, and who receives it (`None`: whoever does).
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -157,7 +84,7 @@ impl Counts {
     }
 
     /// Sent less everything that is accounted for; 0 where the books balance.
-    fn missing(&self) -> i128 {
+    pub(crate) fn missing(&self) -> i128 {
         let accounted = [self.received, self.in_flight].into_iter().chain(self.dropped.values().copied());
         i128::from(self.sent) - accounted.map(i128::from).sum::<i128>()
     }
@@ -213,17 +140,20 @@ impl Ledger {
 
     /// One more message published.
     pub fn sent(&mut self, account: &Account) {
-        self.counts(account).sent += 1;
+        let counts = self.counts(account);
+        counts.sent = counts.sent.saturating_add(1);
     }
 
     /// One more message used.
     pub fn received(&mut self, account: &Account) {
-        self.counts(account).received += 1;
+        let counts = self.counts(account);
+        counts.received = counts.received.saturating_add(1);
     }
 
     /// One more message lost.
     pub fn dropped(&mut self, account: &Account, reason: DropReason) {
-        *self.counts(account).dropped.entry(reason).or_default() += 1;
+        let count = self.counts(account).dropped.entry(reason).or_default();
+        *count = count.saturating_add(1);
     }
 
     /// How many messages are under way right now.
@@ -273,24 +203,7 @@ impl Ledger {
     /// processes' books.
     #[must_use]
     pub fn balance(&self) -> Balance {
-        let mut balance = Balance::default();
-        for (account, counts) in &self.accounts {
-            if account.to.is_none() {
-                let heard = self.accounts.keys().any(|other| other.to.is_some() && other.topic == account.topic);
-                if !heard && counts.missing() > 0 {
-                    balance.unheard.push(Unheard { topic: account.topic.clone(), messages: counts.missing() as u64 });
-                } else if !heard && counts.missing() < 0 {
-                    balance.push_difference(account, counts.clone());
-                }
-                continue;
-            }
-            let mut both = counts.clone();
-            if let Some(published) = self.accounts.get(&Account::published(account.topic.clone())) {
-                both.add(published);
-            }
-            balance.push_difference(account, both);
-        }
-        balance
+        Balance::of(self)
     }
 
     fn counts(&mut self, account: &Account) -> &mut Counts {
@@ -301,67 +214,122 @@ impl Ledger {
     }
 }
 
-/// What [`Ledger::balance`] finds.
-#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
-pub struct Balance {
-    /// Accounts whose numbers do not add up.
-    pub differences: Vec<Difference>,
-    /// Topics that nobody subscribed to: sent, lost to no one.
-    pub unheard: Vec<Unheard>,
-}
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Unheard;
 
-/// One account that does not add up.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Difference {
-    /// The topic.
-    pub topic: Topic,
-    /// The receiving process, where one is known.
-    pub to: Option<ProcessId>,
-    /// Sent less received, dropped and in flight: positive, messages vanished; negative, messages came from nowhere.
-    pub missing: i64,
-    /// The numbers that do not add up.
-    pub counts: Counts,
-}
-
-/// A topic without a receiver.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Unheard {
-    /// The topic.
-    pub topic: Topic,
-    /// Messages published.
-    pub messages: u64,
-}
-
-impl Balance {
-    /// Whether every message is accounted for.
-    #[must_use]
-    pub fn is_exact(&self) -> bool {
-        self.differences.is_empty()
+    fn process(name: &str) -> ProcessId {
+        ProcessId::new(name).unwrap()
     }
 
-    fn push_difference(&mut self, account: &Account, counts: Counts) {
-        let missing = counts.missing();
-        if missing != 0 {
-            let Account { topic, to } = account.clone();
-            // Books of real runs are far from the ends of the range; hostile ones may be cut there.
-            let missing = missing.clamp(i64::MIN.into(), i64::MAX.into()) as i64;
-            self.differences.push(Difference { topic, to, missing, counts });
+    fn bev() -> Topic {
+        "4288/bev".parse().unwrap()
+    }
+
+    /// An agent that sends 10, of which the link holds 1 and loses 2, repeats 1, and the ego uses 6 and drops 2.
+    fn books() -> [Ledger; 3] {
+        let [mut agent, mut link, mut ego] = [(); 3].map(|()| Ledger::default());
+        let published = Account::published(bev());
+        let towards = Account::towards(bev(), &process("ego-4279"));
+        for _ in 0..10 {
+            agent.sent(&published);
         }
+        link.dropped(&towards, DropReason::LinkLoss);
+        link.dropped(&towards, DropReason::LinkQueue);
+        link.sent(&towards);
+        link.set_in_flight(&towards, 7);
+        link.set_in_flight(&towards, 1);
+        ego.open(&towards);
+        for _ in 0..6 {
+            ego.received(&towards);
+        }
+        ego.dropped(&towards, DropReason::Duplicate);
+        ego.dropped(&towards, DropReason::Stale);
+        [agent, link, ego]
     }
-}
 
-impl fmt::Display for Difference {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let Self { topic, to, missing, counts } = self;
-        let to = to.as_ref().map(|to| format!(" to {to}")).unwrap_or_default();
-        let (verb, count) = if *missing > 0 { ("vanished", *missing) } else { ("came from nowhere", -missing) };
-        write!(
-            f,
-            "{topic}{to}: {count} {verb} (sent {}, received {}, dropped {}, in flight {})",
-            counts.sent,
-            counts.received,
-            counts.dropped_total(),
-            counts.in_flight
-        )
+    fn sum(books: &[Ledger]) -> Ledger {
+        let mut sum = Ledger::default();
+        books.iter().for_each(|ledger| sum.merge(ledger));
+        sum
+    }
+
+    #[test]
+    fn books_that_add_up_balance_in_any_order() {
+        let mut books = books();
+        let forward = sum(&books);
+        books.reverse();
+        assert_eq!(sum(&books), forward);
+        assert_eq!(forward.balance(), Balance::default());
+        let total = forward.total();
+        assert_eq!((total.sent, total.received, total.in_flight, total.dropped_total()), (11, 6, 1, 4));
+    }
+
+    #[test]
+    fn a_vanished_message_is_named() {
+        let mut books = books();
+        books[0].sent(&Account::published(bev()));
+        let balance = sum(&books).balance();
+        assert!(!balance.is_exact());
+        assert_eq!(balance.differences[0].missing, 1);
+        assert_eq!(
+            balance.differences[0].to_string(),
+            "4288/bev to ego-4279: 1 vanished (sent 12, received 6, dropped 4, in flight 1)"
+        );
+        books[2].received(&Account::towards(bev(), &process("ego-4279")));
+        books[2].received(&Account::towards(bev(), &process("ego-4279")));
+        assert_eq!(sum(&books).balance().differences[0].missing, -1);
+    }
+
+    #[test]
+    fn every_receiver_must_account_for_every_message() {
+        let mut ledger = sum(&books());
+        let second = Account::towards(bev(), &process("ego-4288"));
+        ledger.open(&second);
+        let difference = ledger.balance().differences.remove(0);
+        assert_eq!((difference.to, difference.missing), (second.to, 10));
+    }
+
+    #[test]
+    fn what_a_sender_drops_is_lost_to_every_receiver() {
+        let mut ledger = Ledger::default();
+        let published = Account::published(bev());
+        let receivers = ["a", "b"].map(|name| Account::towards(bev(), &process(name)));
+        ledger.sent(&published);
+        ledger.sent(&published);
+        ledger.dropped(&published, DropReason::Superseded);
+        receivers.iter().for_each(|receiver| ledger.received(receiver));
+        assert!(ledger.balance().is_exact());
+    }
+
+    #[test]
+    fn what_nobody_hears_is_no_loss_but_is_told() {
+        let mut ledger = Ledger::default();
+        ledger.sent(&Account::published(bev()));
+        let balance = ledger.balance();
+        assert!(balance.is_exact());
+        assert_eq!(balance.unheard, [Unheard { topic: bev(), messages: 1 }]);
+    }
+
+    #[test]
+    fn json_is_readable_and_comes_back() {
+        let ledger = sum(&books());
+        let json = serde_json::to_string(&ledger).unwrap();
+        assert_eq!(
+            json,
+            r#"[{"topic":"4288/bev","to":null,"sent":10,"received":0,"in_flight":0,"dropped":{}},"#.to_owned()
+                + r#"{"topic":"4288/bev","to":"ego-4279","sent":1,"received":6,"in_flight":1,"#
+                + r#""dropped":{"link_loss":1,"link_queue":1,"stale":1,"duplicate":1}}]"#
+        );
+        assert_eq!(serde_json::from_str::<Ledger>(&json).unwrap(), ledger);
+    }
+
+    #[test]
+    fn hostile_numbers_saturate() {
+        let line = r#"{"topic":"1/bev","to":"x","sent":18446744073709551615,"received":0,"in_flight":0,"dropped":{}}"#;
+        let ledger: Ledger = serde_json::from_str(&format!("[{line},{line}]")).unwrap();
+        assert_eq!(ledger.balance().differences[0].missing, i64::MAX);
+        assert!(!ledger.balance().differences[0].to_string().is_empty());
     }
 }

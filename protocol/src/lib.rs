@@ -1,7 +1,68 @@
 //! What crosses the air between connected automated vehicles (CAVs), and in which convention.
 //!
-//! This crate holds plain data and the two doors between that data and bytes. It knows no network, no clock, no file
-//! and no tensor library.
+//! This crate holds plain data and the two doors between that data and bytes, [`wire::encode`] and [`wire::decode`]. It
+//! knows no network, no clock, no file and no tensor library.
+//!
+//! ```
+//! use protocol::{
+//!     Bev, BevFeatures, BevGrid, CavId, CodecConfig, Dtype, Key, Limits, Pose, PoseEstimate, RunId, Stamp, Stream,
+//!     encode_features, wire,
+//! };
+//!
+//! # fn main() -> Result<(), Box<dyn std::error::Error>> {
+//! // An agent: half precision, at most 2,000 bytes, the most confident cells first.
+//! let grid = BevGrid { x_min_m: -51.2, y_min_m: -38.4, cell_m: 0.8, width: 32, height: 24 };
+//! let features = BevFeatures { grid, channels: 4, values: vec![0.5; 4 * 24 * 32] };
+//! let config = CodecConfig { dtype: Dtype::F16, budget_bytes: Some(2_000), zstd_level: None };
+//! let confidence: Vec<f32> = (0..24 * 32).map(|cell| cell as f32 / 768.0).collect();
+//! let message = Bev {
+//!     pose: PoseEstimate::new(Pose::from_xyz_yaw([12.0, -3.5, 1.9], 0.3), 0.8),
+//!     features: encode_features(features, &config, Some(&confidence))?,
+//! };
+//! let cav = CavId::new("4279")?;
+//! let key = Key::stream(&RunId::new("demo")?, &cav, Stream::Bev);
+//! assert_eq!(key.to_string(), "v2v/demo/4279/bev");
+//! let stamp = Stamp { cav, epoch: 7, sequence: 1, capture_nanos: 100_000_000, publish_nanos: 0 };
+//! let encoded = wire::encode(&stamp, message)?;
+//! assert!(encoded.body.len() <= 2_000);
+//!
+//! // The ego: the payload may lie in any number of pieces.
+//! let (header, bev) = wire::decode::<Bev>(encoded.pieces(), &Limits::DEFAULT)?;
+//! header.check_sender(&"4279".parse()?)?;
+//! bev.features.check_shape(&grid, 4)?;
+//! let received = bev.features.decode(&Limits::DEFAULT)?;
+//! let sent_cells = received.sent.expect("not all cells fit").iter().filter(|sent| **sent).count();
+//! assert_eq!(sent_cells, (2_000 - 24 * 32 / 8) / (4 * 2));
+//! # Ok(())
+//! # }
+//! ```
+//!
+//! # Messages
+//!
+//! | message | stream or key | from | to |
+//! | --- | --- | --- | --- |
+//! | [`Lidar`], [`Radar`] | `lidar`, `radar` | replay | that vehicle's agent |
+//! | [`Gnss`] | `gnss` | replay | that vehicle's agent |
+//! | [`PoseEstimate`] | `pose` | agent | ego-fusers |
+//! | [`Bev`] | `bev` | agent | ego-fusers (intermediate fusion) |
+//! | [`Boxes`] | `boxes` | agent | ego-fusers (late fusion) |
+//! | [`Points`] | `points` | agent | ego-fusers (early fusion) |
+//! | [`Descriptor`] | `descriptor` | agent | ego-fusers |
+//! | [`Detections`] | `detections` | ego-fuser | scorer, anyone |
+//! | [`DetectionsReport`] | `detections/json` | ego-fuser | anyone who reads JSON |
+//! | [`Truth`] | `truth` | replay | scorer |
+//! | [`Control`] | `control/*`, and probes on any key | operator, replay, every process | replay, every process |
+//! | [`Stats`] | `stats/<process>` | every process | operator |
+//!
+//! A message is a header ([`header`]: who, which, when, how large, two checksums), metadata, and a body of raw
+//! little-endian values ([`Body`]). Which keys there are says [`key`], how a feature map becomes a body [`codec`].
+//!
+//! # What a receiver can rely on
+//!
+//! Any bytes may come. Decoding never panics, takes no memory for sizes that are only claimed, and hands out nothing but
+//! what was sealed by its sender: sizes that agree with each other and with [`Limits`], values that are finite and
+//! bounded, poses that are poses. Whatever is refused has a [`WireError`] with both numbers and a [`DropReason`] under
+//! which the [`Ledger`] counts it. The checksums find accidents; who a peer is, the transport has to establish.
 //!
 //! # Conventions
 //!
@@ -15,10 +76,12 @@
 //! - BEV maps are `[C, H, W]`: the row grows with y, the column with x.
 //! - Times are nanoseconds: capture times on the clock of the scene, everything else on the Unix clock.
 
+mod balance;
 mod bev;
 mod body;
 mod box3d;
 pub mod codec;
+mod drop_reason;
 mod error;
 pub mod header;
 mod id;
@@ -30,17 +93,20 @@ mod metadata;
 mod point_cloud;
 mod pose;
 mod stream;
+mod topic;
 pub mod wire;
 
+pub use balance::{Balance, Difference, Unheard};
 pub use bev::{BevFeatures, BevGrid};
 pub use body::{Body, BodyShape};
 pub use box3d::{Box3d, Detection};
 pub use codec::{Codec, CodecConfig, DecodedFeatures, Dtype, EncodedFeatures, Packing, Selection, encode_features};
+pub use drop_reason::DropReason;
 pub use error::WireError;
 pub use header::{HEADER_LEN, Header, Kind, Stamp, WIRE_VERSION};
 pub use id::{CavId, IdError, ProcessId, RunId};
-pub use key::{Key, KeyError, Role, Selector, Topic, Verb};
-pub use ledger::{Account, Balance, Counts, Difference, DropReason, Ledger, Unheard};
+pub use key::{Key, KeyError, Selector};
+pub use ledger::{Account, Counts, Ledger};
 pub use limits::Limits;
 pub use message::{
     AgentTruth, Bev, Boxes, Control, Descriptor, Detections, DetectionsReport, FusedNeighbour, Gnss, GnssSource, Lidar,
@@ -50,4 +116,5 @@ pub use message::{
 pub use point_cloud::{Handedness, PointCloud};
 pub use pose::{Pose, PoseError};
 pub use stream::Stream;
+pub use topic::{Role, Topic, Verb};
 pub use wire::Encoded;

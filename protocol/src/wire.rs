@@ -26,14 +26,8 @@ pub struct Encoded {
 impl Encoded {
     /// Bytes on the wire, without what the transport adds.
     #[must_use]
-    pub fn len(&self) -> usize {
+    pub fn wire_bytes(&self) -> usize {
         self.head.len() + self.body.len()
-    }
-
-    /// Never: there is always a header.
-    #[must_use]
-    pub fn is_empty(&self) -> bool {
-        false
     }
 
     /// The two pieces, in order.

@@ -1,0 +1,202 @@
+//! What a key is about, below its run.
+
+use std::fmt;
+use std::str::FromStr;
+
+use serde::{Deserialize, Serialize};
+
+use crate::key::{MAX_KEY_BYTES, beginning};
+use crate::{CavId, IdError, Key, KeyError, ProcessId, RunId, Stream};
+
+/// What a process does in a run: the part of a liveliness token that says whom one can expect what from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Role {
+    /// Publishes one vehicle's poses and features.
+    Agent,
+    /// Fuses and detects for one vehicle.
+    Ego,
+    /// Streams a scene.
+    Replay,
+    /// Emulates the air.
+    Link,
+    /// Compares detections with the truth.
+    Scorer,
+}
+
+impl Role {
+    /// Every role.
+    pub const ALL: [Self; 5] = [Self::Agent, Self::Ego, Self::Replay, Self::Link, Self::Scorer];
+
+    fn as_str(self) -> &'static str {
+        match self {
+            Self::Agent => "agent",
+            Self::Ego => "ego",
+            Self::Replay => "replay",
+            Self::Link => "link",
+            Self::Scorer => "scorer",
+        }
+    }
+}
+
+impl fmt::Display for Role {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.as_str())
+    }
+}
+
+/// What a control message asks for or says: one key each, so that a process hears only what concerns it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Verb {
+    /// Start the scene's clock.
+    Start,
+    /// Halt it.
+    Pause,
+    /// Let it run on.
+    Resume,
+    /// Move on by some ticks and halt.
+    Step,
+    /// Go to a tick.
+    Seek,
+    /// The scene is over.
+    End,
+    /// A process is ready, or has heard a route's probe.
+    Ready,
+    /// A process has finished a tick (stepped runs).
+    Done,
+}
+
+impl Verb {
+    /// Every verb.
+    pub const ALL: [Self; 8] =
+        [Self::Start, Self::Pause, Self::Resume, Self::Step, Self::Seek, Self::End, Self::Ready, Self::Done];
+
+    fn as_str(self) -> &'static str {
+        match self {
+            Self::Start => "start",
+            Self::Pause => "pause",
+            Self::Resume => "resume",
+            Self::Step => "step",
+            Self::Seek => "seek",
+            Self::End => "end",
+            Self::Ready => "ready",
+            Self::Done => "done",
+        }
+    }
+}
+
+impl fmt::Display for Verb {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(self.as_str())
+    }
+}
+
+/// A key below its run: `4279/bev`, `truth`.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub enum Topic {
+    /// `<cav>/<stream>`: what a vehicle, or the replay on its behalf, publishes.
+    Stream {
+        /// The vehicle.
+        cav: CavId,
+        /// What of it.
+        stream: Stream,
+    },
+    /// `rx/<ego>/<cav>/<stream>`: the same as it reaches an ego over the emulated air.
+    Received {
+        /// Who receives.
+        ego: CavId,
+        /// Who sent.
+        cav: CavId,
+        /// What of it.
+        stream: Stream,
+    },
+    /// `truth`.
+    Truth,
+    /// `control/<verb>`.
+    Control(Verb),
+    /// `stats/<process>`.
+    Stats(ProcessId),
+    /// `alive/<role>/<cav>`: a liveliness token.
+    Alive {
+        /// What the process does.
+        role: Role,
+        /// For which vehicle; a process without one uses a name of its own.
+        cav: CavId,
+    },
+}
+
+impl Topic {
+    /// The key of this topic in `run`.
+    #[must_use]
+    pub fn in_run(self, run: &RunId) -> Key {
+        Key { run: run.clone(), topic: self }
+    }
+
+    fn from_chunks(chunks: &[&str]) -> Result<Option<Self>, IdError> {
+        Ok(match chunks {
+            ["truth"] => Some(Self::Truth),
+            ["control", verb] => Verb::ALL.into_iter().find(|known| known.as_str() == *verb).map(Self::Control),
+            ["stats", process] => Some(Self::Stats(ProcessId::new(process)?)),
+            ["alive", role, cav] => match Role::ALL.into_iter().find(|known| known.as_str() == *role) {
+                Some(role) => Some(Self::Alive { role, cav: CavId::new(cav)? }),
+                None => None,
+            },
+            ["rx", ego, cav, stream @ ..] => match Stream::from_chunks(stream) {
+                Some(stream) => Some(Self::Received { ego: CavId::new(ego)?, cav: CavId::new(cav)?, stream }),
+                None => None,
+            },
+            [cav, stream @ ..] => match Stream::from_chunks(stream) {
+                Some(stream) => Some(Self::Stream { cav: CavId::new(cav)?, stream }),
+                None => None,
+            },
+            [] => None,
+        })
+    }
+}
+
+impl fmt::Display for Topic {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Stream { cav, stream } => write!(f, "{cav}/{stream}"),
+            Self::Received { ego, cav, stream } => write!(f, "rx/{ego}/{cav}/{stream}"),
+            Self::Truth => f.write_str("truth"),
+            Self::Control(verb) => write!(f, "control/{verb}"),
+            Self::Stats(process) => write!(f, "stats/{process}"),
+            Self::Alive { role, cav } => write!(f, "alive/{role}/{cav}"),
+        }
+    }
+}
+
+impl FromStr for Topic {
+    type Err = KeyError;
+
+    fn from_str(text: &str) -> Result<Self, KeyError> {
+        if text.len() > MAX_KEY_BYTES {
+            return Err(KeyError::unknown(text));
+        }
+        // `$` and `#` mean something to zenoh too.
+        if text.contains(['*', '$', '#', '?']) {
+            return Err(KeyError::Wildcard { text: beginning(text) });
+        }
+        let chunks: Vec<&str> = text.split('/').collect();
+        Self::from_chunks(&chunks)
+            .map_err(|source| KeyError::Id { text: beginning(text), source })?
+            .ok_or_else(|| KeyError::unknown(text))
+    }
+}
+
+impl TryFrom<String> for Topic {
+    type Error = KeyError;
+
+    fn try_from(text: String) -> Result<Self, KeyError> {
+        text.parse()
+    }
+}
+
+impl From<Topic> for String {
+    fn from(topic: Topic) -> Self {
+        topic.to_string()
+    }
+}
