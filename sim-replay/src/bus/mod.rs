@@ -1,12 +1,30 @@
 //! The bus between the processes of a run: zenoh, with every default that loses data replaced by a rule of ours.
 //!
-//! - One process routes on a fixed endpoint, the others connect to it; nothing is discovered ([`session`]).
+//! - One process routes on a fixed endpoint, the others connect to it; nothing is discovered ([`open`]).
 //! - No producer waits for the network and no callback of zenoh's waits for a consumer: between them lie bounded
-//!   mailboxes in which the newest wins, and whatever is overwritten is counted ([`mailbox`]).
+//!   mailboxes in which the newest wins ([`mailbox`], [`Publisher`], [`Inbox`]).
+//! - What is overwritten, refused or still under way is counted ([`Books`]), and the books are published.
+//! - A scene starts when every route has carried something ([`Barrier`]).
 //! - Ending takes a bounded time, whatever the network does ([`shutdown`]).
+//!
+//! Nothing here is async: zenoh brings its own runtimes, and a `put` that waits for a slow network must not hold up an
+//! executor. Inside tokio it needs the multi-thread runtime.
 
+mod books;
+mod liveliness;
 pub mod mailbox;
+mod membership;
+mod notices;
+mod publisher;
+mod readiness;
 mod session;
 pub mod shutdown;
+mod subscriber;
 
-pub use session::{BusError, BusOptions, Endpoint, Role, open};
+pub use books::Books;
+pub use liveliness::{Presence, Sighting, Watch};
+pub use membership::{Bus, Identity};
+pub use publisher::{Overflow, Publisher, PublisherOptions, unix_nanos};
+pub use readiness::{Barrier, NotReady, Route, RouteError};
+pub use session::{BusError, BusOptions, Endpoint, Role as SessionRole, open};
+pub use subscriber::{Arrival, Event, Inbox, Subscription};

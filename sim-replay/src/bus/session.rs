@@ -197,6 +197,14 @@ pub enum BusError {
         /// Seconds waited.
         waited_s: f64,
     },
+    /// The system gives no thread.
+    #[error("no thread for {what}: {cause}")]
+    Thread {
+        /// What it was wanted for.
+        what: String,
+        /// The system's words.
+        cause: std::io::Error,
+    },
     /// Anything else that zenoh says.
     #[error("zenoh, {doing}: {cause}")]
     Zenoh {

@@ -1,0 +1,215 @@
+//! The ledger of one process, shared by its threads, and how long its stages take.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use protocol::{Account, DropReason, Ledger, ProcessId, StageSummary, Topic, WireError};
+
+/// Timings kept per stage: at 10 Hz the last three minutes.
+const KEPT_TIMINGS: usize = 2048;
+
+/// The books of one process. Cloning shares them.
+#[derive(Clone)]
+pub struct Books {
+    process: ProcessId,
+    state: Arc<Mutex<State>>,
+}
+
+#[derive(Default)]
+struct State {
+    ledger: Ledger,
+    // How many messages of an account have come as far as this process takes them: out of a sender's queue onto the
+    // network, or from the network into a receiver's. What lies between is in flight.
+    passed: BTreeMap<Account, u64>,
+    stages: BTreeMap<String, Timings>,
+}
+
+#[derive(Default)]
+struct Timings {
+    count: u64,
+    max: Duration,
+    last: VecDeque<Duration>,
+}
+
+impl Books {
+    /// Empty books of `process`.
+    #[must_use]
+    pub fn new(process: ProcessId) -> Self {
+        Self { process, state: Arc::default() }
+    }
+
+    /// Whose books these are.
+    #[must_use]
+    pub fn process(&self) -> &ProcessId {
+        &self.process
+    }
+
+    /// This process offers one more message on `topic`.
+    pub fn offered(&self, topic: &Topic) {
+        self.lock().ledger.sent(&Account::published(topic.clone()));
+    }
+
+    /// The network has taken a message that was offered.
+    pub fn handed_over(&self, topic: &Topic) {
+        self.lock().pass(Account::published(topic.clone()));
+    }
+
+    /// A message that was offered will not be sent.
+    pub fn withheld(&self, topic: &Topic, reason: DropReason) {
+        self.lock().ledger.dropped(&Account::published(topic.clone()), reason);
+    }
+
+    /// This process listens to `topic` from now on.
+    pub fn subscribed(&self, topic: &Topic) {
+        self.lock().ledger.open(&self.here(topic));
+    }
+
+    /// The network has delivered a message, sound or not.
+    pub fn arrived(&self, topic: &Topic) {
+        self.lock().pass(self.here(topic));
+    }
+
+    /// A message that arrived was used.
+    pub fn received(&self, topic: &Topic) {
+        self.lock().ledger.received(&self.here(topic));
+    }
+
+    /// A message that arrived was not used.
+    pub fn dropped(&self, topic: &Topic, reason: DropReason) {
+        self.lock().ledger.dropped(&self.here(topic), reason);
+    }
+
+    /// A message that arrived is unsound: counted always, logged ever more rarely, as a hostile peer must not fill the
+    /// log.
+    pub fn rejected(&self, topic: &Topic, error: &WireError) {
+        let (account, reason) = (self.here(topic), error.drop_reason());
+        let times = {
+            let mut state = self.lock();
+            state.ledger.dropped(&account, reason);
+            state.ledger.get(&account).and_then(|counts| counts.dropped.get(&reason)).copied().unwrap_or(1)
+        };
+        if times.is_power_of_two() {
+            tracing::warn!(%topic, %reason, times, "message refused: {error}");
+        }
+    }
+
+    /// A stage took this long for one frame.
+    pub fn timed(&self, stage: &str, time: Duration) {
+        let mut state = self.lock();
+        if !state.stages.contains_key(stage) {
+            state.stages.insert(stage.to_owned(), Timings::default());
+        }
+        let Some(timings) = state.stages.get_mut(stage) else { return };
+        timings.count += 1;
+        timings.max = timings.max.max(time);
+        if timings.last.len() == KEPT_TIMINGS {
+            timings.last.pop_front();
+        }
+        timings.last.push_back(time);
+    }
+
+    /// The ledger as of now. What has been offered and not handed over, or has arrived and not been used or dropped,
+    /// is in flight.
+    #[must_use]
+    pub fn ledger(&self) -> Ledger {
+        let state = self.lock();
+        let mut ledger = state.ledger.clone();
+        for (account, counts) in state.ledger.iter() {
+            let passed = state.passed.get(account).copied().unwrap_or(0);
+            let in_flight = match account.to {
+                None => counts.sent.saturating_sub(passed + counts.dropped_total()),
+                Some(_) => passed.saturating_sub(counts.received + counts.dropped_total()),
+            };
+            ledger.set_in_flight(account, in_flight);
+        }
+        ledger
+    }
+
+    /// Every stage over its most recent frames.
+    #[must_use]
+    pub fn stages(&self) -> Vec<StageSummary> {
+        let state = self.lock();
+        state.stages.iter().map(|(stage, timings)| timings.summary(stage)).collect()
+    }
+
+    fn here(&self, topic: &Topic) -> Account {
+        Account::towards(topic.clone(), &self.process)
+    }
+
+    // Counters are changed in one step each: a panic elsewhere leaves them sound.
+    fn lock(&self) -> MutexGuard<'_, State> {
+        self.state.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+impl State {
+    fn pass(&mut self, account: Account) {
+        *self.passed.entry(account).or_default() += 1;
+    }
+}
+
+impl Timings {
+    fn summary(&self, stage: &str) -> StageSummary {
+        let mut sorted: Vec<Duration> = self.last.iter().copied().collect();
+        sorted.sort_unstable();
+        let quantile_ms = |quantile: f64| {
+            let rank = (quantile * sorted.len() as f64).ceil() as usize;
+            sorted.get(rank.saturating_sub(1)).map_or(0.0, |time| time.as_secs_f64() * 1e3)
+        };
+        StageSummary {
+            stage: stage.to_owned(),
+            count: self.count,
+            p50_ms: quantile_ms(0.50),
+            p95_ms: quantile_ms(0.95),
+            p99_ms: quantile_ms(0.99),
+            max_ms: self.max.as_secs_f64() * 1e3,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn topic() -> Topic {
+        "4279/bev".parse().unwrap()
+    }
+
+    fn books(process: &str) -> Books {
+        Books::new(process.parse().unwrap())
+    }
+
+    #[test]
+    fn what_lies_between_is_in_flight() {
+        let (agent, ego) = (books("agent-4279"), books("ego-4279"));
+        ego.subscribed(&topic());
+        for _ in 0..5 {
+            agent.offered(&topic());
+        }
+        agent.withheld(&topic(), DropReason::Superseded);
+        agent.handed_over(&topic());
+        agent.handed_over(&topic());
+        ego.arrived(&topic());
+        ego.arrived(&topic());
+        ego.received(&topic());
+        let mut ledger = agent.ledger();
+        let published = Account::published(topic());
+        assert_eq!(ledger.get(&published).unwrap().in_flight, 2);
+        ledger.merge(&ego.ledger());
+        assert!(ledger.balance().is_exact(), "{:?}", ledger.balance());
+        ego.dropped(&topic(), DropReason::Stale);
+        assert_eq!(ego.ledger().get(&Account::towards(topic(), ego.process())).unwrap().in_flight, 0);
+    }
+
+    #[test]
+    fn stages_are_summed_up() {
+        let books = books("ego");
+        for ms in 1..=100 {
+            books.timed("fuse", Duration::from_millis(ms));
+        }
+        let stage = &books.stages()[0];
+        assert_eq!((stage.stage.as_str(), stage.count), ("fuse", 100));
+        assert_eq!((stage.p50_ms, stage.p95_ms, stage.p99_ms, stage.max_ms), (50.0, 95.0, 99.0, 100.0));
+    }
+}

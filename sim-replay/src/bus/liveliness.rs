@@ -1,0 +1,82 @@
+//! Who is there: liveliness tokens and those who watch for them.
+
+use protocol::{CavId, Key, Role, RunId, Selector, Topic};
+use zenoh::sample::SampleKind;
+use zenoh::{Session, Wait};
+
+use super::BusError;
+
+/// This process is alive, for as long as the value is.
+///
+/// A process that dies is missed as soon as its connection closes, which on one machine is at once; one that falls
+/// silent behind a cut cable only after zenoh's lease of 10 s. Faster than that is the age of its last message.
+#[must_use = "the token is withdrawn when this is dropped"]
+pub struct Presence(zenoh::liveliness::LivelinessToken);
+
+impl Presence {
+    /// Tells everyone that `cav`'s process of this role is there.
+    ///
+    /// # Errors
+    /// [`BusError::Zenoh`] when the session is closed.
+    pub fn announce(session: &Session, run: &RunId, role: Role, cav: &CavId) -> Result<Self, BusError> {
+        let key = Key::alive(run, role, cav).to_string();
+        let token = session.liveliness().declare_token(&key).wait();
+        token.map(Self).map_err(|cause| BusError::zenoh(format!("announcing {key}"), &cause))
+    }
+
+    /// Withdraws the token and waits until the session has taken note.
+    ///
+    /// # Errors
+    /// [`BusError::Zenoh`] when the session is closed.
+    pub fn withdraw(self) -> Result<(), BusError> {
+        self.0.undeclare().wait().map_err(|cause| BusError::zenoh("withdrawing a liveliness token", &cause))
+    }
+}
+
+/// A process came or went.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Sighting {
+    /// It is there, perhaps since long before the watch began.
+    Appeared {
+        /// What it does.
+        role: Role,
+        /// For which vehicle.
+        cav: CavId,
+    },
+    /// It is gone.
+    Vanished {
+        /// What it did.
+        role: Role,
+        /// For which vehicle.
+        cav: CavId,
+    },
+}
+
+/// A watch over tokens; ends when dropped.
+#[must_use = "the watch ends when this is dropped"]
+pub struct Watch(#[expect(dead_code, reason = "held for its lifetime only")] zenoh::pubsub::Subscriber<()>);
+
+impl Watch {
+    /// Calls `report` for every token that `selector` meets, those present already first.
+    ///
+    /// `report` runs on zenoh's receive thread: it hands over and returns, and must not call zenoh.
+    ///
+    /// # Errors
+    /// [`BusError::Zenoh`] when the session is closed.
+    pub fn begin(
+        session: &Session,
+        selector: &Selector,
+        report: impl Fn(Sighting) + Send + Sync + 'static,
+    ) -> Result<Self, BusError> {
+        let watch = session.liveliness().declare_subscriber(selector.as_str()).history(true).callback(move |sample| {
+            // A token that is no key of ours says nothing to us.
+            if let Ok(Key { topic: Topic::Alive { role, cav }, .. }) = sample.key_expr().as_str().parse() {
+                report(match sample.kind() {
+                    SampleKind::Put => Sighting::Appeared { role, cav },
+                    SampleKind::Delete => Sighting::Vanished { role, cav },
+                });
+            }
+        });
+        watch.wait().map(Self).map_err(|cause| BusError::zenoh(format!("watching {selector}"), &cause))
+    }
+}

@@ -1,0 +1,265 @@
+//! Publishing without ever waiting for the network on the caller's thread.
+
+use std::sync::Arc;
+use std::thread::{self, JoinHandle};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+use protocol::wire::{self, Encoded};
+use protocol::{CavId, Control, DropReason, Key, Payload, Stamp, Topic, TopicCount, WireError};
+use zenoh::Wait;
+use zenoh::bytes::{Encoding, ZBytes};
+use zenoh::qos::{CongestionControl, Priority};
+
+use super::mailbox::{Mailbox, Pushed, Taken};
+use super::{Books, BusError};
+
+/// Between two probes of a publisher that has sent nothing yet.
+const PROBE_PERIOD: Duration = Duration::from_millis(50);
+
+/// What happens to a message offered while the network still takes an earlier one.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Overflow {
+    /// It waits in a queue of this many places; in a full one it takes the place of the oldest, which is counted as
+    /// superseded. For everything that is measured anew all the time.
+    KeepNewest(usize),
+    /// It waits in a queue of this many places, and so does its producer when that is full. For what must not be lost,
+    /// and for paced runs.
+    Wait(usize),
+}
+
+/// How a topic is published.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct PublisherOptions {
+    /// What an overload does.
+    pub overflow: Overflow,
+    /// Which queue of the transport it goes through; a large message does not hold up one of higher priority.
+    pub priority: Priority,
+    /// Sends at once rather than after the batching timer.
+    pub express: bool,
+}
+
+impl PublisherOptions {
+    /// Poses: small, first of all.
+    pub const POSE: Self = Self::new(Priority::InteractiveHigh, true);
+    /// Detections: small, before all bulk.
+    pub const DETECTIONS: Self = Self::new(Priority::DataHigh, true);
+    /// Features, boxes and points on their way to an ego.
+    pub const FEATURES: Self = Self::new(Priority::Data, false);
+    /// Sensor data on their way to an agent.
+    pub const SENSOR: Self = Self::new(Priority::DataLow, false);
+
+    const fn new(priority: Priority, express: bool) -> Self {
+        Self { overflow: Overflow::KeepNewest(1), priority, express }
+    }
+
+    /// The same, but the producer waits rather than that anything be dropped.
+    #[must_use]
+    pub const fn lossless(self, places: usize) -> Self {
+        Self { overflow: Overflow::Wait(places), ..self }
+    }
+}
+
+type Encode = Box<dyn FnOnce(&Stamp) -> Result<Encoded, WireError> + Send>;
+
+struct Offer {
+    capture_nanos: u64,
+    encode: Encode,
+}
+
+/// One topic of this process. A thread of its own encodes and sends what is offered.
+///
+/// `put` is called under `CongestionControl::Block`, so that zenoh never drops: with its default it loses, without an
+/// error, every message that takes longer than 50 ms. The price is that `put` waits for the network, for seconds on a
+/// slow one, which is why neither a clock nor a network thread nor an async task may call it.
+pub struct Publisher {
+    topic: Topic,
+    overflow: Overflow,
+    queue: Arc<Mailbox<(), Offer>>,
+    books: Books,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Publisher {
+    pub(super) fn new(
+        session: &zenoh::Session,
+        (key, cav): (&Key, &CavId),
+        epoch: u64,
+        books: &Books,
+        options: PublisherOptions,
+    ) -> Result<Self, BusError> {
+        let PublisherOptions { overflow, priority, express } = options;
+        let topic = key.topic.clone();
+        // JSON has readers outside this program, to whom a probe would be noise.
+        let is_ours = !matches!(&topic, Topic::Stream { stream, .. } if stream.kind().is_none());
+        let encoding = if is_ours { Encoding::APPLICATION_OCTET_STREAM } else { Encoding::APPLICATION_JSON };
+        let publisher = session
+            .declare_publisher(key.to_string())
+            .encoding(encoding)
+            .congestion_control(CongestionControl::Block)
+            .priority(priority)
+            .express(express)
+            .wait()
+            .map_err(|cause| BusError::zenoh(format!("declaring a publisher on {key}"), &cause))?;
+        let places = match overflow {
+            Overflow::KeepNewest(places) | Overflow::Wait(places) => places,
+        };
+        let queue = Arc::new(Mailbox::new(places, 1));
+        let sender = Sender {
+            topic: topic.clone(),
+            cav: cav.clone(),
+            epoch,
+            sequence: 0,
+            is_ours,
+            queue: Arc::clone(&queue),
+            books: books.clone(),
+            publisher,
+        };
+        let thread = thread::Builder::new()
+            .name(format!("send {topic}"))
+            .spawn(move || sender.run())
+            .map_err(|cause| BusError::Thread { what: format!("sending {key}"), cause })?;
+        Ok(Self { topic, overflow, queue, books: books.clone(), thread: Some(thread) })
+    }
+
+    /// What is published here.
+    #[must_use]
+    pub fn topic(&self) -> &Topic {
+        &self.topic
+    }
+
+    /// Offers a message measured at `capture_nanos`. Returns at once, except under [`Overflow::Wait`] with a full queue.
+    pub fn offer<M: Payload + Send + 'static>(&self, capture_nanos: u64, message: M) {
+        self.offer_encoded(capture_nanos, move |stamp| wire::encode(stamp, message));
+    }
+
+    /// Offers what `encode` makes of the stamp when it is the message's turn, on the sending thread.
+    pub fn offer_encoded(
+        &self,
+        capture_nanos: u64,
+        encode: impl FnOnce(&Stamp) -> Result<Encoded, WireError> + Send + 'static,
+    ) {
+        self.books.offered(&self.topic);
+        let offer = Offer { capture_nanos, encode: Box::new(encode) };
+        let pushed = match self.overflow {
+            Overflow::KeepNewest(_) => self.queue.push((), offer),
+            Overflow::Wait(_) => self.queue.push_waiting((), offer),
+        };
+        match pushed {
+            Pushed::Queued => {}
+            Pushed::Displaced(_) | Pushed::NoLane(_) | Pushed::Closed(_) => {
+                self.books.withheld(&self.topic, DropReason::Superseded);
+            }
+        }
+    }
+
+    /// Sends what is still queued, then a notice of how many messages there were, and ends. Waits for the network.
+    pub fn finish(mut self) {
+        self.queue.close();
+        if let Some(thread) = self.thread.take()
+            && thread.join().is_err()
+        {
+            tracing::error!(topic = %self.topic, "the sending thread panicked");
+        }
+    }
+}
+
+impl Drop for Publisher {
+    /// Without [`Self::finish`] the thread sends what is left and ends by itself.
+    fn drop(&mut self) {
+        self.queue.close();
+    }
+}
+
+/// The sending thread's side.
+struct Sender {
+    topic: Topic,
+    cav: CavId,
+    epoch: u64,
+    sequence: u64,
+    is_ours: bool,
+    queue: Arc<Mailbox<(), Offer>>,
+    books: Books,
+    publisher: zenoh::pubsub::Publisher<'static>,
+}
+
+impl Sender {
+    fn run(mut self) {
+        if self.is_ours {
+            self.notify(Control::Probe);
+        }
+        loop {
+            let probing = self.is_ours && self.sequence == 0;
+            match self.queue.take(probing.then(|| Instant::now() + PROBE_PERIOD)) {
+                Taken::Item((), offer) => self.send(offer),
+                Taken::TimedOut => self.notify(Control::Probe),
+                Taken::Closed => break,
+            }
+        }
+        if self.is_ours {
+            let sent = vec![TopicCount { topic: self.topic.clone(), messages: self.sequence }];
+            self.notify(Control::End { ticks: self.sequence, sent });
+        }
+    }
+
+    fn send(&mut self, Offer { capture_nanos, encode }: Offer) {
+        let began = Instant::now();
+        match encode(&self.stamp(capture_nanos)) {
+            Ok(encoded) => {
+                self.books.timed("encode", began.elapsed());
+                self.sequence += 1;
+                if self.put(encoded) {
+                    self.books.handed_over(&self.topic);
+                }
+            }
+            Err(error) => {
+                tracing::error!(topic = %self.topic, capture_nanos, "message cannot be sent: {error}");
+                self.books.withheld(&self.topic, error.drop_reason());
+            }
+        }
+    }
+
+    /// Markers on the data key keep their place among the data; they are not counted.
+    fn notify(&self, control: Control) {
+        match wire::encode(&self.stamp(0), control) {
+            Ok(encoded) => {
+                self.put(encoded);
+            }
+            Err(error) => tracing::error!(topic = %self.topic, "notice cannot be sent: {error}"),
+        }
+    }
+
+    fn put(&self, encoded: Encoded) -> bool {
+        let sent = self.publisher.put(payload(encoded)).wait();
+        if let Err(cause) = &sent {
+            tracing::error!(topic = %self.topic, "zenoh refuses a message: {cause}");
+        }
+        sent.is_ok()
+    }
+
+    fn stamp(&self, capture_nanos: u64) -> Stamp {
+        Stamp {
+            cav: self.cav.clone(),
+            epoch: self.epoch,
+            sequence: self.sequence,
+            capture_nanos,
+            publish_nanos: unix_nanos(),
+        }
+    }
+}
+
+/// Head and body one after the other, without copying the body.
+pub(super) fn payload(encoded: Encoded) -> ZBytes {
+    let mut writer = ZBytes::writer();
+    writer.append(encoded.head.into());
+    if !encoded.body.is_empty() {
+        writer.append(bytes::Bytes::from_owner(encoded.body).into());
+    }
+    writer.finish()
+}
+
+/// Now, on the Unix clock.
+#[must_use]
+pub fn unix_nanos() -> u64 {
+    let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    u64::try_from(since.as_nanos()).unwrap_or(u64::MAX)
+}

@@ -1,0 +1,156 @@
+//! The barrier in front of a scene: no clock starts before every route has carried something.
+//!
+//! A message published before its route exists is lost without a word, and knowing that *some* subscriber matches does
+//! not tell which. So every publisher sends probes on its real key until its first real message, every subscriber
+//! answers each probe on `control/ready`, and the process that holds the clock waits until all the routes it expects
+//! have been heard of.
+
+use std::collections::BTreeSet;
+use std::fmt;
+use std::str::FromStr;
+use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::time::{Duration, Instant};
+
+use protocol::{ProcessId, Topic};
+
+/// Routes that an error names; a fleet of many misses many at once.
+const NAMED: usize = 20;
+
+/// From the publisher of a topic to one process that listens to it, written `4279/lidar>agent-4279`.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct Route {
+    /// What is published.
+    pub topic: Topic,
+    /// Who has to hear it.
+    pub receiver: ProcessId,
+}
+
+impl fmt::Display for Route {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}>{}", self.topic, self.receiver)
+    }
+}
+
+/// A text that is not a route.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{text:?} is not a route TOPIC>PROCESS such as 4279/lidar>agent-4279: {detail}")]
+pub struct RouteError {
+    text: String,
+    detail: String,
+}
+
+impl FromStr for Route {
+    type Err = RouteError;
+
+    fn from_str(text: &str) -> Result<Self, RouteError> {
+        let error = |detail: String| RouteError { text: text.chars().take(100).collect(), detail };
+        let (topic, receiver) = text.split_once('>').ok_or_else(|| error("there is no '>'".into()))?;
+        Ok(Self {
+            topic: topic.parse().map_err(|cause: protocol::KeyError| error(cause.to_string()))?,
+            receiver: receiver.parse().map_err(|cause: protocol::IdError| error(cause.to_string()))?,
+        })
+    }
+}
+
+/// Not every route came up.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("after {waited:?} nothing has come through {}{}; is that process running, and in the same run?",
+    .missing.iter().take(NAMED).map(ToString::to_string).collect::<Vec<_>>().join(", "),
+    if .missing.len() > NAMED { format!(" and {} more", .missing.len() - NAMED) } else { String::new() })]
+pub struct NotReady {
+    /// Routes nobody has answered on, in order.
+    pub missing: Vec<Route>,
+    /// How long the barrier waited.
+    pub waited: Duration,
+}
+
+/// Routes that are still to be heard of.
+#[derive(Default)]
+pub struct Barrier {
+    missing: Mutex<BTreeSet<Route>>,
+    changed: Condvar,
+}
+
+impl Barrier {
+    /// A barrier that opens when all of `expected` have been heard of; at once if there are none.
+    #[must_use]
+    pub fn new(expected: impl IntoIterator<Item = Route>) -> Self {
+        Self { missing: Mutex::new(expected.into_iter().collect()), changed: Condvar::new() }
+    }
+
+    /// Someone answered a probe on `route`. Routes that nobody expects change nothing.
+    pub fn heard(&self, route: &Route) {
+        if self.lock().remove(route) {
+            self.changed.notify_all();
+        }
+    }
+
+    /// Routes still missing.
+    #[must_use]
+    pub fn missing(&self) -> Vec<Route> {
+        self.lock().iter().cloned().collect()
+    }
+
+    /// Waits until the barrier is open, at most for `patience`.
+    ///
+    /// # Errors
+    /// [`NotReady`] names the routes that are missing.
+    pub fn wait(&self, patience: Duration) -> Result<(), NotReady> {
+        let began = Instant::now();
+        let mut missing = self.lock();
+        while !missing.is_empty() {
+            let left = patience.saturating_sub(began.elapsed());
+            if left.is_zero() {
+                return Err(NotReady { missing: missing.iter().cloned().collect(), waited: patience });
+            }
+            missing = self.changed.wait_timeout(missing, left).unwrap_or_else(PoisonError::into_inner).0;
+        }
+        Ok(())
+    }
+
+    fn lock(&self) -> MutexGuard<'_, BTreeSet<Route>> {
+        self.missing.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn route(text: &str) -> Route {
+        text.parse().unwrap()
+    }
+
+    #[test]
+    fn routes_are_written_and_read_back() {
+        for text in ["4279/lidar>agent-4279", "truth>scorer", "rx/4279/4288/bev>ego-4279"] {
+            assert_eq!(route(text).to_string(), text);
+        }
+        for (text, says) in [("4279/lidar", "'>'"), ("4279/nothing>a", "key"), ("truth>A", "process name")] {
+            let error = text.parse::<Route>().unwrap_err().to_string();
+            assert!(error.contains(says), "{error}");
+        }
+    }
+
+    #[test]
+    fn opens_when_all_have_been_heard() {
+        let barrier = Barrier::new([route("1/lidar>a"), route("2/lidar>b")]);
+        barrier.heard(&route("1/lidar>a"));
+        barrier.heard(&route("3/lidar>c"));
+        let error = barrier.wait(Duration::from_millis(5)).unwrap_err();
+        assert_eq!(error.missing, [route("2/lidar>b")]);
+        assert!(error.to_string().contains("2/lidar>b"), "{error}");
+        std::thread::scope(|scope| {
+            let waiting = scope.spawn(|| barrier.wait(Duration::from_secs(60)));
+            barrier.heard(&route("2/lidar>b"));
+            assert_eq!(waiting.join().unwrap(), Ok(()));
+        });
+    }
+
+    #[test]
+    fn an_error_does_not_name_a_thousand_routes() {
+        let barrier = Barrier::new((0..1000).map(|index| route(&format!("{index}/lidar>a"))));
+        let text = barrier.wait(Duration::ZERO).unwrap_err().to_string();
+        assert!(text.contains("and 980 more") && text.len() < 1000, "{text}");
+    }
+}

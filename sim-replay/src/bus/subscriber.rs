@@ -1,0 +1,254 @@
+//! Taking messages off the network's hands at once, and handing them to the thread that works on them.
+
+use std::collections::BTreeMap;
+use std::sync::{Arc, Mutex, PoisonError};
+use std::time::Instant;
+
+use protocol::{Control, DropReason, Header, Key, Kind, Limits, Payload, Selector, Topic, WireError, wire};
+use zenoh::Wait;
+use zenoh::bytes::ZBytes;
+use zenoh::sample::Sample;
+
+use super::mailbox::{Mailbox, Pushed, Taken};
+use super::notices::Notices;
+use super::{Books, BusError};
+
+/// Where a message waits: data and notices of one topic apart, so that a notice never takes the place of data.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
+struct Lane {
+    topic: Topic,
+    is_notice: bool,
+}
+
+/// What came in.
+#[derive(Debug)]
+pub enum Event {
+    /// A message, its header checked.
+    Message(Arrival),
+    /// The publisher of `topic` has ended.
+    End {
+        /// Its topic.
+        topic: Topic,
+        /// Its epoch.
+        epoch: u64,
+        /// Messages it sent.
+        sent: u64,
+    },
+}
+
+/// A message whose header is sound; whether the rest is, decoding tells.
+#[derive(Debug)]
+pub struct Arrival {
+    /// Where it was published.
+    pub topic: Topic,
+    /// Its header.
+    pub header: Header,
+    /// When it arrived.
+    pub at: Instant,
+    payload: ZBytes,
+}
+
+impl Arrival {
+    /// Decodes the message from the pieces it arrived in, copying its tensor once.
+    ///
+    /// # Errors
+    /// [`WireError`] as [`wire::decode`].
+    pub fn decode<M: Payload>(&self, limits: &Limits) -> Result<M, WireError> {
+        wire::decode(self.payload.slices(), limits).map(|(_, message)| message)
+    }
+}
+
+/// What a thread works on: the messages of all topics it subscribed to, in bounded lanes.
+pub struct Inbox {
+    mailbox: Mailbox<Lane, Event>,
+    books: Books,
+}
+
+impl Inbox {
+    pub(super) fn new(places: usize, max_topics: usize, books: &Books) -> Arc<Self> {
+        // Two lanes a topic: data and notices.
+        Arc::new(Self { mailbox: Mailbox::new(places, max_topics.saturating_mul(2)), books: books.clone() })
+    }
+
+    /// The oldest event, waiting until `deadline` for one.
+    pub fn take(&self, deadline: Option<Instant>) -> Taken<Topic, Event> {
+        match self.mailbox.take(deadline) {
+            Taken::Item(lane, event) => Taken::Item(lane.topic, event),
+            Taken::TimedOut => Taken::TimedOut,
+            Taken::Closed => Taken::Closed,
+        }
+    }
+
+    /// Takes no more; what is inside can still be taken.
+    pub fn close(&self) {
+        self.mailbox.close();
+    }
+
+    /// Decodes `arrival`; an unsound one is counted, logged and answered with `None`.
+    pub fn decode<M: Payload>(&self, arrival: &Arrival, limits: &Limits) -> Option<M> {
+        arrival.decode(limits).map_err(|error| self.books.rejected(&arrival.topic, &error)).ok()
+    }
+
+    fn deliver(&self, topic: &Topic, event: Event) {
+        let lane = Lane { topic: topic.clone(), is_notice: matches!(event, Event::End { .. }) };
+        let lost = match self.mailbox.push(lane, event) {
+            Pushed::Queued => return,
+            Pushed::Displaced(event) | Pushed::NoLane(event) | Pushed::Closed(event) => event,
+        };
+        if let Event::Message(arrival) = lost
+            && is_booked(topic)
+        {
+            self.books.dropped(&arrival.topic, DropReason::Superseded);
+        }
+    }
+}
+
+/// A subscription; ends when dropped.
+#[must_use = "the subscription ends when this is dropped"]
+pub struct Subscription(#[expect(dead_code, reason = "held for its lifetime only")] zenoh::pubsub::Subscriber<()>);
+
+impl Subscription {
+    pub(super) fn to_key(
+        session: &zenoh::Session,
+        key: &Key,
+        inbox: &Arc<Inbox>,
+        notices: &Notices,
+    ) -> Result<Self, BusError> {
+        if is_booked(&key.topic) {
+            inbox.books.subscribed(&key.topic);
+        }
+        let topic = key.topic.clone();
+        Self::declare(session, &key.to_string(), Door::new(inbox, notices), move |_| Some(topic.clone()))
+    }
+
+    pub(super) fn to_all(
+        session: &zenoh::Session,
+        selector: &Selector,
+        inbox: &Arc<Inbox>,
+        notices: &Notices,
+    ) -> Result<Self, BusError> {
+        // A key that is none of ours tells of no message of ours either.
+        let topic = |sample: &Sample| sample.key_expr().as_str().parse::<Key>().ok().map(|key| key.topic);
+        Self::declare(session, selector.as_str(), Door::new(inbox, notices), topic)
+    }
+
+    fn declare(
+        session: &zenoh::Session,
+        key: &str,
+        door: Door,
+        topic: impl Fn(&Sample) -> Option<Topic> + Send + Sync + 'static,
+    ) -> Result<Self, BusError> {
+        let subscriber = session.declare_subscriber(key).callback(move |sample| {
+            if let Some(topic) = topic(&sample) {
+                door.admit(topic, &sample);
+            }
+        });
+        subscriber.wait().map(Self).map_err(|cause| BusError::zenoh(format!("subscribing to {key}"), &cause))
+    }
+}
+
+/// Whether the ledger covers a topic: data, but not the talk about the run itself, which goes to whoever is there.
+fn is_booked(topic: &Topic) -> bool {
+    match topic {
+        Topic::Stream { .. } | Topic::Received { .. } | Topic::Truth => true,
+        Topic::Control(_) | Topic::Stats(_) | Topic::Alive { .. } => false,
+    }
+}
+
+/// The callback's side: runs on zenoh's receive thread, so it looks at headers only, waits for nothing and calls no
+/// zenoh.
+struct Door {
+    inbox: Arc<Inbox>,
+    notices: Notices,
+    // The latest sequence of each topic and epoch: a restarted sender begins anew.
+    last: Mutex<BTreeMap<(Topic, u64), u64>>,
+}
+
+/// Topics and epochs remembered: senders restart now and then, and a hostile one must not fill the memory.
+const MAX_REMEMBERED: usize = 1024;
+
+impl Door {
+    fn new(inbox: &Arc<Inbox>, notices: &Notices) -> Self {
+        Self { inbox: Arc::clone(inbox), notices: notices.clone(), last: Mutex::default() }
+    }
+
+    fn admit(&self, topic: Topic, sample: &Sample) {
+        let header = match wire::decode_header(sample.payload().slices()).and_then(|header| check(&topic, header)) {
+            Ok(header) => header,
+            Err(error) => return self.refuse(&topic, &error),
+        };
+        if header.kind == Kind::Control && is_booked(&topic) {
+            return self.note(topic, &header, sample);
+        }
+        if is_booked(&topic) {
+            self.inbox.books.arrived(&topic);
+            self.notices.heard(&topic);
+            if !self.is_new(&topic, &header) {
+                return self.inbox.books.dropped(&topic, DropReason::Duplicate);
+            }
+        }
+        let payload = sample.payload().clone();
+        self.inbox
+            .deliver(&topic, Event::Message(Arrival { topic: topic.clone(), header, at: Instant::now(), payload }));
+    }
+
+    fn refuse(&self, topic: &Topic, error: &WireError) {
+        if is_booked(topic) {
+            self.inbox.books.arrived(topic);
+            self.inbox.books.rejected(topic, error);
+        } else {
+            tracing::warn!(%topic, "message refused: {error}");
+        }
+    }
+
+    fn note(&self, topic: Topic, header: &Header, sample: &Sample) {
+        match wire::decode(sample.payload().slices(), &Limits::DEFAULT) {
+            Ok((_, Control::Probe)) => self.notices.probed(&topic),
+            Ok((_, Control::End { ticks: sent, .. })) => {
+                let end = Event::End { topic: topic.clone(), epoch: header.stamp.epoch, sent };
+                self.inbox.deliver(&topic, end);
+            }
+            Ok(_) => {}
+            Err(error) => self.refuse(&topic, &error),
+        }
+    }
+
+    fn is_new(&self, topic: &Topic, header: &Header) -> bool {
+        let (key, sequence) = ((topic.clone(), header.stamp.epoch), header.stamp.sequence);
+        let mut last = self.last.lock().unwrap_or_else(PoisonError::into_inner);
+        match last.get_mut(&key) {
+            Some(before) if *before >= sequence => false,
+            Some(before) => {
+                *before = sequence;
+                true
+            }
+            None => {
+                if last.len() >= MAX_REMEMBERED {
+                    last.clear();
+                }
+                last.insert(key, sequence);
+                true
+            }
+        }
+    }
+}
+
+/// Who may speak on `topic`, and of what.
+fn check(topic: &Topic, header: Header) -> Result<Header, WireError> {
+    let expected = match topic {
+        Topic::Stream { cav, stream } | Topic::Received { cav, stream, .. } => {
+            header.check_sender(cav)?;
+            stream.kind()
+        }
+        Topic::Truth => Some(Kind::Truth),
+        Topic::Control(_) => Some(Kind::Control),
+        Topic::Stats(_) => Some(Kind::Stats),
+        Topic::Alive { .. } => None,
+    };
+    match expected {
+        Some(expected) if header.kind != expected && header.kind != Kind::Control => {
+            Err(WireError::Kind { expected, found: header.kind })
+        }
+        _ => Ok(header),
+    }
+}
