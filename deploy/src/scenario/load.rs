@@ -154,9 +154,10 @@ fn first_line(text: &str) -> String {
 
 #[cfg(test)]
 mod tests {
-    use protocol::CavId;
+    use ego_fuser::Method;
+    use protocol::{CavId, Dtype};
 
-    use super::super::{Dtype, Method, NoiseMode, PoseSource, Publish};
+    use super::super::{NoiseMode, PoseSource, Publish};
     use super::*;
 
     const SMALL: &str = "scene: {dir: ../scene}\nmodels: {weights: w.safetensors}\n";
@@ -176,11 +177,11 @@ mod tests {
     #[test]
     fn a_vehicle_overrides_single_fields() {
         let text = format!(
-            "{SMALL}agents: {{zstd: true, dtype: f32}}\nvehicles:\n  4288:\n    dtype: i8\n    pose: {{noisy: {{mode: fixed, std_m: 1.5}}}}\n"
+            "{SMALL}agents: {{codec: {{dtype: f32}}}}\nvehicles:\n  4288:\n    codec: {{dtype: i8, zstd_level: 3}}\n    pose: {{noisy: {{mode: fixed, std_m: 1.5}}}}\n"
         );
         let scenario = parse(&text).unwrap();
         let own = scenario.settings_of(&CavId::new("4288").unwrap());
-        assert_eq!((own.dtype, own.zstd), (Dtype::I8, true));
+        assert_eq!((own.codec.dtype, own.codec.zstd_level), (Dtype::I8, Some(3)));
         let PoseSource::Noisy(noise) = own.pose else { panic!("{:?}", own.pose) };
         assert_eq!((noise.mode, noise.std_m, noise.std_deg), (NoiseMode::Fixed, 1.5, 0.2));
         assert_eq!(scenario.settings_of(&CavId::new("4279").unwrap()), scenario.agents);

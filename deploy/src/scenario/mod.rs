@@ -8,7 +8,8 @@ mod load;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
-use protocol::{CavId, RunId};
+use ego_fuser::{Exchange, Method};
+use protocol::{CavId, CodecConfig, RunId};
 use serde::{Deserialize, Serialize};
 
 pub use load::ScenarioError;
@@ -28,7 +29,7 @@ pub struct Scenario {
     /// The networks.
     pub models: Models,
     /// How the ego fuses.
-    #[serde(default)]
+    #[serde(default = "Scenario::default_method")]
     pub method: Method,
     /// What every vehicle does unless `vehicles` says otherwise.
     #[serde(default)]
@@ -111,68 +112,6 @@ impl Models {
     }
 }
 
-/// How the ego fuses what the vehicles send.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Method {
-    /// The ego alone.
-    None,
-    /// Boxes of everyone, suppressed together.
-    Late,
-    /// Points of everyone, through one detector.
-    Early,
-    /// Feature maps, cell-wise maximum (F-Cooper).
-    Max,
-    /// Feature maps, per-cell attention over vehicles (AttFuse).
-    #[default]
-    Attention,
-}
-
-impl Method {
-    /// All methods, in the order tables show them.
-    pub const ALL: [Self; 5] = [Self::None, Self::Late, Self::Early, Self::Max, Self::Attention];
-
-    /// The name used in files and on command lines.
-    #[must_use]
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::None => "none",
-            Self::Late => "late",
-            Self::Early => "early",
-            Self::Max => "max",
-            Self::Attention => "attention",
-        }
-    }
-
-    /// The stream that vehicles have to publish for this method.
-    #[must_use]
-    pub fn stream(self) -> Publish {
-        match self {
-            Self::None | Self::Max | Self::Attention => Publish::Bev,
-            Self::Late => Publish::Boxes,
-            Self::Early => Publish::Points,
-        }
-    }
-}
-
-impl std::fmt::Display for Method {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        f.pad(self.name())
-    }
-}
-
-impl std::str::FromStr for Method {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, String> {
-        let names = || Self::ALL.map(Self::name).join(", ");
-        Self::ALL
-            .into_iter()
-            .find(|method| method.name() == text)
-            .ok_or_else(|| format!("{text:?} is no fusion method: one of {}", names()))
-    }
-}
-
 /// What a vehicle puts on the air beside its pose.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -186,6 +125,16 @@ pub enum Publish {
 }
 
 impl Publish {
+    /// What vehicles have to publish for a method; the ego's own agent sends its map even where nobody else's counts.
+    #[must_use]
+    pub fn for_method(method: Method) -> Self {
+        match method.exchange() {
+            Exchange::Nothing | Exchange::Features => Self::Bev,
+            Exchange::Boxes => Self::Boxes,
+            Exchange::Points => Self::Points,
+        }
+    }
+
     /// The name used in keys and on command lines.
     #[must_use]
     pub fn name(self) -> &'static str {
@@ -193,31 +142,6 @@ impl Publish {
             Self::Bev => "bev",
             Self::Boxes => "boxes",
             Self::Points => "points",
-        }
-    }
-}
-
-/// How a feature map's numbers are written.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Dtype {
-    /// 4 bytes, exact.
-    F32,
-    /// 2 bytes.
-    #[default]
-    F16,
-    /// 1 byte and a scale per channel.
-    I8,
-}
-
-impl Dtype {
-    /// The name used in files and on command lines.
-    #[must_use]
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::F32 => "f32",
-            Self::F16 => "f16",
-            Self::I8 => "i8",
         }
     }
 }
@@ -283,12 +207,8 @@ pub enum NoiseMode {
 pub struct AgentSettings {
     /// Where the pose comes from.
     pub pose: PoseSource,
-    /// Number format of feature maps on the air.
-    pub dtype: Dtype,
-    /// Bytes a feature map may take, cells chosen by confidence; every cell when absent.
-    pub budget_bytes: Option<u64>,
-    /// Whether bodies are compressed (zstd).
-    pub zstd: bool,
+    /// How feature maps are written: number format, byte budget, packing.
+    pub codec: CodecConfig,
     /// What goes on the air; what the method needs when absent.
     pub publish: Option<Publish>,
     /// Who starts the process.
@@ -312,12 +232,8 @@ pub enum Launch {
 pub struct AgentOverrides {
     /// See [`AgentSettings::pose`].
     pub pose: Option<PoseSource>,
-    /// See [`AgentSettings::dtype`].
-    pub dtype: Option<Dtype>,
-    /// See [`AgentSettings::budget_bytes`].
-    pub budget_bytes: Option<u64>,
-    /// See [`AgentSettings::zstd`].
-    pub zstd: Option<bool>,
+    /// See [`AgentSettings::codec`]; replaces it as a whole.
+    pub codec: Option<CodecConfig>,
     /// See [`AgentSettings::publish`].
     pub publish: Option<Publish>,
     /// See [`AgentSettings::launch`].
@@ -325,6 +241,10 @@ pub struct AgentOverrides {
 }
 
 impl Scenario {
+    fn default_method() -> Method {
+        Method::Attention
+    }
+
     /// What vehicle `cav` does: `agents`, with its own entry of `vehicles` on top.
     #[must_use]
     pub fn settings_of(&self, cav: &CavId) -> AgentSettings {
@@ -332,9 +252,7 @@ impl Scenario {
         let Some(own) = self.vehicles.get(cav) else { return base.clone() };
         AgentSettings {
             pose: own.pose.unwrap_or(base.pose),
-            dtype: own.dtype.unwrap_or(base.dtype),
-            budget_bytes: own.budget_bytes.or(base.budget_bytes),
-            zstd: own.zstd.unwrap_or(base.zstd),
+            codec: own.codec.unwrap_or(base.codec),
             publish: own.publish.or(base.publish),
             launch: own.launch.unwrap_or(base.launch),
         }
