@@ -58,6 +58,12 @@ impl Norm {
         x.batch_norm(weight, bias, mean, var, train, self.momentum, self.eps, true)
     }
 
+    /// Shift `[C]` that is learnt.
+    #[must_use]
+    pub fn bias(&self) -> &Tensor {
+        &self.bias
+    }
+
     /// What the norm does with the running statistics: `x * scale + shift`, both `[C]`.
     #[must_use]
     pub fn scale_shift(&self) -> (Tensor, Tensor) {

@@ -93,3 +93,70 @@ impl PointPillars {
         self.head.forward(features)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use tch::Device;
+    use tch::nn::{OptimizerConfig, VarStore};
+
+    use super::*;
+    use crate::pillars::Voxeliser;
+
+    fn small() -> DetectorConfig {
+        DetectorConfig { lidar_range_m: [-6.4, -6.4, -3.0, 6.4, 6.4, 1.0], ..DetectorConfig::lean() }
+    }
+
+    fn batch(config: &DetectorConfig) -> PillarBatch {
+        let points: Vec<[f32; 4]> =
+            (0..500).map(|k| [k as f32 * 0.02 - 5.0, (k % 50) as f32 * 0.2 - 5.0, -1.0, 0.5]).collect();
+        let pillars = Voxeliser::for_detector(config).voxelise(&points);
+        PillarBatch::new(&[&pillars, &pillars], &PillarLattice::new(config))
+    }
+
+    /// Loss before and after a few steps towards an arbitrary map.
+    fn train(compute: Kind) -> (f64, f64) {
+        tch::set_num_threads(1);
+        tch::manual_seed(7);
+        let network = VarStore::new(Device::Cpu);
+        let mut pillars = PointPillars::new(&network.root(), &small()).unwrap();
+        pillars.compute = compute;
+        let batch = batch(&small());
+        let mut optimizer = tch::nn::Adam::default().build(&network, 1e-2).unwrap();
+        let mut losses = Vec::new();
+        for _ in 0..20 {
+            let heads = pillars.heads(&pillars.features(&batch, true)).unwrap();
+            let loss = (heads.scores - 1.0).square().mean(Kind::Float) + heads.offsets.square().mean(Kind::Float);
+            optimizer.backward_step(&loss);
+            losses.push(loss.double_value(&[]));
+        }
+        let running = network.variables()["backbone.blocks.0.2.running_mean"].abs().sum(Kind::Float);
+        assert!(running.double_value(&[]) > 0.0, "training moves the running statistics");
+        (losses[0], losses[losses.len() - 1])
+    }
+
+    #[test]
+    fn it_learns_in_both_precisions() {
+        let (first, last) = train(Kind::Float);
+        assert!(last < 0.5 * first, "{first} {last}");
+        let (first_half, last_half) = train(Kind::BFloat16);
+        assert!(
+            (first_half - first).abs() < 0.02 * first && (last_half - last).abs() < 0.2 * first,
+            "{first_half} {last_half}"
+        );
+    }
+
+    #[test]
+    fn maps_have_the_promised_shape_and_heads_refuse_others() {
+        tch::set_num_threads(1);
+        let network = VarStore::new(Device::Cpu);
+        let config = small();
+        let pillars = PointPillars::new(&network.root(), &config).unwrap();
+        let features = tch::no_grad(|| pillars.features(&batch(&config), false));
+        let grid = config.feature_grid();
+        assert_eq!(features.size(), [2, config.feature_channels(), i64::from(grid.height), i64::from(grid.width)]);
+        let heads = pillars.heads(&features).unwrap();
+        assert_eq!(heads.offsets.size()[1], 14);
+        assert_eq!(heads.confidence().size(), [2, i64::from(grid.height), i64::from(grid.width)]);
+        assert!(pillars.heads(&features.narrow(1, 0, 8)).is_err());
+    }
+}
