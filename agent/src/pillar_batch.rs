@@ -85,7 +85,7 @@ impl PillarBatch {
         }
         let counts = Tensor::from_slice(&counts);
         Self {
-            features: Tensor::from_slice(&features).view([-1, POINT_FEATURES as i64]),
+            features: Tensor::from_slice(&features).view([points as i64, POINT_FEATURES as i64]),
             partial: counts.lt(lattice.max_points as i64).unsqueeze(1),
             counts,
             cells: Tensor::from_slice(&cells),

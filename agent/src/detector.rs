@@ -1,0 +1,386 @@
+//! The detector for inference: one sweep in, the map for the air and boxes out.
+
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use protocol::{BevFeatures, BevGrid, PointCloud};
+use tch::nn::VarStore;
+use tch::{Device, TchError, Tensor};
+
+use crate::anchors::Anchors;
+use crate::backbone::BevBackbone;
+use crate::crop::Crop;
+use crate::decode::{DecodeError, Decoded, decode};
+use crate::head::{DetectionHead, HeadOutput};
+use crate::model_config::{ConfigError, DetectorConfig};
+use crate::pillar_batch::PillarLattice;
+use crate::pillar_projection::PillarProjection;
+use crate::pillars::Voxeliser;
+use crate::point_pillars::PointPillars;
+use crate::shrink::{Compressor, Shrink};
+use crate::weights::{Weights, WeightsError};
+
+/// Why a detector cannot be made or a map not be read by it.
+#[derive(Debug, thiserror::Error)]
+pub enum DetectorError {
+    /// The weights are not readable or made for something else.
+    #[error(transparent)]
+    Weights(#[from] WeightsError),
+    /// The configuration is not one of a network.
+    #[error(transparent)]
+    Config(#[from] ConfigError),
+    /// A map has not the shape of this detector's.
+    #[error("{what} is {found:?}, this detector's is {expected:?} (channels, height, width)")]
+    Shape {
+        /// Which map.
+        what: &'static str,
+        /// Its shape.
+        found: Vec<i64>,
+        /// The shape of this detector's.
+        expected: [i64; 3],
+    },
+    /// The output of the head does not fit the anchors.
+    #[error(transparent)]
+    Decode(#[from] DecodeError),
+    /// The tensor library refused.
+    #[error("tensor library: {}", first_line(.0))]
+    Tensor(#[from] TchError),
+}
+
+/// What the tensor library says, without its stack of C++ calls.
+fn first_line(error: &TchError) -> String {
+    error.to_string().lines().next().unwrap_or_default().to_owned()
+}
+
+/// Time that each stage of [`Detector::encode`] took.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct EncodeTimes {
+    /// Crop and sorting into pillars.
+    pub voxelise: Duration,
+    /// Pillar features on the canvas.
+    pub pillars: Duration,
+    /// 2D convolutions.
+    pub backbone: Duration,
+}
+
+/// What the encoder makes of one sweep.
+#[derive(Debug)]
+pub struct Encoded {
+    /// `[1, C, H, W]` `f32`, contiguous: what crosses the air.
+    pub features: Tensor,
+    /// Points inside the area.
+    pub points: usize,
+    /// Pillars on them.
+    pub pillars: usize,
+    /// Where the time went.
+    pub times: EncodeTimes,
+}
+
+/// What the head makes of a map.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Heads {
+    /// `[A, H, W]` logits.
+    pub scores: Vec<f32>,
+    /// `[7 A, H, W]` offsets.
+    pub offsets: Vec<f32>,
+    /// `[H, W]`, 0..1: how sure the head is of a vehicle around each cell.
+    pub confidence: Vec<f32>,
+}
+
+/// A trained PointPillars network in its fastest form, for one sweep at a time.
+///
+/// The same sweep gives the same bits, whoever computes it, as long as the number of torch threads is the same
+/// (`tch::set_num_threads`; 1 is what live and offline runs use).
+#[derive(Debug)]
+pub struct Detector {
+    config: DetectorConfig,
+    sha256: String,
+    crop: Crop,
+    voxeliser: Voxeliser,
+    lattice: PillarLattice,
+    projection: PillarProjection,
+    backbone: BevBackbone,
+    shrink: Option<Shrink>,
+    compressor: Option<Compressor>,
+    head: DetectionHead,
+    anchors: Anchors,
+    cropped: Vec<[f32; 4]>,
+    canvas: Vec<f32>,
+}
+
+impl Detector {
+    /// Reads a weights file, configuration included.
+    ///
+    /// # Errors
+    /// [`DetectorError`] names the file, the tensor and both shapes.
+    pub fn load(path: &Path) -> Result<Self, DetectorError> {
+        let weights = Weights::load(path)?;
+        Self::from_weights(&weights, &weights.config()?)
+    }
+
+    /// Builds the detector that `config` describes from a file already read.
+    ///
+    /// # Errors
+    /// See [`Self::load`].
+    pub fn from_weights(weights: &Weights, config: &DetectorConfig) -> Result<Self, DetectorError> {
+        let network = VarStore::new(Device::Cpu);
+        let pillars = PointPillars::new(&network.root(), config)?;
+        weights.copy_into(&network)?;
+        Ok(Self { sha256: weights.sha256().to_owned(), ..Self::from_network(pillars) })
+    }
+
+    /// Takes over a network on the CPU, trained or not; its norms are folded into the convolutions.
+    #[must_use]
+    pub fn from_network(network: PointPillars) -> Self {
+        let lattice = *network.lattice();
+        let projection = PillarProjection::new(&network.encoder);
+        tch::no_grad(|| Self {
+            sha256: String::new(),
+            crop: Crop::for_detector(&network.config),
+            voxeliser: Voxeliser::for_detector(&network.config),
+            backbone: network.backbone.folded(),
+            shrink: network.shrink.as_ref().map(Shrink::folded),
+            compressor: network.compressor.as_ref().map(Compressor::folded),
+            anchors: Anchors::for_detector(&network.config),
+            head: network.head,
+            config: network.config,
+            cropped: Vec::new(),
+            canvas: vec![0.0; lattice.width * lattice.height * projection.channels()],
+            lattice,
+            projection,
+        })
+    }
+
+    /// The numbers it was built from.
+    #[must_use]
+    pub fn config(&self) -> &DetectorConfig {
+        &self.config
+    }
+
+    /// SHA-256 of its weights file; empty when it was not read from one.
+    #[must_use]
+    pub fn sha256(&self) -> &str {
+        &self.sha256
+    }
+
+    /// The lattice of its maps.
+    #[must_use]
+    pub fn grid(&self) -> BevGrid {
+        self.config.feature_grid()
+    }
+
+    /// Channels, height and width of its maps.
+    #[must_use]
+    pub fn map_shape(&self) -> [i64; 3] {
+        let grid = self.grid();
+        [self.config.feature_channels(), i64::from(grid.height), i64::from(grid.width)]
+    }
+
+    /// Encodes one sweep.
+    ///
+    /// Points outside the area, on the own body or not finite do not count; a sweep without any other gives the map of
+    /// an empty world.
+    ///
+    /// # Errors
+    /// The tensor library's.
+    pub fn encode(&mut self, cloud: &PointCloud) -> Result<Encoded, DetectorError> {
+        let mut clock = StageClock::start();
+        self.cropped.clear();
+        self.crop.keep(&cloud.xyzi, &mut self.cropped);
+        let pillars = self.voxeliser.voxelise(&self.cropped);
+        let voxelise = clock.lap();
+        self.canvas.fill(0.0);
+        self.projection.scatter(&pillars, &self.lattice, &mut self.canvas);
+        let (height, width) = (self.lattice.height as i64, self.lattice.width as i64);
+        let canvas = Tensor::f_from_slice(&self.canvas)?.f_view([1, height, width, -1])?.f_permute([0, 3, 1, 2])?;
+        let pillar_time = clock.lap();
+        let features = tch::no_grad(|| {
+            let wide = self.backbone.forward(&canvas, false);
+            match &self.shrink {
+                Some(shrink) => shrink.forward(&wide, false),
+                None => wide,
+            }
+            .f_contiguous()
+        })?;
+        let times = EncodeTimes { voxelise, pillars: pillar_time, backbone: clock.lap() };
+        Ok(Encoded { features, points: self.cropped.len(), pillars: pillars.len(), times })
+    }
+
+    /// The squeezed channels of a map, where the configuration has a compressor.
+    #[must_use]
+    pub fn compressor(&self) -> Option<&Compressor> {
+        self.compressor.as_ref()
+    }
+
+    /// Scores, offsets and confidence of a map `[1, C, H, W]` or `[C, H, W]`, own or fused.
+    ///
+    /// # Errors
+    /// [`DetectorError::Shape`] when the map is not one of this detector's.
+    pub fn heads(&self, features: &Tensor) -> Result<Heads, DetectorError> {
+        let expected = self.map_shape();
+        let found = features.size();
+        if found != expected && found.split_first() != Some((&1, expected.as_slice())) {
+            return Err(DetectorError::Shape { what: "feature map", found, expected });
+        }
+        let [channels, height, width] = expected;
+        tch::no_grad(|| {
+            // One memory layout, or the same values would give other last bits.
+            let output = self.head.forward(&features.f_contiguous()?.f_view([1, channels, height, width])?)?;
+            Heads::new(&output)
+        })
+    }
+
+    /// Boxes above a score, in the frame of the map, not yet suppressed.
+    ///
+    /// # Errors
+    /// [`DetectorError::Decode`] when the heads are of another detector.
+    pub fn boxes(&self, heads: &Heads, score_threshold: f32) -> Result<Vec<Decoded>, DetectorError> {
+        Ok(decode(&heads.scores, &heads.offsets, &self.anchors, score_threshold)?)
+    }
+
+    /// The map as it is sent.
+    ///
+    /// # Errors
+    /// [`DetectorError::Shape`] when the tensor is not a map of this detector.
+    pub fn to_message(&self, features: &Tensor) -> Result<BevFeatures, DetectorError> {
+        let [channels, height, width] = self.map_shape();
+        if features.numel() != (channels * height * width) as usize {
+            let expected = self.map_shape();
+            return Err(DetectorError::Shape { what: "feature map", found: features.size(), expected });
+        }
+        let values = flat(features)?;
+        Ok(BevFeatures { grid: self.grid(), channels: channels as u32, values })
+    }
+}
+
+impl Heads {
+    /// Takes the output for one map to plain values.
+    ///
+    /// # Errors
+    /// The tensor library's.
+    pub fn new(output: &HeadOutput) -> Result<Self, DetectorError> {
+        Ok(Self {
+            scores: flat(&output.scores)?,
+            offsets: flat(&output.offsets)?,
+            confidence: flat(&output.confidence())?,
+        })
+    }
+}
+
+/// The values of a tensor in row-major order.
+fn flat(tensor: &Tensor) -> Result<Vec<f32>, TchError> {
+    Vec::try_from(&tensor.f_contiguous()?.f_view([-1])?)
+}
+
+/// Time from lap to lap.
+struct StageClock(Instant);
+
+impl StageClock {
+    fn start() -> Self {
+        Self(Instant::now())
+    }
+
+    fn lap(&mut self) -> Duration {
+        let now = Instant::now();
+        let lap = now - self.0;
+        self.0 = now;
+        lap
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+
+    use tch::Kind;
+
+    use super::*;
+    use crate::pillar_batch::PillarBatch;
+    use crate::weights::{self, CONFIG_KEY, Precision};
+
+    fn config() -> DetectorConfig {
+        DetectorConfig { lidar_range_m: [-12.8, -6.4, -3.0, 12.8, 6.4, 1.0], ..DetectorConfig::lean() }
+    }
+
+    /// A network with running statistics that are not those of a new one, so that folding has something to do.
+    fn network() -> (VarStore, PointPillars) {
+        tch::set_num_threads(1);
+        tch::manual_seed(5);
+        let network = VarStore::new(Device::Cpu);
+        let pillars = PointPillars::new(&network.root(), &config()).unwrap();
+        for (name, mut variable) in network.variables() {
+            if name.contains("running_var") {
+                let _ = tch::no_grad(|| variable.uniform_(0.3, 1.5));
+            } else if variable.dim() == 1 {
+                let _ = tch::no_grad(|| variable.uniform_(-0.2, 0.8));
+            }
+        }
+        (network, pillars)
+    }
+
+    fn cloud() -> PointCloud {
+        let points = (0..4000).map(|k| [(k % 89) as f32 * 0.3 - 13.0, (k % 53) as f32 * 0.25 - 6.5, -1.0, 0.4]);
+        PointCloud { xyzi: points.collect() }
+    }
+
+    #[test]
+    fn it_is_the_trained_network_only_faster() {
+        let (_store, pillars) = network();
+        let cloud = cloud();
+        let mut cropped = Vec::new();
+        Crop::for_detector(&config()).keep(&cloud.xyzi, &mut cropped);
+        let sweep = Voxeliser::for_detector(&config()).voxelise(&cropped);
+        let batch = PillarBatch::new(&[&sweep], pillars.lattice());
+        let (expected, scores) = tch::no_grad(|| {
+            let features = pillars.features(&batch, false);
+            let scores = pillars.heads(&features).unwrap().scores;
+            (features, scores)
+        });
+        let mut detector = Detector::from_network(pillars);
+        let encoded = detector.encode(&cloud).unwrap();
+        assert_eq!((encoded.points, encoded.pillars), (cropped.len(), sweep.len()));
+        assert!(encoded.features.allclose(&expected, 1e-4, 1e-4, false));
+        let heads = detector.heads(&encoded.features).unwrap();
+        let close = Tensor::from_slice(&heads.scores).allclose(&scores.reshape([-1]), 1e-4, 1e-4, false);
+        assert!(close && heads.confidence.iter().all(|value| (0.0..=1.0).contains(value)));
+    }
+
+    #[test]
+    fn the_same_sweep_gives_the_same_bits_whatever_came_before() {
+        let (_store, pillars) = network();
+        let mut detector = Detector::from_network(pillars);
+        let first = detector.encode(&cloud()).unwrap().features;
+        let nothing = detector.encode(&PointCloud::default()).unwrap();
+        assert_eq!((nothing.points, nothing.pillars), (0, 0));
+        let odd = PointCloud { xyzi: vec![[f32::NAN; 4], [5.0, f32::INFINITY, 0.0, 0.0]] };
+        assert!(detector.encode(&odd).unwrap().features.equal(&nothing.features));
+        assert!(detector.encode(&cloud()).unwrap().features.equal(&first));
+        let message = detector.to_message(&first).unwrap();
+        let [channels, height, width] = detector.map_shape();
+        let back = Tensor::from_slice(&message.values).view([channels, height, width]);
+        assert_eq!(detector.heads(&back).unwrap(), detector.heads(&first).unwrap());
+    }
+
+    #[test]
+    fn it_comes_back_from_its_file_bit_for_bit() {
+        let (store, pillars) = network();
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("lean.safetensors");
+        let metadata: BTreeMap<_, _> = [(CONFIG_KEY.to_owned(), serde_json::to_string(&config()).unwrap())].into();
+        let sha256 = weights::save(&path, &store, &metadata, Precision::Single).unwrap();
+        let mut loaded = Detector::load(&path).unwrap();
+        assert_eq!((loaded.sha256(), loaded.config()), (sha256.as_str(), &config()));
+        let mut original = Detector::from_network(pillars);
+        assert!(loaded.encode(&cloud()).unwrap().features.equal(&original.encode(&cloud()).unwrap().features));
+    }
+
+    #[test]
+    fn maps_of_other_detectors_are_refused_with_both_shapes() {
+        let (_store, pillars) = network();
+        let detector = Detector::from_network(pillars);
+        let other = Tensor::zeros([1, 64, 8, 8], (Kind::Float, Device::Cpu));
+        let message = detector.heads(&other).unwrap_err().to_string();
+        assert!(message.contains("[1, 64, 8, 8]") && message.contains("[64, 16, 32]"), "{message}");
+        assert!(detector.to_message(&other).is_err());
+    }
+}
