@@ -1,5 +1,7 @@
-//! One message of every kind, with every field set.
+//! Messages to test with: one of every kind with every field set, and any at all.
 #![allow(dead_code, reason = "not every test file uses all of it")]
+
+pub(crate) mod any;
 
 use std::time::Duration;
 
@@ -27,8 +29,13 @@ pub(crate) fn confidence() -> Vec<f32> {
     (0..12 * 16).map(|cell| (cell * 29 % 97) as f32 / 97.0).collect()
 }
 
+/// Turned by 2 atan(3/4), in numbers that are the same on every machine.
+fn pose_at(translation_m: [f64; 3]) -> Pose {
+    Pose { translation_m, rotation_wxyz: [0.8, 0.0, 0.0, 0.6] }
+}
+
 pub(crate) fn pose() -> PoseEstimate {
-    PoseEstimate::new(Pose::from_xyz_yaw([120.5, -30.25, 1.75], 0.7), 0.875)
+    PoseEstimate::new(pose_at([120.5, -30.25, 1.75]), 0.875)
 }
 
 pub(crate) fn points() -> PointCloud {
@@ -94,13 +101,13 @@ fn truth() -> Truth {
     let object = TrueObject {
         id: -17,
         class: "car".into(),
-        world_from_object: Pose::from_xyz_yaw([1.0, 2.0, 0.5], 1.2),
+        world_from_object: pose_at([1.0, 2.0, 0.5]),
         size_m: [4.0, 2.0, 1.5],
         speed_mps: Some(8.5),
     };
     let agent = |name| AgentTruth {
         cav: cav(name),
-        world_from_lidar: Pose::from_xyz_yaw([5.0, 5.0, 2.0], -2.0),
+        world_from_lidar: pose_at([5.0, 5.0, 2.0]),
         objects: vec![object.clone(), TrueObject { id: 18, speed_mps: None, ..object.clone() }],
     };
     Truth { frame_index: 9, agents: vec![agent("4279"), agent("-1")] }
@@ -114,7 +121,7 @@ pub(crate) fn every_kind() -> Vec<Message> {
         Message::Lidar(Lidar::default()),
         Message::Radar(Radar { points: points() }),
         Message::Gnss(Gnss {
-            world_from_lidar: Pose::from_xyz_yaw([1.0, 2.0, 3.0], 0.1),
+            world_from_lidar: pose_at([1.0, 2.0, 3.0]),
             position_std_m: 0.4,
             heading_std_rad: 0.02,
             source: GnssSource::Gnss,

@@ -1,0 +1,211 @@
+//! Any message whatever: proptest strategies.
+
+use proptest::collection::vec;
+use proptest::option;
+use proptest::prelude::*;
+use proptest::sample::select;
+use protocol::*;
+
+pub(crate) fn any_cav() -> impl Strategy<Value = CavId> {
+    "[a-z0-9_-]{1,32}".prop_filter_map("a reserved word", |text| CavId::new(&text).ok())
+}
+
+pub(crate) fn any_stamp() -> impl Strategy<Value = Stamp> {
+    (any_cav(), any::<[u64; 4]>()).prop_map(|(cav, [epoch, sequence, capture_nanos, publish_nanos])| Stamp {
+        cav,
+        epoch,
+        sequence,
+        capture_nanos,
+        publish_nanos,
+    })
+}
+
+fn any_process() -> impl Strategy<Value = ProcessId> {
+    "[a-z0-9_-]{1,64}".prop_map(|text| ProcessId::new(&text).unwrap())
+}
+
+fn any_stream() -> impl Strategy<Value = Stream> {
+    prop_oneof![
+        any::<u8>().prop_map(Stream::Camera),
+        select(vec![Stream::Lidar, Stream::Gnss, Stream::Radar, Stream::Pose, Stream::Bev, Stream::Boxes]),
+        select(vec![Stream::Points, Stream::Descriptor, Stream::Detections, Stream::DetectionsJson]),
+    ]
+}
+
+fn any_topic() -> impl Strategy<Value = Topic> {
+    prop_oneof![
+        (any_cav(), any_stream()).prop_map(|(cav, stream)| Topic::Stream { cav, stream }),
+        (any_cav(), any_cav(), any_stream()).prop_map(|(ego, cav, stream)| Topic::Received { ego, cav, stream }),
+        Just(Topic::Truth),
+        select(Verb::ALL.to_vec()).prop_map(Topic::Control),
+        any_process().prop_map(Topic::Stats),
+        (select(Role::ALL.to_vec()), any_cav()).prop_map(|(role, cav)| Topic::Alive { role, cav }),
+    ]
+}
+
+fn any_pose() -> impl Strategy<Value = Pose> {
+    (prop::array::uniform3(-1e6..1e6f64), prop::array::uniform4(-1.0..1.0f64))
+        .prop_filter("a rotation", |(_, q)| q.iter().map(|x| x * x).sum::<f64>() > 1e-3)
+        .prop_map(|(translation_m, q)| {
+            let norm = q.iter().map(|x| x * x).sum::<f64>().sqrt();
+            Pose { translation_m, rotation_wxyz: q.map(|x| x / norm) }
+        })
+}
+
+fn any_estimate() -> impl Strategy<Value = PoseEstimate> {
+    let reasons = vec![NoPoseReason::TooFewPoints, NoPoseReason::TooFewInliers, NoPoseReason::NoSource];
+    prop_oneof![
+        (any_pose(), 0f32..=1.0).prop_map(|(pose, confidence)| PoseEstimate::new(pose, confidence)),
+        (select(reasons), any::<u32>())
+            .prop_map(|(reason, inlier_count)| PoseEstimate::NoPose { reason, inlier_count }),
+    ]
+}
+
+fn any_points() -> impl Strategy<Value = PointCloud> {
+    vec(prop::array::uniform4(-1e6f32..1e6), 0..300).prop_map(|xyzi| PointCloud { xyzi })
+}
+
+fn any_detection() -> impl Strategy<Value = Detection> {
+    let box3d = (prop::array::uniform3(-1e3..1e3f64), prop::array::uniform3(0.1..30.0f64), -7.0..7.0f64)
+        .prop_map(|(center_m, size_m, heading_rad)| Box3d { center_m, size_m, heading_rad });
+    (box3d, 0f32..=1.0, option::of(any_cav())).prop_map(|(box3d, score, source)| Detection { box3d, score, source })
+}
+
+/// A map of up to 6 x 20 x 20, a confidence for each of its cells, and a codec.
+pub(crate) fn any_map() -> impl Strategy<Value = (BevFeatures, Vec<f32>, CodecConfig)> {
+    let grid = (-100.0..100.0f64, -100.0..100.0f64, 0.1..2.0f64, 1..20u32, 1..20u32)
+        .prop_map(|(x_min_m, y_min_m, cell_m, width, height)| BevGrid { x_min_m, y_min_m, cell_m, width, height });
+    (grid, 1..6u32, select(vec![Dtype::F32, Dtype::F16, Dtype::I8]), option::of(80..3000u64), option::of(1..4i32))
+        .prop_flat_map(|(grid, channels, dtype, budget_bytes, zstd_level)| {
+            let cells = grid.cells();
+            let values = vec(prop_oneof![Just(0f32), -100f32..100.0], cells * channels as usize);
+            let config = CodecConfig { dtype, budget_bytes, zstd_level };
+            (values, vec(0f32..1.0, cells))
+                .prop_map(move |(values, confidence)| (BevFeatures { grid, channels, values }, confidence, config))
+        })
+}
+
+fn any_bev() -> impl Strategy<Value = Bev> {
+    (any_estimate(), any_map()).prop_map(|(pose, (features, confidence, config))| Bev {
+        pose,
+        features: encode_features(features, &config, Some(&confidence)).unwrap(),
+    })
+}
+
+fn any_descriptor() -> impl Strategy<Value = Descriptor> {
+    (any::<[u8; 32]>(), any_map(), vec(any_stream(), 0..8)).prop_map(|(hash, (features, _, config), streams)| {
+        let (model_hash, dtype) = (ModelHash(hash), config.dtype);
+        Descriptor { model_hash, grid: features.grid, channels: features.channels, dtype, streams }
+    })
+}
+
+fn any_timing() -> impl Strategy<Value = StageTiming> {
+    ("[a-z ]{0,16}", 0..1_000_000_000_000u64).prop_map(|(stage, nanos)| StageTiming { stage, nanos })
+}
+
+fn any_detections() -> impl Strategy<Value = Detections> {
+    let fused = (any_cav(), -1_000_000_000..1_000_000_000i64, 0f32..=1.0, any::<[u64; 2]>()).prop_map(
+        |(cav, age_nanos, confidence, [payload_bytes, wire_bytes])| FusedNeighbour {
+            cav,
+            age_nanos,
+            confidence,
+            payload_bytes,
+            wire_bytes,
+        },
+    );
+    let skipped = (any_cav(), option::of(select(DropReason::ALL.to_vec())))
+        .prop_map(|(cav, reason)| SkippedNeighbour { cav, reason });
+    let lists = (vec(any_detection(), 0..20), vec(fused, 0..4), vec(skipped, 0..4), vec(any_timing(), 0..4));
+    (any_cav(), any::<u64>(), "[a-z]{1,10}", any_estimate(), lists).prop_map(
+        |(ego, frame_index, method, pose, (detections, fused, skipped, stages))| Detections {
+            ego,
+            frame_index,
+            method,
+            pose,
+            detections,
+            fused,
+            skipped,
+            stages,
+        },
+    )
+}
+
+fn any_truth() -> impl Strategy<Value = Truth> {
+    let size = prop::array::uniform3(0.1..30.0f64);
+    let object = (any::<i64>(), "[a-z]{1,10}", any_pose(), size, option::of(-50.0..50.0f64)).prop_map(
+        |(id, class, world_from_object, size_m, speed_mps)| TrueObject {
+            id,
+            class,
+            world_from_object,
+            size_m,
+            speed_mps,
+        },
+    );
+    let agent = (any_cav(), any_pose(), vec(object, 0..8)).prop_map(|(cav, world_from_lidar, objects)| AgentTruth {
+        cav,
+        world_from_lidar,
+        objects,
+    });
+    (any::<u64>(), vec(agent, 0..4)).prop_map(|(frame_index, agents)| Truth { frame_index, agents })
+}
+
+fn any_control() -> impl Strategy<Value = Control> {
+    let sent = (any_topic(), any::<u64>()).prop_map(|(topic, messages)| TopicCount { topic, messages });
+    prop_oneof![
+        (0.0..100.0f64).prop_map(|rate| Control::Start { rate }),
+        Just(Control::Pause),
+        Just(Control::Resume),
+        Just(Control::Probe),
+        any::<u64>().prop_map(|ticks| Control::Step { ticks }),
+        any::<u64>().prop_map(|frame_index| Control::Seek { frame_index }),
+        (any::<u64>(), vec(sent, 0..6)).prop_map(|(ticks, sent)| Control::End { ticks, sent }),
+        (any_process(), vec(any_topic(), 0..6)).prop_map(|(process, heard)| Control::Ready { process, heard }),
+        (any_process(), any::<u64>()).prop_map(|(process, frame_index)| Control::Done { process, frame_index }),
+    ]
+}
+
+fn any_stats() -> impl Strategy<Value = Stats> {
+    let account = (any_topic(), option::of(any_process())).prop_map(|(topic, to)| Account { topic, to });
+    let line = (account, select(DropReason::ALL.to_vec()), 0..1000u64);
+    let ledger = vec(line, 0..8).prop_map(|lines| {
+        let mut ledger = Ledger::default();
+        for (account, reason, in_flight) in &lines {
+            ledger.sent(account);
+            ledger.dropped(account, *reason);
+            ledger.set_in_flight(account, *in_flight);
+        }
+        ledger
+    });
+    let stage = ("[a-z]{1,10}", any::<u64>(), prop::array::uniform4(0.0..1e6f64)).prop_map(
+        |(stage, count, [p50_ms, p95_ms, p99_ms, max_ms])| StageSummary {
+            stage,
+            count,
+            p50_ms,
+            p95_ms,
+            p99_ms,
+            max_ms,
+        },
+    );
+    (any_process(), ledger, vec(stage, 0..4)).prop_map(|(process, ledger, stages)| Stats { process, ledger, stages })
+}
+
+pub(crate) fn any_message() -> impl Strategy<Value = Message> {
+    prop_oneof![
+        1 => any_points().prop_map(|points| Message::Lidar(Lidar { points })),
+        1 => any_points().prop_map(|points| Message::Radar(Radar { points })),
+        1 => (any_pose(), 0.0..100.0f64, 0.0..3.0f64).prop_map(|(world_from_lidar, position_std_m, heading_std_rad)| {
+            let source = if position_std_m > 50.0 { GnssSource::Gnss } else { GnssSource::Recorded };
+            Message::Gnss(Gnss { world_from_lidar, position_std_m, heading_std_rad, source })
+        }),
+        1 => any_estimate().prop_map(Message::Pose),
+        3 => any_bev().prop_map(Message::Bev),
+        1 => (any_estimate(), vec(any_detection(), 0..20))
+            .prop_map(|(pose, detections)| Message::Boxes(Boxes { pose, detections })),
+        1 => (any_estimate(), any_points()).prop_map(|(pose, points)| Message::Points(Points { pose, points })),
+        1 => any_descriptor().prop_map(Message::Descriptor),
+        1 => any_detections().prop_map(Message::Detections),
+        1 => any_truth().prop_map(Message::Truth),
+        1 => any_control().prop_map(Message::Control),
+        1 => any_stats().prop_map(Message::Stats),
+    ]
+}
