@@ -1,3 +1,4 @@
 //! What the end-to-end and golden tests share.
 
+pub mod bus;
 pub mod fixtures;

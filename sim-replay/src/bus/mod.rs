@@ -25,6 +25,6 @@ pub use books::Books;
 pub use liveliness::{Presence, Sighting, Watch};
 pub use membership::{Bus, Identity};
 pub use publisher::{Overflow, Publisher, PublisherOptions, unix_nanos};
-pub use readiness::{Barrier, NotReady, Route, RouteError};
+pub use readiness::{Attended, Barrier, NotReady, Route, RouteError};
 pub use session::{BusError, BusOptions, Endpoint, Role as SessionRole, open};
 pub use subscriber::{Arrival, Event, Inbox, Subscription};

@@ -8,10 +8,17 @@
 use std::collections::BTreeSet;
 use std::fmt;
 use std::str::FromStr;
-use std::sync::{Condvar, Mutex, MutexGuard, PoisonError};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::thread;
 use std::time::{Duration, Instant};
 
-use protocol::{ProcessId, Topic};
+use protocol::{Control, Limits, ProcessId, Topic, Verb};
+
+use super::mailbox::Taken;
+use super::{Bus, BusError, Event, Inbox, Subscription};
+
+/// Answers that may wait at once; each repeats what the one before it from the same process said.
+const PLACES: usize = 256;
 
 /// Routes that an error names; a fleet of many misses many at once.
 const NAMED: usize = 20;
@@ -78,6 +85,36 @@ impl Barrier {
         Self { missing: Mutex::new(expected.into_iter().collect()), changed: Condvar::new() }
     }
 
+    /// Listens on `bus` for the answers to probes.
+    ///
+    /// # Errors
+    /// [`BusError`] when the bus is closed or the system gives no thread.
+    pub fn attend(self, bus: &Bus) -> Result<Attended, BusError> {
+        let (barrier, inbox) = (Arc::new(self), bus.inbox(PLACES, 1));
+        let subscription = bus.subscribe(Topic::Control(Verb::Ready), &inbox)?;
+        let attending = (Arc::clone(&barrier), Arc::clone(&inbox));
+        thread::Builder::new()
+            .name("readiness".into())
+            .spawn(move || attending.0.listen(&attending.1))
+            .map_err(|cause| BusError::Thread { what: "readiness".into(), cause })?;
+        Ok(Attended { barrier, inbox, _subscription: subscription })
+    }
+
+    fn listen(&self, inbox: &Inbox) {
+        while let Taken::Item(_, event) = inbox.take(None) {
+            let Event::Message(arrival) = event else { continue };
+            match arrival.decode(&Limits::DEFAULT) {
+                Ok(Control::Ready { process, heard }) => {
+                    for topic in heard {
+                        self.heard(&Route { topic, receiver: process.clone() });
+                    }
+                }
+                Ok(other) => tracing::warn!(?other, "not a notice of readiness"),
+                Err(error) => tracing::warn!("notice of readiness refused: {error}"),
+            }
+        }
+    }
+
     /// Someone answered a probe on `route`. Routes that nobody expects change nothing.
     pub fn heard(&self, route: &Route) {
         if self.lock().remove(route) {
@@ -110,6 +147,27 @@ impl Barrier {
 
     fn lock(&self) -> MutexGuard<'_, BTreeSet<Route>> {
         self.missing.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// A [`Barrier`] that hears the answers to probes, until it is dropped.
+pub struct Attended {
+    barrier: Arc<Barrier>,
+    inbox: Arc<Inbox>,
+    _subscription: Subscription,
+}
+
+impl std::ops::Deref for Attended {
+    type Target = Barrier;
+
+    fn deref(&self) -> &Barrier {
+        &self.barrier
+    }
+}
+
+impl Drop for Attended {
+    fn drop(&mut self) {
+        self.inbox.close();
     }
 }
 

@@ -1,0 +1,84 @@
+//! Buses for tests: a router on a free port of this machine and as many clients as a test wants.
+
+use std::net::TcpListener;
+use std::time::{Duration, Instant};
+
+use protocol::{CavId, ProcessId, RunId, Topic};
+use sim_replay::bus::{self, Bus, BusOptions, Endpoint, Event, Identity, Inbox, mailbox::Taken};
+use zenoh::Session;
+
+/// Longer than anything here takes, on a machine however busy.
+pub const PATIENCE: Duration = Duration::from_secs(60);
+
+/// A router that the clients of one test meet at.
+pub struct TestRouter {
+    /// Where it listens.
+    pub endpoint: Endpoint,
+    _session: Session,
+}
+
+impl TestRouter {
+    /// Opens a router on a port that was free a moment ago.
+    ///
+    /// # Panics
+    /// When there is none.
+    #[must_use]
+    pub fn open() -> Self {
+        // Another process may take the port between the two calls.
+        let opened = (0..20).find_map(|_| {
+            let endpoint = Endpoint::loopback(free_port());
+            bus::open(&BusOptions::router(endpoint.clone())).ok().map(|session| (endpoint, session))
+        });
+        let (endpoint, session) = opened.expect("a free port on loopback");
+        Self { endpoint, _session: session }
+    }
+
+    /// A client of this router in the run `test`, named `<role>-<cav>` or, for processes without a vehicle, `<cav>`.
+    ///
+    /// # Panics
+    /// When it cannot connect.
+    #[must_use]
+    pub fn join(&self, process: &str, cav: &str) -> Bus {
+        let identity = Identity {
+            run: RunId::new("test").expect("an identifier"),
+            process: ProcessId::new(process).expect("an identifier"),
+            cav: CavId::new(cav).expect("an identifier"),
+        };
+        Bus::join(&BusOptions::client(self.endpoint.clone()), identity).expect("the router is there")
+    }
+}
+
+/// A port on loopback that is free at this moment.
+///
+/// # Panics
+/// When there is none.
+#[must_use]
+pub fn free_port() -> u16 {
+    let listener = TcpListener::bind("127.0.0.1:0").expect("a free port");
+    listener.local_addr().expect("a bound socket has an address").port()
+}
+
+/// The next event.
+///
+/// # Panics
+/// When none comes.
+#[must_use]
+pub fn next_event(inbox: &Inbox) -> (Topic, Event) {
+    match inbox.take(Some(Instant::now() + PATIENCE)) {
+        Taken::Item(topic, event) => (topic, event),
+        Taken::TimedOut => panic!("nothing came within {PATIENCE:?}"),
+        Taken::Closed => panic!("the inbox is closed"),
+    }
+}
+
+/// Waits until `condition` holds.
+///
+/// # Panics
+/// When it never does.
+pub fn wait_for(what: &str, mut condition: impl FnMut() -> bool) {
+    let deadline = Instant::now() + PATIENCE;
+    while !condition() {
+        assert!(Instant::now() < deadline, "{what}: not within {PATIENCE:?}");
+        std::thread::sleep(Duration::from_millis(2));
+    }
+}

@@ -1,0 +1,368 @@
+//! The bus through real zenoh sessions: a router and clients on loopback.
+
+use std::sync::mpsc;
+use std::time::{Duration, Instant};
+
+use protocol::{
+    Account, CavId, DropReason, Gnss, GnssSource, Ledger, Lidar, Limits, PointCloud, Pose, Role, Stream, Topic,
+};
+use sim_replay::bus::{
+    self, Barrier, Bus, BusError, BusOptions, Endpoint, Event, Overflow, Publisher, PublisherOptions, Route, Sighting,
+    mailbox::Taken,
+};
+use tests::bus::{PATIENCE, TestRouter, free_port, next_event, wait_for};
+use zenoh::Wait;
+use zenoh::qos::CongestionControl;
+
+fn cav(text: &str) -> CavId {
+    CavId::new(text).unwrap()
+}
+
+fn topic(text: &str) -> Topic {
+    text.parse().unwrap()
+}
+
+fn gnss(x_m: f64) -> Gnss {
+    Gnss {
+        world_from_lidar: Pose::from_xyz_yaw([x_m, 0.0, 0.0], 0.0),
+        position_std_m: 0.0,
+        heading_std_rad: 0.0,
+        source: GnssSource::Recorded,
+    }
+}
+
+/// A sweep of `count` points whose values tell them apart.
+fn sweep(count: u16) -> Lidar {
+    Lidar { points: PointCloud { xyzi: (0..count).map(|i| [f32::from(i), 1.0, 2.0, 0.5]).collect() } }
+}
+
+/// Waits on `receiver`'s behalf until a probe of `topic` has reached it.
+fn connect(publisher: &Bus, receiver: &Bus, topic: &Topic) {
+    let route = Route { topic: topic.clone(), receiver: receiver.identity().process.clone() };
+    let barrier = Barrier::new([route]);
+    barrier.attend(publisher).unwrap().wait(PATIENCE).unwrap();
+}
+
+fn balanced(buses: &[&Bus]) -> Ledger {
+    let mut ledger = Ledger::default();
+    buses.iter().for_each(|bus| ledger.merge(&bus.books().ledger()));
+    assert!(ledger.balance().is_exact(), "{:?}", ledger.balance());
+    ledger
+}
+
+#[test]
+fn one_publisher_reaches_every_subscriber() {
+    let router = TestRouter::open();
+    let replay = router.join("replay", "replay");
+    let receivers: Vec<Bus> = (0..3).map(|i| router.join(&format!("agent-{i}"), &i.to_string())).collect();
+    let topic = topic("7/lidar");
+    let publisher = replay.publisher(topic.clone(), PublisherOptions::SENSOR.lossless(8)).unwrap();
+    let inboxes: Vec<_> = receivers.iter().map(|bus| bus.inbox(64, 1)).collect();
+    let _subscriptions: Vec<_> =
+        receivers.iter().zip(&inboxes).map(|(bus, inbox)| bus.subscribe(topic.clone(), inbox).unwrap()).collect();
+    receivers.iter().for_each(|bus| connect(&replay, bus, &topic));
+
+    (0..20).for_each(|tick| publisher.offer(tick, sweep(40_000 + tick as u16)));
+    publisher.finish();
+
+    for (bus, inbox) in receivers.iter().zip(&inboxes) {
+        for tick in 0..20 {
+            let (_, Event::Message(arrival)) = next_event(inbox) else { panic!("an end before the last message") };
+            let lidar: Lidar = inbox.decode(&arrival, &Limits::DEFAULT).unwrap();
+            assert_eq!((arrival.header.stamp.sequence, arrival.header.stamp.capture_nanos), (tick, tick));
+            assert_eq!(lidar, sweep(40_000 + tick as u16));
+            bus.books().received(&topic);
+        }
+        assert!(matches!(next_event(inbox), (_, Event::End { sent: 20, .. })));
+    }
+    let ledger = balanced(&[&replay, &receivers[0], &receivers[1], &receivers[2]]);
+    assert_eq!((ledger.total().sent, ledger.total().received), (20, 60));
+}
+
+#[test]
+fn no_first_frame_is_lost_in_twenty_cold_starts() {
+    for _ in 0..20 {
+        let router = TestRouter::open();
+        let topic = topic("7/gnss");
+        // Both ends start at once, in no order.
+        let (replay, agent) = std::thread::scope(|scope| {
+            let replay = scope.spawn(|| router.join("replay", "replay"));
+            let agent = scope.spawn(|| router.join("agent-7", "7"));
+            (replay.join().unwrap(), agent.join().unwrap())
+        });
+        let inbox = agent.inbox(64, 1);
+        let starting = std::thread::spawn({
+            let topic = topic.clone();
+            move || {
+                let publisher = replay.publisher(topic.clone(), PublisherOptions::SENSOR.lossless(8)).unwrap();
+                let route = Route { topic, receiver: "agent-7".parse().unwrap() };
+                Barrier::new([route]).attend(&replay).unwrap().wait(PATIENCE).unwrap();
+                (0..5).for_each(|tick| publisher.offer(tick, gnss(tick as f64)));
+                publisher.finish();
+                replay
+            }
+        });
+        let _subscription = agent.subscribe(topic, &inbox).unwrap();
+        for tick in 0..5 {
+            let (_, Event::Message(arrival)) = next_event(&inbox) else { panic!("an end before the last message") };
+            assert_eq!(arrival.header.stamp.capture_nanos, tick);
+        }
+        starting.join().unwrap().leave(PATIENCE).unwrap();
+        agent.leave(PATIENCE).unwrap();
+    }
+}
+
+#[test]
+fn a_missing_pair_is_named() {
+    let router = TestRouter::open();
+    let replay = router.join("replay", "replay");
+    let _publisher = replay.publisher(topic("7/lidar"), PublisherOptions::SENSOR).unwrap();
+    let routes = ["7/lidar>agent-7", "7/gnss>agent-7"].map(|route| route.parse::<Route>().unwrap());
+    let barrier = Barrier::new(routes).attend(&replay).unwrap();
+    let error = barrier.wait(Duration::from_millis(200)).unwrap_err().to_string();
+    assert!(error.contains("7/lidar>agent-7, 7/gnss>agent-7"), "{error}");
+}
+
+#[test]
+fn a_slow_consumer_gets_the_newest_and_every_loss_is_counted() {
+    let router = TestRouter::open();
+    let (replay, agent) = (router.join("replay", "replay"), router.join("agent-7", "7"));
+    let topic = topic("7/lidar");
+    let publisher = replay.publisher(topic.clone(), PublisherOptions::SENSOR.lossless(8)).unwrap();
+    let inbox = agent.inbox(1, 1);
+    let _subscription = agent.subscribe(topic.clone(), &inbox).unwrap();
+    connect(&replay, &agent, &topic);
+    (0..10).for_each(|tick| publisher.offer(tick, sweep(1000)));
+    publisher.finish();
+    // The consumer looks only now, when all have arrived.
+    let account = Account::towards(topic.clone(), &agent.identity().process);
+    wait_for("nine superseded", || {
+        let ledger = agent.books().ledger();
+        ledger.get(&account).is_some_and(|counts| counts.dropped.get(&DropReason::Superseded) == Some(&9))
+    });
+    let (_, Event::Message(arrival)) = next_event(&inbox) else { panic!("an end before the message") };
+    assert_eq!(arrival.header.stamp.capture_nanos, 9);
+    agent.books().received(&topic);
+    assert!(matches!(next_event(&inbox), (_, Event::End { sent: 10, .. })), "a notice never takes the place of data");
+    balanced(&[&replay, &agent]);
+}
+
+#[test]
+fn an_overloaded_publisher_returns_at_once_and_counts() {
+    let router = TestRouter::open();
+    let (replay, agent) = (router.join("replay", "replay"), router.join("agent-7", "7"));
+    let topic = topic("7/lidar");
+    let publisher = replay.publisher(topic.clone(), PublisherOptions::SENSOR).unwrap();
+    let inbox = agent.inbox(1000, 1);
+    let _subscription = agent.subscribe(topic.clone(), &inbox).unwrap();
+    connect(&replay, &agent, &topic);
+    let clouds: Vec<Lidar> = (0..50).map(|_| sweep(60_000)).collect();
+    let longest = clouds
+        .into_iter()
+        .enumerate()
+        .map(|(tick, cloud)| {
+            let began = Instant::now();
+            publisher.offer(tick as u64, cloud);
+            began.elapsed()
+        })
+        .max()
+        .unwrap();
+    assert!(longest < Duration::from_millis(50), "an offer took {longest:?}");
+    publisher.finish();
+    let mut last = None;
+    loop {
+        match next_event(&inbox).1 {
+            Event::Message(arrival) => {
+                agent.books().received(&topic);
+                last = Some(arrival.header.stamp.capture_nanos);
+            }
+            Event::End { .. } => break,
+        }
+    }
+    assert_eq!(last, Some(49), "the newest is never the one that is dropped");
+    let ledger = balanced(&[&replay, &agent]);
+    let published = ledger.get(&Account::published(topic)).unwrap();
+    assert_eq!(published.sent, 50);
+    assert!(published.dropped[&DropReason::Superseded] > 0, "50 clouds of 1 MB in a moment cannot all have been sent");
+}
+
+#[test]
+fn a_late_joiner_is_seen_hears_and_is_missed() {
+    let router = TestRouter::open();
+    let ego = router.join("ego-1", "1");
+    let (report, sightings) = mpsc::channel();
+    let early = router.join("agent-1", "1");
+    let _presence = early.announce(Role::Agent).unwrap();
+    let _watch = ego
+        .watch(Role::Agent, move |sighting| {
+            let _ = report.send(sighting);
+        })
+        .unwrap();
+    let seen = |sighting: Sighting| assert_eq!(sightings.recv_timeout(PATIENCE).unwrap(), sighting);
+    seen(Sighting::Appeared { role: Role::Agent, cav: cav("1") });
+
+    let late = router.join("agent-2", "2");
+    let presence = late.announce(Role::Agent).unwrap();
+    seen(Sighting::Appeared { role: Role::Agent, cav: cav("2") });
+    let topic = topic("2/gnss");
+    let inbox = ego.inbox(4, 4);
+    let _subscription = ego.subscribe(topic.clone(), &inbox).unwrap();
+    let publisher = late.publisher(topic.clone(), PublisherOptions::POSE).unwrap();
+    connect(&late, &ego, &topic);
+    publisher.offer(3, gnss(1.0));
+    assert!(matches!(next_event(&inbox), (found, Event::Message(_)) if found == topic));
+
+    presence.withdraw().unwrap();
+    seen(Sighting::Vanished { role: Role::Agent, cav: cav("2") });
+    // One that dies without a word is missed as well.
+    early.session().close().wait().unwrap();
+    seen(Sighting::Vanished { role: Role::Agent, cav: cav("1") });
+}
+
+#[test]
+fn wrong_bytes_are_counted_and_survived() {
+    let router = TestRouter::open();
+    let (good, ego) = (router.join("agent-7", "7"), router.join("ego-1", "1"));
+    let topic = topic("7/gnss");
+    let publisher = good.publisher(topic.clone(), PublisherOptions::POSE.lossless(8)).unwrap();
+    let inbox = ego.inbox(64, 1);
+    let _subscription = ego.subscribe(topic.clone(), &inbox).unwrap();
+    connect(&good, &ego, &topic);
+
+    // Everything a broken or hostile peer may put under this key.
+    let enemy = router.join("enemy", "8");
+    let key = enemy.key(topic.clone()).to_string();
+    let stamp = protocol::Stamp { cav: cav("7"), epoch: 1, sequence: 0, capture_nanos: 0, publish_nanos: 0 };
+    let sound = protocol::wire::encode(&stamp, gnss(0.0)).unwrap().to_vec();
+    let changed = |at: usize, to: u8| {
+        let mut bytes = sound.clone();
+        bytes[at] = to;
+        bytes
+    };
+    let next = protocol::Stamp { sequence: 1, ..stamp.clone() };
+    let mut flipped = protocol::wire::encode(&next, gnss(0.0)).unwrap().to_vec();
+    *flipped.last_mut().unwrap() ^= 1;
+    let impostor = protocol::wire::encode(&protocol::Stamp { cav: cav("8"), ..stamp.clone() }, gnss(0.0)).unwrap();
+    let other_kind = protocol::wire::encode(&stamp, sweep(3)).unwrap();
+    let hostile = [
+        vec![],
+        b"nothing of ours".to_vec(),
+        sound[..sound.len() - 1].to_vec(),
+        changed(4, 99),
+        changed(60, !sound[60]),
+        flipped,
+        sound[..sound.len() - 2].to_vec(),
+        impostor.to_vec(),
+        other_kind.to_vec(),
+    ];
+    let count = hostile.len() as u64;
+    for bytes in hostile {
+        enemy.session().put(&key, bytes).congestion_control(CongestionControl::Block).wait().unwrap();
+    }
+    enemy.leave(PATIENCE).unwrap();
+
+    publisher.offer(5, gnss(5.0));
+    let account = Account::towards(topic.clone(), &ego.identity().process);
+    let mut sound_messages = 0;
+    while sound_messages == 0 || ego.books().ledger().get(&account).unwrap().dropped_total() < count {
+        match inbox.take(Some(Instant::now() + PATIENCE)) {
+            Taken::Item(_, Event::Message(arrival)) => {
+                if let Some(gnss) = inbox.decode::<Gnss>(&arrival, &Limits::DEFAULT) {
+                    assert_eq!(gnss.world_from_lidar.translation_m[0], 5.0);
+                    ego.books().received(&topic);
+                    sound_messages += 1;
+                }
+            }
+            other => panic!("{other:?}"),
+        }
+    }
+    let counts = ego.books().ledger().get(&account).unwrap().clone();
+    assert_eq!((counts.received, counts.in_flight), (1, 0));
+    let dropped = |reason| counts.dropped.get(&reason).copied().unwrap_or(0);
+    assert_eq!(dropped(DropReason::Version), 1);
+    assert_eq!(dropped(DropReason::Identity), 1);
+    assert_eq!(dropped(DropReason::Checksum), 2);
+    assert_eq!(dropped(DropReason::Decode), 4);
+    assert_eq!(dropped(DropReason::Duplicate), 1, "two with one number");
+}
+
+#[test]
+fn a_port_in_use_and_a_missing_router_are_named() {
+    let router = TestRouter::open();
+    let error = bus::open(&BusOptions::router(router.endpoint.clone())).unwrap_err();
+    assert!(matches!(&error, BusError::PortInUse { endpoint } if *endpoint == router.endpoint), "{error}");
+    assert!(error.to_string().contains("the port is in use"), "{error}");
+
+    let nowhere = Endpoint::loopback(free_port());
+    let mut options = BusOptions::client(nowhere.clone());
+    options.patience = Duration::from_millis(300);
+    let error = bus::open(&options).unwrap_err();
+    assert!(matches!(&error, BusError::Unreachable { endpoint, .. } if *endpoint == nowhere), "{error}");
+    assert!(error.to_string().contains(nowhere.as_str()) && error.to_string().contains("start it first"), "{error}");
+}
+
+#[test]
+fn a_client_may_come_before_its_router() {
+    let endpoint = Endpoint::loopback(free_port());
+    let client = std::thread::spawn({
+        let options = BusOptions::client(endpoint.clone());
+        move || bus::open(&options)
+    });
+    std::thread::sleep(Duration::from_millis(100));
+    let _router = bus::open(&BusOptions::router(endpoint)).unwrap();
+    client.join().unwrap().unwrap();
+}
+
+#[test]
+fn what_was_sent_before_leaving_arrives() {
+    let router = TestRouter::open();
+    let ego = router.join("ego-1", "1");
+    for round in 0..20 {
+        let agent = router.join("agent-7", "7");
+        let topic = topic("7/lidar");
+        let inbox = ego.inbox(64, 1);
+        let subscription = ego.subscribe(topic.clone(), &inbox).unwrap();
+        let publisher = agent.publisher(topic.clone(), PublisherOptions::SENSOR.lossless(8)).unwrap();
+        connect(&agent, &ego, &topic);
+        (0..5).for_each(|tick| publisher.offer(tick, sweep(50_000)));
+        publisher.finish();
+        agent.leave(PATIENCE).unwrap();
+        for _ in 0..5 {
+            assert!(matches!(next_event(&inbox).1, Event::Message(_)), "round {round}");
+        }
+        assert!(matches!(next_event(&inbox).1, Event::End { sent: 5, .. }), "round {round}");
+        drop(subscription);
+    }
+}
+
+#[test]
+fn shared_memory_carries_the_same_messages() {
+    let router = TestRouter::open();
+    let join = |process: &str, cav_id: &str| {
+        let mut options = BusOptions::client(router.endpoint.clone());
+        options.shared_memory_pool = Some(64 << 20);
+        let identity = sim_replay::bus::Identity {
+            run: "test".parse().unwrap(),
+            process: process.parse().unwrap(),
+            cav: cav(cav_id),
+        };
+        Bus::join(&options, identity).unwrap()
+    };
+    let (replay, agent) = (join("replay", "replay"), join("agent-7", "7"));
+    let topic = Topic::Stream { cav: cav("7"), stream: Stream::Lidar };
+    let publisher: Publisher = replay
+        .publisher(topic.clone(), PublisherOptions { overflow: Overflow::Wait(4), ..PublisherOptions::SENSOR })
+        .unwrap();
+    let inbox = agent.inbox(64, 1);
+    let _subscription = agent.subscribe(topic.clone(), &inbox).unwrap();
+    connect(&replay, &agent, &topic);
+    (0..20).for_each(|tick| publisher.offer(tick, sweep(60_000)));
+    publisher.finish();
+    for tick in 0..20 {
+        let (_, Event::Message(arrival)) = next_event(&inbox) else { panic!("an end before the last message") };
+        assert_eq!(arrival.header.stamp.capture_nanos, tick);
+        assert_eq!(inbox.decode::<Lidar>(&arrival, &Limits::DEFAULT), Some(sweep(60_000)));
+        agent.books().received(&topic);
+    }
+    balanced(&[&replay, &agent]);
+}
