@@ -170,14 +170,9 @@ fn an_overloaded_publisher_returns_at_once_and_counts() {
     assert!(longest < Duration::from_millis(50), "an offer took {longest:?}");
     publisher.finish();
     let mut last = None;
-    loop {
-        match next_event(&inbox).1 {
-            Event::Message(arrival) => {
-                agent.books().received(&topic);
-                last = Some(arrival.header.stamp.capture_nanos);
-            }
-            Event::End { .. } => break,
-        }
+    while let Event::Message(arrival) = next_event(&inbox).1 {
+        agent.books().received(&topic);
+        last = Some(arrival.header.stamp.capture_nanos);
     }
     assert_eq!(last, Some(49), "the newest is never the one that is dropped");
     let ledger = balanced(&[&replay, &agent]);

@@ -145,6 +145,8 @@ impl BusOptions {
             // A neighbour's fleet on the same network must not leak into this run.
             ("scouting/multicast/enabled", json!(false)),
             ("scouting/gossip/enabled", json!(false)),
+            // With nobody to discover there is nothing to wait half a second for.
+            ("scouting/delay", json!(0)),
             // Capture times stand in our own header; the router's clock has no say.
             ("timestamping/enabled", json!(false)),
             // It loses messages over 64 KiB without a word.
