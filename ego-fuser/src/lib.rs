@@ -5,10 +5,14 @@
 //!
 //! Conventions of axes, units and boxes are those of [`protocol`].
 
+pub mod average_precision;
 pub mod fusion;
 pub mod loss;
 pub mod method;
+pub mod model;
+pub mod samples;
 pub mod targets;
+pub mod train;
 pub mod warp;
 
 pub use method::{Exchange, Method};

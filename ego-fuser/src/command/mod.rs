@@ -1,6 +1,7 @@
 //! One file per subcommand: its arguments, and the call into the library.
 
 mod methods;
+mod train;
 
 use std::process::ExitCode;
 
@@ -9,6 +10,8 @@ use std::process::ExitCode;
 pub(crate) enum Command {
     /// List the collaboration methods and what each sends.
     Methods(methods::Arguments),
+    /// Train a method on scenes.
+    Train(Box<train::Arguments>),
 }
 
 impl Command {
@@ -16,6 +19,7 @@ impl Command {
     pub(crate) fn run(self) -> anyhow::Result<()> {
         match self {
             Self::Methods(arguments) => arguments.run(),
+            Self::Train(arguments) => arguments.run(),
         }
     }
 }

@@ -1,0 +1,116 @@
+//! Datasets as one list of ticks, with poses and annotations kept in memory.
+
+use std::collections::HashMap;
+use std::path::PathBuf;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use protocol::PointCloud;
+use sha2::{Digest, Sha256};
+use sim_replay::dataset::{self, LoadOptions, Scenario};
+use sim_replay::frame::Frame;
+
+use super::SampleError;
+
+/// A tick of a [`SceneSet`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct TickRef {
+    /// Index of the scenario.
+    pub scenario: usize,
+    /// Index of the tick in it.
+    pub tick: usize,
+}
+
+/// Scenes of one or more datasets.
+///
+/// Poses and annotations of a tick are read once and kept (some kilobytes each); points are read whenever they are
+/// asked for, and the system's page cache does the rest.
+#[derive(Debug)]
+pub struct SceneSet {
+    scenarios: Vec<Scenario>,
+    ticks: Vec<TickRef>,
+    known: Mutex<HashMap<TickRef, Arc<Vec<Frame>>>>,
+}
+
+impl SceneSet {
+    /// Opens datasets, splits or scenarios.
+    ///
+    /// # Errors
+    /// [`SampleError::Read`] when a folder cannot be read, [`SampleError::Empty`] when there is no tick in any of them.
+    pub fn open(folders: &[PathBuf]) -> Result<Self, SampleError> {
+        let mut scenarios = Vec::new();
+        for folder in folders {
+            scenarios.extend(dataset::open(folder)?.scenarios);
+        }
+        let set = Self::new(scenarios);
+        if set.ticks.is_empty() {
+            return Err(SampleError::Empty(format!("no tick of any scenario in {folders:?}")));
+        }
+        Ok(set)
+    }
+
+    /// A set of scenarios that are open already.
+    #[must_use]
+    pub fn new(scenarios: Vec<Scenario>) -> Self {
+        let of_scenario = |(scenario, found): (usize, &Scenario)| {
+            (0..found.ticks.len()).map(move |tick| TickRef { scenario, tick }).collect::<Vec<_>>()
+        };
+        let ticks = scenarios.iter().enumerate().flat_map(of_scenario).collect();
+        Self { scenarios, ticks, known: Mutex::default() }
+    }
+
+    /// All ticks, scenario after scenario.
+    #[must_use]
+    pub fn ticks(&self) -> &[TickRef] {
+        &self.ticks
+    }
+
+    /// The scenario of a tick.
+    #[must_use]
+    pub fn scenario(&self, tick: TickRef) -> &Scenario {
+        &self.scenarios[tick.scenario]
+    }
+
+    /// All scenarios.
+    #[must_use]
+    pub fn scenarios(&self) -> &[Scenario] {
+        &self.scenarios
+    }
+
+    /// Poses and annotations of all agents at a tick, without points, in the order of the scenario's agents.
+    ///
+    /// # Errors
+    /// [`SampleError::Read`] when a file is missing or malformed.
+    pub fn annotations(&self, tick: TickRef) -> Result<Arc<Vec<Frame>>, SampleError> {
+        let known = |set: &Self| set.known.lock().unwrap_or_else(PoisonError::into_inner).get(&tick).cloned();
+        if let Some(frames) = known(self) {
+            return Ok(frames);
+        }
+        let options = LoadOptions { points: false, ..LoadOptions::default() };
+        let scenario = self.scenario(tick);
+        let frames: Result<Vec<Frame>, _> =
+            (0..scenario.agents.len()).map(|agent| scenario.load(agent, tick.tick, &options)).collect();
+        let frames = Arc::new(frames?);
+        self.known.lock().unwrap_or_else(PoisonError::into_inner).insert(tick, Arc::clone(&frames));
+        Ok(frames)
+    }
+
+    /// The sweep of one agent.
+    ///
+    /// # Errors
+    /// [`SampleError::Read`] when a file is missing or malformed.
+    pub fn points(&self, tick: TickRef, agent: usize) -> Result<PointCloud, SampleError> {
+        Ok(self.scenario(tick).load(agent, tick.tick, &LoadOptions::default())?.points)
+    }
+
+    /// SHA-256 over names, agents and capture times: which data it was, for model cards.
+    #[must_use]
+    pub fn listing_sha256(&self) -> String {
+        let mut hash = Sha256::new();
+        for scenario in &self.scenarios {
+            hash.update(scenario.name.as_bytes());
+            scenario.agents.iter().for_each(|agent| hash.update(format!("/{agent}")));
+            scenario.ticks.iter().for_each(|tick| hash.update(format!("\n{} {}", tick.stem, tick.capture_nanos)));
+        }
+        hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
+    }
+}

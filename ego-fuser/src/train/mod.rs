@@ -1,0 +1,424 @@
+//! Training of a method on recorded or generated scenes.
+//!
+//! [`run`] does no output of its own but files: whoever calls it hears of every step through [`Observer`].
+
+mod adamw;
+mod card;
+mod checkpoint;
+mod curve;
+mod schedule;
+mod validation;
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use agent::model_config::DetectorConfig;
+use agent::weights;
+use tch::Device;
+
+pub use adamw::{AdamW, AdamWConfig, Step};
+pub use checkpoint::{CheckpointError, Progress};
+pub use schedule::OneCycle;
+pub use validation::{Accuracy, Validator};
+
+use self::curve::Curve;
+use crate::loss::{LabelTensors, LossConfig, detection_loss};
+use crate::method::Method;
+use crate::model::{ComputePrecision, CooperativeModel, ModelError};
+use crate::samples::{Batch, Loader, LoaderConfig, SampleBuilder, SampleConfig, SampleError, SampleKind, SceneSet};
+
+/// Steps between two readings of the loss: reading waits for the device.
+const READ_EVERY: u64 = 10;
+/// Losses that are not finite in a row before the training gives up.
+const MAX_SKIPPED: u32 = 20;
+
+/// What to train, on what, for how long.
+#[derive(Debug, Clone)]
+pub struct TrainConfig {
+    /// Datasets to learn from.
+    pub data: Vec<PathBuf>,
+    /// Datasets to validate on; without any, AP is not measured.
+    pub validation: Vec<PathBuf>,
+    /// The method.
+    pub method: Method,
+    /// The network, where `init` does not say.
+    pub detector: DetectorConfig,
+    /// Weights to begin with.
+    pub init: Option<PathBuf>,
+    /// How long.
+    pub length: Length,
+    /// Samples of a step.
+    pub batch: usize,
+    /// Highest learning rate.
+    pub learning_rate: f64,
+    /// Seed of parameters, order and augmentation.
+    pub seed: u64,
+    /// Where the network computes.
+    pub device: Device,
+    /// Threads that prepare samples.
+    pub loader_threads: usize,
+    /// In which numbers the convolutions compute.
+    pub precision: ComputePrecision,
+    /// Folder of checkpoint, curve, weights and model card.
+    pub out: PathBuf,
+    /// Whether to go on from the checkpoint in `out`.
+    pub resume: bool,
+    /// Steps between two validations.
+    pub validate_every: u64,
+    /// Frames of a validation.
+    pub validation_frames: usize,
+    /// How samples are made.
+    pub samples: SampleConfig,
+    /// The loss.
+    pub loss: LossConfig,
+    /// The optimizer.
+    pub optimizer: AdamWConfig,
+    /// The command as the user gave it, for the model card.
+    pub command: String,
+}
+
+/// Length of a training.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Length {
+    /// So many steps.
+    Steps(u64),
+    /// So many passes over the data.
+    Epochs(f64),
+    /// As many steps as fit into a time; the learning rate follows the clock. Not repeatable to the bit.
+    Time(Duration),
+}
+
+/// Why a training ended early.
+#[derive(Debug, thiserror::Error)]
+pub enum TrainError {
+    /// The model cannot be built or run.
+    #[error(transparent)]
+    Model(#[from] ModelError),
+    /// There is no next sample.
+    #[error(transparent)]
+    Sample(#[from] SampleError),
+    /// The checkpoint cannot be written or continued.
+    #[error(transparent)]
+    Checkpoint(#[from] CheckpointError),
+    /// The method cannot be trained.
+    #[error("method {0} exchanges boxes and is not trained; train `none` and use its weights")]
+    NotTrained(Method),
+    /// The checkpoint is of another training.
+    #[error("the checkpoint was made with {field} {found}, not {asked}")]
+    OtherTraining {
+        /// What differs.
+        field: &'static str,
+        /// In the checkpoint.
+        found: String,
+        /// On the command line.
+        asked: String,
+    },
+    /// The loss has left the numbers.
+    #[error("the loss was not finite {0} times in a row; try a lower learning rate")]
+    Diverged(u32),
+    /// A file cannot be written.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// The tensor library refused.
+    #[error("training: {0}")]
+    Torch(#[from] tch::TchError),
+}
+
+/// What happened in some steps.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct StepReport {
+    /// Steps done.
+    pub step: u64,
+    /// Passes over the data.
+    pub epoch: f64,
+    /// Share of the training that is done, 0..1.
+    pub progress: f64,
+    /// Seconds spent so far, in all runs together.
+    pub seconds: f64,
+    /// Learning rate.
+    pub learning_rate: f64,
+    /// Classification term.
+    pub score_loss: f64,
+    /// Regression term.
+    pub box_loss: f64,
+    /// Samples per second since the last report.
+    pub samples_per_second: f64,
+    /// Share of that time spent waiting for samples, 0..1.
+    pub waiting: f64,
+}
+
+/// Hears how a training goes.
+pub trait Observer {
+    /// Some steps are done.
+    fn stepped(&mut self, report: &StepReport);
+    /// A validation is done.
+    fn validated(&mut self, step: u64, accuracy: &Accuracy);
+}
+
+/// How a training ended.
+#[derive(Debug, Clone)]
+pub struct Summary {
+    /// Steps done.
+    pub steps: u64,
+    /// Seconds spent, in all runs together.
+    pub seconds: f64,
+    /// The last validation.
+    pub accuracy: Option<Accuracy>,
+    /// The weights, in half precision.
+    pub weights: PathBuf,
+    /// Their SHA-256.
+    pub sha256: String,
+}
+
+/// Trains a method and writes checkpoint, curve, weights and model card into `config.out`.
+///
+/// # Errors
+/// [`TrainError`]; the last checkpoint stays.
+pub fn run(config: &TrainConfig, observer: &mut dyn Observer) -> Result<Summary, TrainError> {
+    Training::prepare(config)?.run(observer)
+}
+
+/// The views that a method learns from.
+fn sample_kind(method: Method) -> Result<SampleKind, TrainError> {
+    match method {
+        Method::None => Ok(SampleKind::Single),
+        Method::Early => Ok(SampleKind::Merged),
+        Method::Max | Method::Attention => Ok(SampleKind::Cooperative),
+        Method::Late => Err(TrainError::NotTrained(method)),
+    }
+}
+
+struct Training<'a> {
+    config: &'a TrainConfig,
+    model: CooperativeModel,
+    optimizer: AdamW,
+    schedule: OneCycle,
+    scenes: Arc<SceneSet>,
+    builder: SampleBuilder,
+    validator: Option<Validator>,
+    curve: Curve,
+    progress: Progress,
+    accuracy: Option<Accuracy>,
+    started: Instant,
+    seconds_before: f64,
+}
+
+impl<'a> Training<'a> {
+    fn prepare(config: &'a TrainConfig) -> Result<Self, TrainError> {
+        let samples = SampleConfig { kind: sample_kind(config.method)?, ..config.samples.clone() };
+        std::fs::create_dir_all(&config.out).map_err(|source| TrainError::Io { path: config.out.clone(), source })?;
+        tch::manual_seed(config.seed as i64);
+        let model = match &config.init {
+            Some(path) => CooperativeModel::load(path, Some(config.method), config.device)?,
+            None => CooperativeModel::new(&config.detector, config.method, config.device)?,
+        };
+        let mut optimizer = AdamW::new(&model.variables, config.optimizer);
+        let mut progress = Progress {
+            step: 0,
+            seconds: 0.0,
+            seed: config.seed,
+            batch: config.batch,
+            method: config.method.name().to_owned(),
+        };
+        if config.resume {
+            let stored = checkpoint::restore(&checkpoint_path(config), &model.variables, &mut optimizer)?;
+            progress = same_training(progress, stored)?;
+        }
+        let scenes = Arc::new(SceneSet::open(&config.data)?);
+        let assigner = Arc::new(model.assigner().map_err(SampleError::from)?);
+        let builder = SampleBuilder::new(Arc::clone(&scenes), samples.clone(), model.config().clone(), assigner);
+        let validator = match config.validation.as_slice() {
+            [] => None,
+            folders => Some(Validator::open(folders, &samples, &model, config.validation_frames)?),
+        };
+        let curve = Curve::open(&config.out.join("curve.csv"), config.resume)?;
+        let schedule = OneCycle { peak: config.learning_rate };
+        let seconds_before = progress.seconds;
+        let started = Instant::now();
+        let accuracy = None;
+        Ok(Self {
+            config,
+            model,
+            optimizer,
+            schedule,
+            scenes,
+            builder,
+            validator,
+            curve,
+            progress,
+            accuracy,
+            started,
+            seconds_before,
+        })
+    }
+
+    fn run(mut self, observer: &mut dyn Observer) -> Result<Summary, TrainError> {
+        let loader = LoaderConfig {
+            seed: self.config.seed,
+            batch: self.config.batch,
+            first_batch: self.progress.step,
+            threads: self.config.loader_threads,
+        };
+        let mut loader = Loader::start(&self.builder, *self.model.network().lattice(), &loader);
+        let mut window = Window::new();
+        let mut skipped = 0;
+        while self.share_done() < 1.0 {
+            let asked = Instant::now();
+            let batch = loader.next_batch()?;
+            window.waited += asked.elapsed();
+            let losses = self.step(&batch)?;
+            skipped = if losses.is_some() { 0 } else { skipped + 1 };
+            if skipped >= MAX_SKIPPED {
+                return Err(TrainError::Diverged(skipped));
+            }
+            window.add(losses);
+            self.progress.step += 1;
+            if self.progress.step.is_multiple_of(READ_EVERY) {
+                let report = self.report(&mut window);
+                self.curve.step(&report)?;
+                observer.stepped(&report);
+            }
+            if self.progress.step.is_multiple_of(self.config.validate_every) {
+                self.validate(observer)?;
+                self.checkpoint()?;
+            }
+        }
+        self.validate(observer)?;
+        self.checkpoint()?;
+        self.finish()
+    }
+
+    /// One step; its losses, or nothing when the gradient was not finite.
+    fn step(&mut self, batch: &Batch) -> Result<Option<[f64; 2]>, TrainError> {
+        let pillars = batch.pillars.to_device(self.config.device);
+        let labels = LabelTensors::gather(&batch.labels, self.config.loss.unassigned, self.config.device);
+        let output = self.model.forward(&pillars, &batch.ego_from_cav, true, self.config.precision)?;
+        let loss = detection_loss(&output.scores, &output.offsets, &labels, &self.config.loss)?;
+        self.optimizer.zero_grad();
+        loss.total().f_backward()?;
+        let learning_rate = self.schedule.at(self.share_done());
+        match self.optimizer.step(learning_rate)? {
+            Step::Taken(_) => {
+                Ok(Some([loss.score.f_double_value(&[])?, loss.boxes.f_double_value(&[])?]))
+            }
+            Step::Skipped => Ok(None),
+        }
+    }
+
+    fn seconds(&self) -> f64 {
+        self.seconds_before + self.started.elapsed().as_secs_f64()
+    }
+
+    fn epoch(&self) -> f64 {
+        (self.progress.step * self.config.batch as u64) as f64 / self.scenes.ticks().len() as f64
+    }
+
+    fn share_done(&self) -> f64 {
+        match self.config.length {
+            Length::Steps(steps) => self.progress.step as f64 / steps.max(1) as f64,
+            Length::Epochs(epochs) => self.epoch() / epochs.max(f64::MIN_POSITIVE),
+            Length::Time(limit) => self.seconds() / limit.as_secs_f64().max(f64::MIN_POSITIVE),
+        }
+    }
+
+    fn report(&self, window: &mut Window) -> StepReport {
+        let [score_loss, box_loss] = window.mean_losses();
+        let seconds = window.since.elapsed().as_secs_f64().max(1e-9);
+        let report = StepReport {
+            step: self.progress.step,
+            epoch: self.epoch(),
+            progress: self.share_done().min(1.0),
+            seconds: self.seconds(),
+            learning_rate: self.schedule.at(self.share_done()),
+            score_loss,
+            box_loss,
+            samples_per_second: (window.steps * self.config.batch) as f64 / seconds,
+            waiting: window.waited.as_secs_f64() / seconds,
+        };
+        *window = Window::new();
+        report
+    }
+
+    fn validate(&mut self, observer: &mut dyn Observer) -> Result<(), TrainError> {
+        if let Some(validator) = &mut self.validator {
+            let accuracy = validator.measure(&self.model)?;
+            self.curve.validation(self.progress.step, self.seconds_before + self.started.elapsed().as_secs_f64(), &accuracy)?;
+            observer.validated(self.progress.step, &accuracy);
+            self.accuracy = Some(accuracy);
+        }
+        Ok(())
+    }
+
+    fn checkpoint(&mut self) -> Result<(), TrainError> {
+        self.progress.seconds = self.seconds();
+        Ok(checkpoint::save(&checkpoint_path(self.config), &self.model.variables, &self.optimizer, &self.progress)?)
+    }
+
+    fn finish(self) -> Result<Summary, TrainError> {
+        let weights = self.config.out.join("weights.safetensors");
+        let data_sha256 = self.scenes.listing_sha256();
+        let about = BTreeMap::from([
+            ("seed".to_owned(), self.config.seed.to_string()),
+            ("steps".to_owned(), self.progress.step.to_string()),
+            ("data_sha256".to_owned(), data_sha256.clone()),
+        ]);
+        let sha256 = self.model.save(&weights, &about, weights::Precision::Half)?;
+        let seconds = self.progress.seconds;
+        let summary = Summary { steps: self.progress.step, seconds, accuracy: self.accuracy, weights, sha256 };
+        let path = self.config.out.join("model-card.md");
+        let card = card::text(self.config, &self.model, &self.scenes, &data_sha256, &summary);
+        std::fs::write(&path, card).map_err(|source| TrainError::Io { path, source })?;
+        Ok(summary)
+    }
+}
+
+fn checkpoint_path(config: &TrainConfig) -> PathBuf {
+    config.out.join("checkpoint.safetensors")
+}
+
+/// The stored progress, if it is of a training with the same seed, batch and method.
+fn same_training(asked: Progress, stored: Progress) -> Result<Progress, TrainError> {
+    let fields = [
+        ("seed", stored.seed.to_string(), asked.seed.to_string()),
+        ("batch", stored.batch.to_string(), asked.batch.to_string()),
+        ("method", stored.method.clone(), asked.method.clone()),
+    ];
+    match fields.into_iter().find(|(_, found, asked)| found != asked) {
+        Some((field, found, asked)) => Err(TrainError::OtherTraining { field, found, asked }),
+        None => Ok(stored),
+    }
+}
+
+/// What has happened since the last report.
+struct Window {
+    since: Instant,
+    waited: Duration,
+    steps: usize,
+    losses: [f64; 2],
+    finite: usize,
+}
+
+impl Window {
+    fn new() -> Self {
+        Self { since: Instant::now(), waited: Duration::ZERO, steps: 0, losses: [0.0; 2], finite: 0 }
+    }
+
+    fn add(&mut self, losses: Option<[f64; 2]>) {
+        self.steps += 1;
+        if let Some(losses) = losses {
+            self.finite += 1;
+            self.losses.iter_mut().zip(losses).for_each(|(sum, loss)| *sum += loss);
+        }
+    }
+
+    fn mean_losses(&self) -> [f64; 2] {
+        self.losses.map(|sum| sum / self.finite as f64)
+    }
+}

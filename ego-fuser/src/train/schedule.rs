@@ -1,0 +1,48 @@
+//! The learning rate over a training: one cycle (Smith), up and down along a cosine.
+
+use std::f64::consts::PI;
+
+/// Share of the training that the learning rate rises.
+const RISE: f64 = 0.1;
+/// Where it begins, relative to its peak.
+const START: f64 = 0.04;
+/// Where it ends, relative to its peak.
+const END: f64 = 1e-3;
+
+/// One cycle of the learning rate.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct OneCycle {
+    /// The highest learning rate.
+    pub peak: f64,
+}
+
+impl OneCycle {
+    /// The learning rate when a share of the training lies behind, 0..1.
+    #[must_use]
+    pub fn at(&self, progress: f64) -> f64 {
+        let progress = progress.clamp(0.0, 1.0);
+        let between = |from: f64, to: f64, share: f64| to + (from - to) * (1.0 + (PI * share).cos()) / 2.0;
+        self.peak
+            * if progress < RISE {
+                between(START, 1.0, progress / RISE)
+            } else {
+                between(1.0, END, (progress - RISE) / (1.0 - RISE))
+            }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rises_to_the_peak_and_falls_to_almost_nothing() {
+        let cycle = OneCycle { peak: 2e-3 };
+        assert!((cycle.at(0.0) - 8e-5).abs() < 1e-12);
+        assert!((cycle.at(RISE) - 2e-3).abs() < 1e-12);
+        assert!((cycle.at(1.0) - 2e-6).abs() < 1e-12);
+        assert!((cycle.at(7.0) - cycle.at(1.0)).abs() < 1e-12);
+        let falling: Vec<f64> = (2..=20).map(|step| cycle.at(f64::from(step) / 20.0)).collect();
+        assert!(falling.is_sorted_by(|a, b| a > b));
+    }
+}
