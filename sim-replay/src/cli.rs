@@ -17,6 +17,7 @@ pub(crate) struct Cli {
 #[derive(Debug, Subcommand)]
 enum Command {
     Inspect(command::inspect::Args),
+    Synth(command::synth::Args),
 }
 
 /// How a command that did not fail ended.
@@ -32,6 +33,7 @@ pub(crate) enum Outcome {
 pub(crate) fn run(cli: Cli) -> ExitCode {
     let outcome = match cli.command {
         Command::Inspect(args) => command::inspect::run(&args),
+        Command::Synth(args) => command::synth::run(args),
     };
     match outcome {
         Ok(Outcome::Done) => ExitCode::SUCCESS,

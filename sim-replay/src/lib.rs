@@ -11,4 +11,5 @@ pub mod dataset;
 pub mod frame;
 pub mod ground_truth;
 pub mod pcd;
+pub mod synth;
 pub mod town;

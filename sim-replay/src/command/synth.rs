@@ -1,0 +1,160 @@
+//! `sim-replay synth`: generate scenes.
+
+use std::io::IsTerminal;
+use std::ops::RangeInclusive;
+use std::path::PathBuf;
+use std::time::Instant;
+
+use indicatif::{ProgressBar, ProgressStyle};
+use sim_replay::synth::{self, Subset, Summary, SynthError, SynthOptions, Weather};
+use sim_replay::town::TownSource;
+
+use crate::cli::Outcome;
+
+/// Generate scenes in the layout of OPV2V: the same arguments give the same files, byte for byte.
+///
+/// Seeds 0 to 999 are for training and validation, seeds from 1000 on for measuring only.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// Which subset of V2VLoc to imitate: one agent on several traversals of a town, or several agents together.
+    #[arg(long, value_enum)]
+    subset: Subset,
+    /// Fixes routes, lanes, speeds, traffic, parked vehicles and noise.
+    #[arg(long)]
+    seed: u64,
+    /// Folder for the scenarios; made if missing.
+    #[arg(long)]
+    out: PathBuf,
+    /// town1, town4 or an OpenDRIVE map (.xodr). By default that of the subset; v2vdet takes both in turn.
+    #[arg(long, value_parser = parse_town)]
+    town: Option<TownSource>,
+    /// Fixes roads, buildings, trees and signs.
+    #[arg(long, default_value_t = 0)]
+    town_seed: u64,
+    /// Scenarios of town1loc and town4loc, each another drive through the town.
+    #[arg(long, default_value_t = 1)]
+    traversals: usize,
+    /// Scenarios of v2vdet.
+    #[arg(long, default_value_t = 1)]
+    scenes: usize,
+    /// Agents of a v2vdet scenario: a number or a range.
+    #[arg(long, default_value = "2-4", value_parser = parse_agents)]
+    agents: RangeInclusive<usize>,
+    /// The weather of all scenarios.
+    #[arg(long, value_enum, default_value_t)]
+    weather: Weather,
+    /// Frames of each scenario [default: 60 for v2vdet, 2000 for the others].
+    #[arg(long)]
+    frames: Option<usize>,
+    /// Simulated seconds from one frame to the next, a multiple of 0.05.
+    #[arg(long, default_value_t = 0.1)]
+    period: f64,
+    /// Write into a folder that is not empty; scenarios of the same name are replaced.
+    #[arg(long)]
+    force: bool,
+    /// Print a JSON summary.
+    #[arg(long)]
+    json: bool,
+    /// Threads that cast rays and write files [default: one per core].
+    #[arg(long)]
+    threads: Option<usize>,
+}
+
+/// Generates and prints a summary to standard output.
+pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
+    let json = args.json;
+    let options = options(args);
+    let bar = progress_bar(options.scenarios());
+    let start = Instant::now();
+    let result = synth::generate(&options, &|thousandths| bar.set_position(thousandths));
+    bar.finish_and_clear();
+    match result {
+        Ok(summary) => {
+            print(&summary, &options, start.elapsed().as_secs_f64(), json);
+            Ok(Outcome::Done)
+        }
+        Err(error @ (SynthError::Write { .. } | SynthError::Alone { .. })) => Err(error.into()),
+        Err(error) => {
+            eprintln!("error: {error}");
+            Ok(Outcome::BadInput)
+        }
+    }
+}
+
+fn options(args: Args) -> SynthOptions {
+    SynthOptions {
+        town: args.town,
+        town_seed: args.town_seed,
+        traversals: args.traversals,
+        scenes: args.scenes,
+        agents: args.agents,
+        weather: args.weather,
+        frames: args.frames.unwrap_or_else(|| SynthOptions::default_frames(args.subset)),
+        period_s: args.period,
+        force: args.force,
+        threads: args.threads.unwrap_or_else(|| std::thread::available_parallelism().map_or(1, usize::from)).max(1),
+        ..SynthOptions::new(args.subset, args.seed, args.out)
+    }
+}
+
+/// A bar on standard error where that is a terminal; a silent one elsewhere.
+fn progress_bar(scenarios: usize) -> ProgressBar {
+    if !std::io::stderr().is_terminal() {
+        return ProgressBar::hidden();
+    }
+    let template = format!("{{wide_bar}} {{percent}} % of {scenarios} scenarios, {{eta}} left");
+    let bar = ProgressBar::new(1000 * scenarios as u64);
+    bar.with_style(ProgressStyle::with_template(&template).unwrap_or_else(|_| ProgressStyle::default_bar()))
+}
+
+fn print(summary: &Summary, options: &SynthOptions, seconds: f64, json: bool) {
+    let Summary { scenarios, agent_frames, points, annotations } = *summary;
+    let per_frame = |count: usize| count as f64 / agent_frames.max(1) as f64;
+    if json {
+        let report = serde_json::json!({
+            "out": options.out, "scenarios": scenarios, "agent_frames": agent_frames,
+            "points_per_frame": per_frame(points), "vehicles_per_frame": per_frame(annotations), "seconds": seconds,
+        });
+        println!("{report}");
+        return;
+    }
+    println!("{}: {scenarios} scenarios, {agent_frames} agent-frames", options.out.display());
+    println!("{:.0} points and {:.1} annotated vehicles a frame", per_frame(points), per_frame(annotations));
+    println!("{seconds:.1} s, {:.0} agent-frames a second", agent_frames as f64 / seconds);
+}
+
+fn parse_town(text: &str) -> Result<TownSource, String> {
+    match text {
+        "town1" => Ok(TownSource::Town1),
+        "town4" => Ok(TownSource::Town4),
+        path if path.to_lowercase().ends_with(".xodr") => Ok(TownSource::OpenDrive(path.into())),
+        _ => Err("expected town1, town4 or a file that ends in .xodr".into()),
+    }
+}
+
+fn parse_agents(text: &str) -> Result<RangeInclusive<usize>, String> {
+    let number = |text: &str| text.trim().parse::<usize>().map_err(|_| format!("{text:?} is no number"));
+    match text.split_once('-') {
+        Some((low, high)) => Ok(number(low)?..=number(high)?),
+        None => number(text).map(|count| count..=count),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn agents_are_a_number_or_a_range() {
+        assert_eq!(parse_agents("3"), Ok(3..=3));
+        assert_eq!(parse_agents("2-4"), Ok(2..=4));
+        assert!(parse_agents("many").is_err());
+    }
+
+    #[test]
+    fn towns_are_names_or_maps() {
+        assert_eq!(parse_town("town4"), Ok(TownSource::Town4));
+        assert_eq!(parse_town("a/Town01.xodr"), Ok(TownSource::OpenDrive("a/Town01.xodr".into())));
+        assert!(parse_town("town2").is_err());
+    }
+}

@@ -1,0 +1,124 @@
+//! The rays of a scanning sensor: columns of rays that share an azimuth and a time.
+
+use std::f32::consts::TAU;
+
+use nalgebra::{Matrix3, Vector3};
+
+use super::placement::{Placement, Sweep};
+
+/// Which rays a sensor casts in one sweep: columns at even azimuths, each with the same even elevations.
+///
+/// The rays of one column share one origin and lie in one plane, so most of an intersection is done once a column.
+#[derive(Debug, Clone, PartialEq)]
+pub struct RayPattern {
+    /// Azimuth of the first column, radians.
+    pub first_azimuth_rad: f32,
+    /// From one column to the next, radians; negative turns clockwise seen from above.
+    pub azimuth_step_rad: f32,
+    /// Number of columns.
+    pub columns: usize,
+    /// Elevation of the first channel, radians.
+    pub first_elevation_rad: f32,
+    /// From one channel to the next, radians, positive.
+    pub elevation_step_rad: f32,
+    /// Number of channels.
+    pub channels: usize,
+    /// Nothing farther is hit, metres.
+    pub range_m: f32,
+    /// Whether the columns are measured one after another over the sweep, the last one at its end, or all at its end.
+    pub rolling: bool,
+}
+
+impl RayPattern {
+    /// Whether the columns go all the way round.
+    #[must_use]
+    pub fn is_full_turn(&self) -> bool {
+        self.azimuth_step_rad.abs() * self.columns as f32 > TAU - 0.5 * self.azimuth_step_rad.abs()
+    }
+
+    /// Azimuth of a column, radians.
+    #[must_use]
+    pub fn azimuth_rad(&self, column: usize) -> f32 {
+        self.first_azimuth_rad + self.azimuth_step_rad * column as f32
+    }
+
+    /// Elevation of a channel, radians.
+    #[must_use]
+    pub fn elevation_rad(&self, channel: usize) -> f32 {
+        self.first_elevation_rad + self.elevation_step_rad * channel as f32
+    }
+
+    /// When a column is measured: 0 at the start of the sweep, 1 at its end.
+    #[must_use]
+    pub fn time(&self, column: usize) -> f64 {
+        if self.rolling { (column + 1) as f64 / self.columns as f64 } else { 1.0 }
+    }
+}
+
+/// One column of rays in some frame: ray `i` leaves `origin` along `forward * cos[i] + up * sin[i]`.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct ColumnRays<'a> {
+    pub(super) origin: [f32; 3],
+    pub(super) forward: [f32; 3],
+    pub(super) up: [f32; 3],
+    pub(super) cos: &'a [f32],
+    pub(super) sin: &'a [f32],
+}
+
+impl ColumnRays<'_> {
+    /// The first `count` rays; tells the compiler that all slices of a kernel are as long.
+    #[inline]
+    pub(super) fn cut(&self, count: usize) -> Self {
+        Self { cos: &self.cos[..count], sin: &self.sin[..count], ..*self }
+    }
+
+    /// Unit normal of the plane in which the rays lie.
+    #[inline]
+    pub(super) fn normal(&self) -> [f32; 3] {
+        let (h, u) = (self.forward, self.up);
+        [u[1] * h[2] - u[2] * h[1], u[2] * h[0] - u[0] * h[2], u[0] * h[1] - u[1] * h[0]]
+    }
+}
+
+/// Where the sensor is and looks at one column, relative to a point near the sensor (so that `f32` is exact enough).
+#[derive(Debug, Clone, Copy)]
+pub(super) struct ColumnPose {
+    pub(super) time: f32,
+    pub(super) origin: Vector3<f32>,
+    pub(super) forward: Vector3<f32>,
+    pub(super) up: Vector3<f32>,
+}
+
+impl ColumnPose {
+    /// The column of `sensor` at `column` of `pattern`, relative to `anchor`.
+    pub(super) fn new(pattern: &RayPattern, column: usize, sensor: &Sweep, anchor: &Vector3<f64>) -> Self {
+        let time = pattern.time(column);
+        let Placement { position_m, .. } = sensor.at(time);
+        let rotation = sensor.at(time).rotation();
+        let (sin, cos) = f64::from(pattern.azimuth_rad(column)).sin_cos();
+        Self {
+            time: time as f32,
+            origin: (position_m - anchor).cast(),
+            forward: (rotation * Vector3::new(cos, sin, 0.0)).cast(),
+            up: (rotation * Vector3::z()).cast(),
+        }
+    }
+
+    /// The column in the frame of a body at `body_position` (relative to the anchor) turned by `body_from_world`.
+    #[inline]
+    pub(super) fn in_body<'a>(
+        &self,
+        body_from_world: &Matrix3<f32>,
+        body_position: &Vector3<f32>,
+        cos: &'a [f32],
+        sin: &'a [f32],
+    ) -> ColumnRays<'a> {
+        ColumnRays {
+            origin: (body_from_world * (self.origin - body_position)).into(),
+            forward: (body_from_world * self.forward).into(),
+            up: (body_from_world * self.up).into(),
+            cos,
+            sin,
+        }
+    }
+}

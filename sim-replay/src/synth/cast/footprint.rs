@@ -1,0 +1,133 @@
+//! Which rays of a sweep can meet a body at all.
+
+use std::f32::consts::{PI, TAU};
+use std::ops::Range;
+
+use nalgebra::{Matrix3, Vector2, Vector3};
+
+use super::column::RayPattern;
+use super::placement::{Placement, Sweep};
+use super::{Body, Bounds};
+
+/// Closer than this, metres, a body may be seen in every direction.
+const TOUCHING_M: f32 = 0.3;
+/// What the straight line between two places leaves out of a turning motion of 50 ms, metres.
+const BEND_M: f32 = 0.05;
+
+/// The columns and channels which can meet a body, never fewer than those which do.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Footprint {
+    /// First column; may lie before 0 or go on past the last where the pattern goes all the way round.
+    pub(super) first_column: i64,
+    pub(super) columns: usize,
+    pub(super) channels: Range<usize>,
+    /// No hit is nearer, metres.
+    pub(super) nearest_m: f32,
+}
+
+/// The frames of a sensor at the start and the end of a sweep.
+pub(super) struct SensorFrames {
+    ends: [(Matrix3<f64>, Vector3<f64>); 2],
+}
+
+impl SensorFrames {
+    pub(super) fn new(sensor: &Sweep) -> Self {
+        let frame = |placement: &Placement| (placement.rotation().transpose(), placement.position_m);
+        Self { ends: [frame(&sensor.start), frame(&sensor.end)] }
+    }
+
+    /// The footprint of `body`, or nothing where it is out of range or out of sight.
+    ///
+    /// Bounded by the corners of the body's box at both ends of the sweep: between them the motion is straight up to
+    /// [`BEND_M`], so the body stays in their convex hull.
+    pub(super) fn footprint(&self, pattern: &RayPattern, body: &Body<'_>) -> Option<Footprint> {
+        let corners = self.corners(&body.shape.bounds, &body.motion);
+        let flat = corners.map(|corner| corner.xy());
+        let center = flat.iter().sum::<Vector2<f32>>() / 16.0;
+        let nearest_m = self.nearest(&body.motion, &flat, &center) - BEND_M;
+        if nearest_m > pattern.range_m {
+            return None;
+        }
+        if nearest_m < TOUCHING_M {
+            let channels = 0..pattern.channels;
+            return Some(Footprint { first_column: 0, columns: pattern.columns, channels, nearest_m: 0.0 });
+        }
+        let channels = channels(pattern, &corners, nearest_m)?;
+        let (first_column, columns) = columns(pattern, &flat, &center, nearest_m)?;
+        Some(Footprint { first_column, columns, channels, nearest_m })
+    }
+
+    fn corners(&self, bounds: &Bounds, motion: &Sweep) -> [Vector3<f32>; 16] {
+        let ends = [&motion.start, &motion.end];
+        let poses = [0, 1].map(|end| {
+            let (sensor_from_world, sensor_position) = &self.ends[end];
+            let rotation: Matrix3<f32> = (sensor_from_world * ends[end].rotation()).cast();
+            let position: Vector3<f32> = (sensor_from_world * (ends[end].position_m - sensor_position)).cast();
+            (rotation, position)
+        });
+        let corners = bounds.corners();
+        std::array::from_fn(|index| {
+            let (rotation, position) = &poses[index / 8];
+            rotation * Vector3::from(corners[index % 8]) + position
+        })
+    }
+
+    /// A lower bound of the horizontal distance: the best of a few lines that part the sensor from the corners.
+    fn nearest(&self, motion: &Sweep, flat: &[Vector2<f32>; 16], center: &Vector2<f32>) -> f32 {
+        let axes: Matrix3<f32> = (self.ends[1].0 * motion.end.rotation()).cast();
+        let closest = flat.iter().min_by(|a, b| a.norm_squared().total_cmp(&b.norm_squared())).unwrap_or(center);
+        let (x, y) = (axes.column(0).xy(), axes.column(1).xy());
+        let directions = [x, -x, y, -y, *center, *closest];
+        let parting = |direction: &Vector2<f32>| {
+            let direction = direction.try_normalize(1e-6)?;
+            flat.iter().map(|corner| corner.dot(&direction)).min_by(f32::total_cmp)
+        };
+        directions.iter().filter_map(parting).fold(f32::MIN, f32::max)
+    }
+}
+
+/// The channels between the lowest and the highest elevation under which a corner's height can be seen.
+fn channels(pattern: &RayPattern, corners: &[Vector3<f32>; 16], nearest_m: f32) -> Option<Range<usize>> {
+    let farthest_m = corners.iter().map(|corner| corner.xy().norm()).fold(0.0, f32::max) + BEND_M;
+    let low = corners.iter().map(|corner| corner.z).fold(f32::MAX, f32::min) - BEND_M;
+    let high = corners.iter().map(|corner| corner.z).fold(f32::MIN, f32::max) + BEND_M;
+    let steepest =
+        |height: f32, falling: bool| (height / if (height < 0.0) == falling { nearest_m } else { farthest_m }).atan();
+    let channel = |elevation: f32| (elevation - pattern.first_elevation_rad) / pattern.elevation_step_rad;
+    let first = channel(steepest(low, true)).floor().max(0.0);
+    let last = channel(steepest(high, false)).ceil().min((pattern.channels - 1) as f32);
+    (first <= last).then(|| first as usize..last as usize + 1)
+}
+
+/// The columns between the outermost azimuths of the corners: the first one and how many.
+fn columns(
+    pattern: &RayPattern,
+    flat: &[Vector2<f32>; 16],
+    center: &Vector2<f32>,
+    nearest_m: f32,
+) -> Option<(i64, usize)> {
+    let middle = center.y.atan2(center.x);
+    let (mut low, mut high) = (0.0f32, 0.0f32);
+    for corner in flat {
+        // The hull does not hold the sensor, so all azimuths lie within half a turn of the middle one.
+        let aside = corner.y * center.x - corner.x * center.y;
+        let delta = aside.atan2(corner.dot(center));
+        (low, high) = (low.min(delta), high.max(delta));
+    }
+    let margin = BEND_M / nearest_m;
+    let index = |azimuth: f32| (azimuth - pattern.first_azimuth_rad) / pattern.azimuth_step_rad;
+    let interval = |turn: f32| {
+        let (a, b) = (index(middle + low - margin + turn), index(middle + high + margin + turn));
+        (a.min(b).floor() as i64 - 1, a.max(b).ceil() as i64 + 1)
+    };
+    let count = pattern.columns as i64;
+    if pattern.is_full_turn() {
+        let (first, last) = interval(0.0);
+        return Some((first, (last - first + 1).min(count) as usize));
+    }
+    debug_assert!(middle.abs() <= PI + 1e-3);
+    let clipped = [-TAU, 0.0, TAU].map(interval).into_iter().filter(|(first, last)| *last >= 0 && *first < count);
+    let (first, last) = clipped.reduce(|a, b| (a.0.min(b.0), a.1.max(b.1)))?;
+    let (first, last) = (first.max(0), last.min(count - 1));
+    Some((first, (last - first + 1) as usize))
+}

@@ -1,0 +1,238 @@
+//! Ray casting for scanning sensors.
+//!
+//! Everything that can be hit is a body of convex parts, or the ground. A sweep is drawn like a picture with a depth
+//! buffer: each body is projected to the columns and channels that can meet it, and exactly those rays are intersected,
+//! without approximation, at the time at which their column is measured. For a spinning LiDAR this beats a tree per ray:
+//! neighbouring rays share nearly all of the work, and the loops over the channels of a column are vector code.
+
+mod column;
+mod footprint;
+mod part;
+mod placement;
+#[cfg(test)]
+mod tests;
+
+pub use column::RayPattern;
+pub use part::{Bounds, Part};
+pub use placement::{Placement, Sweep, wrapped};
+
+use nalgebra::{Matrix3, Vector3};
+
+use column::{ColumnPose, ColumnRays};
+use footprint::{Footprint, SensorFrames};
+
+/// [`RangeImage::hits`] of a ray that met nothing.
+pub const MISS: u32 = u32::MAX;
+/// [`RangeImage::hits`] of a ray that met the ground.
+pub const GROUND: u32 = u32::MAX - 1;
+
+/// What a body looks like: convex parts in its own frame.
+#[derive(Debug, Clone, PartialEq)]
+pub struct BodyShape {
+    /// The parts; they may overlap.
+    pub parts: Vec<Part>,
+    /// The box around all parts.
+    pub bounds: Bounds,
+    /// Share of the light that comes back, 0..1.
+    pub reflectivity: f32,
+}
+
+impl BodyShape {
+    /// A shape of at least one part.
+    ///
+    /// # Panics
+    /// Where `parts` is empty: a body without extent is a mistake of the caller.
+    #[must_use]
+    pub fn new(parts: Vec<Part>, reflectivity: f32) -> Self {
+        let bounds = parts.iter().map(Part::bounds).reduce(|a, b| a.union(&b)).expect("a body has parts");
+        Self { parts, bounds, reflectivity }
+    }
+}
+
+/// A shape and where it is during one sweep.
+#[derive(Debug, Clone, Copy)]
+pub struct Body<'a> {
+    /// Its form.
+    pub shape: &'a BodyShape,
+    /// `world_from_body` over the sweep.
+    pub motion: Sweep,
+}
+
+/// What lies under everything.
+pub trait Surface {
+    /// Shortens `depth` to the ground where rays meet it, and writes [`GROUND`] into `hit` there.
+    ///
+    /// Ray `i` leaves `origin` (world, metres) along `forward * cos[i] + up * sin[i]`, a unit vector.
+    fn cast(&self, rays: &SurfaceRays<'_>, depth: &mut [f32], hit: &mut [u32]);
+}
+
+/// One column of rays in the world.
+#[derive(Debug, Clone, Copy)]
+pub struct SurfaceRays<'a> {
+    /// Where all rays begin, metres.
+    pub origin: Vector3<f64>,
+    /// Direction at elevation 0.
+    pub forward: Vector3<f32>,
+    /// Direction at elevation 90 degrees.
+    pub up: Vector3<f32>,
+    /// Cosines of the elevations.
+    pub cos: &'a [f32],
+    /// Sines of the elevations.
+    pub sin: &'a [f32],
+}
+
+/// A level plane at this height, metres.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Plane(pub f64);
+
+impl Surface for Plane {
+    fn cast(&self, rays: &SurfaceRays<'_>, depth: &mut [f32], hit: &mut [u32]) {
+        let drop = (self.0 - rays.origin.z) as f32;
+        for (((cos, sin), depth), hit) in rays.cos.iter().zip(rays.sin).zip(depth).zip(hit) {
+            let at = drop / (rays.forward.z * cos + rays.up.z * sin);
+            let nearer = (at > 0.0) & (at < *depth);
+            *depth = if nearer { at } else { *depth };
+            *hit = if nearer { GROUND } else { *hit };
+        }
+    }
+}
+
+/// Where one column was measured, seen from the sensor at the sweep's end.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SkewedColumn {
+    /// Where the sensor was, metres.
+    pub origin_m: Vector3<f32>,
+    /// Where the column points at elevation 0.
+    pub forward: Vector3<f32>,
+    /// Where it points at elevation 90 degrees.
+    pub up: Vector3<f32>,
+}
+
+impl SkewedColumn {
+    /// The point at `range_m` along the ray of an elevation given by its cosine and sine.
+    #[inline]
+    #[must_use]
+    pub fn point_m(&self, (cos, sin): (f32, f32), range_m: f32) -> [f32; 3] {
+        (self.origin_m + (self.forward * cos + self.up * sin) * range_m).into()
+    }
+}
+
+/// What the rays of one sweep met: `[columns, channels]`, the channels of a column side by side.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct RangeImage {
+    /// Distance of the first hit, metres; the pattern's range where nothing was met.
+    pub depths_m: Vec<f32>,
+    /// Index into the bodies that were cast, [`GROUND`] or [`MISS`].
+    pub hits: Vec<u32>,
+}
+
+/// Casts sweeps of one pattern; keeps its buffers from one to the next.
+#[derive(Debug, Clone)]
+pub struct Caster {
+    pattern: RayPattern,
+    cos: Vec<f32>,
+    sin: Vec<f32>,
+    columns: Vec<ColumnPose>,
+    order: Vec<(Footprint, usize)>,
+    image: RangeImage,
+}
+
+impl Caster {
+    /// A caster for sweeps of `pattern`.
+    #[must_use]
+    pub fn new(pattern: RayPattern) -> Self {
+        let elevations: Vec<f32> = (0..pattern.channels).map(|channel| pattern.elevation_rad(channel)).collect();
+        Self {
+            cos: elevations.iter().map(|elevation| elevation.cos()).collect(),
+            sin: elevations.iter().map(|elevation| elevation.sin()).collect(),
+            columns: Vec::new(),
+            order: Vec::new(),
+            image: RangeImage::default(),
+            pattern,
+        }
+    }
+
+    /// The pattern.
+    #[must_use]
+    pub fn pattern(&self) -> &RayPattern {
+        &self.pattern
+    }
+
+    /// Casts one sweep: `sensor` is `world_from_sensor` over it. Bodies around the sensor itself are seen through.
+    pub fn cast(&mut self, sensor: &Sweep, ground: &dyn Surface, bodies: &[Body<'_>]) -> &RangeImage {
+        let anchor = sensor.end.position_m;
+        let (pattern, channels) = (&self.pattern, self.pattern.channels);
+        self.columns.clear();
+        self.columns.extend((0..pattern.columns).map(|column| ColumnPose::new(pattern, column, sensor, &anchor)));
+        self.image.depths_m.clear();
+        self.image.depths_m.resize(pattern.columns * channels, pattern.range_m);
+        self.image.hits.clear();
+        self.image.hits.resize(pattern.columns * channels, MISS);
+
+        let image = self.image.depths_m.chunks_exact_mut(channels).zip(self.image.hits.chunks_exact_mut(channels));
+        for (pose, (depths, hits)) in self.columns.iter().zip(image) {
+            let origin = anchor + pose.origin.cast::<f64>();
+            let rays = SurfaceRays { origin, forward: pose.forward, up: pose.up, cos: &self.cos, sin: &self.sin };
+            ground.cast(&rays, depths, hits);
+        }
+
+        let frames = SensorFrames::new(sensor);
+        self.order.clear();
+        let visible = bodies.iter().enumerate();
+        self.order.extend(visible.filter_map(|(index, body)| Some((frames.footprint(&self.pattern, body)?, index))));
+        // Near bodies first: what they hide need not be intersected. The index settles ties the same way every time.
+        self.order.sort_unstable_by(|(a, i), (b, j)| a.nearest_m.total_cmp(&b.nearest_m).then(i.cmp(j)));
+        for index in 0..self.order.len() {
+            let (footprint, body) = self.order[index].clone();
+            self.cast_body(&bodies[body], &footprint, body as u32, &anchor);
+        }
+        &self.image
+    }
+
+    /// The last sweep, as [`Caster::cast`] returned it.
+    #[must_use]
+    pub fn image(&self) -> &RangeImage {
+        &self.image
+    }
+
+    /// The columns of the last sweep in the frame of the sensor at the sweep's end, where de-skewed points lie.
+    pub fn columns_at_end<'a>(&'a self, sensor: &Sweep) -> impl Iterator<Item = SkewedColumn> + 'a {
+        let end_from_world: Matrix3<f32> = sensor.end.rotation().transpose().cast();
+        self.columns.iter().map(move |pose| SkewedColumn {
+            origin_m: end_from_world * pose.origin,
+            forward: end_from_world * pose.forward,
+            up: end_from_world * pose.up,
+        })
+    }
+
+    /// Cosine and sine of the elevation of each channel.
+    pub fn elevations(&self) -> impl Iterator<Item = (f32, f32)> + '_ {
+        self.cos.iter().copied().zip(self.sin.iter().copied())
+    }
+
+    fn cast_body(&mut self, body: &Body<'_>, footprint: &Footprint, id: u32, anchor: &Vector3<f64>) {
+        let count = self.pattern.columns as i64;
+        let (cos, sin) = (&self.cos[footprint.channels.clone()], &self.sin[footprint.channels.clone()]);
+        let frame = |time: f32| -> (Matrix3<f32>, Vector3<f32>) {
+            let placement = body.motion.at(f64::from(time));
+            (placement.rotation().transpose().cast(), (placement.position_m - anchor).cast())
+        };
+        let still = body.motion.is_still().then(|| frame(1.0));
+        for column in footprint.first_column..footprint.first_column + footprint.columns as i64 {
+            let column = column.rem_euclid(count) as usize;
+            let offset = column * self.pattern.channels;
+            let range = offset + footprint.channels.start..offset + footprint.channels.end;
+            let depths = &mut self.image.depths_m[range.clone()];
+            if depths.iter().fold(0.0f32, |far, &depth| if depth > far { depth } else { far }) < footprint.nearest_m {
+                continue;
+            }
+            let hits = &mut self.image.hits[range];
+            let pose = &self.columns[column];
+            let (body_from_world, position) = still.unwrap_or_else(|| frame(pose.time));
+            let rays: ColumnRays<'_> = pose.in_body(&body_from_world, &position, cos, sin);
+            for part in &body.shape.parts {
+                part.cast(&rays, depths, hits, id);
+            }
+        }
+    }
+}

@@ -1,0 +1,241 @@
+//! Convex parts that bodies are made of, and the kernels that intersect one of them with a column of rays.
+
+use super::column::ColumnRays;
+
+/// Directions shorter than this count as parallel to a face, and are nudged off it.
+const PARALLEL: f32 = 1e-20;
+
+/// A convex solid in the frame of its body, metres.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Part {
+    /// Half-spaces `n . x <= d` as `[nx, ny, nz, d]`, which together bound a solid, and the box around it.
+    Hull {
+        /// The half-spaces; normals of length one.
+        planes: Vec<[f32; 4]>,
+        /// Box around the solid.
+        bounds: Bounds,
+    },
+    /// A box along the axes of the body.
+    Box(Bounds),
+    /// An upright cylinder with its two lids.
+    Cylinder {
+        /// Centre.
+        center_m: [f32; 3],
+        /// Radius.
+        radius_m: f32,
+        /// Half of the height.
+        half_height_m: f32,
+    },
+    /// An ellipsoid along the axes of the body.
+    Ellipsoid {
+        /// Centre.
+        center_m: [f32; 3],
+        /// Radii along x, y, z.
+        radii_m: [f32; 3],
+    },
+}
+
+/// A box along the axes, metres.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Bounds {
+    /// Lower corner.
+    pub min_m: [f32; 3],
+    /// Upper corner.
+    pub max_m: [f32; 3],
+}
+
+impl Bounds {
+    /// A box from its centre and half sizes.
+    #[must_use]
+    pub fn centered(center_m: [f32; 3], half_m: [f32; 3]) -> Self {
+        Self {
+            min_m: std::array::from_fn(|axis| center_m[axis] - half_m[axis]),
+            max_m: std::array::from_fn(|axis| center_m[axis] + half_m[axis]),
+        }
+    }
+
+    /// The smallest box around both.
+    #[must_use]
+    pub fn union(&self, other: &Self) -> Self {
+        Self {
+            min_m: std::array::from_fn(|axis| self.min_m[axis].min(other.min_m[axis])),
+            max_m: std::array::from_fn(|axis| self.max_m[axis].max(other.max_m[axis])),
+        }
+    }
+
+    /// The eight corners.
+    #[must_use]
+    pub fn corners(&self) -> [[f32; 3]; 8] {
+        std::array::from_fn(|corner| {
+            std::array::from_fn(|axis| if corner >> axis & 1 == 0 { self.min_m[axis] } else { self.max_m[axis] })
+        })
+    }
+
+    /// Whether the plane through `origin` with unit normal `normal` touches the box.
+    fn meets_plane(&self, origin: &[f32; 3], normal: &[f32; 3]) -> bool {
+        let (mut distance, mut reach) = (0.0f32, 1e-3f32);
+        for axis in 0..3 {
+            distance += normal[axis] * ((self.min_m[axis] + self.max_m[axis]) * 0.5 - origin[axis]);
+            reach += normal[axis].abs() * (self.max_m[axis] - self.min_m[axis]) * 0.5;
+        }
+        distance.abs() <= reach
+    }
+}
+
+impl Part {
+    /// The box around the part.
+    #[must_use]
+    pub fn bounds(&self) -> Bounds {
+        match self {
+            Self::Hull { bounds, .. } | Self::Box(bounds) => *bounds,
+            Self::Cylinder { center_m, radius_m, half_height_m } => {
+                Bounds::centered(*center_m, [*radius_m, *radius_m, *half_height_m])
+            }
+            Self::Ellipsoid { center_m, radii_m } => Bounds::centered(*center_m, *radii_m),
+        }
+    }
+
+    /// Shortens the depths of a column to this part where it is hit from outside, and writes `id` there.
+    pub(super) fn cast(&self, rays: &ColumnRays<'_>, depth: &mut [f32], hit: &mut [u32], id: u32) {
+        let rays = &rays.cut(depth.len());
+        match self {
+            Self::Hull { planes, bounds } => {
+                if bounds.meets_plane(&rays.origin, &rays.normal()) {
+                    cast_hull(planes, rays, depth, hit, id);
+                }
+            }
+            Self::Box(bounds) => {
+                if bounds.meets_plane(&rays.origin, &rays.normal()) {
+                    cast_box(bounds, rays, depth, hit, id);
+                }
+            }
+            Self::Cylinder { center_m, radius_m, half_height_m } => {
+                if self.bounds().meets_plane(&rays.origin, &rays.normal()) {
+                    cast_cylinder(*center_m, *radius_m, *half_height_m, rays, depth, hit, id);
+                }
+            }
+            Self::Ellipsoid { center_m, radii_m } => {
+                if self.bounds().meets_plane(&rays.origin, &rays.normal()) {
+                    cast_ellipsoid(*center_m, *radii_m, rays, depth, hit, id);
+                }
+            }
+        }
+    }
+}
+
+/// Takes the entry into a solid as the new depth where it lies before the old one.
+///
+/// Written with selects instead of a branch so that the loops around it become vector code.
+#[inline(always)]
+fn shorten(enter: f32, is_hit: bool, depth: &mut f32, hit: &mut u32, id: u32) {
+    let nearer = is_hit & (enter > 0.0) & (enter < *depth);
+    *depth = if nearer { enter } else { *depth };
+    *hit = if nearer { id } else { *hit };
+}
+
+#[inline(always)]
+fn lesser(a: f32, b: f32) -> f32 {
+    if a < b { a } else { b }
+}
+
+#[inline(always)]
+fn greater(a: f32, b: f32) -> f32 {
+    if a > b { a } else { b }
+}
+
+#[inline(always)]
+fn off_zero(value: f32) -> f32 {
+    if value.abs() < PARALLEL { -PARALLEL } else { value }
+}
+
+fn cast_box(bounds: &Bounds, rays: &ColumnRays<'_>, depth: &mut [f32], hit: &mut [u32], id: u32) {
+    let low: [f32; 3] = std::array::from_fn(|axis| bounds.min_m[axis] - rays.origin[axis]);
+    let high: [f32; 3] = std::array::from_fn(|axis| bounds.max_m[axis] - rays.origin[axis]);
+    let (h, u) = (rays.forward, rays.up);
+    for (((cos, sin), depth), hit) in rays.cos.iter().zip(rays.sin).zip(depth).zip(hit) {
+        let slab = |axis: usize| {
+            let inverse = 1.0 / off_zero(h[axis] * cos + u[axis] * sin);
+            let (a, b) = (low[axis] * inverse, high[axis] * inverse);
+            (lesser(a, b), greater(a, b))
+        };
+        let ((x_in, x_out), (y_in, y_out), (z_in, z_out)) = (slab(0), slab(1), slab(2));
+        let enter = greater(greater(x_in, y_in), z_in);
+        let exit = lesser(lesser(x_out, y_out), z_out);
+        shorten(enter, enter <= exit, depth, hit, id);
+    }
+}
+
+fn cast_hull(planes: &[[f32; 4]], rays: &ColumnRays<'_>, depth: &mut [f32], hit: &mut [u32], id: u32) {
+    const LANES: usize = 64;
+    for start in (0..depth.len()).step_by(LANES) {
+        let count = LANES.min(depth.len() - start);
+        let range = start..start + count;
+        let (mut enter, mut exit) = ([f32::MIN; LANES], [f32::MAX; LANES]);
+        for plane in planes {
+            let dot = |v: &[f32; 3]| plane[0] * v[0] + plane[1] * v[1] + plane[2] * v[2];
+            // Distance to the plane from inside, and its decrease along the two directions that span the column.
+            let (inside, along, rise) = (plane[3] - dot(&rays.origin), dot(&rays.forward), dot(&rays.up));
+            let lanes = enter[..count].iter_mut().zip(&mut exit[..count]);
+            for ((enter, exit), (cos, sin)) in lanes.zip(rays.cos[range.clone()].iter().zip(&rays.sin[range.clone()])) {
+                let slope = off_zero(along * cos + rise * sin);
+                let at = inside / slope;
+                *enter = if slope < 0.0 { greater(*enter, at) } else { *enter };
+                *exit = if slope < 0.0 { *exit } else { lesser(*exit, at) };
+            }
+        }
+        let lanes = enter[..count].iter().zip(&exit[..count]);
+        for ((enter, exit), (depth, hit)) in lanes.zip(depth[range.clone()].iter_mut().zip(&mut hit[range])) {
+            shorten(*enter, enter <= exit, depth, hit, id);
+        }
+    }
+}
+
+fn cast_cylinder(
+    center: [f32; 3],
+    radius: f32,
+    half_height: f32,
+    rays: &ColumnRays<'_>,
+    depth: &mut [f32],
+    hit: &mut [u32],
+    id: u32,
+) {
+    let o: [f32; 3] = std::array::from_fn(|axis| rays.origin[axis] - center[axis]);
+    let (h, u) = (rays.forward, rays.up);
+    for (((cos, sin), depth), hit) in rays.cos.iter().zip(rays.sin).zip(depth).zip(hit) {
+        let (dx, dy, dz) = (h[0] * cos + u[0] * sin, h[1] * cos + u[1] * sin, off_zero(h[2] * cos + u[2] * sin));
+        let flat = greater(dx * dx + dy * dy, PARALLEL);
+        // From the ray's distance to the axis rather than from b^2 - ac, which cancels for a thin pole far away.
+        let aside = o[0] * dy - o[1] * dx;
+        let room = radius * radius * flat - aside * aside;
+        let half_chord = greater(room, 0.0).sqrt();
+        let middle = -(o[0] * dx + o[1] * dy);
+        let inverse = 1.0 / dz;
+        let (a, b) = ((-half_height - o[2]) * inverse, (half_height - o[2]) * inverse);
+        let enter = greater((middle - half_chord) / flat, lesser(a, b));
+        let exit = lesser((middle + half_chord) / flat, greater(a, b));
+        shorten(enter, (room >= 0.0) & (enter <= exit), depth, hit, id);
+    }
+}
+
+fn cast_ellipsoid(
+    center: [f32; 3],
+    radii: [f32; 3],
+    rays: &ColumnRays<'_>,
+    depth: &mut [f32],
+    hit: &mut [u32],
+    id: u32,
+) {
+    // In the space where the ellipsoid is the unit sphere.
+    let o: [f32; 3] = std::array::from_fn(|axis| (rays.origin[axis] - center[axis]) / radii[axis]);
+    let h: [f32; 3] = std::array::from_fn(|axis| rays.forward[axis] / radii[axis]);
+    let u: [f32; 3] = std::array::from_fn(|axis| rays.up[axis] / radii[axis]);
+    for (((cos, sin), depth), hit) in rays.cos.iter().zip(rays.sin).zip(depth).zip(hit) {
+        let d = [h[0] * cos + u[0] * sin, h[1] * cos + u[1] * sin, h[2] * cos + u[2] * sin];
+        let square = d[0] * d[0] + d[1] * d[1] + d[2] * d[2];
+        let middle = -(o[0] * d[0] + o[1] * d[1] + o[2] * d[2]) / square;
+        let closest = [o[0] + middle * d[0], o[1] + middle * d[1], o[2] + middle * d[2]];
+        let room = 1.0 - (closest[0] * closest[0] + closest[1] * closest[1] + closest[2] * closest[2]);
+        let enter = middle - (greater(room, 0.0) / square).sqrt();
+        shorten(enter, room >= 0.0, depth, hit, id);
+    }
+}

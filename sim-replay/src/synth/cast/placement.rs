@@ -1,0 +1,121 @@
+//! Where things are during one sweep.
+
+use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion, Vector3};
+use std::f64::consts::{PI, TAU};
+
+/// A pose without roll: position in metres, heading, and pitch (positive lifts the nose), radians.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Placement {
+    /// Position in the world.
+    pub position_m: Vector3<f64>,
+    /// Turn about z, from x towards y.
+    pub yaw_rad: f64,
+    /// Upward slope of the x axis.
+    pub pitch_rad: f64,
+}
+
+impl Placement {
+    /// A level placement.
+    #[must_use]
+    pub fn level(position_m: [f64; 3], yaw_rad: f64) -> Self {
+        Self { position_m: position_m.into(), yaw_rad, pitch_rad: 0.0 }
+    }
+
+    /// `world_from_self`, the turning part.
+    #[must_use]
+    pub fn rotation(&self) -> Matrix3<f64> {
+        let (sy, cy) = self.yaw_rad.sin_cos();
+        let (sp, cp) = self.pitch_rad.sin_cos();
+        Matrix3::new(cy * cp, -sy, -cy * sp, sy * cp, cy, -sy * sp, sp, 0.0, cp)
+    }
+
+    /// `world_from_self`.
+    #[must_use]
+    pub fn isometry(&self) -> Isometry3<f64> {
+        let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(self.rotation()));
+        Isometry3::from_parts(Translation3::from(self.position_m), rotation)
+    }
+
+    /// The placement of something mounted at `offset_m` in this frame, with the same axes.
+    #[must_use]
+    pub fn mounted(&self, offset_m: [f64; 3]) -> Self {
+        Self { position_m: self.position_m + self.rotation() * Vector3::from(offset_m), ..*self }
+    }
+}
+
+/// A motion over one sweep: straight and even from start to end.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Sweep {
+    /// At the sweep's start.
+    pub start: Placement,
+    /// At the sweep's end.
+    pub end: Placement,
+}
+
+impl Sweep {
+    /// No motion.
+    #[must_use]
+    pub fn still(placement: Placement) -> Self {
+        Self { start: placement, end: placement }
+    }
+
+    /// Whether nothing moves.
+    #[must_use]
+    pub fn is_still(&self) -> bool {
+        self.start == self.end
+    }
+
+    /// The placement at a time between 0 (start) and 1 (end).
+    #[must_use]
+    pub fn at(&self, time: f64) -> Placement {
+        let mix = |a: f64, b: f64| a + (b - a) * time;
+        let turn = wrapped(self.end.yaw_rad - self.start.yaw_rad);
+        Placement {
+            position_m: self.start.position_m + (self.end.position_m - self.start.position_m) * time,
+            // Backwards from the end, so that the pose at time 1 is the end to the last bit.
+            yaw_rad: self.end.yaw_rad - turn * (1.0 - time),
+            pitch_rad: mix(self.start.pitch_rad, self.end.pitch_rad),
+        }
+    }
+
+    /// The motion of something mounted on this.
+    #[must_use]
+    pub fn mounted(&self, offset_m: [f64; 3]) -> Self {
+        Self { start: self.start.mounted(offset_m), end: self.end.mounted(offset_m) }
+    }
+}
+
+/// The angle on the branch from -pi to pi.
+#[must_use]
+pub fn wrapped(angle_rad: f64) -> f64 {
+    let turned = (angle_rad + PI).rem_euclid(TAU) - PI;
+    if turned.is_finite() { turned } else { 0.0 }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pitch_lifts_the_nose_and_yaw_turns_left() {
+        let nose =
+            Placement { position_m: Vector3::zeros(), yaw_rad: PI / 2.0, pitch_rad: 0.1 }.rotation() * Vector3::x();
+        assert!((nose - Vector3::new(0.0, 0.1f64.cos(), 0.1f64.sin())).norm() < 1e-12);
+    }
+
+    #[test]
+    fn a_sweep_turns_the_short_way_round() {
+        let start = Placement::level([0.0; 3], 3.1);
+        let end = Placement::level([1.0, 0.0, 0.0], -3.1);
+        let middle = Sweep { start, end }.at(0.5);
+        assert!((wrapped(middle.yaw_rad - PI)).abs() < 1e-9 && (middle.position_m.x - 0.5).abs() < 1e-12);
+        assert_eq!(Sweep { start, end }.at(1.0).yaw_rad, -3.1);
+    }
+
+    #[test]
+    fn the_rotation_is_that_of_the_isometry() {
+        let placement = Placement { position_m: Vector3::new(1.0, 2.0, 3.0), yaw_rad: 0.7, pitch_rad: -0.2 };
+        let difference = placement.isometry().rotation.to_rotation_matrix().into_inner() - placement.rotation();
+        assert!(difference.amax() < 1e-12);
+    }
+}

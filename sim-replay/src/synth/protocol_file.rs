@@ -1,0 +1,61 @@
+//! `data_protocol.yaml`: how a scenario was made.
+
+use super::options::SynthOptions;
+use super::recording::SceneSpec;
+use super::traffic::STEP_S;
+use crate::town::Town;
+
+/// The text of the file. It names what decides the bytes of the scenario, and the sensors in the words of OpenCDA.
+pub(crate) fn protocol_yaml(options: &SynthOptions, spec: &SceneSpec, town: &Town) -> String {
+    let SynthOptions { subset, seed, town_seed, weather, frames, period_s, .. } = options;
+    let (name, town_name, scene_seed, agents) = (&spec.name, &town.name, spec.seed, spec.agents);
+    let (subset, weather, version) = (subset.name(), weather.name(), env!("CARGO_PKG_VERSION"));
+    format!(
+        "\
+description: generated scene, no recording
+generator:
+  name: sim-replay synth
+  version: {version}
+  subset: {subset}
+  scenario: {name}
+  seed: {seed}
+  scene_seed: {scene_seed}
+  town: '{town_name}'
+  town_seed: {town_seed}
+  agents: {agents}
+  frames: {frames}
+  period_seconds: {period_s}
+  weather: {weather}
+vehicle_base:
+  sensing:
+    localization:
+      gnss:
+        heading_direction_stddev: 0.1
+        noise_alt_stddev: 0.001
+        noise_lat_stddev: 1.0e-06
+        noise_lon_stddev: 1.0e-06
+        speed_stddev: 0.2
+    perception:
+      lidar:
+        channels: 64
+        dropoff_general_rate: 0.1
+        dropoff_intensity_limit: 0.7
+        dropoff_zero_intensity: 0.15
+        lower_fov: -25
+        noise_stddev: 0.02
+        points_per_second: 1300000
+        range: 120
+        rotation_frequency: 20
+        upper_fov: 2
+      radar:
+        horizontal_fov: 120
+        range: 150
+        red_channel_mps: [-64, 64]
+        vertical_fov: 30
+world:
+  fixed_delta_seconds: {STEP_S}
+  seed: {seed}
+  sync_mode: true
+"
+    )
+}

@@ -1,0 +1,156 @@
+//! The way of one vehicle: the lane it is on, the one it came from, those ahead.
+
+use std::collections::VecDeque;
+
+use crate::synth::cast::Placement;
+use crate::town::{LaneGraph, LaneId};
+
+/// A place on a chain of lanes.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Path {
+    /// Lanes in driving order, each a successor of the one before it.
+    lanes: VecDeque<LaneId>,
+    /// Which of them the vehicle's middle is on.
+    current: usize,
+    /// How far along it, metres.
+    s_m: f64,
+}
+
+impl Path {
+    /// Starts on one lane.
+    pub(crate) fn new(lane: LaneId, s_m: f64) -> Self {
+        Self { lanes: VecDeque::from([lane]), current: 0, s_m }
+    }
+
+    /// The lane under the vehicle's middle.
+    pub(crate) fn lane(&self) -> LaneId {
+        self.lanes[self.current]
+    }
+
+    /// How far along that lane, metres.
+    pub(crate) fn s_m(&self) -> f64 {
+        self.s_m
+    }
+
+    /// The last lane that is decided.
+    pub(crate) fn last(&self) -> LaneId {
+        self.lanes[self.lanes.len() - 1]
+    }
+
+    /// Appends a successor of the last lane.
+    pub(crate) fn push(&mut self, lane: LaneId) {
+        self.lanes.push_back(lane);
+    }
+
+    /// How far the decided way goes on, metres.
+    pub(crate) fn remaining_m(&self, graph: &LaneGraph) -> f64 {
+        self.ahead(graph).map(|(lane, start_m)| start_m + graph.lane(lane).length_m).last().unwrap_or(0.0)
+    }
+
+    /// The lane under the vehicle and those ahead, each with how far ahead it begins (negative for the first), metres.
+    pub(crate) fn ahead<'a>(&'a self, graph: &'a LaneGraph) -> impl Iterator<Item = (LaneId, f64)> + 'a {
+        let mut start_m = -self.s_m;
+        self.lanes.iter().skip(self.current).map(move |&lane| {
+            let entry = (lane, start_m);
+            start_m += graph.lane(lane).length_m;
+            entry
+        })
+    }
+
+    /// Drives on. Lanes farther back than the previous one are forgotten, unless a long vehicle still stands on them.
+    pub(crate) fn advance(&mut self, graph: &LaneGraph, distance_m: f64, keep_behind_m: f64) {
+        self.s_m += distance_m;
+        while self.s_m > graph.lane(self.lane()).length_m && self.current + 1 < self.lanes.len() {
+            self.s_m -= graph.lane(self.lane()).length_m;
+            self.current += 1;
+        }
+        let behind = |path: &Self| -> f64 {
+            path.lanes.iter().take(path.current).skip(1).map(|&lane| graph.lane(lane).length_m).sum::<f64>() + path.s_m
+        };
+        while self.current > 0 && behind(self) > keep_behind_m {
+            self.lanes.pop_front();
+            self.current -= 1;
+        }
+    }
+
+    /// Lanes which the stretch from `behind_m` behind to the vehicle's middle touches, the current one first.
+    pub(crate) fn lanes_under(&self, graph: &LaneGraph, behind_m: f64) -> impl Iterator<Item = LaneId> + '_ {
+        let mut left_m = behind_m - self.s_m;
+        let mut lanes = vec![self.lane()];
+        for &lane in self.lanes.iter().take(self.current).rev() {
+            if left_m <= 0.0 {
+                break;
+            }
+            lanes.push(lane);
+            left_m -= graph.lane(lane).length_m;
+        }
+        lanes.into_iter()
+    }
+
+    /// The point `offset_m` ahead of (or behind) the vehicle's middle, straight on where the way is not known.
+    pub(crate) fn point_m(&self, graph: &LaneGraph, offset_m: f64) -> [f64; 3] {
+        let (mut index, mut s_m) = (self.current, self.s_m + offset_m);
+        while s_m < 0.0 && index > 0 {
+            index -= 1;
+            s_m += graph.lane(self.lanes[index]).length_m;
+        }
+        while s_m > graph.lane(self.lanes[index]).length_m && index + 1 < self.lanes.len() {
+            s_m -= graph.lane(self.lanes[index]).length_m;
+            index += 1;
+        }
+        let lane = graph.lane(self.lanes[index]);
+        let (point, heading) = lane.at(s_m);
+        let beyond_m = s_m - s_m.clamp(0.0, lane.length_m);
+        let (sin, cos) = heading.sin_cos();
+        [point[0] + beyond_m * cos, point[1] + beyond_m * sin, point[2]]
+    }
+
+    /// Where a vehicle of this wheelbase stands after `drive_m` more metres, both axles on the way, `aside_m` to the
+    /// left of it.
+    pub(crate) fn placement(&self, graph: &LaneGraph, drive_m: f64, wheelbase_m: f64, aside_m: f64) -> Placement {
+        let front = self.point_m(graph, drive_m + 0.5 * wheelbase_m);
+        let rear = self.point_m(graph, drive_m - 0.5 * wheelbase_m);
+        let (dx, dy, dz) = (front[0] - rear[0], front[1] - rear[1], front[2] - rear[2]);
+        let base = dx.hypot(dy).max(1e-6);
+        let middle: [f64; 3] = std::array::from_fn(|axis| 0.5 * (front[axis] + rear[axis]));
+        let position = [middle[0] - aside_m * dy / base, middle[1] + aside_m * dx / base, middle[2]];
+        Placement { pitch_rad: dz.atan2(base), ..Placement::level(position, dy.atan2(dx)) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::town::Lane;
+
+    fn two_lanes() -> LaneGraph {
+        let line = |from: i32, to: i32| (from..=to).map(|x| [f64::from(x), 0.0, 0.1 * f64::from(x)]).collect();
+        let mut first = Lane::new(LaneId(0), line(0, 20), 3.5, 10.0);
+        first.successors = vec![LaneId(1)];
+        LaneGraph::new(vec![first, Lane::new(LaneId(1), line(20, 50), 3.5, 10.0)])
+    }
+
+    #[test]
+    fn a_vehicle_between_two_lanes_stands_on_both() {
+        let graph = two_lanes();
+        let mut path = Path::new(LaneId(0), 18.0);
+        path.push(LaneId(1));
+        path.advance(&graph, 3.0, 6.0);
+        assert_eq!((path.lane(), path.s_m()), (LaneId(1), 1.0));
+        assert_eq!(path.lanes_under(&graph, 3.0).collect::<Vec<_>>(), [LaneId(1), LaneId(0)]);
+        let placement = path.placement(&graph, 0.0, 3.0, 0.5);
+        assert!((placement.position_m - nalgebra::Vector3::new(21.0, 0.5, 2.1)).norm() < 1e-9);
+        assert!((placement.pitch_rad - 0.1f64.atan()).abs() < 1e-9);
+        assert!((path.remaining_m(&graph) - 29.0).abs() < 1e-9);
+    }
+
+    #[test]
+    fn lanes_that_lie_behind_are_forgotten() {
+        let graph = two_lanes();
+        let mut path = Path::new(LaneId(0), 18.0);
+        path.push(LaneId(1));
+        path.advance(&graph, 20.0, 6.0);
+        assert_eq!(path.lanes.len(), 1);
+        assert_eq!(path.point_m(&graph, 20.0)[0], 58.0);
+    }
+}

@@ -1,0 +1,155 @@
+//! How vehicles come into a scene and leave it.
+
+use super::car::Car;
+use super::driver::Driver;
+use super::junction::RightOfWay;
+use super::path::Path;
+use super::rectangle::{NeighbourIndex, Rectangle};
+use super::roads::{Roads, Spawn};
+use super::{Traffic, TrafficOptions};
+use crate::synth::cast::Sweep;
+use crate::synth::random::SplitMix64;
+use crate::synth::vehicle::Vehicle;
+
+/// New vehicles come in at most this far inside the edge, metres.
+const EDGE_M: f64 = 35.0;
+/// Free room before and behind a new vehicle, metres.
+const SPAWN_ROOM_M: f64 = 4.0;
+/// Tries to place one vehicle in one step.
+const TRIES: usize = 4;
+/// The id of the focus; all others follow.
+pub(crate) const FOCUS_ID: i64 = 1000;
+
+impl<'t> Traffic<'t> {
+    /// Traffic around a focus that starts at `start`, parked vehicles given by their footprints.
+    pub(crate) fn new(
+        roads: &'t Roads<'t>,
+        parked: &'t [Rectangle],
+        options: TrafficOptions,
+        start: Spawn,
+        seed: u64,
+    ) -> Self {
+        let mut parked_index = NeighbourIndex::default();
+        for (spot, rectangle) in parked.iter().enumerate() {
+            parked_index.insert(spot as u32, rectangle.center_m);
+        }
+        let lanes = roads.graph.lanes.len();
+        let mut traffic = Self {
+            roads,
+            parked,
+            parked_index,
+            options,
+            cars: Vec::new(),
+            right_of_way: RightOfWay::new(lanes),
+            occupants: vec![Vec::new(); lanes],
+            index: NeighbourIndex::default(),
+            random: SplitMix64::new(seed),
+            next_id: FOCUS_ID,
+            visits: vec![0; lanes],
+        };
+        let focus = Vehicle::random_connected(&mut traffic.random);
+        traffic.add(focus, start);
+        traffic.fill(start.point_m);
+        traffic
+    }
+
+    /// Puts vehicles on all lanes around the focus.
+    fn fill(&mut self, center_m: [f64; 2]) {
+        let radius_m = self.options.radius_m;
+        let mut spawns: Vec<Spawn> = self.spawns_between(center_m, 0.0, radius_m);
+        let lane_km = spawns.len() as f64 * 4.0 / 1000.0;
+        let wanted = (lane_km * self.options.vehicles_per_km).round() as usize;
+        self.random.shuffle(&mut spawns);
+        let mut near = Vec::new();
+        for spawn in spawns {
+            if self.cars.len() > wanted {
+                return;
+            }
+            let vehicle = Vehicle::random_driving(&mut self.random);
+            if self.has_room(&vehicle, spawn, usize::MAX, &mut near) {
+                self.add(vehicle, spawn);
+            }
+        }
+    }
+
+    fn spawns_between(&self, center_m: [f64; 2], low_m: f64, high_m: f64) -> Vec<Spawn> {
+        let is_inside = |spawn: &&Spawn| {
+            let distance = (spawn.point_m[0] - center_m[0]).hypot(spawn.point_m[1] - center_m[1]);
+            (low_m..high_m).contains(&distance)
+        };
+        self.roads.spawns.iter().filter(is_inside).copied().collect()
+    }
+
+    fn has_room(&self, vehicle: &Vehicle, spawn: Spawn, index: usize, near: &mut Vec<u32>) -> bool {
+        let placement = Path::new(spawn.lane, spawn.s_m).placement(self.roads.graph, 0.0, 0.6 * vehicle.size_m[0], 0.0);
+        let mut footprint = Rectangle::new(&placement, &vehicle.size_m).grown(0.4);
+        footprint.half_m[0] += SPAWN_ROOM_M;
+        self.is_free(index, &footprint, near)
+    }
+
+    fn add(&mut self, vehicle: Vehicle, spawn: Spawn) {
+        let driver = Driver::random(&mut self.random);
+        let path = Path::new(spawn.lane, spawn.s_m);
+        let aside_m = self.random.between(-0.2, 0.2);
+        let placement = path.placement(self.roads.graph, 0.0, 0.6 * vehicle.size_m[0], aside_m);
+        let speed_mps = 0.6 * driver.pace * self.roads.speed_mps(spawn.lane, spawn.s_m);
+        self.index.insert(self.cars.len() as u32, placement.position_m.xy().into());
+        self.cars.push(Car {
+            id: self.next_id,
+            vehicle,
+            driver,
+            path,
+            aside_m,
+            speed_mps,
+            motion: Sweep::still(placement),
+            is_present: true,
+            standing_s: 0.0,
+            held: Vec::new(),
+        });
+        self.next_id += 1;
+    }
+
+    /// Takes out who is too far from the focus or at the end of a road, and lets others in at the edge.
+    pub(super) fn exchange_far_cars(&mut self) {
+        let center_m = self.cars[0].point_m();
+        let mut edge: Option<Vec<Spawn>> = None;
+        let mut near = Vec::new();
+        for index in 1..self.cars.len() {
+            let car = &self.cars[index];
+            if car.is_present {
+                let point_m = car.point_m();
+                let distance_m = (point_m[0] - center_m[0]).hypot(point_m[1] - center_m[1]);
+                let is_at_an_end = car.path.remaining_m(self.roads.graph) < car.half_length_m() + 3.0;
+                if distance_m > self.options.radius_m || is_at_an_end {
+                    self.index.remove(index as u32, point_m);
+                    let car = &mut self.cars[index];
+                    car.is_present = false;
+                    self.right_of_way.release_behind(index as u32, car, self.roads);
+                }
+                continue;
+            }
+            let low_m = self.options.radius_m - EDGE_M;
+            let edge = edge.get_or_insert_with(|| self.spawns_between(center_m, low_m, self.options.radius_m));
+            for _ in 0..TRIES.min(edge.len()) {
+                let spawn = edge[self.random.below(edge.len())];
+                if self.has_room(&self.cars[index].vehicle, spawn, index, &mut near) {
+                    self.let_in(index, spawn);
+                    break;
+                }
+            }
+        }
+    }
+
+    fn let_in(&mut self, index: usize, spawn: Spawn) {
+        let speed = self.roads.speed_mps(spawn.lane, spawn.s_m);
+        let car = &mut self.cars[index];
+        car.id = self.next_id;
+        car.path = Path::new(spawn.lane, spawn.s_m);
+        car.motion = Sweep::still(car.placement_after(self.roads, 0.0));
+        car.speed_mps = 0.6 * car.driver.pace * speed;
+        car.is_present = true;
+        car.standing_s = 0.0;
+        self.index.insert(index as u32, car.point_m());
+        self.next_id += 1;
+    }
+}
