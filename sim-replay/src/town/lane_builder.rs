@@ -125,7 +125,8 @@ fn center_line(road: &Road, origin: Origin, from: f64, to: f64) -> Option<(Vec<[
     let mut samples: Vec<([f64; 3], f64)> = (0..=fine)
         .map(|i| {
             let s = from + (to - from) * i as f64 / fine as f64;
-            let [low, high] = road.lane_span_m(origin.section, origin.lane, s);
+            // Lane offsets may jump where the next section begins: stay on this side of it.
+            let [low, high] = road.lane_span_m(origin.section, origin.lane, s.min(to - 1e-6).max(from));
             (road.point_at(s, (low + high) / 2.0), high - low)
         })
         .collect();

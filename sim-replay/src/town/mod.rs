@@ -8,15 +8,20 @@
 
 mod clothoid;
 mod conflicts;
+mod convex;
 pub mod curve;
+mod furniture;
 mod ground;
 mod lane;
 pub mod lane_builder;
 mod lane_queries;
 mod layout;
+mod noise;
 pub mod opendrive;
 pub mod road;
 mod solid;
+mod surface;
+mod terrain;
 
 use std::path::{Path, PathBuf};
 
@@ -27,6 +32,7 @@ use layout::Layout;
 pub use opendrive::OpenDriveError;
 use road::RoadNetwork;
 pub use solid::{Shape, Solid, SolidKind};
+use surface::Surface;
 
 /// Everything that stands still.
 #[derive(Debug, Clone)]
@@ -128,27 +134,12 @@ fn read_map(path: &Path) -> Result<RoadNetwork, TownError> {
     opendrive::read(&text).map_err(|source| TownError::OpenDrive { path: path.into(), source })
 }
 
-fn furnish(name: String, layout: &Layout, _town_seed: u64) -> Town {
+fn furnish(name: String, layout: &Layout, town_seed: u64) -> Town {
     let (lanes, _) = lane_builder::lane_graph(&layout.network);
-    let index = LaneIndex::new(&lanes);
-    let mut town = Town { name, ground: Ground::plane(0.0), solids: Vec::new(), parking: Vec::new(), lanes };
-    for lane in town.lanes.lanes.iter().filter(|lane| !lane.in_junction) {
-        let mut s = 12.0;
-        while s + 12.0 < lane.length_m {
-            let (point, yaw_rad) = lane.at(s);
-            let beside = |t: f64, z: f64| [point[0] + t * yaw_rad.sin(), point[1] - t * yaw_rad.cos(), point[2] + z];
-            let parked = beside(4.2, 0.0);
-            town.parking.push(ParkingSpot { center_m: parked, yaw_rad, length_m: 6.0, width_m: 2.3 });
-            let half_height = 3.0 + (s % 5.0);
-            let center_m = beside(14.0, half_height);
-            if index.nearest(&town.lanes, [center_m[0], center_m[1]], 12.0, None, None).is_none() {
-                let half_m = [6.0 + s % 3.0, 4.0, half_height];
-                town.solids.push(Solid::new(SolidKind::Building, Shape::Box { half_m }, center_m, yaw_rad, 0.4));
-            }
-            s += 19.0;
-        }
-    }
-    town
+    let surface = Surface::new(&layout.network);
+    let ground = terrain::ground(&surface, town_seed);
+    let (solids, parking) = furniture::furnish(layout, &surface, &ground, town_seed);
+    Town { name, lanes, ground, solids, parking }
 }
 
 #[cfg(test)]

@@ -95,7 +95,7 @@ fn errors_name_line_element_attribute_and_values() {
         "line 22: <road> has id=\"a\"; expected used by one element only"
     );
     assert!(error_of("<line/>", "<helix/>").contains("holds <helix>"));
-    assert!(error_of(r#"curvature="0.05""#, r#"curvature="9.5""#).contains("expected a value from -6.3"));
+    assert!(error_of(r#"curvature="0.05""#, r#"curvature="9.5""#).contains("expected a value from -0.63"));
     assert!(error_of("</OpenDRIVE>", "").contains("not well-formed XML"));
     assert!(error_of("<OpenDRIVE>", "<!DOCTYPE a [<!ENTITY b \"c\">]><OpenDRIVE>").contains("not well-formed XML"));
 }

@@ -1,0 +1,128 @@
+//! Convex outlines in the plane, and a grid to find those near a place.
+
+/// Corners of a convex quadrilateral, in order around it, metres.
+pub(crate) type Quad = [[f64; 2]; 4];
+
+/// A rectangle seen from above.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Rectangle {
+    pub center_m: [f64; 2],
+    pub half_m: [f64; 2],
+    pub yaw_rad: f64,
+}
+
+impl Rectangle {
+    /// The same rectangle, larger by `margin_m` on every side.
+    pub(crate) fn grown(&self, margin_m: f64) -> Self {
+        Self { half_m: self.half_m.map(|half| half + margin_m), ..*self }
+    }
+
+    /// The place `u` along and `v` across, from the middle.
+    pub(crate) fn at(&self, u: f64, v: f64) -> [f64; 2] {
+        let (sin, cos) = self.yaw_rad.sin_cos();
+        [self.center_m[0] + u * cos - v * sin, self.center_m[1] + u * sin + v * cos]
+    }
+
+    pub(crate) fn corners(&self) -> Quad {
+        let [x, y] = self.half_m;
+        [self.at(-x, -y), self.at(x, -y), self.at(x, y), self.at(-x, y)]
+    }
+}
+
+/// Lowest and highest x and y of some points.
+pub(crate) fn bounds(points: &[[f64; 2]]) -> [[f64; 2]; 2] {
+    let low = points.iter().fold([f64::INFINITY; 2], |low, p| [low[0].min(p[0]), low[1].min(p[1])]);
+    let high = points.iter().fold([f64::NEG_INFINITY; 2], |high, p| [high[0].max(p[0]), high[1].max(p[1])]);
+    [low, high]
+}
+
+/// Whether two convex outlines have more than their edges in common (separating axes).
+pub(crate) fn overlap(a: &[[f64; 2]], b: &[[f64; 2]]) -> bool {
+    !separated_by_edge_of(a, b) && !separated_by_edge_of(b, a)
+}
+
+fn separated_by_edge_of(a: &[[f64; 2]], b: &[[f64; 2]]) -> bool {
+    (0..a.len()).any(|i| {
+        let (from, to) = (a[i], a[(i + 1) % a.len()]);
+        let normal = [to[1] - from[1], from[0] - to[0]];
+        if normal == [0.0, 0.0] {
+            return false;
+        }
+        let [low_a, high_a] = span(a, normal);
+        let [low_b, high_b] = span(b, normal);
+        high_a <= low_b || high_b <= low_a
+    })
+}
+
+fn span(points: &[[f64; 2]], axis: [f64; 2]) -> [f64; 2] {
+    let along = points.iter().map(|p| p[0] * axis[0] + p[1] * axis[1]);
+    along.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], value| [low.min(value), high.max(value)])
+}
+
+/// Numbered outlines by the cells of a square grid that their bounds touch.
+#[derive(Debug, Clone)]
+pub(crate) struct CellIndex {
+    origin_m: [f64; 2],
+    cell_m: f64,
+    columns: usize,
+    rows: usize,
+    cells: Vec<Vec<u32>>,
+}
+
+impl CellIndex {
+    /// An empty index over a rectangle; what lies outside goes into the cells at its edge.
+    pub(crate) fn new([low, high]: [[f64; 2]; 2], cell_m: f64) -> Self {
+        // Huge maps get larger cells rather than more of them.
+        let cell_m = cell_m.max((high[0] - low[0]).max(high[1] - low[1]) / 2000.0);
+        let count = |axis: usize| ((high[axis] - low[axis]).max(0.0) / cell_m) as usize + 1;
+        let (columns, rows) = (count(0), count(1));
+        Self { origin_m: low, cell_m, columns, rows, cells: vec![Vec::new(); columns * rows] }
+    }
+
+    pub(crate) fn insert(&mut self, number: u32, [low, high]: [[f64; 2]; 2]) {
+        let ([c0, r0], [c1, r1]) = (self.cell(low), self.cell(high));
+        for row in r0..=r1 {
+            for column in c0..=c1 {
+                self.cells[row * self.columns + column].push(number);
+            }
+        }
+    }
+
+    /// Whether any outline whose cells touch the bounds answers `test` with yes. One may be asked several times.
+    pub(crate) fn any(&self, [low, high]: [[f64; 2]; 2], mut test: impl FnMut(u32) -> bool) -> bool {
+        let ([c0, r0], [c1, r1]) = (self.cell(low), self.cell(high));
+        (r0..=r1).any(|row| (c0..=c1).any(|column| self.cells[row * self.columns + column].iter().any(|&n| test(n))))
+    }
+
+    fn cell(&self, [x, y]: [f64; 2]) -> [usize; 2] {
+        let place =
+            |value: f64, origin: f64, count: usize| (((value - origin) / self.cell_m).max(0.0) as usize).min(count - 1);
+        [place(x, self.origin_m[0], self.columns), place(y, self.origin_m[1], self.rows)]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn turned_squares_overlap_only_when_they_do() {
+        let square = |x: f64, yaw_rad| Rectangle { center_m: [x, 0.0], half_m: [1.0, 1.0], yaw_rad }.corners();
+        let diamond = std::f64::consts::FRAC_PI_4;
+        assert!(overlap(&square(0.0, 0.0), &square(1.9, 0.0)));
+        assert!(!overlap(&square(0.0, 0.0), &square(2.1, 0.0)));
+        // A diamond's corner reaches 1.414 towards the square.
+        assert!(overlap(&square(0.0, 0.0), &square(2.3, diamond)));
+        assert!(!overlap(&square(0.0, 0.0), &square(2.5, diamond)));
+    }
+
+    #[test]
+    fn index_finds_what_is_near_and_what_lies_outside() {
+        let mut index = CellIndex::new([[0.0, 0.0], [100.0, 50.0]], 10.0);
+        index.insert(1, [[12.0, 12.0], [28.0, 14.0]]);
+        index.insert(2, [[-50.0, -50.0], [-40.0, -40.0]]);
+        assert!(index.any([[21.0, 11.0], [22.0, 12.0]], |n| n == 1));
+        assert!(!index.any([[51.0, 11.0], [52.0, 12.0]], |_| true));
+        assert!(index.any([[-45.0, -45.0], [-44.0, -44.0]], |n| n == 2));
+    }
+}

@@ -1,0 +1,169 @@
+//! Crash barriers along motorways and country roads, and between carriageways.
+
+use rand::Rng;
+use rand_chacha::ChaCha8Rng;
+
+use super::super::lane::wrap_angle;
+use super::super::surface::CrossSection;
+use super::super::{Solid, SolidKind};
+use super::frontage::{Side, Zone, sides};
+use super::parts::{Foot, wall};
+use super::site::Site;
+
+/// Longest straight piece, metres.
+const PIECE_M: f64 = 12.0;
+/// A piece ends where the road has turned by this much, radians.
+const PIECE_TURN_RAD: f64 = 0.025;
+/// Distance between the posts of a steel rail, metres.
+const POST_M: f64 = 4.0;
+
+/// Kinds of barriers.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Barrier {
+    /// A rail on posts.
+    Steel,
+    /// A low wall.
+    Concrete,
+}
+
+/// Places barriers along all fast roads.
+pub(super) fn place(site: &mut Site, rng: &mut ChaCha8Rng) {
+    for side in sides(site.network) {
+        let (share, barrier) = match side.zone {
+            Zone::Street => continue,
+            Zone::Motorway if side.median => {
+                (1.0, if rng.random_bool(0.5) { Barrier::Concrete } else { Barrier::Steel })
+            }
+            Zone::Motorway => (0.9, Barrier::Steel),
+            Zone::Rural => (0.55, Barrier::Steel),
+        };
+        along_side(site, &side, share, barrier, rng);
+    }
+    for road in 0..site.network.roads.len() {
+        between_directions(site, road);
+    }
+}
+
+fn along_side(site: &mut Site, side: &Side, share: f64, barrier: Barrier, rng: &mut ChaCha8Rng) {
+    let mut s = 0.0;
+    while s < side.length_m - 1.0 {
+        let stretch = rng.random_range(40.0..160.0f64);
+        let end = (s + stretch).min(side.length_m);
+        if rng.random_bool(share) {
+            let line = |s: f64| {
+                let pose = side.beyond_kerb(site.surface, site.network, s, 0.45);
+                [pose.x, pose.y, side.road_m(site.network, s)]
+            };
+            let pieces = pieces(s, end, |s| site.network.roads[side.road].pose_at(s).heading_rad);
+            let parts: Vec<Vec<Solid>> =
+                pieces.iter().map(|&[from, to]| piece(line(from), line(to), barrier)).collect();
+            for parts in parts {
+                site.try_place(&parts, 0.0, false);
+            }
+        }
+        s = end;
+    }
+}
+
+/// The strip between left and right driving lanes of a road with both directions.
+fn between_directions(site: &mut Site, road: usize) {
+    let network = site.network;
+    let middle = |cut: &CrossSection| {
+        let section = &network.roads[road].sections[cut.section];
+        let edge = |ids: Vec<i32>| {
+            ids.into_iter()
+                .find(|&id| section.lane(id).is_some_and(|lane| lane.kind == super::super::road::LaneKind::Driving))
+        };
+        let left = edge((1..=section.left.len() as i32).collect())?;
+        let right = edge((1..=section.right.len() as i32).map(|id| -id).collect())?;
+        let s = cut.s_m.min(network.roads[road].section_end_m(cut.section) - 1e-6).max(section.s_m);
+        let low = network.roads[road].lane_span_m(cut.section, right, s)[1];
+        let high = network.roads[road].lane_span_m(cut.section, left, s)[0];
+        (high - low > 1.0).then(|| {
+            let [x, y] = cut.at((low + high) / 2.0);
+            [x, y, cut.z_m]
+        })
+    };
+    let cuts = &site.surface.roads[road];
+    let mut parts = Vec::new();
+    for pair in cuts.chunks(4) {
+        // One piece from each fourth cut to the next.
+        let Some(last) = pair.last() else { continue };
+        let next = cuts.iter().find(|cut| cut.s_m > last.s_m).unwrap_or(last);
+        if let (Some(from), Some(to)) = (middle(&pair[0]), middle(next))
+            && (to[0] - from[0]).hypot(to[1] - from[1]) > 0.5
+        {
+            parts.extend(piece(from, to, Barrier::Concrete));
+        }
+    }
+    // Inside a junction only where no lane leads across.
+    let clear = |part: &Solid| {
+        let [a, b] = [part.bottom_m(), part.top_m()];
+        let outline = super::site::outline(part);
+        network.roads[road].junction.is_none()
+            && !site.surface.any(&outline, |patch| {
+                patch.road as usize != road
+                    && patch.carriageway
+                    && a < patch.z_m[0].max(patch.z_m[1]) + 4.5
+                    && b > patch.z_m[0] - 0.05
+            })
+    };
+    let parts: Vec<Solid> = parts.into_iter().filter(clear).collect();
+    site.place(&parts);
+}
+
+/// Splits a stretch into nearly straight pieces.
+fn pieces(from: f64, to: f64, heading_rad: impl Fn(f64) -> f64) -> Vec<[f64; 2]> {
+    let mut pieces = Vec::new();
+    let mut start = from;
+    while start < to - 0.2 {
+        let mut end = (start + 2.0).min(to);
+        while end < to
+            && end - start < PIECE_M
+            && wrap_angle(heading_rad(end) - heading_rad(start)).abs() < PIECE_TURN_RAD
+        {
+            end = (end + 1.0).min(to);
+        }
+        pieces.push([start, end]);
+        start = end;
+    }
+    pieces
+}
+
+fn piece(from: [f64; 3], to: [f64; 3], barrier: Barrier) -> Vec<Solid> {
+    let (a, b) = ([from[0], from[1]], [to[0], to[1]]);
+    let z = from[2].min(to[2]);
+    let rise = (to[2] - from[2]).abs();
+    match barrier {
+        Barrier::Concrete => vec![wall(SolidKind::Barrier, a, b, [z - 0.2, z + rise + 0.85], 0.4, 0.5)],
+        Barrier::Steel => {
+            let mut parts = vec![wall(SolidKind::Barrier, a, b, [z + 0.42, z + rise + 0.76], 0.1, 0.6)];
+            let length = (b[0] - a[0]).hypot(b[1] - a[1]);
+            let posts = (length / POST_M).floor() as u32;
+            for post in 0..=posts {
+                let share = f64::from(post) * POST_M / length.max(0.1);
+                let at = |i: usize| from[i] + share * (to[i] - from[i]);
+                let pose = super::super::curve::Pose2::new(at(0), at(1), (b[1] - a[1]).atan2(b[0] - a[0]));
+                let foot = Foot::new(pose, at(2));
+                parts.push(foot.cuboid(SolidKind::Barrier, [0.0, 0.0, -0.3], [0.1, 0.14, 1.02], 0.5));
+            }
+            parts
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn pieces_follow_each_other_and_are_short_in_bends() {
+        let straight = pieces(0.0, 50.0, |_| 1.0);
+        let bend = pieces(0.0, 50.0, |s| s / 40.0);
+        assert!(straight.len() < bend.len());
+        for pieces in [straight, bend] {
+            assert!(pieces.windows(2).all(|pair| pair[0][1] == pair[1][0]));
+            assert_eq!((pieces[0][0], pieces[pieces.len() - 1][1]), (0.0, 50.0));
+        }
+    }
+}

@@ -1,0 +1,177 @@
+//! Under and beside roads that do not lie on the ground: slabs, parapets, pillars, retaining walls, tunnels.
+
+use super::super::convex::Rectangle;
+use super::super::curve::Pose2;
+use super::super::surface::CrossSection;
+use super::super::{Solid, SolidKind};
+use super::frontage::cut_at;
+use super::parts::{Foot, wall};
+use super::site::{HEADROOM_M, Site};
+
+/// A road this far above the terrain stands on a bridge, metres.
+const BRIDGE_M: f64 = 1.2;
+/// Slab thickness, metres.
+const SLAB_M: [f64; 2] = [0.25, 0.8];
+/// Distance between rows of pillars, metres.
+const PILLARS_M: f64 = 14.0;
+/// How far from the edge of a road the height of its surroundings is taken, metres; the terrain follows the road to
+/// about two cells beyond its edge.
+const BESIDE_M: f64 = 4.5;
+/// Surroundings higher than this are held by a wall, metres.
+const RETAINED_M: f64 = 0.9;
+/// Clear height inside a tunnel, metres.
+const TUNNEL_M: f64 = 5.2;
+
+/// Places the structures of all roads.
+pub(super) fn place(site: &mut Site) {
+    let flat = site.ground.plane_z_m().is_some();
+    for road in 0..site.surface.roads.len() {
+        for structure in site.network.roads[road].structures.iter().filter(|structure| structure.tunnel) {
+            tunnel(site, road, structure.s_m, structure.s_m + structure.length_m);
+        }
+        if !flat {
+            bridge(site, road);
+            retaining_walls(site, road);
+        }
+    }
+}
+
+/// Height of the road over the lowest terrain under a cut, metres.
+fn drop_m(site: &Site, cut: &CrossSection) -> f64 {
+    let [low, high] = cut.paved_m;
+    let probes = [low, low + 0.25 * (high - low), (low + high) / 2.0, high - 0.25 * (high - low), high];
+    probes.iter().map(|&t| cut.z_m - site.ground_m(cut.at(t))).fold(0.0, f64::max)
+}
+
+fn bridge(site: &mut Site, road: usize) {
+    let cuts = site.surface.roads[road].clone();
+    let drops: Vec<f64> = cuts.iter().map(|cut| drop_m(site, cut)).collect();
+    let mut since_pillars = PILLARS_M / 2.0;
+    for i in 1..cuts.len() {
+        let (from, to) = (&cuts[i - 1], &cuts[i]);
+        let length = to.s_m - from.s_m;
+        if drops[i - 1].min(drops[i]) < BRIDGE_M || length < 0.1 {
+            since_pillars = PILLARS_M / 2.0;
+            continue;
+        }
+        let drop = drops[i - 1].min(drops[i]);
+        let thickness = (drop - HEADROOM_M - 0.05).clamp(SLAB_M[0], SLAB_M[1]).min(drop * 0.4);
+        let slab = slab(from, to, thickness);
+        site.place(&[slab]);
+        parapet(site, road, from, to);
+        since_pillars += length;
+        if since_pillars >= PILLARS_M && drop > 3.0 {
+            since_pillars = 0.0;
+            pillars(site, to, thickness);
+        }
+    }
+}
+
+fn slab(from: &CrossSection, to: &CrossSection, thickness_m: f64) -> Solid {
+    let middle = |cut: &CrossSection| cut.at((cut.paved_m[0] + cut.paved_m[1]) / 2.0);
+    let (a, b) = (middle(from), middle(to));
+    let width = (from.paved_m[1] - from.paved_m[0]).max(to.paved_m[1] - to.paved_m[0]);
+    let top = from.z_m.min(to.z_m) - 0.06;
+    wall(SolidKind::BridgeDeck, a, b, [top - thickness_m, top], width + 0.3, 0.35)
+}
+
+/// Low walls at both edges, where no other lane of the same height joins.
+fn parapet(site: &mut Site, road: usize, from: &CrossSection, to: &CrossSection) {
+    for side in [0, 1] {
+        let out = if side == 0 { -0.2 } else { 0.2 };
+        let [a, b] = [from, to].map(|cut| cut.at(cut.paved_m[side] + out));
+        let z = [from.z_m.min(to.z_m) - 0.3, from.z_m.max(to.z_m) + 1.0];
+        let part = wall(SolidKind::Barrier, a, b, z, 0.25, 0.45);
+        let outline = super::site::outline(&part);
+        let joined = site.surface.any(&outline, |patch| {
+            let own = patch.road as usize == road && !patch.carriageway;
+            !own && z[0] < patch.z_m[0].max(patch.z_m[1]) + HEADROOM_M && z[1] > patch.z_m[0].min(patch.z_m[1]) - 0.05
+        });
+        if !joined {
+            site.place(&[part]);
+        }
+    }
+}
+
+fn pillars(site: &mut Site, cut: &CrossSection, thickness_m: f64) {
+    let [low, high] = cut.paved_m;
+    let count = if high - low > 9.0 { 3 } else { 2 };
+    for place in 0..count {
+        let t = low + (high - low) * (f64::from(place) + 0.5) / f64::from(count);
+        let at = cut.at(t);
+        let ground = site.ground_m(at);
+        let height = cut.z_m - thickness_m - 0.1 - ground;
+        if height < 2.0 {
+            continue;
+        }
+        let foot = Foot::new(Pose2::new(at[0], at[1], cut.pose.heading_rad), ground);
+        let pillar = foot.cylinder(SolidKind::Pillar, [0.0, 0.0, -0.5], [0.55, height + 0.5], 0.4);
+        let around = super::site::outline(&pillar).grown(0.5);
+        // Clear of the lanes below; its own slab above does not count.
+        if site.surface.is_clear(&around, [pillar.bottom_m(), pillar.top_m() - 0.2], HEADROOM_M, true) {
+            site.place(&[pillar]);
+        }
+    }
+}
+
+/// Walls along roads that lie lower than their surroundings.
+fn retaining_walls(site: &mut Site, road: usize) {
+    let cuts = site.surface.roads[road].clone();
+    for pair in cuts.windows(2) {
+        let (from, to) = (&pair[0], &pair[1]);
+        if to.s_m - from.s_m < 0.1 {
+            continue;
+        }
+        for side in [0, 1] {
+            let sign = if side == 0 { -1.0 } else { 1.0 };
+            let beside = [from, to].map(|cut| site.ground_m(cut.at(cut.paved_m[side] + sign * BESIDE_M)));
+            let high = beside[0].max(beside[1]);
+            let road_z = from.z_m.min(to.z_m);
+            if beside[0].min(beside[1]) - road_z < RETAINED_M {
+                continue;
+            }
+            let [a, b] = [from, to].map(|cut| cut.at(cut.paved_m[side] + sign * 0.5));
+            let middle = [(a[0] + b[0]) / 2.0, (a[1] + b[1]) / 2.0];
+            let around = Rectangle { center_m: middle, half_m: [1.0, 1.0], yaw_rad: from.pose.heading_rad };
+            let mut above = f64::INFINITY;
+            site.surface.any(&around, |patch| {
+                let z = patch.z_m[0].min(patch.z_m[1]);
+                if z > road_z + 3.0 {
+                    above = above.min(z);
+                }
+                false
+            });
+            let covered = above.is_finite();
+            let top = (high + 0.4).min(above - 0.9);
+            let kind = if covered { SolidKind::TunnelWall } else { SolidKind::Wall };
+            site.try_place(&[wall(kind, a, b, [road_z - 0.4, top], 0.3, 0.4)], 0.0, false);
+        }
+    }
+}
+
+/// Walls and roof over a stretch of road.
+fn tunnel(site: &mut Site, road: usize, from_m: f64, to_m: f64) {
+    const PIECE_M: f64 = 4.0;
+    let end = to_m.min(site.network.roads[road].length_m);
+    let mut s = from_m;
+    while s + 1.0 < end {
+        let next = (s + PIECE_M).min(end);
+        let (a, b) = (*cut_at(site.surface, road, s), *cut_at(site.surface, road, next));
+        let z = [a.z_m.min(b.z_m), a.z_m.max(b.z_m)];
+        for side in [0, 1] {
+            let out = if side == 0 { -0.45 } else { 0.45 };
+            let [p, q] = [a, b].map(|cut| cut.at(cut.paved_m[side] + out));
+            let part = wall(SolidKind::TunnelWall, p, q, [z[0] - 0.3, z[1] + TUNNEL_M], 0.4, 0.4);
+            if site.surface.is_clear(&super::site::outline(&part), [z[0], z[1] + 1.0], HEADROOM_M, true) {
+                site.place(&[part]);
+            }
+        }
+        let [p, q] = [a, b].map(|cut| cut.at((cut.paved_m[0] + cut.paved_m[1]) / 2.0));
+        let width = (a.paved_m[1] - a.paved_m[0]).max(b.paved_m[1] - b.paved_m[0]) + 1.3;
+        let roof = wall(SolidKind::BridgeDeck, p, q, [z[1] + TUNNEL_M, z[1] + TUNNEL_M + 0.8], width, 0.35);
+        if site.surface.is_clear(&super::site::outline(&roof), [roof.bottom_m(), roof.top_m()], HEADROOM_M, true) {
+            site.place(&[roof]);
+        }
+        s = next;
+    }
+}

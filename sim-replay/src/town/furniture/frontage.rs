@@ -1,0 +1,126 @@
+//! The two sides of every road, as places to put things along.
+
+use super::super::curve::Pose2;
+use super::super::road::{LaneKind, Road, RoadNetwork};
+use super::super::surface::Surface;
+
+/// Roads on which one may go this fast have no houses along them, metres per second.
+const FAST_MPS: f64 = 17.0;
+/// From this width on, a fast road is a motorway, metres.
+const MOTORWAY_WIDTH_M: f64 = 6.5;
+
+/// What a side of a road is like.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Zone {
+    /// Houses, pavements, lamps.
+    Street,
+    /// Ramps and country roads.
+    Rural,
+    /// Several fast lanes.
+    Motorway,
+}
+
+/// One side of a road outside junctions.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Side {
+    pub road: usize,
+    /// 1 for the left side, -1 for the right.
+    pub sign: f64,
+    pub zone: Zone,
+    pub length_m: f64,
+    /// Whether traffic on this side leads along the road's own direction.
+    pub along: bool,
+    /// Whether nothing but the other direction's traffic is expected here: the left of a one-way motorway.
+    pub median: bool,
+}
+
+/// Both sides of every road outside junctions.
+pub(super) fn sides(network: &RoadNetwork) -> Vec<Side> {
+    let mut sides = Vec::new();
+    for (index, road) in network.roads.iter().enumerate().filter(|(_, road)| road.junction.is_none()) {
+        let [left, right] = [drives(road, true), drives(road, false)];
+        for sign in [-1.0, 1.0] {
+            let zone = zone(road);
+            let along = if sign < 0.0 { right } else { !left };
+            let one_way_left = (sign > 0.0 && !left) || (sign < 0.0 && !right);
+            let median = one_way_left && zone == Zone::Motorway;
+            sides.push(Side { road: index, sign, zone, length_m: road.length_m, along, median });
+        }
+    }
+    sides
+}
+
+impl Side {
+    /// The place `out_m` beyond what is paved, `s_m` along the road (also a little before its start or behind its end),
+    /// looking along the road.
+    pub(super) fn beyond_paved(&self, surface: &Surface, network: &RoadNetwork, s_m: f64, out_m: f64) -> Pose2 {
+        self.beyond(surface, network, s_m, out_m, |cut| cut.paved_m)
+    }
+
+    /// The same, from the edge of the carriageway.
+    pub(super) fn beyond_kerb(&self, surface: &Surface, network: &RoadNetwork, s_m: f64, out_m: f64) -> Pose2 {
+        self.beyond(surface, network, s_m, out_m, |cut| cut.carriageway_m)
+    }
+
+    /// Height of the road, metres.
+    pub(super) fn road_m(&self, network: &RoadNetwork, s_m: f64) -> f64 {
+        network.roads[self.road].elevation.at(s_m.clamp(0.0, self.length_m))
+    }
+
+    /// Width of pavement and verge on this side, metres.
+    pub(super) fn pavement_m(&self, surface: &Surface, s_m: f64) -> f64 {
+        let cut = cut_at(surface, self.road, s_m);
+        if self.sign > 0.0 { cut.paved_m[1] - cut.carriageway_m[1] } else { cut.carriageway_m[0] - cut.paved_m[0] }
+    }
+
+    /// Angle by which something that faces the road from this side is turned against the road's direction, radians.
+    pub(super) fn facing_rad(&self) -> f64 {
+        -self.sign * std::f64::consts::FRAC_PI_2
+    }
+
+    fn beyond(
+        &self,
+        surface: &Surface,
+        network: &RoadNetwork,
+        s_m: f64,
+        out_m: f64,
+        range: impl Fn(&super::super::surface::CrossSection) -> [f64; 2],
+    ) -> Pose2 {
+        let inside = s_m.clamp(0.0, self.length_m);
+        let [low, high] = range(cut_at(surface, self.road, inside));
+        let t = if self.sign > 0.0 { high + out_m } else { low - out_m };
+        network.roads[self.road].pose_at(inside).moved(s_m - inside, t, 0.0)
+    }
+}
+
+/// The cross-section nearest to `s_m`, at or before it.
+pub(super) fn cut_at(surface: &Surface, road: usize, s_m: f64) -> &super::super::surface::CrossSection {
+    let cuts = &surface.roads[road];
+    let after = cuts.partition_point(|cut| cut.s_m <= s_m);
+    &cuts[after.saturating_sub(1)]
+}
+
+fn drives(road: &Road, left: bool) -> bool {
+    road.sections.iter().any(|section| {
+        let side = if left { &section.left } else { &section.right };
+        side.iter().any(|lane| lane.kind == LaneKind::Driving)
+    })
+}
+
+fn zone(road: &Road) -> Zone {
+    let middle = road.length_m / 2.0;
+    let section = &road.sections[road.section_at(middle)];
+    let lanes = || section.left.iter().chain(&section.right);
+    let driving = |side: &[super::super::road::RoadLane]| -> f64 {
+        side.iter().filter(|lane| lane.kind == LaneKind::Driving).map(|lane| lane.width.at(middle - section.s_m)).sum()
+    };
+    if lanes().any(|lane| lane.kind == LaneKind::Sidewalk) {
+        Zone::Street
+    } else if driving(&section.left).max(driving(&section.right)) > MOTORWAY_WIDTH_M {
+        Zone::Motorway
+    } else if road.speed_limit_mps(middle).is_some_and(|limit| limit > FAST_MPS) {
+        Zone::Rural
+    } else {
+        Zone::Street
+    }
+}

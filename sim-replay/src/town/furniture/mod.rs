@@ -1,0 +1,54 @@
+//! What stands beside the roads: placed by frontage, for any road network.
+//!
+//! Every group of things has its own random stream, so that a change to one leaves the others as they were.
+
+mod barriers;
+mod bridges;
+mod buildings;
+mod frontage;
+mod infill;
+mod lots;
+mod motorway;
+mod parking;
+mod parts;
+mod plots;
+mod poles;
+mod site;
+mod trees;
+
+use rand_chacha::ChaCha8Rng;
+use rand_chacha::rand_core::SeedableRng;
+
+use super::ground::Ground;
+use super::layout::Layout;
+use super::surface::Surface;
+use super::{ParkingSpot, Solid};
+use site::Site;
+
+/// Solids and parking spots of the town of a seed.
+pub(super) fn furnish(
+    layout: &Layout,
+    surface: &Surface,
+    ground: &Ground,
+    seed: u64,
+) -> (Vec<Solid>, Vec<ParkingSpot>) {
+    let mut site = Site::new(&layout.network, surface, ground);
+    let stream = |number| {
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        rng.set_stream(number);
+        rng
+    };
+    bridges::place(&mut site);
+    barriers::place(&mut site, &mut stream(1));
+    parking::place_along_kerbs(&mut site, &mut stream(2));
+    poles::place(&mut site, &mut stream(3));
+    motorway::place(&mut site, &mut stream(4));
+    trees::place_along_streets(&mut site, &mut stream(5));
+    plots::place(&mut site, &mut stream(6));
+    infill::place_islands(&mut site, &layout.islands, &mut stream(7));
+    infill::place(&mut site, &mut stream(8));
+    (site.solids, site.parking)
+}
+
+#[cfg(test)]
+mod tests;

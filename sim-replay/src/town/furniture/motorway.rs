@@ -1,0 +1,213 @@
+//! What makes one stretch of motorway differ from the next: noise walls, gantries, overpasses, trees, halls, masts.
+
+use rand::Rng;
+use rand_chacha::ChaCha8Rng;
+
+use super::super::convex::Rectangle;
+use super::super::{Solid, SolidKind};
+use super::buildings::{Lot, Style, build};
+use super::frontage::{Side, Zone, cut_at, sides};
+use super::lots;
+use super::parts::{Foot, wall};
+use super::site::{HEADROOM_M, Site};
+use super::trees::{Species, plant};
+
+/// Places what stands along motorways.
+pub(super) fn place(site: &mut Site, rng: &mut ChaCha8Rng) {
+    for side in sides(site.network) {
+        if side.zone != Zone::Motorway || side.median {
+            continue;
+        }
+        across(site, &side, rng);
+        noise_walls(site, &side, rng);
+        markers(site, &side, rng);
+        behind(site, &side, rng);
+    }
+}
+
+/// Gantries and footbridges over the carriageway.
+fn across(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
+    let mut s = rng.random_range(15.0..180.0);
+    while s < side.length_m - 10.0 {
+        if rng.random_bool(0.65) {
+            gantry(site, side, s, rng);
+        } else {
+            footbridge(site, side, s, rng);
+        }
+        s += rng.random_range(110.0..320.0);
+    }
+}
+
+fn gantry(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) {
+    let cut = *cut_at(site.surface, side.road, s);
+    let [low, high] = [cut.carriageway_m[0] - 0.9, cut.carriageway_m[1] + 0.9];
+    let clear = rng.random_range(5.4..6.4);
+    let z = cut.z_m;
+    let mut parts = Vec::new();
+    for t in [low, high] {
+        let pose = cut.pose.moved(0.0, t, 0.0);
+        let ground = site.ground_m([pose.x, pose.y]);
+        parts.push(Foot::new(pose, ground).cylinder(
+            SolidKind::Pole,
+            [0.0, 0.0, -0.3],
+            [0.2, z + clear + 0.9 - ground],
+            0.5,
+        ));
+    }
+    parts.push(wall(SolidKind::Pole, cut.at(low), cut.at(high), [z + clear, z + clear + 0.6], 0.5, 0.5));
+    let boards = rng.random_range(1..=3);
+    for board in 0..boards {
+        let t = low + (high - low) * (f64::from(board) + 0.5) / f64::from(boards) + rng.random_range(-0.5..0.5);
+        let foot = Foot::new(cut.pose.moved(0.0, t, 0.0), z);
+        let size = [0.15, rng.random_range(2.0..4.0), rng.random_range(1.2..2.6)];
+        parts.push(foot.cuboid(SolidKind::Sign, [-0.35, 0.0, clear - 0.2], size, 0.95));
+    }
+    site.try_place(&parts, 0.0, true);
+}
+
+/// A bridge for walkers from this side to the other side of the carriageway: deck, rails, stairs towers.
+fn footbridge(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) {
+    let cut = *cut_at(site.surface, side.road, s);
+    let [low, high] = [cut.carriageway_m[0] - 1.6, cut.carriageway_m[1] + 1.6];
+    let (z, width) = (cut.z_m + rng.random_range(5.3..6.2), rng.random_range(2.4..4.5));
+    let (a, b) = (cut.at(low), cut.at(high));
+    let mut parts = vec![wall(SolidKind::BridgeDeck, a, b, [z, z + 0.5], width, 0.4)];
+    for edge in [-0.5, 0.5] {
+        let [p, q] = [low, high].map(|t| {
+            let pose = cut.pose.moved(edge * (width - 0.1), t, 0.0);
+            [pose.x, pose.y]
+        });
+        parts.push(wall(SolidKind::Fence, p, q, [z + 0.5, z + 1.6], 0.08, 0.4));
+    }
+    for t in [low + 0.5, high - 0.5] {
+        let pose = cut.pose.moved(0.0, t, 0.0);
+        let ground = site.ground_m([pose.x, pose.y]);
+        if z - ground < 1.0 {
+            return;
+        }
+        let foot = Foot::new(pose, ground);
+        parts.push(foot.cuboid(SolidKind::Pillar, [0.0, 0.0, -0.5], [width * 0.6, 0.7, z - ground + 0.5], 0.4));
+    }
+    site.try_place(&parts, 0.0, true);
+}
+
+fn noise_walls(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
+    let mut s = rng.random_range(0.0..80.0);
+    while s < side.length_m {
+        let (length, out) = (rng.random_range(50.0..170.0f64), rng.random_range(2.5..7.0));
+        let (height, step) = (rng.random_range(2.2..5.0), rng.random_range(3.5..6.0));
+        let end = (s + length).min(side.length_m);
+        while s + step < end {
+            let [a, b] = [s, s + step].map(|s| side.beyond_paved(site.surface, site.network, s, out));
+            let ground = [a, b].map(|pose| site.ground_m([pose.x, pose.y]));
+            let (low, high) = (ground[0].min(ground[1]), ground[0].max(ground[1]));
+            // Panels of slightly different height between posts; some are missing or glazed (lower).
+            let own = height * if rng.random_bool(0.08) { 0.45 } else { rng.random_range(0.94..1.06) };
+            let near_road = (low - side.road_m(site.network, s)).abs() < 3.0;
+            if near_road {
+                let panel = wall(SolidKind::NoiseWall, [a.x, a.y], [b.x, b.y], [low - 0.3, high + own], 0.2, 0.35);
+                let post =
+                    Foot::new(a, ground[0]).cuboid(SolidKind::NoiseWall, [0.0, 0.0, -0.3], [0.3, 0.4, own + 0.6], 0.4);
+                site.try_place(&[panel, post], 0.0, true);
+            }
+            s += step;
+        }
+        s = end + rng.random_range(40.0..200.0);
+    }
+}
+
+/// Posts, boards, emergency telephones and cabinets at the edge.
+fn markers(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
+    let mut s = rng.random_range(3.0..40.0);
+    while s < side.length_m - 2.0 {
+        let pose = side.beyond_kerb(site.surface, site.network, s, rng.random_range(1.1..1.9));
+        let pose = if side.along { pose } else { pose.reversed() };
+        let foot = Foot::new(pose, site.ground_m([pose.x, pose.y]));
+        let parts: Vec<Solid> = match rng.random_range(0..6) {
+            0 => {
+                let size = [0.1, rng.random_range(1.5..3.2), rng.random_range(1.0..2.4)];
+                let posts = [-0.4, 0.4]
+                    .map(|v| foot.cylinder(SolidKind::Pole, [0.1, v * size[1], -0.2], [0.07, 2.0 + size[2]], 0.5));
+                let board = foot.cuboid(SolidKind::Sign, [0.0, 0.0, 1.8], size, 0.95);
+                vec![posts[0], posts[1], board]
+            }
+            1 => vec![foot.cuboid(
+                SolidKind::StreetFurniture,
+                [0.0, 0.0, -0.1],
+                [0.5, 1.2, rng.random_range(1.2..2.0)],
+                0.5,
+            )],
+            2 => vec![
+                foot.cylinder(SolidKind::Pole, [0.0, 0.0, -0.2], [0.05, 1.4], 0.5),
+                foot.cuboid(SolidKind::Sign, [0.0, 0.0, 1.2], [0.25, 0.35, 0.5], 0.9),
+            ],
+            _ => vec![foot.cuboid(SolidKind::Pole, [0.0, 0.0, -0.1], [0.12, 0.12, 1.1], 0.8)],
+        };
+        site.try_place(&parts, 0.05, false);
+        s += rng.random_range(14.0..55.0);
+    }
+}
+
+/// Trees in groups and rows, halls, masts and tanks behind the barrier.
+fn behind(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
+    let mut s = rng.random_range(0.0..15.0);
+    while s < side.length_m {
+        match rng.random_range(0..16) {
+            0..=1 => large(site, side, s, rng),
+            2 => mast(site, side, s, rng),
+            3..=4 => {
+                // A row of one species.
+                let (species, out, step) =
+                    (Species::random(rng), rng.random_range(4.0..9.0), rng.random_range(4.0..8.0));
+                for place in 0..rng.random_range(3..=8) {
+                    let pose = side.beyond_paved(site.surface, site.network, s + f64::from(place) * step, out);
+                    plant(site, pose, species, rng.random_range(0.8..1.2), rng);
+                }
+            }
+            _ => {
+                for _ in 0..rng.random_range(1..=5) {
+                    let (ds, out) = (rng.random_range(-8.0..8.0), rng.random_range(3.0..26.0));
+                    let pose = side.beyond_paved(site.surface, site.network, s + ds, out);
+                    let species = Species::random(rng);
+                    plant(site, pose, species, rng.random_range(0.7..1.5), rng);
+                }
+            }
+        }
+        s += rng.random_range(7.0..24.0);
+    }
+}
+
+fn large(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) {
+    let style = [Style::Hall, Style::Hall, Style::Block, Style::Tanks, Style::Tower][rng.random_range(0..5)];
+    let [width_m, depth_m] = style.lot_m(rng);
+    let out = rng.random_range(6.0..30.0) + depth_m / 2.0;
+    let pose = side.beyond_paved(site.surface, site.network, s, out);
+    let pose = if side.sign > 0.0 { pose } else { pose.reversed() };
+    let half_m = [width_m / 2.0, depth_m / 2.0];
+    let rectangle = Rectangle { center_m: [pose.x, pose.y], half_m, yaw_rad: pose.heading_rad };
+    let [low, high] = site.ground_range_m(&rectangle);
+    if high - low < 3.0 && site.is_free(&rectangle.grown(0.5), [low - 1.5, low + 40.0], true) {
+        let lot = Lot { foot: Foot::new(pose, low), width_m, depth_m };
+        let parts = build(style, &lot, rng);
+        site.place(&parts);
+        site.take(&lots::outline(&lot), [low - 1.5, low + 40.0]);
+    }
+}
+
+/// A mast for power lines or radio: legs and arms.
+fn mast(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) {
+    let pose = side.beyond_paved(site.surface, site.network, s, rng.random_range(8.0..30.0));
+    let foot = Foot::new(pose.moved(0.0, 0.0, rng.random_range(0.0..3.1)), site.ground_m([pose.x, pose.y]));
+    let (height, spread) = (rng.random_range(14.0..28.0), rng.random_range(0.9..2.2));
+    let mut parts = Vec::new();
+    for (u, v) in [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)] {
+        let at = [u * spread, v * spread, -0.5];
+        parts.push(foot.cuboid(SolidKind::Pole, at, [0.25, 0.25, height * 0.6], 0.5));
+    }
+    parts.push(foot.cuboid(SolidKind::Pole, [0.0, 0.0, height * 0.6 - 0.5], [0.9, 0.9, height * 0.4], 0.5));
+    for arm in [0.62, 0.78, 0.94] {
+        parts.push(foot.cuboid(SolidKind::Pole, [0.0, 0.0, height * arm], [0.3, 6.0 + 4.0 * (1.0 - arm), 0.3], 0.5));
+    }
+    debug_assert!(height * 0.6 > HEADROOM_M);
+    site.try_place(&parts, 0.3, true);
+}

@@ -1,0 +1,67 @@
+//! Small builders of solids, by the place where they stand.
+
+use super::super::curve::Pose2;
+use super::super::{Shape, Solid, SolidKind};
+
+/// Where a group of solids stands: plan pose and the height of its foot, metres.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Foot {
+    pub pose: Pose2,
+    pub z_m: f64,
+}
+
+impl Foot {
+    /// A foot at a pose and height.
+    pub(super) fn new(pose: Pose2, z_m: f64) -> Self {
+        Self { pose, z_m }
+    }
+
+    /// A box of full `size_m`, its middle `u` ahead and `v` to the left, standing `lift_m` over the foot.
+    pub(super) fn cuboid(
+        &self,
+        kind: SolidKind,
+        [u, v, lift_m]: [f64; 3],
+        size_m: [f64; 3],
+        reflectivity: f32,
+    ) -> Solid {
+        let half_m = size_m.map(|length| length / 2.0);
+        self.solid(kind, Shape::Box { half_m }, [u, v, lift_m + half_m[2]], reflectivity)
+    }
+
+    /// An upright cylinder.
+    pub(super) fn cylinder(
+        &self,
+        kind: SolidKind,
+        [u, v, lift_m]: [f64; 3],
+        [radius_m, height_m]: [f64; 2],
+        reflectivity: f32,
+    ) -> Solid {
+        let shape = Shape::Cylinder { radius_m, half_height_m: height_m / 2.0 };
+        self.solid(kind, shape, [u, v, lift_m + height_m / 2.0], reflectivity)
+    }
+
+    /// An ellipsoid with its middle `lift_m` over the foot.
+    pub(super) fn ellipsoid(&self, kind: SolidKind, center_m: [f64; 3], radii_m: [f64; 3], reflectivity: f32) -> Solid {
+        self.solid(kind, Shape::Ellipsoid { radii_m }, center_m, reflectivity)
+    }
+
+    fn solid(&self, kind: SolidKind, shape: Shape, [u, v, w]: [f64; 3], reflectivity: f32) -> Solid {
+        let at = self.pose.moved(u, v, 0.0);
+        Solid::new(kind, shape, [at.x, at.y, self.z_m + w], self.pose.heading_rad, reflectivity)
+    }
+}
+
+/// A straight wall-like box from one place to another: `bottom_m` to `top_m`, `thickness_m` across.
+pub(super) fn wall(
+    kind: SolidKind,
+    from: [f64; 2],
+    to: [f64; 2],
+    [bottom_m, top_m]: [f64; 2],
+    thickness_m: f64,
+    reflectivity: f32,
+) -> Solid {
+    let (dx, dy) = (to[0] - from[0], to[1] - from[1]);
+    let half_m = [dx.hypot(dy) / 2.0, thickness_m / 2.0, (top_m - bottom_m) / 2.0];
+    let center_m = [(from[0] + to[0]) / 2.0, (from[1] + to[1]) / 2.0, (bottom_m + top_m) / 2.0];
+    Solid::new(kind, Shape::Box { half_m }, center_m, dy.atan2(dx), reflectivity)
+}

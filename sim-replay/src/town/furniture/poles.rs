@@ -1,0 +1,223 @@
+//! Lamp posts, traffic lights, signs and the small things on pavements.
+
+use rand::Rng;
+use rand_chacha::ChaCha8Rng;
+
+use super::super::curve::Pose2;
+use super::super::road::RoadLink;
+use super::super::{Solid, SolidKind};
+use super::frontage::{Side, Zone, cut_at, sides};
+use super::parts::Foot;
+use super::site::Site;
+
+/// Radius of ordinary posts, metres.
+const POST_M: f64 = 0.08;
+
+/// Places everything that stands on a post, first what the map records, then our own.
+pub(super) fn place(site: &mut Site, rng: &mut ChaCha8Rng) {
+    let recorded_lights = place_recorded(site, rng);
+    for side in sides(site.network) {
+        if !recorded_lights && side.zone == Zone::Street {
+            traffic_light(site, &side, rng);
+        }
+        match side.zone {
+            Zone::Street => {
+                lamps(site, &side, 24.0..36.0, 5.5..8.5, rng);
+                small_things(site, &side, rng);
+                signs(site, &side, 30.0..90.0, rng);
+            }
+            Zone::Rural => signs(site, &side, 50.0..140.0, rng),
+            // Lit stretches and dark ones.
+            Zone::Motorway if rng.random_bool(0.5) => lamps(site, &side, 38.0..55.0, 9.0..13.0, rng),
+            Zone::Motorway => {}
+        }
+    }
+}
+
+/// Signals and signs of the map; whether it has traffic lights.
+fn place_recorded(site: &mut Site, rng: &mut ChaCha8Rng) -> bool {
+    let mut lights = false;
+    for index in 0..site.network.roads.len() {
+        let road = &site.network.roads[index];
+        for signal in &road.signals {
+            lights |= signal.dynamic;
+            let pose = road.pose_at(signal.s_m).moved(0.0, signal.t_m, signal.heading_rad);
+            let foot = Foot::new(pose, site.ground_m([pose.x, pose.y]));
+            let parts = if signal.dynamic { light(foot) } else { sign(foot, rng) };
+            beside_carriageway(site, &parts, signal.t_m);
+        }
+        for object in road.objects.iter().filter(|object| is_sign(&object.label)) {
+            let pose = road.pose_at(object.s_m).moved(0.0, object.t_m, object.heading_rad);
+            let foot = Foot::new(pose, site.ground_m([pose.x, pose.y]));
+            let parts = sign(foot, rng);
+            beside_carriageway(site, &parts, object.t_m);
+        }
+    }
+    lights
+}
+
+/// Places parts, or the same a little farther out where the map has them on the carriageway.
+fn beside_carriageway(site: &mut Site, parts: &[Solid], t_m: f64) {
+    for shift in [0.0, 0.4, 0.8, 1.4, 2.2, 3.0] {
+        let moved: Vec<Solid> = parts
+            .iter()
+            .map(|part| {
+                // Their own y axis points across the road.
+                let pose = Pose2::new(part.center_m[0], part.center_m[1], part.yaw_rad);
+                let pose = pose.moved(0.0, shift * t_m.signum(), 0.0);
+                Solid { center_m: [pose.x, pose.y, part.center_m[2]], ..*part }
+            })
+            .collect();
+        if site.try_place(&moved, 0.05, false) {
+            return;
+        }
+    }
+}
+
+/// Things the map paints on the road are no signs.
+fn is_sign(label: &str) -> bool {
+    let label = label.to_ascii_lowercase();
+    let painted = ["stencil", "line", "crosswalk", "solid", "dashed", "arrow"];
+    (label.contains("speed") || label.contains("sign") || label.contains("stop"))
+        && !painted.iter().any(|word| label.contains(word))
+}
+
+fn light(foot: Foot) -> Vec<Solid> {
+    vec![
+        foot.cylinder(SolidKind::Pole, [0.0, 0.0, -0.2], [0.1, 4.2], 0.5),
+        foot.cuboid(SolidKind::Sign, [-0.2, 0.0, 2.9], [0.25, 0.45, 1.2], 0.6),
+    ]
+}
+
+/// A post with a plate; plates reflect strongly.
+fn sign(foot: Foot, rng: &mut ChaCha8Rng) -> Vec<Solid> {
+    let height = rng.random_range(2.0..2.6);
+    let [width, tall] = match rng.random_range(0..4) {
+        0 => [0.6, 0.6],
+        1 => [0.75, 0.65],
+        2 => [0.6, 1.3],
+        _ => [rng.random_range(0.9..1.8), rng.random_range(0.4..0.9)],
+    };
+    vec![
+        foot.cylinder(SolidKind::Pole, [0.06, 0.0, -0.2], [0.04, height + tall + 0.2], 0.5),
+        foot.cuboid(SolidKind::Sign, [0.0, 0.0, height], [0.04, width, tall], 0.95),
+    ]
+}
+
+fn lamps(
+    site: &mut Site,
+    side: &Side,
+    rhythm_m: std::ops::Range<f64>,
+    height_m: std::ops::Range<f64>,
+    rng: &mut ChaCha8Rng,
+) {
+    // Lamps stand on one side of a street or the other, or alternate.
+    let (rhythm, height) = (rng.random_range(rhythm_m), rng.random_range(height_m));
+    if rng.random_bool(0.25) {
+        return;
+    }
+    let mut s = rng.random_range(2.0..rhythm);
+    while s < side.length_m - 1.0 {
+        let out = if side.zone == Zone::Street { 0.45 } else { 1.3 };
+        let pose = side.beyond_kerb(site.surface, site.network, s, out);
+        // The arm points over the road.
+        let pose = pose.moved(0.0, 0.0, side.facing_rad());
+        let foot = Foot::new(pose, site.ground_m([pose.x, pose.y]));
+        let arm = height * 0.2;
+        let parts = [
+            foot.cylinder(SolidKind::Pole, [0.0, 0.0, -0.2], [POST_M + height * 0.006, height + 0.2], 0.5),
+            foot.cuboid(SolidKind::Pole, [arm / 2.0, 0.0, height - 0.1], [arm, 0.1, 0.1], 0.5),
+            foot.cuboid(SolidKind::Pole, [arm, 0.0, height - 0.15], [0.7, 0.3, 0.15], 0.5),
+        ];
+        site.try_place(&parts, 0.05, false);
+        s += rhythm * rng.random_range(0.9..1.1);
+    }
+}
+
+/// A traffic light where this side's traffic enters a junction, for most junctions.
+fn traffic_light(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
+    let road = &site.network.roads[side.road];
+    let (link, s) = if side.along { (road.successor, side.length_m - 0.6) } else { (road.predecessor, 0.6) };
+    let Some(RoadLink::Junction(junction)) = link else { return };
+    // The same answer for every road of the junction.
+    let lit = !(junction * 7 + site.network.junctions[junction].connections.len()).is_multiple_of(3);
+    let right_of_traffic = (side.sign < 0.0) == side.along;
+    if !lit || !right_of_traffic {
+        return;
+    }
+    let pose = side.beyond_kerb(site.surface, site.network, s, 0.4);
+    let pose = if side.along { pose } else { pose.reversed() };
+    let foot = Foot::new(pose, site.ground_m([pose.x, pose.y]));
+    let mut parts = light(foot);
+    // Some carry a second head over the lane.
+    if rng.random_bool(0.3) {
+        parts[0] = foot.cylinder(SolidKind::Pole, [0.0, 0.0, -0.2], [0.12, 6.6], 0.5);
+        parts.push(foot.cuboid(SolidKind::Pole, [0.0, 1.7, 6.0], [0.12, 3.2, 0.12], 0.5));
+        parts.push(foot.cuboid(SolidKind::Sign, [-0.2, 3.0, 5.2], [0.25, 0.45, 1.2], 0.6));
+    }
+    site.try_place(&parts, 0.02, false);
+}
+
+fn signs(site: &mut Site, side: &Side, distance_m: std::ops::Range<f64>, rng: &mut ChaCha8Rng) {
+    let mut s = rng.random_range(3.0..distance_m.end);
+    while s < side.length_m - 2.0 {
+        let out = if side.zone == Zone::Street { rng.random_range(0.5..0.9) } else { rng.random_range(0.8..1.6) };
+        let pose = side.beyond_kerb(site.surface, site.network, s, out);
+        let pose = if side.along { pose } else { pose.reversed() };
+        let parts = sign(Foot::new(pose, site.ground_m([pose.x, pose.y])), rng);
+        site.try_place(&parts, 0.05, false);
+        s += rng.random_range(distance_m.clone());
+    }
+}
+
+/// Bins, hydrants, cabinets, bollards, benches, shelters and kiosks.
+fn small_things(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
+    let mut s = rng.random_range(3.0..20.0);
+    while s < side.length_m - 3.0 {
+        let pavement = side.pavement_m(site.surface, s);
+        let out = if rng.random_bool(0.5) { 0.6 } else { (pavement - 0.4).max(0.6) };
+        let pose = side.beyond_kerb(site.surface, site.network, s, out);
+        let foot = Foot::new(pose.moved(0.0, 0.0, side.facing_rad()), site.ground_m([pose.x, pose.y]));
+        let kind = SolidKind::StreetFurniture;
+        let parts = match rng.random_range(0..12) {
+            0..=2 => vec![foot.cylinder(kind, [0.0, 0.0, -0.1], [0.25, 1.0], 0.4)],
+            3..=4 => vec![foot.cylinder(kind, [0.0, 0.0, -0.1], [0.12, 0.85], 0.7)],
+            5..=6 => vec![foot.cuboid(kind, [0.0, 0.0, -0.1], [0.45, 1.1, 1.4], 0.5)],
+            7..=8 => vec![foot.cuboid(kind, [0.0, 0.0, -0.1], [0.6, 1.8, 0.95], 0.4)],
+            9 => (0..4)
+                .map(|i| foot.cylinder(SolidKind::Pole, [0.0, 1.4 * f64::from(i), -0.1], [0.07, 1.0], 0.5))
+                .collect(),
+            10 => shelter(site, side, s, rng),
+            _ => kiosk(site, side, s, pavement, rng),
+        };
+        site.try_place(&parts, 0.05, false);
+        s += rng.random_range(8.0..26.0);
+    }
+}
+
+/// A bus shelter: back, one side and roof.
+fn shelter(site: &Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) -> Vec<Solid> {
+    let pavement = cut_at(site.surface, side.road, s);
+    let depth = side.pavement_m(site.surface, pavement.s_m).clamp(1.2, 1.7);
+    let pose = side.beyond_kerb(site.surface, site.network, s, 0.5 + depth / 2.0);
+    let foot = Foot::new(pose.moved(0.0, 0.0, side.facing_rad()), site.ground_m([pose.x, pose.y]));
+    let length = rng.random_range(3.0..4.6);
+    let kind = SolidKind::StreetFurniture;
+    vec![
+        foot.cuboid(kind, [-depth / 2.0 + 0.05, 0.0, -0.1], [0.08, length, 2.5], 0.3),
+        foot.cuboid(kind, [0.0, length / 2.0 - 0.05, -0.1], [depth, 0.08, 2.5], 0.3),
+        foot.cuboid(kind, [0.0, 0.0, 2.4], [depth, length, 0.15], 0.4),
+        foot.cuboid(kind, [-depth / 2.0 + 0.35, 0.0, -0.1], [0.4, length * 0.7, 0.6], 0.4),
+    ]
+}
+
+fn kiosk(site: &Site, side: &Side, s: f64, pavement: f64, rng: &mut ChaCha8Rng) -> Vec<Solid> {
+    let pose = side.beyond_kerb(site.surface, site.network, s, pavement + 1.3);
+    let foot = Foot::new(pose.moved(0.0, 0.0, side.facing_rad()), site.ground_m([pose.x, pose.y]));
+    let kind = SolidKind::StreetFurniture;
+    let width = rng.random_range(2.2..3.6);
+    vec![
+        foot.cuboid(kind, [0.0, 0.0, -0.3], [2.0, width, 2.8], 0.5),
+        foot.cuboid(kind, [0.2, 0.0, 2.5], [2.5, width + 0.4, 0.2], 0.5),
+    ]
+}

@@ -1,0 +1,152 @@
+//! The ground plan while it fills: what is taken, and what has been placed.
+
+use super::super::convex::{CellIndex, Quad, Rectangle, bounds, overlap};
+use super::super::curve::Pose2;
+use super::super::ground::Ground;
+use super::super::road::RoadNetwork;
+use super::super::surface::Surface;
+use super::super::{ParkingSpot, Shape, Solid};
+
+/// Height over a road that stays free, metres.
+pub(super) const HEADROOM_M: f64 = 4.7;
+/// Edge of a cell of the index of taken outlines, metres.
+const CELL_M: f64 = 6.0;
+/// Junctions larger than this are not kept free between their lanes, metres.
+const MAX_JUNCTION_M: f64 = 70.0;
+
+/// A town in the making.
+pub(super) struct Site<'a> {
+    pub network: &'a RoadNetwork,
+    pub surface: &'a Surface,
+    pub ground: &'a Ground,
+    pub solids: Vec<Solid>,
+    pub parking: Vec<ParkingSpot>,
+    /// Outlines with their lowest and highest place.
+    taken: Vec<(Vec<[f64; 2]>, [f64; 2])>,
+    index: CellIndex,
+}
+
+impl<'a> Site<'a> {
+    pub(super) fn new(network: &'a RoadNetwork, surface: &'a Surface, ground: &'a Ground) -> Self {
+        let index = CellIndex::new(surface.bounds_m, CELL_M);
+        let mut site =
+            Self { network, surface, ground, solids: Vec::new(), parking: Vec::new(), taken: Vec::new(), index };
+        for junction in 0..network.junctions.len() {
+            site.keep_junction_free(junction);
+        }
+        site
+    }
+
+    /// Whether a rectangle is free of roads and of everything placed, between two heights.
+    pub(super) fn is_free(&self, rectangle: &Rectangle, z_m: [f64; 2], pavements: bool) -> bool {
+        self.surface.is_clear(rectangle, z_m, HEADROOM_M, pavements) && !self.is_taken(&rectangle.corners(), z_m)
+    }
+
+    /// Takes a rectangle between two heights.
+    pub(super) fn take(&mut self, rectangle: &Rectangle, z_m: [f64; 2]) {
+        self.take_outline(rectangle.corners().to_vec(), z_m);
+    }
+
+    /// Places all of `parts` if each is free, with `margin_m` around; else none of them. Parts may touch each other.
+    pub(super) fn try_place(&mut self, parts: &[Solid], margin_m: f64, pavements: bool) -> bool {
+        let free = parts.iter().all(|part| {
+            let outline = outline(part).grown(margin_m);
+            self.is_free(&outline, [part.bottom_m(), part.top_m()], pavements)
+        });
+        if free {
+            self.place(parts);
+        }
+        free
+    }
+
+    /// Places parts wherever they are: for what belongs to a road, or stands on ground taken before.
+    pub(super) fn place(&mut self, parts: &[Solid]) {
+        for part in parts {
+            self.take(&outline(part), [part.bottom_m(), part.top_m()]);
+            self.solids.push(*part);
+        }
+    }
+
+    /// Height of the terrain, metres.
+    pub(super) fn ground_m(&self, [x, y]: [f64; 2]) -> f64 {
+        self.ground.height_m(x, y)
+    }
+
+    /// Lowest and highest terrain under the corners and the middle of a rectangle, metres.
+    pub(super) fn ground_range_m(&self, rectangle: &Rectangle) -> [f64; 2] {
+        let corners: Quad = rectangle.corners();
+        let heights = corners.iter().chain(std::iter::once(&rectangle.center_m)).map(|&corner| self.ground_m(corner));
+        heights.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], z| [low.min(z), high.max(z)])
+    }
+
+    /// A pose on the terrain as position.
+    pub(super) fn on_ground(&self, pose: Pose2) -> [f64; 3] {
+        [pose.x, pose.y, self.ground_m([pose.x, pose.y])]
+    }
+
+    fn is_taken(&self, outline: &[[f64; 2]], [bottom_m, top_m]: [f64; 2]) -> bool {
+        self.index.any(bounds(outline), |number| {
+            let (other, [low, high]) = &self.taken[number as usize];
+            bottom_m < *high && top_m > *low && overlap(outline, other)
+        })
+    }
+
+    fn take_outline(&mut self, outline: Vec<[f64; 2]>, z_m: [f64; 2]) {
+        self.index.insert(self.taken.len() as u32, bounds(&outline));
+        self.taken.push((outline, z_m));
+    }
+
+    /// Takes the hull of a junction's lanes, so that nothing ends up between them.
+    fn keep_junction_free(&mut self, junction: usize) {
+        let inside = |road: u32| self.network.roads[road as usize].junction == Some(junction);
+        let patches = self.surface.patches.iter().filter(|patch| patch.carriageway && inside(patch.road));
+        let (mut points, mut z_m) = (Vec::new(), [f64::INFINITY, f64::NEG_INFINITY]);
+        for patch in patches {
+            points.extend(patch.quad);
+            z_m = [z_m[0].min(patch.z_m[0]), z_m[1].max(patch.z_m[1])];
+        }
+        let [low, high] = bounds(&points);
+        if points.len() > 2 && (high[0] - low[0]).max(high[1] - low[1]) < MAX_JUNCTION_M {
+            self.take_outline(hull(points), [z_m[0] - 0.5, z_m[1] + HEADROOM_M]);
+        }
+    }
+}
+
+/// Outline of a solid seen from above.
+pub(super) fn outline(solid: &Solid) -> Rectangle {
+    let half_m = solid.shape.half_footprint_m();
+    // A round outline needs no turning, and fits its own rectangle best untilted.
+    let yaw_rad = if matches!(solid.shape, Shape::Cylinder { .. }) { 0.0 } else { solid.yaw_rad };
+    Rectangle { center_m: [solid.center_m[0], solid.center_m[1]], half_m, yaw_rad }
+}
+
+/// Convex hull, anticlockwise (Andrew's monotone chain).
+fn hull(mut points: Vec<[f64; 2]>) -> Vec<[f64; 2]> {
+    points.sort_by(|a, b| a[0].total_cmp(&b[0]).then(a[1].total_cmp(&b[1])));
+    let turn = |a: [f64; 2], b: [f64; 2], c: [f64; 2]| (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]);
+    let half = |points: &mut dyn Iterator<Item = [f64; 2]>| {
+        let mut chain: Vec<[f64; 2]> = Vec::new();
+        for point in points {
+            while chain.len() > 1 && turn(chain[chain.len() - 2], chain[chain.len() - 1], point) <= 0.0 {
+                chain.pop();
+            }
+            chain.push(point);
+        }
+        chain.pop();
+        chain
+    };
+    let mut lower = half(&mut points.iter().copied());
+    lower.extend(half(&mut points.iter().rev().copied()));
+    lower
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn hull_keeps_the_corners_only() {
+        let points = vec![[0.0, 0.0], [2.0, 0.0], [1.0, 1.0], [2.0, 2.0], [0.0, 2.0], [1.0, 0.0]];
+        assert_eq!(hull(points), [[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0]]);
+    }
+}

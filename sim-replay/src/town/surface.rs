@@ -1,0 +1,186 @@
+//! What roads cover: quadrilaterals across every road, by use.
+
+use super::convex::{CellIndex, Quad, Rectangle, bounds, overlap};
+use super::curve::Pose2;
+use super::road::{LaneKind, Road, RoadNetwork};
+
+/// Distance between cross-sections, metres.
+pub(crate) const STEP_M: f64 = 2.0;
+/// Edge of a cell of the index, metres.
+const CELL_M: f64 = 6.0;
+
+/// A cut across a road.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct CrossSection {
+    pub s_m: f64,
+    /// Place and heading of the reference line.
+    pub pose: Pose2,
+    pub z_m: f64,
+    /// Lowest and highest `t` of what vehicles drive on: driving lanes, shoulders, parking lanes; metres. Equal where
+    /// there is none.
+    pub carriageway_m: [f64; 2],
+    /// The same with pavements and verges.
+    pub paved_m: [f64; 2],
+    /// The same for driving lanes only.
+    pub driving_m: [f64; 2],
+    /// Section of the road.
+    pub section: usize,
+}
+
+/// A piece of a road's surface between two cross-sections.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Patch {
+    /// Corners: start right, end right, end left, start left; metres.
+    pub quad: Quad,
+    /// Heights of the start and the end, metres.
+    pub z_m: [f64; 2],
+    pub road: u32,
+    /// Whether vehicles drive here; else pavement or verge.
+    pub carriageway: bool,
+}
+
+/// All roads' cross-sections and patches.
+#[derive(Debug, Clone)]
+pub(crate) struct Surface {
+    /// Cross-sections by road.
+    pub roads: Vec<Vec<CrossSection>>,
+    pub patches: Vec<Patch>,
+    index: CellIndex,
+    /// Lowest and highest x and y of all patches, metres.
+    pub bounds_m: [[f64; 2]; 2],
+}
+
+impl CrossSection {
+    /// Place at `t`, metres.
+    pub(crate) fn at(&self, t_m: f64) -> [f64; 2] {
+        let pose = self.pose.moved(0.0, t_m, 0.0);
+        [pose.x, pose.y]
+    }
+}
+
+impl Patch {
+    /// Height of the surface at (or beside) a place, metres.
+    pub(crate) fn height_m(&self, [x, y]: [f64; 2]) -> f64 {
+        let middle = |a: [f64; 2], b: [f64; 2]| [(a[0] + b[0]) / 2.0, (a[1] + b[1]) / 2.0];
+        let (start, end) = (middle(self.quad[0], self.quad[3]), middle(self.quad[1], self.quad[2]));
+        let (dx, dy) = (end[0] - start[0], end[1] - start[1]);
+        let share = ((x - start[0]) * dx + (y - start[1]) * dy) / (dx * dx + dy * dy).max(1e-9);
+        self.z_m[0] + share.clamp(0.0, 1.0) * (self.z_m[1] - self.z_m[0])
+    }
+}
+
+impl Surface {
+    pub(crate) fn new(network: &RoadNetwork) -> Self {
+        let roads: Vec<Vec<CrossSection>> = network.roads.iter().map(cross_sections).collect();
+        let mut patches = Vec::new();
+        for (road, sections) in roads.iter().enumerate() {
+            for pair in sections.windows(2) {
+                let [from, to] = [pair[0], pair[1]];
+                let mut strip = |a: [f64; 2], b: [f64; 2], carriageway| {
+                    if a[1] - a[0] > 0.01 || b[1] - b[0] > 0.01 {
+                        let quad = [from.at(a[0]), to.at(b[0]), to.at(b[1]), from.at(a[1])];
+                        patches.push(Patch { quad, z_m: [from.z_m, to.z_m], road: road as u32, carriageway });
+                    }
+                };
+                strip(from.carriageway_m, to.carriageway_m, true);
+                let right = |c: CrossSection| [c.paved_m[0], c.carriageway_m[0]];
+                let left = |c: CrossSection| [c.carriageway_m[1], c.paved_m[1]];
+                strip(right(from), right(to), false);
+                strip(left(from), left(to), false);
+            }
+        }
+        let corners: Vec<[f64; 2]> = patches.iter().flat_map(|patch| patch.quad).collect();
+        let bounds_m = if corners.is_empty() { [[0.0; 2]; 2] } else { bounds(&corners) };
+        let mut index = CellIndex::new(bounds_m, CELL_M);
+        for (number, patch) in patches.iter().enumerate() {
+            index.insert(number as u32, bounds(&patch.quad));
+        }
+        Self { roads, patches, index, bounds_m }
+    }
+
+    /// Whether any patch that overlaps `rectangle` answers `test` with yes.
+    pub(crate) fn any(&self, rectangle: &Rectangle, mut test: impl FnMut(&Patch) -> bool) -> bool {
+        let corners = rectangle.corners();
+        self.index.any(bounds(&corners), |number| {
+            let patch = &self.patches[number as usize];
+            overlap(&corners, &patch.quad) && test(patch)
+        })
+    }
+
+    /// Whether something from `bottom_m` to `top_m` over `rectangle` keeps clear of every road: above `headroom_m` over
+    /// its surface, or wholly below it. Pavements count only when `pavements` says so.
+    pub(crate) fn is_clear(
+        &self,
+        rectangle: &Rectangle,
+        [bottom_m, top_m]: [f64; 2],
+        headroom_m: f64,
+        pavements: bool,
+    ) -> bool {
+        !self.any(rectangle, |patch| {
+            let (low, high) = (patch.z_m[0].min(patch.z_m[1]), patch.z_m[0].max(patch.z_m[1]));
+            (pavements || patch.carriageway) && bottom_m < high + headroom_m && top_m > low - 0.05
+        })
+    }
+}
+
+fn cross_sections(road: &Road) -> Vec<CrossSection> {
+    let mut cuts = Vec::new();
+    for section in 0..road.sections.len() {
+        let (from, to) = (road.sections[section].s_m, road.section_end_m(section));
+        let steps = ((to - from) / STEP_M).ceil().max(1.0) as usize;
+        for step in 0..=steps {
+            let s_m = from + (to - from) * step as f64 / steps as f64;
+            cuts.push(cut(road, section, s_m, s_m.min(to - 1e-6).max(from)));
+        }
+    }
+    cuts
+}
+
+/// The cut at `s_m`, with widths taken at `inside_m`, which lies in the section for certain.
+fn cut(road: &Road, section: usize, s_m: f64, inside_m: f64) -> CrossSection {
+    let origin = road.lane_offset.at(inside_m);
+    let range = |wanted: fn(LaneKind) -> bool| {
+        let mut range: Option<[f64; 2]> = None;
+        for id in road.sections[section].lane_ids() {
+            let Some(lane) = road.sections[section].lane(id) else { continue };
+            let [low, high] = road.lane_span_m(section, id, inside_m);
+            if wanted(lane.kind) && high > low {
+                range = Some(range.map_or([low, high], |[a, b]| [a.min(low), b.max(high)]));
+            }
+        }
+        range
+    };
+    let driving = range(|kind| kind == LaneKind::Driving);
+    let carriageway = range(|kind| matches!(kind, LaneKind::Driving | LaneKind::Shoulder | LaneKind::Parking));
+    let paved = range(|kind| kind != LaneKind::Other && kind != LaneKind::Median);
+    let carriageway_m = carriageway.or(driving).unwrap_or([origin; 2]);
+    let paved_m = paved.unwrap_or(carriageway_m);
+    CrossSection {
+        s_m,
+        pose: road.pose_at(s_m),
+        z_m: road.elevation.at(s_m),
+        carriageway_m,
+        paved_m,
+        driving_m: driving.unwrap_or([origin; 2]),
+        section,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn patches_follow_a_street_and_leave_headroom() {
+        let layout = super::super::layout::town1(1);
+        let surface = Surface::new(&layout.network);
+        let road = layout.network.roads.iter().position(|road| road.junction.is_none()).unwrap();
+        let cut = surface.roads[road][5];
+        let above = |t: f64, z: [f64; 2]| {
+            let rectangle = Rectangle { center_m: cut.at(t), half_m: [0.2, 0.2], yaw_rad: 0.0 };
+            surface.is_clear(&rectangle, z, 4.5, false)
+        };
+        assert!(!above(1.0, [0.0, 3.0]) && above(1.0, [4.6, 8.0]) && above(1.0, [-3.0, -0.2]));
+        assert!(above(cut.paved_m[1] + 0.5, [0.0, 3.0]));
+    }
+}

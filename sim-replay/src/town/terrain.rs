@@ -1,0 +1,236 @@
+//! The ground from the roads: level or shaped to meet every road, with hills away from them, and decks where a road
+//! passes above.
+
+use super::convex::{Rectangle, bounds};
+use super::ground::{Ground, HeightGrid, Terrain, Triangle};
+use super::noise::hills_m;
+use super::surface::{Patch, Surface};
+
+/// Distance between terrain nodes, metres; larger on maps that would need more than [`MAX_NODES`].
+const CELL_M: f64 = 2.0;
+/// Most nodes of a terrain.
+const MAX_NODES: f64 = 4e6;
+/// How far the terrain reaches beyond the roads, metres; a LiDAR sees 120 m, a radar 150 m.
+const MARGIN_M: f64 = 160.0;
+/// Roads within this of one height lie on level ground, metres.
+const LEVEL_M: f64 = 0.05;
+/// A road surface this far above the terrain becomes a deck, metres.
+const DECK_M: f64 = 0.12;
+/// Where hills begin and where they are full, distance from the nearest road in metres.
+const HILLS_FROM_M: [f64; 2] = [14.0, 90.0];
+/// Rounds of smoothing at each level between the roads.
+const SMOOTHING: usize = 12;
+
+/// The ground under and between the roads.
+pub(crate) fn ground(surface: &Surface, seed: u64) -> Ground {
+    let heights = surface.patches.iter().flat_map(|patch| patch.z_m);
+    let [low, high] = heights.fold([f64::INFINITY, f64::NEG_INFINITY], |[low, high], z| [low.min(z), high.max(z)]);
+    if high - low < LEVEL_M {
+        return Ground::plane((low + high) / 2.0);
+    }
+    let mut grid = empty_grid(surface);
+    let fixed = fix_under_roads(&mut grid, surface);
+    fill(&mut grid, &fixed);
+    raise_hills(&mut grid, &fixed, seed);
+    let decks = decks(&grid, surface);
+    Ground { terrain: Terrain::Grid(grid), decks }
+}
+
+fn empty_grid(surface: &Surface) -> HeightGrid {
+    let [low, high] = surface.bounds_m;
+    let extent = [0, 1].map(|axis| high[axis] - low[axis] + 2.0 * MARGIN_M);
+    let cell_m = CELL_M.max((extent[0] * extent[1] / MAX_NODES).sqrt());
+    let [columns, rows] = extent.map(|extent| (extent / cell_m).ceil() as usize + 1);
+    let origin_m = low.map(|low| low - MARGIN_M);
+    HeightGrid { origin_m, cell_m, columns, rows, heights_m: vec![f32::NAN; columns * rows] }
+}
+
+/// Sets every node within a cell of a road to the height of the lowest road there; returns which are set.
+fn fix_under_roads(grid: &mut HeightGrid, surface: &Surface) -> Vec<bool> {
+    let cell = grid.cell_m;
+    for patch in &surface.patches {
+        let [low, high] = bounds(&patch.quad);
+        let place = |value: f64, axis: usize| ((value - grid.origin_m[axis]) / cell).max(0.0);
+        let rows = place(low[1] - cell, 1).floor() as usize..=place(high[1] + cell, 1).ceil() as usize;
+        let columns = place(low[0] - cell, 0).floor() as usize..=place(high[0] + cell, 0).ceil() as usize;
+        for row in rows {
+            for column in columns.clone() {
+                let node = [grid.origin_m[0] + column as f64 * cell, grid.origin_m[1] + row as f64 * cell];
+                let around = Rectangle { center_m: node, half_m: [cell; 2], yaw_rad: 0.0 };
+                if super::convex::overlap(&around.corners(), &patch.quad) {
+                    let height = &mut grid.heights_m[row * grid.columns + column];
+                    // f32::min takes the number where the other is NaN.
+                    *height = height.min(patch.height_m(node) as f32);
+                }
+            }
+        }
+    }
+    grid.heights_m.iter().map(|height| !height.is_nan()).collect()
+}
+
+/// Gives the nodes between the roads heights that pass smoothly from road to road: averages of ever coarser grids fill
+/// what the finer ones leave open, and each level is smoothed on the way back.
+fn fill(grid: &mut HeightGrid, fixed: &[bool]) {
+    fill_level(&mut grid.heights_m, fixed, grid.columns, grid.rows);
+}
+
+fn fill_level(heights: &mut [f32], fixed: &[bool], columns: usize, rows: usize) {
+    if fixed.iter().all(|&fixed| fixed) {
+        return;
+    }
+    if columns <= 2 && rows <= 2 {
+        let known: Vec<f32> = heights.iter().copied().filter(|height| !height.is_nan()).collect();
+        let mean = known.iter().sum::<f32>() / known.len().max(1) as f32;
+        heights.iter_mut().filter(|height| height.is_nan()).for_each(|height| *height = mean);
+        return;
+    }
+    let (half_columns, half_rows) = (columns.div_ceil(2), rows.div_ceil(2));
+    let mut sums = vec![(0.0f32, 0u32); half_columns * half_rows];
+    for row in 0..rows {
+        for column in 0..columns {
+            let place = row * columns + column;
+            if fixed[place] {
+                let (sum, count) = &mut sums[row / 2 * half_columns + column / 2];
+                (*sum, *count) = (*sum + heights[place], *count + 1);
+            }
+        }
+    }
+    let mut coarse: Vec<f32> =
+        sums.iter().map(|&(sum, count)| if count > 0 { sum / count as f32 } else { f32::NAN }).collect();
+    let coarse_fixed: Vec<bool> = sums.iter().map(|&(_, count)| count > 0).collect();
+    fill_level(&mut coarse, &coarse_fixed, half_columns, half_rows);
+    for row in 0..rows {
+        for column in 0..columns {
+            let place = row * columns + column;
+            if !fixed[place] {
+                heights[place] = coarse[row / 2 * half_columns + column / 2];
+            }
+        }
+    }
+    for _ in 0..SMOOTHING {
+        smooth(heights, fixed, columns, rows);
+    }
+}
+
+/// One round of replacing open nodes by the mean of their four neighbours, in place, from the first to the last.
+fn smooth(heights: &mut [f32], fixed: &[bool], columns: usize, rows: usize) {
+    for row in 0..rows {
+        for column in 0..columns {
+            let place = row * columns + column;
+            if fixed[place] {
+                continue;
+            }
+            let left = heights[place - usize::from(column > 0)];
+            let right = heights[place + usize::from(column + 1 < columns)];
+            let below = heights[if row > 0 { place - columns } else { place }];
+            let above = heights[if row + 1 < rows { place + columns } else { place }];
+            heights[place] = (left + right + below + above) / 4.0;
+        }
+    }
+}
+
+/// Adds hills, the higher the farther from the roads.
+fn raise_hills(grid: &mut HeightGrid, fixed: &[bool], seed: u64) {
+    let distances = distances(fixed, grid.columns, grid.rows);
+    for row in 0..grid.rows {
+        for column in 0..grid.columns {
+            let place = row * grid.columns + column;
+            let distance_m = f64::from(distances[place]) * grid.cell_m;
+            let share = ((distance_m - HILLS_FROM_M[0]) / (HILLS_FROM_M[1] - HILLS_FROM_M[0])).clamp(0.0, 1.0);
+            let (x, y) = (grid.origin_m[0] + column as f64 * grid.cell_m, grid.origin_m[1] + row as f64 * grid.cell_m);
+            grid.heights_m[place] += (share * share * (3.0 - 2.0 * share) * hills_m(x, y, seed)) as f32;
+        }
+    }
+}
+
+/// Distance of every node from the nearest set one, in cells: two sweeps over the neighbours (chamfer distance).
+fn distances(fixed: &[bool], columns: usize, rows: usize) -> Vec<f32> {
+    let mut distances: Vec<f32> = fixed.iter().map(|&fixed| if fixed { 0.0 } else { f32::MAX / 4.0 }).collect();
+    let mut relax = |place: usize, column: usize, row: usize, steps: [(i64, i64, f32); 4]| {
+        for (dx, dy, cost) in steps {
+            let (x, y) = (column as i64 + dx, row as i64 + dy);
+            if x >= 0 && y >= 0 && x < columns as i64 && y < rows as i64 {
+                let near = distances[y as usize * columns + x as usize] + cost;
+                distances[place] = distances[place].min(near);
+            }
+        }
+    };
+    const DIAGONAL: f32 = std::f32::consts::SQRT_2;
+    for row in 0..rows {
+        for column in 0..columns {
+            let back = [(-1, 0, 1.0), (0, -1, 1.0), (-1, -1, DIAGONAL), (1, -1, DIAGONAL)];
+            relax(row * columns + column, column, row, back);
+        }
+    }
+    for row in (0..rows).rev() {
+        for column in (0..columns).rev() {
+            let ahead = [(1, 0, 1.0), (0, 1, 1.0), (1, 1, DIAGONAL), (-1, 1, DIAGONAL)];
+            relax(row * columns + column, column, row, ahead);
+        }
+    }
+    distances
+}
+
+/// Triangles of the road surfaces that lie above the terrain.
+fn decks(grid: &HeightGrid, surface: &Surface) -> Vec<Triangle> {
+    let mut triangles = Vec::new();
+    for patch in surface.patches.iter().filter(|patch| is_deck(patch, |x, y| grid.height_m(x, y))) {
+        let [a, b, c, d] = patch.quad;
+        let [start, end] = patch.z_m;
+        let corners = [[a[0], a[1], start], [b[0], b[1], end], [c[0], c[1], end], [d[0], d[1], start]];
+        for [i, j, k] in [[0, 1, 2], [0, 2, 3]] {
+            let (p, q, r): ([f64; 3], [f64; 3], [f64; 3]) = (corners[i], corners[j], corners[k]);
+            let area = (q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0]);
+            if area > 1e-6 {
+                triangles.push([p, q, r]);
+            }
+        }
+    }
+    triangles
+}
+
+/// Whether a patch lies above the terrain anywhere.
+pub(crate) fn is_deck(patch: &Patch, height_m: impl Fn(f64, f64) -> f64) -> bool {
+    let [a, b, c, d] = patch.quad;
+    let middle = |p: [f64; 2], q: [f64; 2]| [(p[0] + q[0]) / 2.0, (p[1] + q[1]) / 2.0];
+    let probes = [a, b, c, d, middle(a, b), middle(c, d), middle(a, d), middle(b, c), middle(a, c)];
+    probes.iter().any(|&p| patch.height_m(p) - height_m(p[0], p[1]) > DECK_M)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn level_roads_lie_on_a_plane() {
+        let surface = Surface::new(&super::super::layout::town1(2).network);
+        assert_eq!(ground(&surface, 2), Ground::plane(0.0));
+    }
+
+    #[test]
+    fn filled_heights_stay_between_the_fixed_ones_and_keep_them() {
+        let (columns, rows) = (40, 30);
+        let mut heights = vec![f32::NAN; columns * rows];
+        for row in 0..rows {
+            heights[row * columns + 3] = 0.0;
+            heights[row * columns + 33] = 6.0;
+        }
+        let fixed: Vec<bool> = heights.iter().map(|height| !height.is_nan()).collect();
+        fill_level(&mut heights, &fixed, columns, rows);
+        for row in 0..rows {
+            assert_eq!((heights[row * columns + 3], heights[row * columns + 33]), (0.0, 6.0));
+            let middle = heights[row * columns + 18];
+            assert!((2.0..4.0).contains(&middle), "{middle}");
+        }
+        assert!(heights.iter().all(|height| (-0.001..=6.001).contains(height)));
+    }
+
+    #[test]
+    fn distances_count_cells() {
+        let mut fixed = vec![false; 100];
+        fixed[0] = true;
+        let found = distances(&fixed, 10, 10);
+        assert_eq!(found[7], 7.0);
+        assert!((found[99] - 9.0 * std::f32::consts::SQRT_2).abs() < 1e-4);
+    }
+}
