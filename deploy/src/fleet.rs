@@ -1,0 +1,291 @@
+//! Which processes a scenario needs, and with which arguments.
+
+use std::ffi::OsString;
+use std::path::{Path, PathBuf};
+
+use agent::model_config::DetectorConfig;
+use agent::weights::{Weights, WeightsError};
+use protocol::{CavId, Dtype, RunId};
+use sim_replay::dataset::{self, ReadError};
+use sim_replay::ground_truth::GroundTruthRule;
+
+use crate::scenario::{Launch, NoiseMode, PoseSource, Publish, Scenario};
+use crate::supervise::{Life, ProcessSpec};
+
+/// Vehicles farther than this from the ego do not take part, metres (the rule of the OPV2V family).
+const COMM_RANGE_M: f64 = 70.0;
+
+/// Why a scenario makes no fleet.
+#[derive(Debug, thiserror::Error)]
+pub enum FleetError {
+    /// The scene cannot be read.
+    #[error("scene: {0}")]
+    Scene(#[from] ReadError),
+    /// The data set has no scenario at all.
+    #[error("scene {}: there is no scenario in it", .0.display())]
+    Empty(PathBuf),
+    /// The data set has no scenario of that name.
+    #[error("scene {}: there is no scenario {asked:?}; it has {found:?}", dir.display())]
+    NoScenario {
+        /// The data set.
+        dir: PathBuf,
+        /// The name asked for.
+        asked: String,
+        /// The names there are.
+        found: Vec<String>,
+    },
+    /// The scenario has no moment that all its vehicles have.
+    #[error("scene {}: scenario {name} has no frame that all of {agents:?} have", dir.display())]
+    NoFrames {
+        /// The data set.
+        dir: PathBuf,
+        /// The scenario.
+        name: String,
+        /// Its vehicles.
+        agents: Vec<String>,
+    },
+    /// The first tick to play is behind the last.
+    #[error("scene.seek is {seek}, but scenario {name} has {ticks} ticks")]
+    Seek {
+        /// The tick asked for.
+        seek: usize,
+        /// The scenario.
+        name: String,
+        /// Its ticks.
+        ticks: usize,
+    },
+    /// A vehicle is named that the scene does not have.
+    #[error("{field} names vehicle {cav}, but scenario {name} has {found:?}")]
+    NoVehicle {
+        /// Where it is named.
+        field: &'static str,
+        /// The vehicle.
+        cav: CavId,
+        /// The scenario.
+        name: String,
+        /// The vehicles there are.
+        found: Vec<String>,
+    },
+    /// The weights cannot be used.
+    #[error("weights: {0}")]
+    Weights(#[from] WeightsError),
+}
+
+/// A scenario with everything filled in that it leaves open.
+#[derive(Debug, Clone)]
+pub struct Fleet {
+    /// The scenario, with scene and vehicles named.
+    pub scenario: Scenario,
+    /// Every vehicle that takes part, in the scene's order.
+    pub agents: Vec<CavId>,
+    /// The fusing one.
+    pub ego: CavId,
+    /// Ticks that will be played; `None`: until someone ends it.
+    pub ticks: Option<usize>,
+    /// Folder of the recorded scenario, for its hash.
+    pub scene_dir: PathBuf,
+    /// The model, as its weights say.
+    pub detector: DetectorConfig,
+}
+
+impl Fleet {
+    /// Looks into scene and weights.
+    ///
+    /// # Errors
+    /// [`FleetError`] says what the scene or the weights lack.
+    pub fn plan(scenario: &Scenario) -> Result<Self, FleetError> {
+        let mut scenario = scenario.clone();
+        let detector = Weights::load(&scenario.models.weights)?.config()?;
+        let scene = &mut scenario.scene;
+        let dataset = dataset::open(&scene.dir)?;
+        let recorded = match &scene.scenario {
+            None => dataset.scenarios.first().ok_or_else(|| FleetError::Empty(scene.dir.clone()))?,
+            Some(name) => {
+                dataset.scenarios.iter().find(|known| known.name == *name).ok_or_else(|| FleetError::NoScenario {
+                    dir: scene.dir.clone(),
+                    asked: name.clone(),
+                    found: dataset.scenarios.iter().map(|known| known.name.clone()).collect(),
+                })?
+            }
+        };
+        let name = recorded.name.clone();
+        if recorded.ticks.is_empty() {
+            let agents = recorded.agents.iter().map(ToString::to_string).collect();
+            return Err(FleetError::NoFrames { dir: scene.dir.clone(), name, agents });
+        }
+        if scene.seek >= recorded.ticks.len() {
+            return Err(FleetError::Seek { seek: scene.seek, name, ticks: recorded.ticks.len() });
+        }
+        let known = |field, cav: &CavId| {
+            if recorded.agents.contains(cav) {
+                return Ok(());
+            }
+            let found = recorded.agents.iter().map(ToString::to_string).collect();
+            Err(FleetError::NoVehicle { field, cav: cav.clone(), name: name.clone(), found })
+        };
+        scene.agents.iter().try_for_each(|cav| known("scene.agents", cav))?;
+        scenario.ego.id.iter().try_for_each(|cav| known("ego.id", cav))?;
+        scenario.vehicles.keys().try_for_each(|cav| known("vehicles", cav))?;
+        let chosen = |cav: &&CavId| scene.agents.is_empty() || scene.agents.contains(cav);
+        let agents: Vec<CavId> = recorded.agents.iter().filter(chosen).cloned().collect();
+        let ego = scenario.ego.id.clone().unwrap_or_else(|| agents[0].clone());
+        let left = recorded.ticks.len() - scene.seek;
+        let ticks =
+            if scene.repeat { scene.frames } else { Some(scene.frames.map_or(left, |frames| frames.min(left))) };
+        let scene_dir = Some(scene.dir.join(&name)).filter(|folder| folder.is_dir()).unwrap_or(scene.dir.clone());
+        scene.scenario = Some(name);
+        scene.agents.clone_from(&agents);
+        scenario.ego.id = Some(ego.clone());
+        Ok(Self { scenario, agents, ego, ticks, scene_dir, detector })
+    }
+
+    /// Which objects count: the model's own range, all corners inside, vehicles within 70 m.
+    #[must_use]
+    pub fn ground_truth_rule(&self) -> GroundTruthRule {
+        let [x_low, y_low, z_low, x_high, y_high, z_high] = self.detector.lidar_range_m;
+        GroundTruthRule {
+            x_m: [x_low, x_high],
+            y_m: [y_low, y_high],
+            z_m: [z_low, z_high],
+            comm_range_m: COMM_RANGE_M,
+            min_corners: 8,
+        }
+    }
+
+    /// Every process to start, which all meet at `endpoint`; the programs lie in `programs`.
+    #[must_use]
+    pub fn processes(&self, run: &RunId, endpoint: &str, programs: &Path) -> Vec<ProcessSpec> {
+        let meeting = Meeting { run, endpoint, programs };
+        let here = |cav: &&CavId| self.scenario.settings_of(cav).launch == Launch::Here;
+        let mut specs: Vec<ProcessSpec> =
+            self.agents.iter().filter(here).map(|cav| self.agent(cav, &meeting)).collect();
+        specs.push(self.ego_fuser(&meeting));
+        specs.push(self.replay(&meeting));
+        specs
+    }
+
+    /// The executables of a fleet.
+    #[must_use]
+    pub fn programs(programs: &Path) -> Vec<PathBuf> {
+        ["agent", "ego-fuser", "sim-replay", "v2vloc"].iter().map(|name| programs.join(name)).collect()
+    }
+
+    fn agent(&self, cav: &CavId, meeting: &Meeting<'_>) -> ProcessSpec {
+        let settings = self.scenario.settings_of(cav);
+        let mut args = Arguments::of("run", meeting);
+        args.option("--cav", cav.as_str());
+        self.model(&mut args);
+        args.option("--publish", settings.publish.unwrap_or(Publish::for_method(self.scenario.method)).name());
+        args.option("--pose-source", settings.pose.name());
+        if let PoseSource::Noisy(noise) = settings.pose {
+            args.option("--noise-mode", noise_mode(noise.mode));
+            args.option("--noise-std-m", &noise.std_m.to_string());
+            args.option("--noise-std-deg", &noise.std_deg.to_string());
+            args.option("--noise-seed", &noise.seed.to_string());
+        }
+        args.option("--dtype", dtype(settings.codec.dtype));
+        if let Some(bytes) = settings.codec.budget_bytes {
+            args.option("--budget-bytes", &bytes.to_string());
+        }
+        if let Some(level) = settings.codec.zstd_level {
+            args.option("--zstd-level", &level.to_string());
+        }
+        meeting.process(format!("agent-{cav}"), "agent", args, Life::Service)
+    }
+
+    fn ego_fuser(&self, meeting: &Meeting<'_>) -> ProcessSpec {
+        let mut args = Arguments::of("run", meeting);
+        args.option("--ego", self.ego.as_str());
+        self.model(&mut args);
+        args.option("--method", self.scenario.method.name());
+        args.option("--deadline-ms", &self.scenario.ego.deadline_ms.to_string());
+        args.option("--max-age-ms", &self.scenario.ego.max_age_ms.to_string());
+        meeting.process(format!("ego-{}", self.ego), "ego-fuser", args, Life::Service)
+    }
+
+    fn replay(&self, meeting: &Meeting<'_>) -> ProcessSpec {
+        let scene = &self.scenario.scene;
+        let mut args = Arguments::of("stream", meeting);
+        args.option("--scene", &scene.dir);
+        if let Some(name) = &scene.scenario {
+            args.option("--scenario", name);
+        }
+        let agents: Vec<&str> = self.agents.iter().map(CavId::as_str).collect();
+        args.option("--agents", &agents.join(","));
+        if let Some(variant) = &scene.variant {
+            args.option("--variant", variant);
+        }
+        args.option("--rate", &scene.rate.to_string());
+        args.option("--seek", &scene.seek.to_string());
+        if let Some(frames) = scene.frames {
+            args.option("--frames", &frames.to_string());
+        }
+        if scene.repeat {
+            args.flag("--loop");
+        }
+        if scene.lockstep {
+            args.flag("--lockstep");
+        }
+        args.option("--ready-timeout-s", &self.scenario.timeouts.ready_s.to_string());
+        meeting.process("replay".into(), "sim-replay", args, Life::Task)
+    }
+
+    fn model(&self, args: &mut Arguments) {
+        args.option("--weights", &self.scenario.models.weights);
+        args.option("--threads", &self.scenario.models.threads.to_string());
+    }
+}
+
+/// Where the processes of a run meet, and where their programs lie.
+struct Meeting<'a> {
+    run: &'a RunId,
+    endpoint: &'a str,
+    programs: &'a Path,
+}
+
+impl Meeting<'_> {
+    fn process(&self, name: String, program: &str, args: Arguments, life: Life) -> ProcessSpec {
+        ProcessSpec { name, program: self.programs.join(program), args: args.0, life }
+    }
+}
+
+struct Arguments(Vec<OsString>);
+
+impl Arguments {
+    /// What every process of a fleet is told.
+    fn of(command: &str, meeting: &Meeting<'_>) -> Self {
+        let mut args = Self(vec![command.into()]);
+        args.option("--connect", meeting.endpoint);
+        args.option("--run", meeting.run.as_str());
+        args.flag("--lifeline");
+        args
+    }
+
+    /// One argument, so that a value that begins with `-` (a roadside unit's id) is not taken for a flag.
+    fn option<V: AsRef<std::ffi::OsStr> + ?Sized>(&mut self, name: &str, value: &V) {
+        let mut argument = OsString::from(name);
+        argument.push("=");
+        argument.push(value);
+        self.0.push(argument);
+    }
+
+    fn flag(&mut self, name: &str) {
+        self.0.push(name.into());
+    }
+}
+
+fn dtype(dtype: Dtype) -> &'static str {
+    match dtype {
+        Dtype::F32 => "f32",
+        Dtype::F16 => "f16",
+        Dtype::I8 => "i8",
+    }
+}
+
+fn noise_mode(mode: NoiseMode) -> &'static str {
+    match mode {
+        NoiseMode::Fixed => "fixed",
+        NoiseMode::Independent => "independent",
+        NoiseMode::Autoregressive => "autoregressive",
+    }
+}

@@ -1,0 +1,457 @@
+//! The score of a run, tick by tick, from what was detected and what was there. Knows no network and no file.
+
+use std::collections::BTreeMap;
+
+use ego_fuser::average_precision::{Ordering, Scorer};
+use protocol::{AgentTruth, Box3d, CavId, Detections, Handedness, PointCloud, Pose, PoseEstimate, Stamp, Truth};
+use serde::Serialize;
+use sim_replay::frame::{Frame, Object, ObjectClass};
+use sim_replay::ground_truth::{self, GroundTruthRule};
+
+use crate::metrics::{ByIou, Communication, Latencies, Percentiles, PoseError, PoseErrors};
+
+/// Ticks that may still be waiting for something: at 10 Hz six seconds, longer than any detection takes.
+const OPEN_TICKS: usize = 64;
+/// Overlap from which a detection counts as found in `frames.csv`.
+const FOUND_IOU: f64 = 0.5;
+
+/// One line of `frames.csv`.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct FrameRecord {
+    /// Which frame of the scene, counted from 0.
+    pub frame_index: u64,
+    /// Capture time on the scene's clock, nanoseconds.
+    pub capture_nanos: u64,
+    /// From the publication of the tick to that of its detections, milliseconds.
+    pub latency_ms: f64,
+    /// Boxes detected.
+    pub detected: usize,
+    /// Boxes there were.
+    pub truth: usize,
+    /// Detections that overlap a true box by at least 0.5.
+    pub found: usize,
+    /// Neighbours whose data are in the result.
+    pub fused: usize,
+    /// Neighbours whose data could not be.
+    pub skipped: usize,
+    /// Bytes of metadata and body of what was fused, over all neighbours.
+    pub payload_bytes: u64,
+    /// Bytes of everything those neighbours sent for it.
+    pub wire_bytes: u64,
+    /// Distance of the ego's own pose from the truth, metres; empty where it had none.
+    pub ego_error_m: Option<f64>,
+    /// Angle of the ego's own pose to the truth, degrees.
+    pub ego_error_deg: Option<f64>,
+}
+
+/// A result and what it was judged against, for pictures.
+#[derive(Debug, Clone)]
+pub struct JudgedFrame {
+    /// Which frame of the scene, counted from 0.
+    pub frame_index: u64,
+    /// The ego's result.
+    pub result: Detections,
+    /// What was there, in the ego's LiDAR frame.
+    pub truth: Vec<Box3d>,
+    /// True pose of every vehicle's LiDAR.
+    pub world_from_lidar: Vec<(CavId, Pose)>,
+}
+
+/// What has come of one tick so far.
+#[derive(Default)]
+struct Tick {
+    truth: Option<(u64, Truth)>,
+    result: Option<(u64, Detections)>,
+    poses: Vec<(CavId, PoseEstimate)>,
+}
+
+/// The score so far. Ticks are judged in the order of their capture times, whatever order their parts come in.
+pub struct Board {
+    ego: CavId,
+    rule: GroundTruthRule,
+    nominal_values: u64,
+    open: BTreeMap<u64, Tick>,
+    scorer: Scorer,
+    records: Vec<FrameRecord>,
+    pose_errors: Vec<PoseError>,
+    no_pose: u64,
+    bytes: Vec<(u64, u64)>,
+    missed: u64,
+    best: Option<JudgedFrame>,
+    judged_until: Option<u64>,
+}
+
+impl Board {
+    /// An empty board for the detections of `ego`, judged by `rule`; a feature map of the model has `nominal_values`
+    /// numbers.
+    #[must_use]
+    pub fn new(ego: CavId, rule: GroundTruthRule, nominal_values: u64) -> Self {
+        Self {
+            ego,
+            rule,
+            nominal_values,
+            open: BTreeMap::new(),
+            scorer: Scorer::default(),
+            records: Vec::new(),
+            pose_errors: Vec::new(),
+            no_pose: 0,
+            bytes: Vec::new(),
+            missed: 0,
+            best: None,
+            judged_until: None,
+        }
+    }
+
+    /// What was there at a tick.
+    pub fn truth(&mut self, stamp: &Stamp, truth: Truth) {
+        if let Some(tick) = self.tick(stamp.capture_nanos) {
+            tick.truth.get_or_insert((stamp.publish_nanos, truth));
+        }
+    }
+
+    /// What the ego makes of a tick. A second result of the same tick (of an ego started again) does not count.
+    pub fn result(&mut self, stamp: &Stamp, result: Detections) {
+        if let Some(tick) = self.tick(stamp.capture_nanos) {
+            tick.result.get_or_insert((stamp.publish_nanos, result));
+        }
+    }
+
+    /// Where a vehicle believes to be at a tick.
+    pub fn pose(&mut self, stamp: &Stamp, estimate: PoseEstimate) {
+        let cav = stamp.cav.clone();
+        if let Some(tick) = self.tick(stamp.capture_nanos)
+            && tick.poses.iter().all(|(known, _)| *known != cav)
+        {
+            tick.poses.push((cav, estimate));
+        }
+    }
+
+    /// Judges what is still open: nothing more will come.
+    pub fn close(&mut self) {
+        while let Some((capture_nanos, tick)) = self.open.pop_first() {
+            self.judge(capture_nanos, tick);
+        }
+    }
+
+    /// The frames judged so far, in order.
+    #[must_use]
+    pub fn records(&self) -> &[FrameRecord] {
+        &self.records
+    }
+
+    /// Ticks of which the ego never told anything.
+    #[must_use]
+    pub fn missed(&self) -> u64 {
+        self.missed
+    }
+
+    /// The frame most worth a picture so far: the one with the most neighbours, then true boxes.
+    #[must_use]
+    pub fn showpiece(&self) -> Option<&JudgedFrame> {
+        self.best.as_ref()
+    }
+
+    /// Average precision, ordered by score over all frames, and ordered by frame.
+    #[must_use]
+    pub fn average_precision(&self) -> (ByIou, ByIou) {
+        let objects = self.scorer.tallies().first().map_or(0, |tally| tally.objects);
+        let by_iou = |ordering| match self.scorer.average_precisions(ordering)[..] {
+            [at_30, at_50, at_70] if objects > 0 => {
+                ByIou { at_30: Some(at_30), at_50: Some(at_50), at_70: Some(at_70) }
+            }
+            _ => ByIou::default(),
+        };
+        (by_iou(Ordering::Global), by_iou(Ordering::Frame))
+    }
+
+    /// Errors of all vehicles' poses.
+    #[must_use]
+    pub fn pose_errors(&self) -> PoseErrors {
+        PoseErrors::of(&self.pose_errors, self.no_pose)
+    }
+
+    /// Delays of all frames.
+    #[must_use]
+    pub fn latencies(&self) -> Latencies {
+        let sample: Vec<f64> = self.records.iter().map(|record| record.latency_ms).collect();
+        Latencies { capture_to_detection: Percentiles::of(&sample) }
+    }
+
+    /// Bytes of all that was fused.
+    #[must_use]
+    pub fn communication(&self) -> Communication {
+        Communication::of(&self.bytes, self.nominal_values)
+    }
+
+    /// The open tick of a capture time; `None` for one that has been judged already.
+    fn tick(&mut self, capture_nanos: u64) -> Option<&mut Tick> {
+        if self.judged_until.is_some_and(|judged| capture_nanos <= judged) {
+            return None;
+        }
+        if self.open.len() >= OPEN_TICKS
+            && !self.open.contains_key(&capture_nanos)
+            && let Some((oldest, tick)) = self.open.pop_first()
+        {
+            self.judge(oldest, tick);
+        }
+        Some(self.open.entry(capture_nanos).or_default())
+    }
+
+    fn judge(&mut self, capture_nanos: u64, tick: Tick) {
+        self.judged_until = Some(capture_nanos);
+        let Some((began_nanos, truth)) = tick.truth else { return };
+        self.judge_poses(&tick.poses, &truth);
+        let Some((done_nanos, result)) = tick.result else {
+            self.missed += 1;
+            return;
+        };
+        let boxes = true_boxes(&truth, &self.ego, &self.rule);
+        let found = self.score(&result, &boxes);
+        let bytes: Vec<(u64, u64)> =
+            result.fused.iter().map(|neighbour| (neighbour.payload_bytes, neighbour.wire_bytes)).collect();
+        let ego_error = result.pose.world_from_cav().zip(true_pose(&truth, &self.ego));
+        let ego_error = ego_error.map(|(found, truth)| PoseError::between(found, truth));
+        self.records.push(FrameRecord {
+            frame_index: result.frame_index,
+            capture_nanos,
+            latency_ms: (done_nanos as f64 - began_nanos as f64) / 1e6,
+            detected: result.detections.len(),
+            truth: boxes.len(),
+            found,
+            fused: result.fused.len(),
+            skipped: result.skipped.len(),
+            payload_bytes: bytes.iter().map(|(payload, _)| payload).sum(),
+            wire_bytes: bytes.iter().map(|(_, wire)| wire).sum(),
+            ego_error_m: ego_error.map(|error| error.distance_m),
+            ego_error_deg: ego_error.map(|error| error.angle_deg),
+        });
+        self.bytes.extend(bytes);
+        self.keep_showpiece(result, boxes, &truth);
+    }
+
+    /// Adds a frame to the score; returns how many detections count as found.
+    fn score(&mut self, result: &Detections, boxes: &[Box3d]) -> usize {
+        let tally = |scorer: &Scorer| {
+            scorer.tallies().iter().find(|tally| tally.iou_threshold == FOUND_IOU).map_or(0, |tally| {
+                let first = tally.matched.len().saturating_sub(result.detections.len());
+                tally.matched[first..].iter().filter(|matched| matched.is_true).count()
+            })
+        };
+        self.scorer.add(&result.detections, boxes);
+        tally(&self.scorer)
+    }
+
+    fn judge_poses(&mut self, poses: &[(CavId, PoseEstimate)], truth: &Truth) {
+        for (cav, estimate) in poses {
+            match (estimate.world_from_cav(), true_pose(truth, cav)) {
+                (Some(found), Some(truth)) => self.pose_errors.push(PoseError::between(found, truth)),
+                (None, Some(_)) => self.no_pose += 1,
+                // A vehicle that the scene does not know has no truth to compare with.
+                (_, None) => {}
+            }
+        }
+    }
+
+    fn keep_showpiece(&mut self, result: Detections, boxes: Vec<Box3d>, truth: &Truth) {
+        let worth = |fused: usize, boxes: usize| (fused, boxes);
+        let better = self.best.as_ref().is_none_or(|best| {
+            worth(result.fused.len(), boxes.len()) > worth(best.result.fused.len(), best.truth.len())
+        });
+        if better {
+            let world_from_lidar =
+                truth.agents.iter().map(|agent| (agent.cav.clone(), agent.world_from_lidar)).collect();
+            self.best = Some(JudgedFrame { frame_index: result.frame_index, result, truth: boxes, world_from_lidar });
+        }
+    }
+}
+
+fn true_pose<'a>(truth: &'a Truth, cav: &CavId) -> Option<&'a Pose> {
+    truth.agents.iter().find(|agent| agent.cav == *cav).map(|agent| &agent.world_from_lidar)
+}
+
+/// The boxes the ego is expected to find, in its LiDAR frame.
+#[must_use]
+pub fn true_boxes(truth: &Truth, ego: &CavId, rule: &GroundTruthRule) -> Vec<Box3d> {
+    let frames: Vec<Frame> = truth.agents.iter().map(as_frame).collect();
+    let Some(ego_index) = frames.iter().position(|frame| frame.cav == *ego) else { return Vec::new() };
+    let merged = ground_truth::merge(&frames.iter().collect::<Vec<_>>(), ego_index, rule);
+    merged.into_iter().map(|(_, box3d)| box3d).collect()
+}
+
+/// The part of a recorded frame that the rule looks at.
+fn as_frame(agent: &AgentTruth) -> Frame {
+    let class = |name: &str| serde_json::from_value(name.into()).unwrap_or(ObjectClass::Other);
+    let objects = agent.objects.iter().map(|object| Object {
+        id: object.id,
+        class: class(&object.class),
+        world_from_object: object.world_from_object,
+        size_m: object.size_m,
+        speed_mps: object.speed_mps,
+    });
+    Frame {
+        cav: agent.cav.clone(),
+        capture_nanos: 0,
+        points: PointCloud::default(),
+        dropped_points: 0,
+        radar: None,
+        world_from_lidar: Some(agent.world_from_lidar),
+        world_from_vehicle: None,
+        gnss_world_from_vehicle: None,
+        speed_mps: None,
+        objects: objects.collect(),
+        source_handedness: Handedness::Right,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use protocol::{Detection, FusedNeighbour, TrueObject};
+
+    use super::*;
+
+    const RULE: GroundTruthRule = GroundTruthRule {
+        x_m: [-50.0, 50.0],
+        y_m: [-40.0, 40.0],
+        z_m: [-3.0, 1.0],
+        comm_range_m: 70.0,
+        min_corners: 8,
+    };
+
+    fn cav(text: &str) -> CavId {
+        CavId::new(text).unwrap()
+    }
+
+    fn stamp(name: &str, tick: u64, publish_ms: u64) -> Stamp {
+        let publish_nanos = publish_ms * 1_000_000;
+        Stamp { cav: cav(name), epoch: 1, sequence: tick, capture_nanos: tick * 100_000_000, publish_nanos }
+    }
+
+    fn object(id: i64, class: &str, x: f64) -> TrueObject {
+        let world_from_object = Pose::from_xyz_yaw([x, 0.0, -1.0], 0.0);
+        TrueObject { id, class: class.into(), world_from_object, size_m: [4.0, 2.0, 1.5], speed_mps: None }
+    }
+
+    /// The ego at the origin sees 1 and a pedestrian, its neighbour at x = 20 m sees 1 and 2.
+    fn truth(tick: u64) -> Truth {
+        let agent = |name: &str, x: f64, objects| AgentTruth {
+            cav: cav(name),
+            world_from_lidar: Pose::from_xyz_yaw([x, 0.0, 0.0], 0.0),
+            objects,
+        };
+        let (first, second) = (object(1, "car", 10.0), object(2, "van", 30.0));
+        Truth {
+            frame_index: tick,
+            agents: vec![
+                agent("e", 0.0, vec![first.clone(), object(9, "pedestrian", 5.0)]),
+                agent("n", 20.0, vec![first, second]),
+            ],
+        }
+    }
+
+    fn result(tick: u64, at_x: &[f64]) -> Detections {
+        let found = |&x: &f64| Detection {
+            box3d: Box3d { center_m: [x, 0.0, -1.0], size_m: [4.0, 2.0, 1.5], heading_rad: 0.0 },
+            score: 0.9,
+            source: None,
+        };
+        Detections {
+            ego: cav("e"),
+            frame_index: tick,
+            method: "max".into(),
+            pose: PoseEstimate::new(Pose::from_xyz_yaw([1.0, 0.0, 0.0], 0.0), 1.0),
+            detections: at_x.iter().map(found).collect(),
+            fused: vec![FusedNeighbour {
+                cav: cav("n"),
+                age_nanos: 0,
+                confidence: 1.0,
+                payload_bytes: 1000,
+                wire_bytes: 1300,
+            }],
+            skipped: vec![],
+            stages: vec![],
+        }
+    }
+
+    fn board() -> Board {
+        Board::new(cav("e"), RULE, 64 * 96 * 128)
+    }
+
+    #[test]
+    fn a_frame_is_judged_against_everyones_truth() {
+        let mut board = board();
+        board.truth(&stamp("replay", 0, 1_000), truth(0));
+        board.result(&stamp("e", 0, 1_080), result(0, &[10.0, 30.0, -20.0]));
+        board.close();
+        let record = &board.records()[0];
+        assert_eq!((record.truth, record.detected, record.found), (2, 3, 2), "the pedestrian does not count");
+        assert_eq!((record.latency_ms, record.payload_bytes, record.wire_bytes), (80.0, 1000, 1300));
+        assert_eq!(record.ego_error_m, Some(1.0));
+        let (global, _) = board.average_precision();
+        assert_eq!(global.at_50, Some(1.0), "the false box has the same score and comes last");
+        assert_eq!(board.communication().payload_bytes_mean, Some(1000.0));
+        assert_eq!(board.showpiece().unwrap().truth.len(), 2);
+    }
+
+    #[test]
+    fn order_of_arrival_changes_nothing() {
+        let score = |backwards: bool| {
+            let mut board = board();
+            let mut ticks: Vec<u64> = (0..10).collect();
+            if backwards {
+                ticks.reverse();
+            }
+            for tick in ticks {
+                let detected: &[f64] = if tick % 2 == 0 { &[10.0] } else { &[-7.0, 30.0] };
+                if backwards {
+                    board.result(&stamp("e", tick, 50), result(tick, detected));
+                    board.truth(&stamp("replay", tick, 0), truth(tick));
+                } else {
+                    board.truth(&stamp("replay", tick, 0), truth(tick));
+                    board.result(&stamp("e", tick, 50), result(tick, detected));
+                }
+            }
+            board.close();
+            (board.average_precision(), board.records().to_vec())
+        };
+        assert_eq!(score(false), score(true));
+    }
+
+    #[test]
+    fn a_tick_without_result_is_missed_and_a_second_result_ignored() {
+        let mut board = board();
+        for tick in 0..3 {
+            board.truth(&stamp("replay", tick, 0), truth(tick));
+        }
+        board.result(&stamp("e", 1, 50), result(1, &[10.0]));
+        board.result(&stamp("e", 1, 90), result(1, &[]));
+        board.close();
+        assert_eq!((board.missed(), board.records().len()), (2, 1));
+        assert_eq!((board.records()[0].latency_ms, board.records()[0].detected), (50.0, 1));
+    }
+
+    #[test]
+    fn poses_of_all_vehicles_are_judged() {
+        let mut board = board();
+        board.pose(&stamp("n", 0, 0), PoseEstimate::new(Pose::from_xyz_yaw([20.0, 4.0, 0.0], 0.0), 0.5));
+        let reason = protocol::NoPoseReason::TooFewPoints;
+        board.pose(&stamp("e", 0, 0), PoseEstimate::NoPose { reason, inlier_count: 2 });
+        board.pose(&stamp("stranger", 0, 0), PoseEstimate::new(Pose::IDENTITY, 0.5));
+        board.truth(&stamp("replay", 0, 0), truth(0));
+        board.close();
+        let errors = board.pose_errors();
+        assert_eq!((errors.mean_m, errors.no_pose, errors.success_3m), (Some(4.0), 1, Some(0.0)));
+    }
+
+    #[test]
+    fn a_long_run_keeps_few_ticks_open() {
+        let mut board = board();
+        for tick in 0..1_000 {
+            board.truth(&stamp("replay", tick, 0), truth(tick));
+            board.result(&stamp("e", tick, 50), result(tick, &[10.0]));
+        }
+        assert!(board.open.len() <= OPEN_TICKS && board.records().len() >= 1_000 - OPEN_TICKS);
+        board.result(&stamp("e", 3, 50), result(3, &[]));
+        board.close();
+        assert_eq!(board.records().len(), 1_000, "a late second result of a judged tick adds none");
+    }
+}

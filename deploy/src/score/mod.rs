@@ -1,0 +1,5 @@
+//! What a run is worth: detections against the truth, poses, delays, bytes, and whether every message is accounted for.
+
+mod board;
+
+pub use board::{Board, FrameRecord, JudgedFrame, true_boxes};
