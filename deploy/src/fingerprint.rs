@@ -112,7 +112,7 @@ mod tests {
         let [one, two, three] = [(); 3].map(|()| tempfile::tempdir().unwrap());
         let weights = one.path().join("w.safetensors");
         std::fs::write(&weights, b"weights").unwrap();
-        let collect = |scene: &Path| Provenance::collect(&[weights.clone()], &weights, scene).unwrap();
+        let collect = |scene: &Path| Provenance::collect(std::slice::from_ref(&weights), &weights, scene).unwrap();
         let first = collect(&scene(one.path(), "0 0 0"));
         assert_eq!(first.scene_files, 2, "images do not count");
         // From `printf weights | sha256sum`.

@@ -67,6 +67,9 @@ pub struct ProcessBooks {
     pub stages: Vec<StageSummary>,
 }
 
+/// The last books of every process and epoch.
+type Books = BTreeMap<(ProcessId, u64), ProcessBooks>;
+
 /// Everything the scorer has at the end.
 pub struct Scored {
     /// Detections against the truth.
@@ -98,7 +101,7 @@ pub struct ScorerNode {
     bus: Bus,
     inbox: Arc<Inbox>,
     progress: Arc<Mutex<Progress>>,
-    thread: JoinHandle<(Board, BTreeMap<(ProcessId, u64), ProcessBooks>)>,
+    thread: JoinHandle<(Board, Books)>,
     _subscriptions: Vec<Subscription>,
     _presence: Presence,
 }
@@ -184,7 +187,7 @@ struct Worker {
     inbox: Arc<Inbox>,
     bus_books: sim_replay::bus::Books,
     board: Board,
-    books: BTreeMap<(ProcessId, u64), ProcessBooks>,
+    books: Books,
     progress: Arc<Mutex<Progress>>,
     detections: BufWriter<File>,
     // When each recent tick was published, by capture time: for the latency that is shown while the run goes.
@@ -192,7 +195,7 @@ struct Worker {
 }
 
 impl Worker {
-    fn run(mut self) -> (Board, BTreeMap<(ProcessId, u64), ProcessBooks>) {
+    fn run(mut self) -> (Board, Books) {
         loop {
             match self.inbox.take(None) {
                 Taken::Item(topic, Event::Message(arrival)) => self.take(&topic, &arrival),
@@ -243,7 +246,8 @@ impl Worker {
         }
         let began = self.published.get(&stamp.capture_nanos);
         let latency_ms = began.map(|began| (stamp.publish_nanos as f64 - *began as f64) / 1e6);
-        let (fused, bytes) = (result.fused.len(), result.fused.iter().map(|neighbour| neighbour.wire_bytes).sum::<u64>());
+        let (fused, bytes) =
+            (result.fused.len(), result.fused.iter().map(|neighbour| neighbour.wire_bytes).sum::<u64>());
         let at = arrival.at;
         self.note(|progress| {
             progress.frames += 1;
