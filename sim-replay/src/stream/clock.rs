@@ -1,0 +1,122 @@
+//! When the next tick is due on the wall.
+
+use std::time::{Duration, Instant};
+
+/// The scene's clock on the wall: running at a rate, or halted, perhaps with some ticks still to go.
+#[derive(Debug, Clone)]
+pub struct ReplayClock {
+    /// Seconds of the scene per second of the wall; 0: every tick is due at once.
+    rate: f64,
+    state: State,
+    // The moment at which a capture time was due; all others follow from it. None: the next tick is due at once.
+    anchor: Option<(Instant, u64)>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum State {
+    Running,
+    Halted { steps: u64 },
+}
+
+impl ReplayClock {
+    /// A running clock.
+    #[must_use]
+    pub fn new(rate: f64) -> Self {
+        Self { rate, state: State::Running, anchor: None }
+    }
+
+    /// Runs on from here, at another rate where one is given.
+    pub fn resume(&mut self, rate: Option<f64>) {
+        self.rate = rate.unwrap_or(self.rate);
+        self.state = State::Running;
+        self.anchor = None;
+    }
+
+    /// Halts after the current tick.
+    pub fn pause(&mut self) {
+        self.state = State::Halted { steps: 0 };
+    }
+
+    /// Halts, but lets `ticks` more through, each at once.
+    pub fn step(&mut self, ticks: u64) {
+        let steps = match self.state {
+            State::Halted { steps } => steps,
+            State::Running => 0,
+        };
+        self.state = State::Halted { steps: steps.saturating_add(ticks) };
+    }
+
+    /// The scene's time has jumped, or the scene has been waited for: the next tick is due at once.
+    pub fn rebase(&mut self) {
+        self.anchor = None;
+    }
+
+    /// When the tick captured at `capture_nanos` is due; `None` while the clock is halted.
+    #[must_use]
+    pub fn due(&self, capture_nanos: u64, now: Instant) -> Option<Instant> {
+        match (self.state, self.anchor) {
+            (State::Halted { steps: 0 }, _) => None,
+            (State::Running, Some((at, anchored))) if self.rate > 0.0 => {
+                let scene = Duration::from_nanos(capture_nanos.saturating_sub(anchored));
+                Some(at + scene.div_f64(self.rate))
+            }
+            _ => Some(now),
+        }
+    }
+
+    /// The tick captured at `capture_nanos`, which was due at `due`, is out. Counting from when it was due and not from
+    /// now keeps the pace: a late tick does not delay those after it.
+    pub fn published(&mut self, capture_nanos: u64, due: Instant) {
+        match &mut self.state {
+            State::Running => self.anchor = Some((due, capture_nanos)),
+            State::Halted { steps } => *steps = steps.saturating_sub(1),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const TENTH: u64 = 100_000_000;
+
+    #[test]
+    fn ticks_keep_the_pace_however_late_one_was() {
+        let mut clock = ReplayClock::new(2.0);
+        let start = Instant::now();
+        assert_eq!(clock.due(5 * TENTH, start), Some(start));
+        clock.published(5 * TENTH, start);
+        for tick in 1..5 {
+            let due = clock.due((5 + tick) * TENTH, start + Duration::from_secs(9)).unwrap();
+            assert_eq!(due, start + Duration::from_millis(50 * tick));
+            clock.published((5 + tick) * TENTH, due);
+        }
+    }
+
+    #[test]
+    fn a_halted_clock_lets_steps_through() {
+        let mut clock = ReplayClock::new(1.0);
+        let now = Instant::now();
+        clock.pause();
+        assert_eq!(clock.due(0, now), None);
+        clock.step(2);
+        for tick in 0..2 {
+            assert_eq!(clock.due(tick * TENTH, now), Some(now));
+            clock.published(tick * TENTH, now);
+        }
+        assert_eq!(clock.due(2 * TENTH, now), None);
+        clock.resume(None);
+        assert_eq!(clock.due(2 * TENTH, now), Some(now), "the pause does not count as lateness");
+    }
+
+    #[test]
+    fn rate_nought_waits_for_nothing() {
+        let mut clock = ReplayClock::new(0.0);
+        let now = Instant::now();
+        clock.published(0, now);
+        assert_eq!(clock.due(TENTH, now), Some(now));
+        clock.resume(Some(1.0));
+        clock.published(0, now);
+        assert_eq!(clock.due(TENTH, now), Some(now + Duration::from_millis(100)));
+    }
+}

@@ -1,0 +1,110 @@
+//! Reading the next ticks from disk while the current one is being waited for.
+
+use std::collections::{BTreeMap, VecDeque};
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::thread::{self, JoinHandle};
+
+use crate::dataset::{LoadOptions, ReadError, Scenario};
+use crate::frame::Frame;
+
+/// The frames of one tick, one for each agent that was asked for, in that order.
+pub type TickFrames = Vec<Result<Frame, ReadError>>;
+
+#[derive(Default)]
+struct State {
+    wanted: VecDeque<usize>,
+    ready: BTreeMap<usize, TickFrames>,
+    is_closed: bool,
+}
+
+impl State {
+    fn next(&self) -> Option<usize> {
+        self.wanted.iter().copied().find(|index| !self.ready.contains_key(index))
+    }
+}
+
+/// A thread that reads the ticks it is told will be wanted, in order, and holds no more than those.
+pub struct ReadAhead {
+    shared: Arc<(Mutex<State>, Condvar)>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl ReadAhead {
+    /// Starts a thread that reads frames of `agents` (indices into the scenario's agents).
+    ///
+    /// # Errors
+    /// When the system gives no thread.
+    pub fn start(scenario: Scenario, agents: Vec<usize>, options: LoadOptions) -> std::io::Result<Self> {
+        let shared: Arc<(Mutex<State>, Condvar)> = Arc::default();
+        let thread = thread::Builder::new().name("read ahead".into()).spawn({
+            let shared = Arc::clone(&shared);
+            move || {
+                while let Some(tick) = next_wanted(&shared) {
+                    let frames = agents.iter().map(|&agent| scenario.load(agent, tick, &options)).collect();
+                    let mut state = lock(&shared);
+                    // A jump may have made it unwanted in the meantime.
+                    if state.wanted.contains(&tick) {
+                        state.ready.insert(tick, frames);
+                        shared.1.notify_all();
+                    }
+                }
+            }
+        })?;
+        Ok(Self { shared, thread: Some(thread) })
+    }
+
+    /// Says which ticks will be taken next, in order; whatever else has been read is forgotten.
+    pub fn want(&self, ticks: &[usize]) {
+        let mut state = lock(&self.shared);
+        state.wanted = ticks.iter().copied().collect();
+        state.ready.retain(|tick, _| ticks.contains(tick));
+        self.shared.1.notify_all();
+    }
+
+    /// The frames of a tick that is wanted, as soon as they are read; empty if the reading thread is gone.
+    #[must_use]
+    pub fn take(&self, tick: usize) -> TickFrames {
+        let mut state = lock(&self.shared);
+        loop {
+            if let Some(frames) = state.ready.remove(&tick) {
+                return frames;
+            }
+            if self.thread.as_ref().is_none_or(JoinHandle::is_finished) {
+                return Vec::new();
+            }
+            if !state.wanted.contains(&tick) {
+                state.wanted.push_front(tick);
+                self.shared.1.notify_all();
+            }
+            state = self.shared.1.wait(state).unwrap_or_else(PoisonError::into_inner);
+        }
+    }
+}
+
+impl Drop for ReadAhead {
+    fn drop(&mut self) {
+        lock(&self.shared).is_closed = true;
+        self.shared.1.notify_all();
+        if let Some(thread) = self.thread.take() {
+            // A reader that panicked has already said so.
+            let _ = thread.join();
+        }
+    }
+}
+
+fn next_wanted(shared: &(Mutex<State>, Condvar)) -> Option<usize> {
+    let mut state = lock(shared);
+    loop {
+        if state.is_closed {
+            return None;
+        }
+        if let Some(tick) = state.next() {
+            return Some(tick);
+        }
+        state = shared.1.wait(state).unwrap_or_else(PoisonError::into_inner);
+    }
+}
+
+fn lock(shared: &(Mutex<State>, Condvar)) -> MutexGuard<'_, State> {
+    shared.0.lock().unwrap_or_else(PoisonError::into_inner)
+}

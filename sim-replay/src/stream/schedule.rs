@@ -1,0 +1,128 @@
+//! Which tick comes next, and at what time of the scene.
+
+use std::sync::Arc;
+
+use crate::dataset::Tick;
+
+/// Between two ticks where a scene has only one, nanoseconds.
+const SINGLE_TICK_PERIOD: u64 = 100_000_000;
+
+/// One tick that is to be published.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Planned {
+    /// Its place in the scenario's ticks.
+    pub tick_index: usize,
+    /// Capture time on the clock of the replay, nanoseconds: the recorded one until the replay first goes back.
+    pub capture_nanos: u64,
+}
+
+/// The order of ticks under seeking, looping and a limit. A clone of it looks ahead.
+///
+/// Capture times always rise, as if the cars went on driving: whoever pairs by capture time must not see one twice.
+/// After a jump back (a loop, or a seek) all times are shifted so that the next tick follows the last at the scene's
+/// pace.
+#[derive(Debug, Clone)]
+pub struct Schedule {
+    captures: Arc<[u64]>,
+    next_index: usize,
+    left: Option<usize>,
+    repeats: bool,
+    shift_nanos: u64,
+    last_nanos: Option<u64>,
+}
+
+impl Schedule {
+    /// Begins at tick `first`; ends after `frames` ticks, or, unless it `repeats`, with the scene.
+    #[must_use]
+    pub fn new(ticks: &[Tick], first: usize, frames: Option<usize>, repeats: bool) -> Self {
+        Self {
+            captures: ticks.iter().map(|tick| tick.capture_nanos).collect(),
+            next_index: first,
+            left: frames,
+            repeats,
+            shift_nanos: 0,
+            last_nanos: None,
+        }
+    }
+
+    /// Goes on from tick `index` instead.
+    pub fn seek(&mut self, index: usize) {
+        self.next_index = index;
+    }
+
+    /// The ticks that come next, at most `count`.
+    #[must_use]
+    pub fn ahead(&self, count: usize) -> Vec<usize> {
+        self.clone().take(count).map(|planned| planned.tick_index).collect()
+    }
+
+    fn period_nanos(&self) -> u64 {
+        let mut steps: Vec<u64> = self.captures.windows(2).map(|pair| pair[1].saturating_sub(pair[0])).collect();
+        steps.sort_unstable();
+        steps.get(steps.len() / 2).copied().filter(|step| *step > 0).unwrap_or(SINGLE_TICK_PERIOD)
+    }
+}
+
+impl Iterator for Schedule {
+    type Item = Planned;
+
+    fn next(&mut self) -> Option<Planned> {
+        if self.left == Some(0) {
+            return None;
+        }
+        if self.next_index >= self.captures.len() && self.repeats {
+            self.next_index = 0;
+        }
+        let tick_index = self.next_index;
+        let recorded = *self.captures.get(tick_index)?;
+        if let Some(last) = self.last_nanos
+            && recorded + self.shift_nanos <= last
+        {
+            self.shift_nanos = last + self.period_nanos() - recorded;
+        }
+        let capture_nanos = recorded + self.shift_nanos;
+        self.next_index += 1;
+        self.left = self.left.map(|left| left - 1);
+        self.last_nanos = Some(capture_nanos);
+        Some(Planned { tick_index, capture_nanos })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn ticks(captures: &[u64]) -> Vec<Tick> {
+        captures.iter().map(|&capture_nanos| Tick { stem: capture_nanos.to_string(), capture_nanos }).collect()
+    }
+
+    fn plan(schedule: Schedule, count: usize) -> Vec<(usize, u64)> {
+        schedule.take(count).map(|planned| (planned.tick_index, planned.capture_nanos)).collect()
+    }
+
+    #[test]
+    fn a_scene_is_played_once() {
+        let schedule = Schedule::new(&ticks(&[100, 200, 300]), 0, None, false);
+        assert_eq!(plan(schedule, 9), [(0, 100), (1, 200), (2, 300)]);
+        assert_eq!(plan(Schedule::new(&ticks(&[100, 200, 300]), 1, Some(1), false), 9), [(1, 200)]);
+        assert_eq!(plan(Schedule::new(&[], 0, None, true), 9), []);
+    }
+
+    #[test]
+    fn a_loop_drives_on() {
+        let schedule = Schedule::new(&ticks(&[100, 200, 350]), 1, Some(6), true);
+        assert_eq!(plan(schedule, 9), [(1, 200), (2, 350), (0, 500), (1, 600), (2, 750), (0, 900)]);
+        assert_eq!(plan(Schedule::new(&ticks(&[7]), 0, None, true), 2), [(0, 7), (0, 100_000_007)]);
+    }
+
+    #[test]
+    fn a_jump_back_never_repeats_a_time_and_one_ahead_keeps_the_recorded() {
+        let mut schedule = Schedule::new(&ticks(&[100, 200, 300, 400]), 0, None, false);
+        assert_eq!(schedule.next().map(|planned| planned.capture_nanos), Some(100));
+        schedule.seek(2);
+        assert_eq!(schedule.ahead(3), [2, 3]);
+        assert_eq!(schedule.next().map(|planned| planned.capture_nanos), Some(300));
+        schedule.seek(0);
+        assert_eq!(plan(schedule, 2), [(0, 400), (1, 500)]);
+    }
+}
