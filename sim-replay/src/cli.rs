@@ -8,7 +8,7 @@ use crate::command;
 
 /// Scenes: look into recorded ones, generate new ones, stream either as live traffic.
 #[derive(Debug, Parser)]
-#[command(version, after_help = "Exit codes: 0 done, 1 failed, 2 bad usage or input.")]
+#[command(version, after_help = "Exit codes: 0 done, 1 failed, 2 bad usage or input, 3 finished but data was lost.")]
 pub(crate) struct Cli {
     #[command(subcommand)]
     command: Command,
@@ -17,6 +17,7 @@ pub(crate) struct Cli {
 #[derive(Debug, Subcommand)]
 enum Command {
     Inspect(command::inspect::Args),
+    Stream(command::stream::Args),
     Synth(command::synth::Args),
 }
 
@@ -27,17 +28,21 @@ pub(crate) enum Outcome {
     Done,
     /// The input is wrong; what is wrong has been said.
     BadInput,
+    /// Finished, but not everything of the input came through.
+    DataLost,
 }
 
 /// Runs what was asked for and prints the chain of causes where it failed.
 pub(crate) fn run(cli: Cli) -> ExitCode {
     let outcome = match cli.command {
         Command::Inspect(args) => command::inspect::run(&args),
+        Command::Stream(args) => command::stream::run(&args),
         Command::Synth(args) => command::synth::run(args),
     };
     match outcome {
         Ok(Outcome::Done) => ExitCode::SUCCESS,
         Ok(Outcome::BadInput) => ExitCode::from(2),
+        Ok(Outcome::DataLost) => ExitCode::from(3),
         Err(error) => {
             eprintln!("error: {error:#}");
             ExitCode::FAILURE

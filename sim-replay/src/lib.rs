@@ -11,5 +11,6 @@ pub mod dataset;
 pub mod frame;
 pub mod ground_truth;
 pub mod pcd;
+pub mod stream;
 pub mod synth;
 pub mod town;

@@ -10,6 +10,7 @@
 //! Nothing here is async: zenoh brings its own runtimes, and a `put` that waits for a slow network must not hold up an
 //! executor. Inside tokio it needs the multi-thread runtime.
 
+mod args;
 mod books;
 mod liveliness;
 pub mod mailbox;
@@ -21,10 +22,11 @@ mod session;
 pub mod shutdown;
 mod subscriber;
 
+pub use args::{BusArgs, STOP_LIMIT, log_to_stderr};
 pub use books::Books;
 pub use liveliness::{Presence, Sighting, Watch};
 pub use membership::{Bus, Identity};
 pub use publisher::{Overflow, Publisher, PublisherOptions, unix_nanos};
-pub use readiness::{Attended, Barrier, NotReady, Route, RouteError};
+pub use readiness::{Attended, Barrier, NotReady, Route, RouteError, process_id};
 pub use session::{BusError, BusOptions, Endpoint, Role as SessionRole, open};
 pub use subscriber::{Arrival, Event, Inbox, Subscription};

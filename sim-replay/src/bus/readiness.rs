@@ -12,7 +12,7 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use protocol::{Control, Limits, ProcessId, Topic, Verb};
+use protocol::{CavId, Control, Limits, ProcessId, Role, Topic, Verb};
 
 use super::mailbox::Taken;
 use super::{Bus, BusError, Event, Inbox, Subscription};
@@ -20,6 +20,8 @@ use super::{Bus, BusError, Event, Inbox, Subscription};
 /// Answers that may wait at once; each repeats what the one before it from the same process said.
 const PLACES: usize = 256;
 
+/// How often a waiting barrier asks whether it should still wait.
+const ASK_AGAIN: Duration = Duration::from_millis(100);
 /// Routes that an error names; a fleet of many misses many at once.
 const NAMED: usize = 20;
 
@@ -36,6 +38,17 @@ impl fmt::Display for Route {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         write!(f, "{}>{}", self.topic, self.receiver)
     }
+}
+
+/// The name of a process in ledgers and routes: `agent-4279`, or the role alone where the vehicle is only a stand-in for
+/// it (`replay`).
+///
+/// # Panics
+/// Never: both parts are identifiers, and short enough.
+#[must_use]
+pub fn process_id(role: Role, cav: &CavId) -> ProcessId {
+    let name = if cav.as_str() == role.to_string() { role.to_string() } else { format!("{role}-{cav}") };
+    ProcessId::new(&name).expect("two identifiers and a hyphen make one")
 }
 
 /// A text that is not a route.
@@ -61,7 +74,7 @@ impl FromStr for Route {
 
 /// Not every route came up.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("after {waited:?} nothing has come through {}{}; is that process running, and in the same run?",
+#[error("after {:.1} s nothing has come through {}{}; is that process running, and in the same run?", .waited.as_secs_f64(),
     .missing.iter().take(NAMED).map(ToString::to_string).collect::<Vec<_>>().join(", "),
     if .missing.len() > NAMED { format!(" and {} more", .missing.len() - NAMED) } else { String::new() })]
 pub struct NotReady {
@@ -133,14 +146,24 @@ impl Barrier {
     /// # Errors
     /// [`NotReady`] names the routes that are missing.
     pub fn wait(&self, patience: Duration) -> Result<(), NotReady> {
+        self.wait_unless(patience, || false)
+    }
+
+    /// [`Self::wait`] that gives up as soon as `given_up` says so.
+    ///
+    /// # Errors
+    /// [`NotReady`] names the routes that are missing.
+    pub fn wait_unless(&self, patience: Duration, given_up: impl Fn() -> bool) -> Result<(), NotReady> {
         let began = Instant::now();
         let mut missing = self.lock();
         while !missing.is_empty() {
             let left = patience.saturating_sub(began.elapsed());
-            if left.is_zero() {
-                return Err(NotReady { missing: missing.iter().cloned().collect(), waited: patience });
+            if left.is_zero() || given_up() {
+                let waited = began.elapsed();
+                return Err(NotReady { missing: missing.iter().cloned().collect(), waited });
             }
-            missing = self.changed.wait_timeout(missing, left).unwrap_or_else(PoisonError::into_inner).0;
+            let nap = left.min(ASK_AGAIN);
+            missing = self.changed.wait_timeout(missing, nap).unwrap_or_else(PoisonError::into_inner).0;
         }
         Ok(())
     }
@@ -188,6 +211,13 @@ mod tests {
             let error = text.parse::<Route>().unwrap_err().to_string();
             assert!(error.contains(says), "{error}");
         }
+    }
+
+    #[test]
+    fn processes_are_named_by_role_and_vehicle() {
+        assert_eq!(process_id(Role::Agent, &CavId::new("-1").unwrap()).as_str(), "agent--1");
+        assert_eq!(process_id(Role::Replay, &CavId::new("replay").unwrap()).as_str(), "replay");
+        assert_eq!(process_id(Role::Replay, &CavId::new(&"z".repeat(32)).unwrap()).as_str().len(), 39);
     }
 
     #[test]

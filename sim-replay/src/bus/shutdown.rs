@@ -113,6 +113,19 @@ impl Stop {
         Ok(())
     }
 
+    /// Ends the process with exit code 1 when it has not ended by itself `limit` after the first request: a network that
+    /// is stuck must not keep it.
+    pub fn enforce(&self, limit: Duration) {
+        self.on_request(move || {
+            // Without a thread for it, the operator's second Ctrl-C is left.
+            let _ = thread::Builder::new().name("enforcer".into()).spawn(move || {
+                thread::sleep(limit);
+                tracing::error!("not ended {limit:?} after it was asked to; giving up what is left");
+                std::process::exit(1);
+            });
+        });
+    }
+
     fn lock(&self) -> std::sync::MutexGuard<'_, State> {
         self.0.0.lock().unwrap_or_else(PoisonError::into_inner)
     }

@@ -1,4 +1,5 @@
 //! One file per sub-command: its arguments and its `run`.
 
 pub(crate) mod inspect;
+pub(crate) mod stream;
 pub(crate) mod synth;

@@ -3,6 +3,7 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::{self, JoinHandle};
+use std::time::Duration;
 
 use crate::dataset::{LoadOptions, ReadError, Scenario};
 use crate::frame::Frame;
@@ -76,7 +77,8 @@ impl ReadAhead {
                 state.wanted.push_front(tick);
                 self.shared.1.notify_all();
             }
-            state = self.shared.1.wait(state).unwrap_or_else(PoisonError::into_inner);
+            // A thread that panics wakes nobody.
+            state = self.shared.1.wait_timeout(state, Duration::from_secs(1)).unwrap_or_else(PoisonError::into_inner).0;
         }
     }
 }

@@ -1,0 +1,158 @@
+//! `sim-replay stream`: a scene as live traffic.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use anyhow::Context;
+use protocol::{CavId, Role};
+use sim_replay::bus::{BusArgs, Route, STOP_LIMIT, log_to_stderr};
+use sim_replay::dataset::{self, LoadOptions, Scenario};
+use sim_replay::stream::{Replay, StreamError, StreamOptions, StreamReport};
+
+use crate::cli::Outcome;
+
+/// Publish a scene as if its vehicles were driving now.
+///
+/// The clock starts when all expected routes have carried a probe. While it runs, control messages (`pause`, `resume`,
+/// `step`, `seek`, `start` with another rate) steer it.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// Dataset, split or scenario; the layout is found out.
+    dir: PathBuf,
+    #[command(flatten)]
+    bus: BusArgs,
+    /// Scenario to play [default: the first].
+    #[arg(long)]
+    scenario: Option<String>,
+    /// Vehicles that take part [default: all].
+    #[arg(long, value_delimiter = ',', allow_hyphen_values = true)]
+    agents: Vec<CavId>,
+    /// Seconds of the scene per second; 0: as fast as the bus takes it, dropping nothing.
+    #[arg(long, default_value_t = 1.0)]
+    rate: f64,
+    /// Start again after the last tick.
+    #[arg(long = "loop")]
+    repeats: bool,
+    /// First tick, counted from 0.
+    #[arg(long, default_value_t = 0)]
+    seek: usize,
+    /// Ticks to play [default: to the end, or for ever with --loop].
+    #[arg(long)]
+    frames: Option<usize>,
+    /// Variant of the sweeps, for example fog_0.060 [default: the plain ones].
+    #[arg(long)]
+    variant: Option<String>,
+    /// Publish radar sweeps too.
+    #[arg(long)]
+    radar: bool,
+    /// A route that has to stand before the clock starts, TOPIC>PROCESS, for example 4288/bev>ego-4279; repeatable.
+    /// The routes from here to every vehicle's agent are expected anyway.
+    #[arg(long = "expect", value_name = "ROUTE", allow_hyphen_values = true)]
+    expect: Vec<Route>,
+    /// Do not wait for the vehicles' agents.
+    #[arg(long)]
+    no_wait: bool,
+    /// Seconds to wait for all routes.
+    #[arg(long, default_value_t = 60.0)]
+    ready_timeout: f64,
+    /// Publish a tick only when these egos have answered the one before: slow, but nothing is ever late.
+    #[arg(long, value_delimiter = ',', value_name = "EGO", allow_hyphen_values = true)]
+    lockstep: Vec<CavId>,
+    /// Seconds to wait for an ego's answer under --lockstep.
+    #[arg(long, default_value_t = 60.0)]
+    answer_timeout: f64,
+    /// Print a JSON summary.
+    #[arg(long)]
+    json: bool,
+}
+
+/// Plays the scene and prints a summary to standard output.
+pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
+    log_to_stderr();
+    let scenario = match open(args) {
+        Ok(scenario) => scenario,
+        Err(error) => return Ok(bad_input(&error)),
+    };
+    let stop = args.bus.stop().context("installing signal handlers")?;
+    let bus = args.bus.join(Role::Replay, &CavId::new("replay")?)?;
+    let replay = match Replay::prepare(&bus, &scenario, args.options(), &stop) {
+        Ok(replay) => replay,
+        Err(error @ (StreamError::NoAgent { .. } | StreamError::NoTick { .. } | StreamError::Rate(_))) => {
+            return Ok(bad_input(&error.into()));
+        }
+        Err(error) => return Err(error.into()),
+    };
+    match replay.wait_until_ready() {
+        Ok(()) => {}
+        Err(StreamError::NotReady(_)) if stop.requested() => return Ok(Outcome::Done),
+        Err(error) => return Err(error.into()),
+    }
+    tracing::info!(scenario = scenario.name, ticks = scenario.ticks.len(), rate = args.rate, "the clock runs");
+    let report = replay.play();
+    print(&report, args.json)?;
+    if let Err(overdue) = bus.leave(STOP_LIMIT) {
+        tracing::warn!("{overdue}");
+    }
+    Ok(if report.is_complete() { Outcome::Done } else { Outcome::DataLost })
+}
+
+impl Args {
+    fn options(&self) -> StreamOptions {
+        let seconds = |seconds| Duration::try_from_secs_f64(seconds).unwrap_or(Duration::MAX);
+        StreamOptions {
+            agents: self.agents.clone(),
+            rate: self.rate,
+            repeats: self.repeats,
+            seek: self.seek,
+            frames: self.frames,
+            load: LoadOptions { lidar_variant: self.variant.clone(), points: true, radar: self.radar },
+            await_agents: !self.no_wait,
+            expect: self.expect.clone(),
+            patience: seconds(self.ready_timeout),
+            lockstep: self.lockstep.clone(),
+            answer_patience: seconds(self.answer_timeout),
+        }
+    }
+}
+
+fn open(args: &Args) -> anyhow::Result<Scenario> {
+    let dataset = dataset::open(&args.dir)?;
+    for problem in &dataset.problems {
+        tracing::warn!("{problem}");
+    }
+    let names = || dataset.scenarios.iter().map(|scenario| scenario.name.as_str()).collect::<Vec<_>>().join(", ");
+    let found = match &args.scenario {
+        None => dataset.scenarios.first().cloned(),
+        Some(name) => dataset.scenarios.iter().find(|scenario| scenario.name == *name).cloned(),
+    };
+    found.with_context(|| {
+        let asked = args.scenario.as_deref().unwrap_or("any");
+        format!("{}: no scenario {asked}; there are: {}", args.dir.display(), names())
+    })
+}
+
+fn bad_input(error: &anyhow::Error) -> Outcome {
+    eprintln!("error: {error:#}");
+    Outcome::BadInput
+}
+
+fn print(report: &StreamReport, as_json: bool) -> anyhow::Result<()> {
+    if as_json {
+        println!("{}", serde_json::to_string(report)?);
+        return Ok(());
+    }
+    let messages: u64 = report.sent.iter().map(|count| count.messages).sum();
+    println!("{} ticks, {messages} messages in {:.1} s", report.ticks, report.seconds);
+    let lateness = &report.lateness;
+    println!(
+        "late by p50 {:.1} ms, p95 {:.1} ms, at most {:.1} ms; {} ticks over 5 ms",
+        lateness.p50_ms, lateness.p95_ms, lateness.max_ms, lateness.late_ticks
+    );
+    if report.unreadable_frames > 0 {
+        println!("{} frames could not be read", report.unreadable_frames);
+    }
+    if report.unanswered > 0 {
+        println!("{} ticks were not answered", report.unanswered);
+    }
+    Ok(())
+}

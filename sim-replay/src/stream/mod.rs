@@ -1,0 +1,19 @@
+//! A scene as live traffic: every vehicle's sensors on the bus, at the pace they were recorded at or another.
+//!
+//! - [`Schedule`]: which tick comes next, and its time on the replay's clock.
+//! - [`ReplayClock`]: when that is on the wall; pause, step, rate.
+//! - [`ReadAhead`]: the next ticks are read while the current one is waited for.
+//! - [`Replay`]: the loop over the three, steered over `control/*`.
+
+mod clock;
+mod outlet;
+mod read_ahead;
+mod replay;
+mod report;
+mod schedule;
+
+pub use clock::ReplayClock;
+pub use read_ahead::{ReadAhead, TickFrames};
+pub use replay::{Replay, StreamError, StreamOptions};
+pub use report::{Lateness, StreamReport, Unreadable};
+pub use schedule::{Planned, Schedule};

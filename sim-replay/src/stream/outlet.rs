@@ -1,0 +1,102 @@
+//! The topics of a replayed scene: each vehicle's sensors, and the truth.
+
+use protocol::message::{AgentTruth, TrueObject};
+use protocol::{CavId, Gnss, GnssSource, Lidar, Radar, Stream, Topic, TopicCount, Truth};
+
+use crate::bus::{Bus, BusError, Publisher, PublisherOptions};
+use crate::frame::{Frame, Object};
+
+/// Places in the queue of a topic of which nothing may be lost.
+const LOSSLESS_PLACES: usize = 16;
+
+/// The sensors of one vehicle.
+struct Sensors {
+    lidar: Publisher,
+    gnss: Publisher,
+    radar: Option<Publisher>,
+}
+
+/// Everything a replay publishes.
+pub(super) struct Outlet {
+    sensors: Vec<Sensors>,
+    truth: Publisher,
+    sent: Vec<TopicCount>,
+}
+
+impl Outlet {
+    /// Publishers for `agents`. Under `is_paced` the sender waits rather than that a sweep be superseded.
+    pub(super) fn open(bus: &Bus, agents: &[CavId], with_radar: bool, is_paced: bool) -> Result<Self, BusError> {
+        let options =
+            if is_paced { PublisherOptions::SENSOR.lossless(LOSSLESS_PLACES) } else { PublisherOptions::SENSOR };
+        let sensors = agents.iter().map(|cav| {
+            let publisher = |stream| bus.publisher(Topic::Stream { cav: cav.clone(), stream }, options);
+            Ok(Sensors {
+                lidar: publisher(Stream::Lidar)?,
+                gnss: publisher(Stream::Gnss)?,
+                radar: with_radar.then(|| publisher(Stream::Radar)).transpose()?,
+            })
+        });
+        let truth = bus.publisher(Topic::Truth, PublisherOptions::FEATURES.lossless(LOSSLESS_PLACES))?;
+        Ok(Self { sensors: sensors.collect::<Result<_, _>>()?, truth, sent: Vec::new() })
+    }
+
+    /// Offers what one vehicle measured, as captured at `capture_nanos`.
+    pub(super) fn offer(&mut self, agent: usize, capture_nanos: u64, frame: Frame) {
+        let Some(sensors) = self.sensors.get(agent) else { return };
+        if let Some(world_from_lidar) = frame.world_from_lidar {
+            // The pose goes first: it is small, and the sweep is of no use without it.
+            let source = GnssSource::Recorded;
+            let gnss = Gnss { world_from_lidar, position_std_m: 0.0, heading_std_rad: 0.0, source };
+            sensors.gnss.offer(capture_nanos, gnss);
+            count(&mut self.sent, sensors.gnss.topic());
+        }
+        sensors.lidar.offer(capture_nanos, Lidar { points: frame.points });
+        count(&mut self.sent, sensors.lidar.topic());
+        if let (Some(publisher), Some(points)) = (&sensors.radar, frame.radar) {
+            publisher.offer(capture_nanos, Radar { points });
+            count(&mut self.sent, publisher.topic());
+        }
+    }
+
+    /// Offers the truth of one tick.
+    pub(super) fn offer_truth(&mut self, capture_nanos: u64, truth: Truth) {
+        self.truth.offer(capture_nanos, truth);
+        count(&mut self.sent, self.truth.topic());
+    }
+
+    /// Sends what is queued and ends every topic; says how much was published on each.
+    pub(super) fn finish(self) -> Vec<TopicCount> {
+        for Sensors { lidar, gnss, radar } in self.sensors {
+            [Some(lidar), Some(gnss), radar].into_iter().flatten().for_each(Publisher::finish);
+        }
+        self.truth.finish();
+        self.sent
+    }
+}
+
+fn count(sent: &mut Vec<TopicCount>, topic: &Topic) {
+    match sent.iter_mut().find(|count| count.topic == *topic) {
+        Some(count) => count.messages += 1,
+        None => sent.push(TopicCount { topic: topic.clone(), messages: 1 }),
+    }
+}
+
+/// What of a frame is true: where the vehicle is and what it annotates. `None` where the recording does not know.
+pub(super) fn truth_of(frame: &Frame) -> Option<AgentTruth> {
+    let objects = frame.objects.iter().map(|object: &Object| TrueObject {
+        id: object.id,
+        class: class_name(object),
+        world_from_object: object.world_from_object,
+        size_m: object.size_m,
+        speed_mps: object.speed_mps,
+    });
+    Some(AgentTruth { cav: frame.cav.clone(), world_from_lidar: frame.world_from_lidar?, objects: objects.collect() })
+}
+
+/// The class as it stands in every file of this program.
+fn class_name(object: &Object) -> String {
+    match serde_json::to_value(object.class) {
+        Ok(serde_json::Value::String(name)) => name,
+        _ => format!("{:?}", object.class).to_lowercase(),
+    }
+}

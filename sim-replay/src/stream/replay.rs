@@ -1,0 +1,333 @@
+//! The loop that plays a scene.
+
+use std::collections::BTreeSet;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use protocol::{CavId, Control, Limits, Role, Stream, Topic, Truth, Verb};
+
+use super::ReplayClock;
+use super::outlet::{Outlet, truth_of};
+use super::read_ahead::{ReadAhead, TickFrames};
+use super::report::StreamReport;
+use super::schedule::{Planned, Schedule};
+use crate::bus::mailbox::Taken;
+use crate::bus::shutdown::Stop;
+use crate::bus::{Barrier, Bus, BusError, Event, Inbox, NotReady, Presence, Route, Subscription, process_id};
+use crate::dataset::{LoadOptions, Scenario};
+
+/// Ticks read ahead of the clock.
+const READ_AHEAD: usize = 4;
+/// Commands that may wait.
+const COMMANDS: usize = 64;
+
+/// How to play a scene.
+#[derive(Debug, Clone)]
+pub struct StreamOptions {
+    /// Vehicles that take part; all of the scenario where empty.
+    pub agents: Vec<CavId>,
+    /// Seconds of the scene per second; 0: as fast as the bus takes it, dropping nothing.
+    pub rate: f64,
+    /// Start again after the last tick.
+    pub repeats: bool,
+    /// First tick, counted from 0.
+    pub seek: usize,
+    /// Ticks to play; `None`: to the end, or for ever.
+    pub frames: Option<usize>,
+    /// What to read of each frame.
+    pub load: LoadOptions,
+    /// Whether the vehicles' own agents are waited for: their `lidar` and `gnss` routes.
+    pub await_agents: bool,
+    /// Further routes that have to stand before the clock starts.
+    pub expect: Vec<Route>,
+    /// How long to wait for the routes.
+    pub patience: Duration,
+    /// Egos whose detections of a tick are waited for before the next; none: the clock does not wait.
+    pub lockstep: Vec<CavId>,
+    /// How long to wait for an ego's detections before the tick is counted as unanswered.
+    pub answer_patience: Duration,
+}
+
+impl Default for StreamOptions {
+    fn default() -> Self {
+        Self {
+            agents: Vec::new(),
+            rate: 1.0,
+            repeats: false,
+            seek: 0,
+            frames: None,
+            load: LoadOptions::default(),
+            await_agents: true,
+            expect: Vec::new(),
+            patience: Duration::from_secs(60),
+            lockstep: Vec::new(),
+            answer_patience: Duration::from_secs(60),
+        }
+    }
+}
+
+/// Why a scene cannot be played.
+#[derive(Debug, thiserror::Error)]
+pub enum StreamError {
+    /// A vehicle that the scenario does not have.
+    #[error("scenario {scenario} has no agent {asked}; it has {available}")]
+    NoAgent {
+        /// The scenario.
+        scenario: String,
+        /// Who was asked for.
+        asked: CavId,
+        /// Who is there.
+        available: String,
+    },
+    /// A tick that the scenario does not have.
+    #[error("scenario {scenario} has {ticks} ticks, counted from 0; there is no tick {asked}")]
+    NoTick {
+        /// The scenario.
+        scenario: String,
+        /// Which was asked for.
+        asked: usize,
+        /// How many there are.
+        ticks: usize,
+    },
+    /// A rate that is none.
+    #[error("rate is {0}, not a number from 0 to 1000")]
+    Rate(f64),
+    /// Not every route came up.
+    #[error("the fleet is not ready: {0}")]
+    NotReady(#[from] NotReady),
+    /// The bus failed.
+    #[error(transparent)]
+    Bus(#[from] BusError),
+    /// The reading thread could not be started.
+    #[error("no thread for reading ahead: {0}")]
+    Thread(std::io::Error),
+}
+
+/// A scene that is being played.
+pub struct Replay<'a> {
+    bus: &'a Bus,
+    options: StreamOptions,
+    tick_count: usize,
+    reading: ReadAhead,
+    schedule: Schedule,
+    clock: ReplayClock,
+    outlet: Outlet,
+    inbox: Arc<Inbox>,
+    stop: Stop,
+    report: StreamReport,
+    _presence: Presence,
+    _subscriptions: Vec<Subscription>,
+}
+
+impl<'a> Replay<'a> {
+    /// Opens everything that the scene needs on the bus and begins to read; publishes nothing yet.
+    ///
+    /// # Errors
+    /// [`StreamError`] when the scenario has no such agent or tick, or the bus refuses.
+    pub fn prepare(
+        bus: &'a Bus,
+        scenario: &Scenario,
+        options: StreamOptions,
+        stop: &Stop,
+    ) -> Result<Self, StreamError> {
+        let agents = agent_indices(scenario, &options.agents)?;
+        check(scenario, &options)?;
+        let cavs: Vec<CavId> = agents.iter().map(|&index| scenario.agents[index].clone()).collect();
+        let options = StreamOptions { agents: cavs, ..options };
+        let schedule = Schedule::new(&scenario.ticks, options.seek, options.frames, options.repeats);
+        let reading = ReadAhead::start(scenario.clone(), agents, options.load.clone()).map_err(StreamError::Thread)?;
+        reading.want(&schedule.ahead(READ_AHEAD));
+
+        let inbox = bus.inbox(COMMANDS, 16);
+        stop.on_request({
+            let inbox = Arc::clone(&inbox);
+            move || inbox.close()
+        });
+        let verbs = [Verb::Start, Verb::Pause, Verb::Resume, Verb::Step, Verb::Seek].map(Topic::Control);
+        let answers = options.lockstep.iter().map(|ego| Topic::Stream { cav: ego.clone(), stream: Stream::Detections });
+        let subscriptions = verbs.into_iter().chain(answers).map(|topic| bus.subscribe(topic, &inbox));
+        let is_paced = options.rate == 0.0 || !options.lockstep.is_empty();
+        Ok(Self {
+            bus,
+            tick_count: scenario.ticks.len(),
+            reading,
+            schedule,
+            clock: ReplayClock::new(options.rate),
+            outlet: Outlet::open(bus, &options.agents, options.load.radar, is_paced)?,
+            _subscriptions: subscriptions.collect::<Result<_, _>>()?,
+            inbox,
+            stop: stop.clone(),
+            report: StreamReport::default(),
+            _presence: bus.announce(Role::Replay)?,
+            options,
+        })
+    }
+
+    /// Waits until every expected route has carried a probe.
+    ///
+    /// # Errors
+    /// [`StreamError::NotReady`] names the routes that have not.
+    pub fn wait_until_ready(&self) -> Result<(), StreamError> {
+        let barrier = Barrier::new(self.expected_routes()).attend(self.bus)?;
+        let stop = self.stop.clone();
+        Ok(barrier.wait_unless(self.options.patience, || stop.requested())?)
+    }
+
+    /// Plays the scene to its end, or until someone asks to stop. Sends the end markers, and returns when the network
+    /// has taken everything.
+    #[must_use]
+    pub fn play(mut self) -> StreamReport {
+        let began = Instant::now();
+        let mut last = began;
+        while let Some((planned, due)) = self.wait_for_next() {
+            self.publish(planned, due);
+            last = Instant::now();
+            self.wait_for_answers(planned.capture_nanos);
+        }
+        let Self { bus, outlet, mut report, .. } = self;
+        report.seconds = last.duration_since(began).as_secs_f64();
+        report.lateness.sum_up();
+        report.sent = outlet.finish();
+        bus.say(Control::End { ticks: report.ticks, sent: report.sent.clone() }, 0);
+        report
+    }
+
+    fn expected_routes(&self) -> Vec<Route> {
+        let sensors = |cav: &CavId| {
+            [Stream::Lidar, Stream::Gnss].map(|stream| Route {
+                topic: Topic::Stream { cav: cav.clone(), stream },
+                receiver: process_id(Role::Agent, cav),
+            })
+        };
+        let answers = self.options.lockstep.iter().map(|ego| Route {
+            topic: Topic::Stream { cav: ego.clone(), stream: Stream::Detections },
+            receiver: self.bus.identity().process.clone(),
+        });
+        let agents = self.options.agents.iter().filter(|_| self.options.await_agents);
+        agents.flat_map(sensors).chain(answers).chain(self.options.expect.iter().cloned()).collect()
+    }
+
+    /// The next tick and when it is due, at that moment. `None`: the scene is over, or someone asked to stop.
+    fn wait_for_next(&mut self) -> Option<(Planned, Instant)> {
+        loop {
+            // A command may change what comes next, so the plan is made anew each time.
+            let planned = self.schedule.clone().next()?;
+            let due = self.clock.due(planned.capture_nanos, Instant::now());
+            match due {
+                Some(due) if due <= Instant::now() && !self.stop.requested() => {
+                    self.schedule.next();
+                    return Some((planned, due));
+                }
+                _ => {}
+            }
+            match self.inbox.take(due) {
+                Taken::Item(_, Event::Message(arrival)) => {
+                    if let Ok(command) = arrival.decode(&Limits::DEFAULT) {
+                        self.obey(command);
+                    }
+                }
+                Taken::Item(_, Event::End { .. }) | Taken::TimedOut => {}
+                Taken::Closed => return None,
+            }
+        }
+    }
+
+    fn obey(&mut self, command: Control) {
+        tracing::info!(?command, "asked to");
+        match command {
+            Control::Start { rate } => self.clock.resume(Some(rate)),
+            Control::Resume => self.clock.resume(None),
+            Control::Pause => self.clock.pause(),
+            Control::Step { ticks } => self.clock.step(ticks),
+            Control::Seek { frame_index } => match usize::try_from(frame_index) {
+                Ok(index) if index < self.tick_count => {
+                    self.schedule.seek(index);
+                    self.clock.rebase();
+                    self.reading.want(&self.schedule.ahead(READ_AHEAD));
+                }
+                _ => tracing::warn!(frame_index, ticks = self.tick_count, "no such tick to seek"),
+            },
+            Control::End { .. } | Control::Ready { .. } | Control::Probe | Control::Done { .. } => {}
+        }
+    }
+
+    fn publish(&mut self, planned: Planned, due: Instant) {
+        let Planned { tick_index, capture_nanos } = planned;
+        let frames: TickFrames = self.reading.take(tick_index);
+        self.reading.want(&self.schedule.ahead(READ_AHEAD));
+        let mut agents = Vec::with_capacity(frames.len());
+        if self.options.lockstep.is_empty() && self.options.rate > 0.0 {
+            self.report.lateness.add(due.elapsed());
+        }
+        for (agent, frame) in frames.into_iter().enumerate() {
+            match frame {
+                Ok(frame) => {
+                    agents.extend(truth_of(&frame));
+                    self.outlet.offer(agent, capture_nanos, frame);
+                }
+                Err(error) => self.report.unreadable(capture_nanos, &error),
+            }
+        }
+        self.outlet.offer_truth(capture_nanos, Truth { frame_index: tick_index as u64, agents });
+        self.report.ticks += 1;
+        self.clock.published(capture_nanos, due);
+    }
+
+    /// Under lockstep, waits until every ego has answered the tick.
+    fn wait_for_answers(&mut self, capture_nanos: u64) {
+        if self.options.lockstep.is_empty() {
+            return;
+        }
+        let mut missing: BTreeSet<CavId> = self.options.lockstep.iter().cloned().collect();
+        let deadline = Instant::now() + self.options.answer_patience;
+        while !missing.is_empty() {
+            match self.inbox.take(Some(deadline)) {
+                Taken::Item(Topic::Stream { cav, .. }, Event::Message(arrival)) => {
+                    self.bus.books().received(&arrival.topic);
+                    if arrival.header.stamp.capture_nanos >= capture_nanos {
+                        missing.remove(&cav);
+                    }
+                }
+                Taken::Item(_, Event::Message(arrival)) => {
+                    if let Ok(command) = arrival.decode(&Limits::DEFAULT) {
+                        self.obey(command);
+                    }
+                }
+                Taken::Item(_, Event::End { .. }) => {}
+                Taken::TimedOut => {
+                    tracing::error!(capture_nanos, ?missing, "no detections within {:?}", self.options.answer_patience);
+                    self.report.unanswered += 1;
+                    break;
+                }
+                Taken::Closed => break,
+            }
+        }
+        // The fleet sets the pace: the next tick is not late because this one took long.
+        self.clock.rebase();
+    }
+}
+
+fn check(scenario: &Scenario, options: &StreamOptions) -> Result<(), StreamError> {
+    if !(0.0..=1e3).contains(&options.rate) {
+        return Err(StreamError::Rate(options.rate));
+    }
+    if options.seek >= scenario.ticks.len() {
+        let (scenario, ticks) = (scenario.name.clone(), scenario.ticks.len());
+        return Err(StreamError::NoTick { scenario, asked: options.seek, ticks });
+    }
+    Ok(())
+}
+
+fn agent_indices(scenario: &Scenario, asked: &[CavId]) -> Result<Vec<usize>, StreamError> {
+    if asked.is_empty() {
+        return Ok((0..scenario.agents.len()).collect());
+    }
+    let find = |cav: &CavId| {
+        scenario.agents.iter().position(|agent| agent == cav).ok_or_else(|| StreamError::NoAgent {
+            scenario: scenario.name.clone(),
+            asked: cav.clone(),
+            available: scenario.agents.iter().map(CavId::as_str).collect::<Vec<_>>().join(", "),
+        })
+    };
+    asked.iter().map(find).collect()
+}
