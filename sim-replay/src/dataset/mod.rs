@@ -12,15 +12,24 @@
 //! # }
 //! ```
 
+mod agent_folders;
 mod error;
+mod files;
+mod numpy_tags;
+mod open;
+mod opv2v;
+mod points;
+mod v2v4real;
+mod yaml;
 
-use std::path::Path;
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use protocol::{CavId, Handedness};
 use serde::Serialize;
 
 pub use error::ReadError;
+pub use open::{OpenOptions, open, open_with};
 
 use crate::frame::Frame;
 
@@ -62,6 +71,15 @@ pub struct Tick {
     pub capture_nanos: u64,
 }
 
+/// A frame that one agent lacks.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct MissingFrame {
+    /// Who lacks it.
+    pub agent: CavId,
+    /// Its stem.
+    pub stem: String,
+}
+
 /// Some vehicles on the way together.
 #[derive(Debug, Clone)]
 pub struct Scenario {
@@ -71,8 +89,14 @@ pub struct Scenario {
     pub agents: Vec<CavId>,
     /// The moments that every agent has, in order.
     pub ticks: Vec<Tick>,
+    /// Frames that some agents have and others lack; their moments are not among `ticks`.
+    pub missing: Vec<MissingFrame>,
     /// Variants of the LiDAR sweep beside the plain one, for example `fog_0.060`.
     pub lidar_variants: Vec<String>,
+    /// Whether there are 4D radar points.
+    pub has_radar: bool,
+    /// Layout of this scenario's files.
+    pub layout: Layout,
     /// Which way the axes of the recording turned.
     pub source_handedness: Handedness,
     source: Arc<dyn FrameSource>,
@@ -97,8 +121,11 @@ impl Default for LoadOptions {
 
 /// How a layout finds and reads its frames.
 trait FrameSource: std::fmt::Debug + Send + Sync {
-    /// Reads one frame. Both indices lie within the scenario's `agents` and `ticks`.
-    fn load(&self, agent: (usize, &CavId), tick: (usize, &Tick), options: &LoadOptions) -> Result<Frame, ReadError>;
+    /// Reads one frame of an agent and a tick of the scenario.
+    fn load(&self, agent: &CavId, tick: &Tick, options: &LoadOptions) -> Result<Frame, ReadError>;
+
+    /// The file that the LiDAR's points come from.
+    fn lidar_path(&self, agent: &CavId, tick: &Tick, options: &LoadOptions) -> PathBuf;
 }
 
 impl Scenario {
@@ -118,20 +145,32 @@ impl Scenario {
                 available: format!("there are {:?}", self.lidar_variants),
             });
         }
-        self.source.load((agent_index, agent), (tick_index, tick), options)
+        self.source.load(agent, tick, options)
+    }
+
+    /// The file that a frame's LiDAR points come from.
+    ///
+    /// # Errors
+    /// [`ReadError::NoSuch`] when there is no such agent or tick.
+    pub fn lidar_path(
+        &self,
+        agent_index: usize,
+        tick_index: usize,
+        options: &LoadOptions,
+    ) -> Result<PathBuf, ReadError> {
+        let (agent, tick) = self.frame_of(agent_index, tick_index)?;
+        Ok(self.source.lidar_path(agent, tick, options))
+    }
+
+    fn frame_of(&self, agent_index: usize, tick_index: usize) -> Result<(&CavId, &Tick), ReadError> {
+        let agent =
+            self.agents.get(agent_index).ok_or_else(|| self.no_such("agent", agent_index, self.agents.len()))?;
+        let tick = self.ticks.get(tick_index).ok_or_else(|| self.no_such("tick", tick_index, self.ticks.len()))?;
+        Ok((agent, tick))
     }
 
     fn no_such(&self, what: &'static str, index: usize, count: usize) -> ReadError {
         let available = format!("there are {count}, counted from 0");
         ReadError::NoSuch { scenario: self.name.clone(), what, asked: index.to_string(), available }
     }
-}
-
-/// Opens the dataset, split, scenario or sequence in `dir`; the layout is found out.
-///
-/// # Errors
-/// [`ReadError`] when `dir` cannot be read or is no layout that is known here. What is wrong with single frames is
-/// found when they are loaded; what had to be left out stands in [`Dataset::problems`].
-pub fn open(dir: &Path) -> Result<Dataset, ReadError> {
-    Err(ReadError::Layout { path: dir.to_owned(), reason: "no known layout".into() })
 }

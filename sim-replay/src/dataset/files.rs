@@ -1,0 +1,105 @@
+//! Folders and files, with the path in every error.
+
+use std::fs::{self, File};
+use std::io::Read;
+use std::path::{Path, PathBuf};
+
+use super::ReadError;
+
+/// A folder's entries that are not hidden, in text order.
+#[derive(Debug, Default)]
+pub(super) struct Listing {
+    /// Names of folders.
+    pub(super) folders: Vec<String>,
+    /// Names of files.
+    pub(super) files: Vec<String>,
+}
+
+/// Lists a folder. Names that are not UTF-8 are none of ours and are left out.
+pub(super) fn list(dir: &Path) -> Result<Listing, ReadError> {
+    let mut listing = Listing::default();
+    for entry in fs::read_dir(dir).map_err(|error| ReadError::io(dir, error))? {
+        let entry = entry.map_err(|error| ReadError::io(dir, error))?;
+        let Some(name) = entry.file_name().to_str().filter(|name| !name.starts_with('.')).map(str::to_owned) else {
+            continue;
+        };
+        // Data often lies behind symbolic links, so these are followed.
+        match fs::metadata(entry.path()) {
+            Ok(metadata) if metadata.is_dir() => listing.folders.push(name),
+            Ok(_) => listing.files.push(name),
+            Err(error) => return Err(ReadError::io(&entry.path(), error)),
+        }
+    }
+    listing.folders.sort_unstable();
+    listing.files.sort_unstable();
+    Ok(listing)
+}
+
+/// Reads a file of at most `max_bytes`.
+pub(super) fn read_limited(path: &Path, max_bytes: u64) -> Result<Vec<u8>, ReadError> {
+    let io = |error| ReadError::io(path, error);
+    let file = File::open(path).map_err(io)?;
+    let stated = file.metadata().map_err(io)?.len();
+    let mut bytes = Vec::with_capacity(usize::try_from(stated.min(max_bytes)).unwrap_or(0));
+    file.take(max_bytes + 1).read_to_end(&mut bytes).map_err(io)?;
+    if bytes.len() as u64 > max_bytes {
+        return Err(ReadError::malformed(path, format!("larger than {max_bytes} bytes, the most that is read")));
+    }
+    Ok(bytes)
+}
+
+/// Reads a text file of at most `max_bytes`.
+pub(super) fn read_text(path: &Path, max_bytes: u64) -> Result<String, ReadError> {
+    String::from_utf8(read_limited(path, max_bytes)?).map_err(|_| ReadError::malformed(path, "the text is not UTF-8"))
+}
+
+/// The stems of the files that end in `suffix`, in the order given.
+pub(super) fn stems<'a>(files: &'a [String], suffix: &str) -> Vec<&'a str> {
+    files.iter().filter_map(|name| name.strip_suffix(suffix)).collect()
+}
+
+/// The name of a path below `root`, or the folder's own name where they are the same.
+pub(super) fn name_below(root: &Path, dir: &Path) -> String {
+    let below = dir.strip_prefix(root).ok().filter(|below| !below.as_os_str().is_empty());
+    let own_name = || dir.canonicalize().ok().and_then(|dir| dir.file_name().map(PathBuf::from)).unwrap_or_default();
+    below.map_or_else(own_name, Path::to_owned).to_string_lossy().replace('\\', "/")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn listings_are_sorted_and_leave_hidden_entries_out() {
+        let dir = tempfile::tempdir().unwrap();
+        for name in ["b.yaml", "a.yaml", ".hidden"] {
+            fs::write(dir.path().join(name), "").unwrap();
+        }
+        fs::create_dir(dir.path().join("4279")).unwrap();
+        let listing = list(dir.path()).unwrap();
+        assert_eq!((listing.files, listing.folders), (vec!["a.yaml".into(), "b.yaml".into()], vec!["4279".into()]));
+    }
+
+    #[test]
+    fn a_file_that_is_too_large_is_named() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a");
+        fs::write(&path, [0; 11]).unwrap();
+        assert_eq!(read_limited(&path, 11).unwrap().len(), 11);
+        assert!(
+            read_limited(&path, 10)
+                .unwrap_err()
+                .to_string()
+                .ends_with("a: larger than 10 bytes, the most that is read")
+        );
+        assert!(matches!(read_limited(&dir.path().join("b"), 10), Err(ReadError::Io { .. })));
+    }
+
+    #[test]
+    fn a_scenario_is_named_by_its_path_below_the_root() {
+        assert_eq!(name_below(Path::new("/data"), Path::new("/data/test/one")), "test/one");
+        let dir = tempfile::tempdir().unwrap();
+        let own = dir.path().file_name().unwrap().to_string_lossy();
+        assert_eq!(name_below(dir.path(), dir.path()), own);
+    }
+}
