@@ -10,6 +10,7 @@ pub mod crop;
 pub mod dataset;
 pub mod frame;
 pub mod ground_truth;
+pub mod inspect;
 pub mod pcd;
 pub mod stream;
 pub mod synth;

@@ -1,10 +1,14 @@
 //! `sim-replay inspect`: what is in a dataset, and what is wrong with it.
 
+use std::io::Write;
 use std::path::PathBuf;
+
+use indicatif::{ProgressBar, ProgressStyle};
+use sim_replay::inspect::{Report, inspect};
 
 use crate::cli::Outcome;
 
-/// Say what a dataset holds and what is wrong with it.
+/// Say what a dataset holds (agents, frames, points, rates, boxes, merged ground truth) and what is wrong with it.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
     /// Dataset, split, scenario or sequence; the layout is found out.
@@ -16,14 +20,28 @@ pub(crate) struct Args {
 
 /// Prints the findings to standard output.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
-    match sim_replay::dataset::open(&args.dir) {
-        Ok(dataset) => {
-            println!("{:?}: {} scenarios{}", dataset.layout, dataset.scenarios.len(), if args.json { "" } else { "." });
-            Ok(Outcome::Done)
-        }
-        Err(error) => {
-            eprintln!("error: {error}");
-            Ok(Outcome::BadInput)
-        }
+    let report = with_progress(args);
+    let mut out = std::io::stdout().lock();
+    if args.json {
+        serde_json::to_writer_pretty(&mut out, &report)?;
+        writeln!(out)?;
+    } else {
+        writeln!(out, "{report}")?;
     }
+    Ok(if report.problems.is_empty() { Outcome::Done } else { Outcome::BadInput })
+}
+
+/// Reads everything; a bar on a terminal says how far.
+fn with_progress(args: &Args) -> Report {
+    // Hidden by itself where stderr is no terminal.
+    let bar = ProgressBar::new(0);
+    if let Ok(style) = ProgressStyle::with_template("{bar:40} {pos}/{len} frames, {eta} left") {
+        bar.set_style(style);
+    }
+    let report = inspect(&args.dir, &|done, total| {
+        bar.set_length(total as u64);
+        bar.set_position(done as u64);
+    });
+    bar.finish_and_clear();
+    report
 }

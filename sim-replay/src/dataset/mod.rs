@@ -32,6 +32,7 @@ pub use error::ReadError;
 pub use open::{OpenOptions, open, open_with};
 
 use crate::frame::Frame;
+use crate::pcd::PcdCloud;
 
 /// The layouts that are known here.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -119,13 +120,22 @@ impl Default for LoadOptions {
     }
 }
 
-/// How a layout finds and reads its frames.
+/// How a layout finds and reads its frames, in our conventions.
 trait FrameSource: std::fmt::Debug + Send + Sync {
-    /// Reads one frame of an agent and a tick of the scenario.
-    fn load(&self, agent: &CavId, tick: &Tick, options: &LoadOptions) -> Result<Frame, ReadError>;
+    /// Reads all of a frame but its points.
+    fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame, ReadError>;
+
+    /// Reads the LiDAR's points, the plain sweep or a variant.
+    fn points(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> Result<PcdCloud, ReadError>;
+
+    /// Reads the radar's points. Asked only of scenarios that have them.
+    fn radar(&self, agent: &CavId, tick: &Tick) -> Result<PcdCloud, ReadError> {
+        let path = self.points_path(agent, tick, None);
+        Err(ReadError::malformed(&path, "there are no radar points beside it"))
+    }
 
     /// The file that the LiDAR's points come from.
-    fn lidar_path(&self, agent: &CavId, tick: &Tick, options: &LoadOptions) -> PathBuf;
+    fn points_path(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> PathBuf;
 }
 
 impl Scenario {
@@ -134,32 +144,52 @@ impl Scenario {
     /// # Errors
     /// [`ReadError`] when there is no such agent, tick or variant, and when a file is missing or malformed.
     pub fn load(&self, agent_index: usize, tick_index: usize, options: &LoadOptions) -> Result<Frame, ReadError> {
-        let agent =
-            self.agents.get(agent_index).ok_or_else(|| self.no_such("agent", agent_index, self.agents.len()))?;
-        let tick = self.ticks.get(tick_index).ok_or_else(|| self.no_such("tick", tick_index, self.ticks.len()))?;
-        if let Some(variant) = options.lidar_variant.as_ref().filter(|variant| !self.lidar_variants.contains(variant)) {
+        let (agent, tick) = self.frame_of(agent_index, tick_index)?;
+        let mut frame = self.source.frame(agent, tick)?;
+        if options.points {
+            let cloud = self.load_points(agent_index, tick_index, options.lidar_variant.as_deref())?;
+            (frame.points, frame.dropped_points) = (cloud.points, cloud.dropped);
+        }
+        if options.radar && self.has_radar {
+            frame.radar = Some(self.source.radar(agent, tick)?.points);
+        }
+        Ok(frame)
+    }
+
+    /// Reads the LiDAR's points alone: the plain sweep, or a variant of [`Self::lidar_variants`].
+    ///
+    /// # Errors
+    /// As [`Self::load`].
+    pub fn load_points(
+        &self,
+        agent_index: usize,
+        tick_index: usize,
+        variant: Option<&str>,
+    ) -> Result<PcdCloud, ReadError> {
+        let (agent, tick) = self.frame_of(agent_index, tick_index)?;
+        if let Some(asked) = variant.filter(|asked| !self.lidar_variants.iter().any(|known| known == asked)) {
             return Err(ReadError::NoSuch {
                 scenario: self.name.clone(),
                 what: "LiDAR variant",
-                asked: variant.clone(),
+                asked: asked.to_owned(),
                 available: format!("there are {:?}", self.lidar_variants),
             });
         }
-        self.source.load(agent, tick, options)
+        self.source.points(agent, tick, variant)
     }
 
     /// The file that a frame's LiDAR points come from.
     ///
     /// # Errors
     /// [`ReadError::NoSuch`] when there is no such agent or tick.
-    pub fn lidar_path(
+    pub fn points_path(
         &self,
         agent_index: usize,
         tick_index: usize,
-        options: &LoadOptions,
+        variant: Option<&str>,
     ) -> Result<PathBuf, ReadError> {
         let (agent, tick) = self.frame_of(agent_index, tick_index)?;
-        Ok(self.source.lidar_path(agent, tick, options))
+        Ok(self.source.points_path(agent, tick, variant))
     }
 
     fn frame_of(&self, agent_index: usize, tick_index: usize) -> Result<(&CavId, &Tick), ReadError> {

@@ -8,9 +8,10 @@ use protocol::{CavId, Handedness, PointCloud, Pose};
 
 use super::agent_folders::ScenarioFolder;
 use super::yaml::{self, Field};
-use super::{FrameSource, LoadOptions, ReadError, Tick, points};
+use super::{FrameSource, ReadError, Tick, points};
 use crate::carla_pose::CarlaPose;
 use crate::frame::{Frame, Object, ObjectClass};
+use crate::pcd::PcdCloud;
 
 /// Kilometres per hour in a metre per second.
 const KMH_PER_MPS: f64 = 3.6;
@@ -20,26 +21,30 @@ const KMH_PER_MPS: f64 = 3.6;
 pub(super) struct Opv2v(pub(super) ScenarioFolder);
 
 impl FrameSource for Opv2v {
-    fn load(&self, agent: &CavId, tick: &Tick, options: &LoadOptions) -> Result<Frame, ReadError> {
+    fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame, ReadError> {
         let path = self.0.yaml(agent, &tick.stem);
         let node = yaml::read(&path)?;
-        let mut frame = frame_without_points(agent, tick, &Field::root(&path, &node))?;
-        if options.points {
-            let mut cloud = points::read_pcd(&self.lidar_path(agent, tick, options))?;
-            points::mirror_y(&mut cloud.points);
-            (frame.points, frame.dropped_points) = (cloud.points, cloud.dropped);
-        }
-        if options.radar && self.0.has_radar {
-            let mut cloud = points::read_pcd(&self.0.radar(agent, &tick.stem))?.points;
-            points::mirror_y(&mut cloud);
-            frame.radar = Some(cloud);
-        }
-        Ok(frame)
+        frame_without_points(agent, tick, &Field::root(&path, &node))
     }
 
-    fn lidar_path(&self, agent: &CavId, tick: &Tick, options: &LoadOptions) -> PathBuf {
-        self.0.pcd(agent, &tick.stem, options.lidar_variant.as_deref())
+    fn points(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> Result<PcdCloud, ReadError> {
+        mirrored(&self.points_path(agent, tick, variant))
     }
+
+    fn radar(&self, agent: &CavId, tick: &Tick) -> Result<PcdCloud, ReadError> {
+        mirrored(&self.0.radar(agent, &tick.stem))
+    }
+
+    fn points_path(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> PathBuf {
+        self.0.pcd(agent, &tick.stem, variant)
+    }
+}
+
+/// Reads left-handed points and makes them right-handed.
+fn mirrored(path: &Path) -> Result<PcdCloud, ReadError> {
+    let mut cloud = points::read_pcd(path)?;
+    points::mirror_y(&mut cloud.points);
+    Ok(cloud)
 }
 
 fn frame_without_points(agent: &CavId, tick: &Tick, root: &Field<'_>) -> Result<Frame, ReadError> {

@@ -13,9 +13,10 @@ use super::agent_folders::ScenarioFolder;
 use super::numpy_tags::{self, NumpyArray};
 use super::opv2v::{object_entries, object_id, object_pose, object_size, speed_mps};
 use super::yaml::{self, Field};
-use super::{FrameSource, LoadOptions, ReadError, Tick, points};
+use super::{FrameSource, ReadError, Tick, points};
 use crate::carla_pose::CarlaPose;
 use crate::frame::{Frame, Object, ObjectClass};
+use crate::pcd::PcdCloud;
 
 /// Objects without partner get this times the agent's id added, so that ids of two agents do not meet.
 const UNMATCHED_STEP: i64 = 100;
@@ -25,19 +26,18 @@ const UNMATCHED_STEP: i64 = 100;
 pub(super) struct V2v4Real(pub(super) ScenarioFolder);
 
 impl FrameSource for V2v4Real {
-    fn load(&self, agent: &CavId, tick: &Tick, options: &LoadOptions) -> Result<Frame, ReadError> {
+    fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame, ReadError> {
         let path = self.0.yaml(agent, &tick.stem);
         let node = yaml::read(&path)?;
-        let mut frame = frame_without_points(agent, tick, &Field::root(&path, &node))?;
-        if options.points {
-            let cloud = points::read_pcd(&self.lidar_path(agent, tick, options))?;
-            (frame.points, frame.dropped_points) = (cloud.points, cloud.dropped);
-        }
-        Ok(frame)
+        frame_without_points(agent, tick, &Field::root(&path, &node))
     }
 
-    fn lidar_path(&self, agent: &CavId, tick: &Tick, options: &LoadOptions) -> PathBuf {
-        self.0.pcd(agent, &tick.stem, options.lidar_variant.as_deref())
+    fn points(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> Result<PcdCloud, ReadError> {
+        points::read_pcd(&self.points_path(agent, tick, variant))
+    }
+
+    fn points_path(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> PathBuf {
+        self.0.pcd(agent, &tick.stem, variant)
     }
 }
 

@@ -1,0 +1,133 @@
+//! What a dataset holds, and everything that is wrong with it.
+//!
+//! Every frame is read. What cannot be read becomes a [`Problem`] with file, line and field, and the rest goes on.
+
+mod survey;
+mod table;
+
+use std::path::Path;
+
+use protocol::{CavId, Handedness};
+use serde::Serialize;
+
+pub use survey::inspect;
+
+use crate::dataset::{Layout, MissingFrame, ReadError};
+
+/// The findings. Serializes to the JSON of `sim-replay inspect --json`, prints as its table.
+#[derive(Debug, Clone, Serialize)]
+pub struct Report {
+    /// The folder, as it was given.
+    pub path: String,
+    /// Its layout, where it has one that is known.
+    pub layout: Option<Layout>,
+    /// What was found in each scenario.
+    pub scenarios: Vec<ScenarioReport>,
+    /// Merged ground truth by tick, ego and set of agents: the ego alone, and with all in range.
+    pub ticks: Vec<TickReport>,
+    /// What is wrong.
+    pub problems: Vec<Problem>,
+}
+
+/// A scenario.
+#[derive(Debug, Clone, Serialize)]
+pub struct ScenarioReport {
+    /// Its name.
+    pub name: String,
+    /// Its layout.
+    pub layout: Layout,
+    /// Which way its axes turn on disk.
+    pub handedness: Handedness,
+    /// Moments that all agents have.
+    pub frames: usize,
+    /// From the first moment to the last, seconds.
+    pub seconds: f64,
+    /// Frames per second, by the median step; `None` for a single frame.
+    pub rate_hz: Option<f64>,
+    /// Its agents, ego first.
+    pub agents: Vec<AgentReport>,
+    /// Variants of the LiDAR sweep.
+    pub lidar_variants: Vec<String>,
+    /// Whether there are radar points.
+    pub has_radar: bool,
+    /// Frames that some agents have and others lack.
+    pub missing: Vec<MissingFrame>,
+}
+
+/// An agent of a scenario.
+#[derive(Debug, Clone, Serialize)]
+pub struct AgentReport {
+    /// Who.
+    pub id: CavId,
+    /// Points of a sweep.
+    pub points: Option<Summary>,
+    /// Points left out because a number is not finite, over all sweeps.
+    pub dropped_points: usize,
+    /// Radar points of a frame.
+    pub radar_points: Option<Summary>,
+    /// Annotated objects of a frame.
+    pub boxes: Option<Summary>,
+    /// Boxes that hold none of the agent's own points, over all frames. Many of them hint at wrong axes.
+    pub boxes_without_points: usize,
+    /// How far the LiDAR moved, metres, over all frames with a pose; `None` without poses.
+    pub distance_m: Option<f64>,
+}
+
+/// Smallest, mean and largest of a count per frame.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Summary {
+    /// Smallest.
+    pub min: usize,
+    /// Mean.
+    pub mean: f64,
+    /// Largest.
+    pub max: usize,
+}
+
+impl Summary {
+    /// Of counts, one per frame; `None` where there is none.
+    #[must_use]
+    pub fn of(counts: &[usize]) -> Option<Self> {
+        let (min, max) = (*counts.iter().min()?, *counts.iter().max()?);
+        Some(Self { min, mean: counts.iter().sum::<usize>() as f64 / counts.len() as f64, max })
+    }
+}
+
+/// Merged ground truth of one tick for one ego and one set of agents.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct TickReport {
+    /// Scenario.
+    pub scenario: String,
+    /// Stem of the tick.
+    pub tick: String,
+    /// In whose LiDAR frame and range.
+    pub ego: CavId,
+    /// Whose annotations were merged, the ego first.
+    pub agents: Vec<CavId>,
+    /// How many objects there are.
+    pub merged_boxes: usize,
+}
+
+/// Something wrong.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize)]
+pub struct Problem {
+    /// The file or folder.
+    pub path: String,
+    /// The line, from 1, where the file has lines.
+    pub line: Option<u64>,
+    /// The field.
+    pub field: Option<String>,
+    /// What is wrong, with place and both values.
+    pub message: String,
+}
+
+impl From<&ReadError> for Problem {
+    fn from(error: &ReadError) -> Self {
+        Self {
+            path: error.path().unwrap_or(Path::new("")).display().to_string(),
+            line: error.line(),
+            field: error.field().map(str::to_owned),
+            message: error.to_string(),
+        }
+    }
+}

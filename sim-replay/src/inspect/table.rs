@@ -1,0 +1,129 @@
+//! The findings for human eyes.
+
+use std::collections::BTreeMap;
+use std::fmt;
+
+use protocol::Handedness;
+
+use super::{AgentReport, Report, ScenarioReport, Summary, TickReport};
+use crate::dataset::Layout;
+
+/// Problems that are printed before the rest is only counted.
+const MAX_PROBLEMS: usize = 50;
+
+impl fmt::Display for Report {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let layout = self.layout.map_or("no known layout", layout_name);
+        let frames: usize = self.scenarios.iter().map(|scenario| scenario.frames).sum();
+        writeln!(
+            f,
+            "{}: {layout}, {}, {}",
+            self.path,
+            count(self.scenarios.len(), "scenario"),
+            count(frames, "frame")
+        )?;
+        for scenario in &self.scenarios {
+            self.write_scenario(f, scenario)?;
+        }
+        if self.problems.is_empty() {
+            return write!(f, "\nno problems");
+        }
+        write!(f, "\n{}:", count(self.problems.len(), "problem"))?;
+        for problem in self.problems.iter().take(MAX_PROBLEMS) {
+            write!(f, "\n  {}", problem.message)?;
+        }
+        match self.problems.len().saturating_sub(MAX_PROBLEMS) {
+            0 => Ok(()),
+            more => write!(f, "\n  and {more} more (--json lists all)"),
+        }
+    }
+}
+
+impl Report {
+    fn write_scenario(&self, f: &mut fmt::Formatter<'_>, scenario: &ScenarioReport) -> fmt::Result {
+        let axes = match scenario.handedness {
+            Handedness::Left => "left-handed",
+            Handedness::Right => "right-handed",
+        };
+        let rate = scenario.rate_hz.map(|rate| format!(" at {rate:.1} Hz")).unwrap_or_default();
+        let seconds = scenario.seconds;
+        writeln!(f, "\n{}: {}{rate}, {seconds:.1} s, {axes} on disk", scenario.name, count(scenario.frames, "frame"))?;
+        writeln!(
+            f,
+            "  {:<12} {:>26} {:>9} {:>20} {:>12} {:>20} {:>10}",
+            "agent", "points", "dropped", "boxes", "empty boxes", "radar", "metres"
+        )?;
+        for agent in &scenario.agents {
+            write_agent(f, agent)?;
+        }
+        if !scenario.lidar_variants.is_empty() {
+            writeln!(f, "  LiDAR variants: {}", scenario.lidar_variants.join(", "))?;
+        }
+        if !scenario.missing.is_empty() {
+            let first = &scenario.missing[0];
+            let missing = count(scenario.missing.len(), "frame");
+            writeln!(
+                f,
+                "  {missing} left out because an agent lacks it; first: {} of agent {}",
+                first.stem, first.agent
+            )?;
+        }
+        self.write_merged(f, scenario)
+    }
+
+    /// A line per ego: boxes alone, and with the others.
+    fn write_merged(&self, f: &mut fmt::Formatter<'_>, scenario: &ScenarioReport) -> fmt::Result {
+        let of_scenario = self.ticks.iter().filter(|tick| tick.scenario == scenario.name);
+        let mut by_ego: BTreeMap<&str, (Vec<usize>, Vec<usize>)> = BTreeMap::new();
+        for TickReport { ego, agents, merged_boxes, .. } in of_scenario {
+            let (alone, together) = by_ego.entry(ego.as_str()).or_default();
+            if agents.len() == 1 { alone } else { together }.push(*merged_boxes);
+        }
+        for (ego, (alone, together)) in by_ego {
+            let with_others = match Summary::of(&together) {
+                Some(summary) => format!(", {} with those in range", shown(Some(summary))),
+                None => String::new(),
+            };
+            writeln!(f, "  ground truth of ego {ego}: {} alone{with_others}", shown(Summary::of(&alone)))?;
+        }
+        Ok(())
+    }
+}
+
+fn write_agent(f: &mut fmt::Formatter<'_>, agent: &AgentReport) -> fmt::Result {
+    writeln!(
+        f,
+        "  {:<12} {:>26} {:>9} {:>20} {:>12} {:>20} {:>10}",
+        agent.id.as_str(),
+        shown(agent.points),
+        agent.dropped_points,
+        shown(agent.boxes),
+        agent.boxes_without_points,
+        shown(agent.radar_points),
+        agent.distance_m.map_or("no pose".into(), |metres| format!("{metres:.1}")),
+    )
+}
+
+/// The mean, and the span where there is one.
+fn shown(summary: Option<Summary>) -> String {
+    match summary {
+        None => "-".into(),
+        Some(Summary { min, max, .. }) if min == max => min.to_string(),
+        Some(Summary { min, mean, max }) => format!("{mean:.1} ({min} to {max})"),
+    }
+}
+
+fn count(number: usize, noun: &str) -> String {
+    format!("{number} {noun}{}", if number == 1 { "" } else { "s" })
+}
+
+fn layout_name(layout: Layout) -> &'static str {
+    match layout {
+        Layout::Opv2v => "OPV2V layout",
+        Layout::V2v4Real => "V2V4Real layout",
+        Layout::Nclt => "NCLT localization sequences",
+        Layout::Oxford => "Oxford localization sequences",
+        Layout::KittiOdometry => "KITTI odometry",
+        Layout::KittiObject => "KITTI object",
+    }
+}
