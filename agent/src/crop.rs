@@ -1,9 +1,11 @@
 //! Which points of a sweep the detector looks at.
 
+use protocol::PointCloud;
+
 use crate::model_config::DetectorConfig;
 
 /// Keeps the points inside the detector's area and outside the own body.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Crop {
     low_m: [f32; 3],
     high_m: [f32; 3],
@@ -27,6 +29,22 @@ impl Crop {
     /// The area is open: a point on its edge goes, as in the reference. Points that are not finite go.
     pub fn keep(&self, points: &[[f32; 4]], kept: &mut Vec<[f32; 4]>) {
         kept.extend(points.iter().filter(|point| self.is_kept(point)));
+    }
+
+    /// The sweep without the points on the vehicle's own body, at any distance: what goes to others for early fusion.
+    /// Points that are not finite go as well.
+    #[must_use]
+    pub fn without_own_body(&self, cloud: &PointCloud) -> PointCloud {
+        let anywhere = Self { low_m: [f32::NEG_INFINITY; 3], high_m: [f32::INFINITY; 3], ..*self };
+        let mut kept = PointCloud::default();
+        anywhere.keep(&cloud.xyzi, &mut kept.xyzi);
+        kept
+    }
+
+    /// The same area, the own body included.
+    #[must_use]
+    pub fn range_only(&self) -> Self {
+        Self { own_body_m: None, ..*self }
     }
 
     fn is_kept(&self, &[x, y, z, intensity]: &[f32; 4]) -> bool {
@@ -58,5 +76,8 @@ mod tests {
         let whole = Crop::for_detector(&DetectorConfig { own_body_m: None, ..DetectorConfig::lean() });
         whole.keep(&drop, &mut kept);
         assert_eq!(kept, [keep, drop[0]]);
+        assert_eq!(crop.range_only(), whole);
+        let sent = crop.without_own_body(&PointCloud { xyzi: vec![drop[0], keep, drop[1], drop[3], drop[4]] });
+        assert_eq!(sent.xyzi, [keep, drop[1]]);
     }
 }

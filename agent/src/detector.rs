@@ -184,9 +184,32 @@ impl Detector {
     /// # Errors
     /// The tensor library's.
     pub fn encode(&mut self, cloud: &PointCloud) -> Result<Encoded, DetectorError> {
+        let crop = self.crop;
+        self.encode_within(&crop, cloud)
+    }
+
+    /// Encodes the points of several vehicles in one frame, for early fusion.
+    ///
+    /// Nothing is cut out around the origin: others see the body that stands there, and it is to be found. Each sweep's
+    /// own body must have been cut out in its own frame, see [`Crop::without_own_body`].
+    ///
+    /// # Errors
+    /// The tensor library's.
+    pub fn encode_merged(&mut self, cloud: &PointCloud) -> Result<Encoded, DetectorError> {
+        let crop = self.crop.range_only();
+        self.encode_within(&crop, cloud)
+    }
+
+    /// Which points it looks at.
+    #[must_use]
+    pub fn crop(&self) -> &Crop {
+        &self.crop
+    }
+
+    fn encode_within(&mut self, crop: &Crop, cloud: &PointCloud) -> Result<Encoded, DetectorError> {
         let mut clock = StageClock::start();
         self.cropped.clear();
-        self.crop.keep(&cloud.xyzi, &mut self.cropped);
+        crop.keep(&cloud.xyzi, &mut self.cropped);
         let pillars = self.voxeliser.voxelise(&self.cropped);
         let voxelise = clock.lap();
         self.canvas.fill(0.0);

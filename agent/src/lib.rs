@@ -1,5 +1,6 @@
 //! What one connected vehicle does with its sweep: where am I, what do I see, what do I tell the others.
 
+pub mod agent;
 pub mod agent_attention;
 pub mod anchors;
 pub mod backbone;
@@ -15,6 +16,7 @@ pub mod pillar_encoder;
 pub mod pillar_projection;
 pub mod pillars;
 pub mod point_pillars;
+pub mod pose_source;
 pub mod postprocess;
 pub mod rotated_iou;
 pub mod shrink;

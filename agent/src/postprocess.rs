@@ -5,6 +5,7 @@ use protocol::{Box3d, CavId, Detection};
 use serde::{Deserialize, Serialize};
 
 use crate::decode::Decoded;
+use crate::model_config::DetectorConfig;
 use crate::nms::rotated_nms;
 use crate::rotated_iou::Polygon;
 
@@ -36,6 +37,21 @@ impl Default for PostprocessConfig {
             z_range_m: [-3.0, 1.0],
             keep_range_m: [-140.0, -40.0, 140.0, 40.0],
         }
+    }
+}
+
+impl PostprocessConfig {
+    /// The reference's numbers with the range of a detector instead of its fixed one.
+    #[must_use]
+    pub fn for_detector(config: &DetectorConfig) -> Self {
+        let [x_low, y_low, z_low, x_high, y_high, z_high] = config.lidar_range_m;
+        Self { z_range_m: [z_low, z_high], keep_range_m: [x_low, y_low, x_high, y_high], ..Self::default() }
+    }
+
+    /// For boxes that another vehicle will merge: what counts as within range is the receiver's to say.
+    #[must_use]
+    pub fn for_late_fusion(config: &DetectorConfig) -> Self {
+        Self { keep_range_m: [f64::MIN, f64::MIN, f64::MAX, f64::MAX], ..Self::for_detector(config) }
     }
 }
 

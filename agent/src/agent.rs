@@ -1,0 +1,207 @@
+//! The pipeline of one vehicle: a sweep in, its pose, its map and its own detections out.
+//!
+//! Synchronous and without any network: live process, offline evaluation, tests and benches run the same lines.
+
+use std::time::{Duration, Instant};
+
+use protocol::{BevFeatures, CavId, Detection, PointCloud, Pose, PoseEstimate, StageTiming};
+
+use crate::detector::{Detector, DetectorError, EncodeTimes};
+use crate::pose_source::{PoseInput, PoseSource};
+use crate::postprocess::{AgentBoxes, PostprocessConfig, postprocess};
+
+/// Everything known about one sweep.
+#[derive(Debug, Clone, Copy)]
+pub struct AgentInput<'a> {
+    /// Capture time on the clock of the scene, nanoseconds.
+    pub capture_nanos: u64,
+    /// The sweep, in the LiDAR frame.
+    pub cloud: &'a PointCloud,
+    /// `world_from_lidar` as recorded or measured, where there is one.
+    pub measured_pose: Option<&'a Pose>,
+}
+
+/// What the detector makes of one sweep.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Perception {
+    /// The map for intermediate fusion.
+    pub features: BevFeatures,
+    /// `[H, W]`, 0..1: where a vehicle is likely; which cells are worth sending.
+    pub confidence: Vec<f32>,
+    /// What this vehicle detects alone, in its own LiDAR frame, for late fusion.
+    pub detections: Vec<Detection>,
+    /// Where the time went.
+    pub times: PerceptionTimes,
+}
+
+/// Pose and perception of one sweep.
+#[derive(Debug, Clone, PartialEq)]
+pub struct AgentOutput {
+    /// Where the vehicle is, or why it does not know.
+    pub pose: PoseEstimate,
+    /// Time the pose took.
+    pub pose_time: Duration,
+    /// What it sees.
+    pub perception: Perception,
+}
+
+/// Time per stage of [`Agent::perceive`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct PerceptionTimes {
+    /// The encoder's stages.
+    pub encode: EncodeTimes,
+    /// The map out of the tensor library.
+    pub message: Duration,
+    /// Scores, offsets, confidence.
+    pub head: Duration,
+    /// Decoding, suppression, clean-up.
+    pub boxes: Duration,
+}
+
+impl PerceptionTimes {
+    /// The stages by name, in the order they run.
+    #[must_use]
+    pub fn stages(&self) -> Vec<StageTiming> {
+        let EncodeTimes { voxelise, pillars, backbone } = self.encode;
+        [
+            ("voxelise", voxelise),
+            ("pillars", pillars),
+            ("backbone", backbone),
+            ("message", self.message),
+            ("head", self.head),
+            ("boxes", self.boxes),
+        ]
+        .map(|(stage, time)| StageTiming::new(stage, time))
+        .into()
+    }
+}
+
+/// One vehicle: where it believes to be and what it sees.
+#[derive(Debug)]
+pub struct Agent {
+    cav: CavId,
+    pose_source: Box<dyn PoseSource>,
+    detector: Detector,
+    postprocess: PostprocessConfig,
+}
+
+impl Agent {
+    /// A vehicle with its pose source and its detector.
+    #[must_use]
+    pub fn new(cav: CavId, pose_source: Box<dyn PoseSource>, detector: Detector) -> Self {
+        let postprocess = PostprocessConfig::for_late_fusion(detector.config());
+        Self { cav, pose_source, detector, postprocess }
+    }
+
+    /// The same with another clean-up of its own detections.
+    #[must_use]
+    pub fn with_postprocess(self, postprocess: PostprocessConfig) -> Self {
+        Self { postprocess, ..self }
+    }
+
+    /// Who it is.
+    #[must_use]
+    pub fn cav(&self) -> &CavId {
+        &self.cav
+    }
+
+    /// Its detector.
+    #[must_use]
+    pub fn detector(&self) -> &Detector {
+        &self.detector
+    }
+
+    /// First step: the pose, which goes out before anything else is computed.
+    pub fn estimate_pose(&mut self, input: &AgentInput<'_>) -> PoseEstimate {
+        self.pose_source.estimate(&PoseInput {
+            cav: &self.cav,
+            capture_nanos: input.capture_nanos,
+            cloud: input.cloud,
+            measured: input.measured_pose,
+        })
+    }
+
+    /// Second step: map, confidence and own detections.
+    ///
+    /// # Errors
+    /// [`DetectorError`] when the tensor library refuses.
+    pub fn perceive(&mut self, cloud: &PointCloud) -> Result<Perception, DetectorError> {
+        let encoded = self.detector.encode(cloud)?;
+        let (features, message) = timed(|| self.detector.to_message(&encoded.features))?;
+        let (heads, head) = timed(|| self.detector.heads(&encoded.features))?;
+        let (detections, boxes) = timed(|| {
+            let boxes = self.detector.boxes(&heads, self.postprocess.score_threshold)?;
+            let own = AgentBoxes { boxes: &boxes, output_from_agent: nalgebra::Isometry3::identity() };
+            let found = postprocess(&[own], &self.postprocess);
+            Ok(found.iter().map(|candidate| candidate.detection(Some(self.cav.clone()))).collect())
+        })?;
+        let times = PerceptionTimes { encode: encoded.times, message, head, boxes };
+        Ok(Perception { features, confidence: heads.confidence, detections, times })
+    }
+
+    /// Both steps.
+    ///
+    /// # Errors
+    /// See [`Self::perceive`].
+    pub fn process(&mut self, input: &AgentInput<'_>) -> Result<AgentOutput, DetectorError> {
+        let (pose, pose_time) = timed(|| Ok(self.estimate_pose(input)))?;
+        Ok(AgentOutput { pose, pose_time, perception: self.perceive(input.cloud)? })
+    }
+}
+
+fn timed<T>(step: impl FnOnce() -> Result<T, DetectorError>) -> Result<(T, Duration), DetectorError> {
+    let start = Instant::now();
+    step().map(|value| (value, start.elapsed()))
+}
+
+#[cfg(test)]
+mod tests {
+    use tch::Device;
+    use tch::nn::VarStore;
+
+    use super::*;
+    use crate::model_config::DetectorConfig;
+    use crate::point_pillars::PointPillars;
+    use crate::pose_source::RecordedPose;
+
+    fn agent() -> Agent {
+        tch::set_num_threads(1);
+        tch::manual_seed(11);
+        let config = DetectorConfig { lidar_range_m: [-12.8, -6.4, -3.0, 12.8, 6.4, 1.0], ..DetectorConfig::lean() };
+        let network = VarStore::new(Device::Cpu);
+        let pillars = PointPillars::new(&network.root(), &config).unwrap();
+        // A head that believes in vehicles everywhere gives the clean-up something to do.
+        let _ = tch::no_grad(|| network.variables()["cls_head.bias"].shallow_clone().fill_(0.5));
+        Agent::new(CavId::new("4279").unwrap(), Box::new(RecordedPose), Detector::from_network(pillars))
+    }
+
+    #[test]
+    fn a_sweep_becomes_pose_map_and_detections() {
+        let mut agent = agent();
+        let points = (0..3000).map(|k| [(k % 83) as f32 * 0.3 - 12.0, (k % 41) as f32 * 0.3 - 6.0, -1.5, 0.2]);
+        let cloud = PointCloud { xyzi: points.collect() };
+        let pose = Pose::from_xyz_yaw([5.0, 6.0, 0.0], 0.3);
+        let input = AgentInput { capture_nanos: 0, cloud: &cloud, measured_pose: Some(&pose) };
+        let first = agent.process(&input).unwrap();
+        assert_eq!(first.pose.world_from_cav(), Some(&pose));
+        let Perception { features, confidence, detections, times } = &first.perception;
+        let [channels, height, width] = agent.detector().map_shape();
+        assert_eq!(features.values.len() as i64, channels * height * width);
+        assert_eq!(confidence.len(), features.grid.cells());
+        assert!(!detections.is_empty() && detections.len() <= 1000);
+        assert!(detections.windows(2).all(|pair| pair[0].score >= pair[1].score));
+        assert!(detections.iter().all(|detection| detection.source.as_ref() == Some(agent.cav())));
+        assert_eq!(times.stages().len(), 6);
+        let second = agent.process(&input).unwrap();
+        assert_eq!((second.perception.features, second.perception.detections), (features.clone(), detections.clone()));
+    }
+
+    #[test]
+    fn an_empty_sweep_without_a_pose_is_an_answer_too() {
+        let mut agent = agent();
+        let input = AgentInput { capture_nanos: 0, cloud: &PointCloud::default(), measured_pose: None };
+        let output = agent.process(&input).unwrap();
+        assert!(output.pose.world_from_cav().is_none());
+        assert!(output.perception.features.values.iter().all(|value| value.is_finite()));
+    }
+}

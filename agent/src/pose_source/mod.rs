@@ -1,0 +1,175 @@
+//! Where an agent's pose comes from.
+//!
+//! One door for every source: the recording's own pose, that pose with an error of a chosen kind, and an estimate from
+//! the sweep alone. A source that has no pose says so; nothing is made up.
+
+mod error_table;
+mod noise;
+mod noisy;
+
+use std::path::PathBuf;
+
+use protocol::{CavId, NoPoseReason, PointCloud, Pose, PoseEstimate};
+use serde::{Deserialize, Serialize};
+
+pub use error_table::{ErrorTable, ErrorTableError, TableRow};
+pub use noise::{PlanarError, PoseNoise};
+pub use noisy::NoisyPose;
+
+/// What a source may look at for one sweep.
+#[derive(Debug, Clone, Copy)]
+pub struct PoseInput<'a> {
+    /// Whose sweep.
+    pub cav: &'a CavId,
+    /// Capture time on the clock of the scene, nanoseconds.
+    pub capture_nanos: u64,
+    /// The sweep, in the LiDAR frame.
+    pub cloud: &'a PointCloud,
+    /// `world_from_lidar` as recorded, or as a receiver measured it.
+    pub measured: Option<&'a Pose>,
+}
+
+/// Says where an agent is.
+pub trait PoseSource: std::fmt::Debug + Send {
+    /// The pose of one sweep with its confidence, or why there is none.
+    fn estimate(&mut self, input: &PoseInput<'_>) -> PoseEstimate;
+}
+
+/// Takes the measured pose as it is, fully trusted.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct RecordedPose;
+
+impl PoseSource for RecordedPose {
+    fn estimate(&mut self, input: &PoseInput<'_>) -> PoseEstimate {
+        match input.measured {
+            Some(pose) => PoseEstimate::new(*pose, 1.0),
+            None => NO_SOURCE,
+        }
+    }
+}
+
+/// There is nothing to take a pose from.
+const NO_SOURCE: PoseEstimate = PoseEstimate::NoPose { reason: NoPoseReason::NoSource, inlier_count: 0 };
+
+/// Which source, as a scenario file names it.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case", deny_unknown_fields)]
+pub enum PoseSourceConfig {
+    /// The measured pose.
+    #[default]
+    Recorded,
+    /// The measured pose with an error.
+    Noisy(NoisyPoseConfig),
+}
+
+/// An error on the measured pose.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct NoisyPoseConfig {
+    /// Which kind of error.
+    pub mode: NoiseMode,
+    /// Standard deviation of x, y and z, metres.
+    pub position_std_m: f64,
+    /// Standard deviation of yaw, degrees.
+    pub heading_std_deg: f64,
+    /// Same seed, same errors.
+    pub seed: u64,
+    /// Time between two draws of the modes that depend on time, seconds.
+    pub step_s: f64,
+    /// `autoregressive`: time after which an error has decayed to 1/e, seconds.
+    pub decay_s: f64,
+    /// `replayed`: the table of errors.
+    pub table: Option<PathBuf>,
+}
+
+impl Default for NoisyPoseConfig {
+    /// OpenCOOD's: 0.2 m, 0.2 degrees, one fixed offset, seed 25.
+    fn default() -> Self {
+        Self {
+            mode: NoiseMode::Fixed,
+            position_std_m: 0.2,
+            heading_std_deg: 0.2,
+            seed: 25,
+            step_s: 0.1,
+            decay_s: 5.0,
+            table: None,
+        }
+    }
+}
+
+/// The four kinds of pose error.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum NoiseMode {
+    /// One offset, the same for all agents and frames: what the reference code does, which seeds anew at every call.
+    /// There the ego stays exact; give its agent the `recorded` source to repeat that.
+    #[default]
+    Fixed,
+    /// Drawn anew for every agent and frame.
+    Independent,
+    /// First-order autoregressive per agent: it wanders, as a filter's error does.
+    Autoregressive,
+    /// The errors that a pose generator really made, from a table.
+    Replayed,
+}
+
+/// Why a pose source cannot be set up.
+#[derive(Debug, thiserror::Error)]
+pub enum PoseSourceError {
+    /// A number is negative, not finite or absurd.
+    #[error("pose source: {field} is {value}, must be {must}")]
+    Value {
+        /// Name of the field.
+        field: &'static str,
+        /// What stood there.
+        value: f64,
+        /// What would be right.
+        must: &'static str,
+    },
+    /// `replayed` without a table.
+    #[error("pose source: mode replayed needs `table`, the file of errors")]
+    NoTable,
+    /// The table is not readable.
+    #[error(transparent)]
+    Table(#[from] ErrorTableError),
+}
+
+impl PoseSourceConfig {
+    /// Sets the source up, files read.
+    ///
+    /// # Errors
+    /// [`PoseSourceError`] names the field or the file.
+    pub fn build(&self) -> Result<Box<dyn PoseSource>, PoseSourceError> {
+        Ok(match self {
+            Self::Recorded => Box::new(RecordedPose),
+            Self::Noisy(config) => Box::new(NoisyPose::new(config)?),
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_recorded_pose_passes_unchanged_and_a_missing_one_is_said() {
+        let cav = CavId::new("7").unwrap();
+        let cloud = PointCloud::default();
+        let pose = Pose::from_xyz_yaw([1.0, 2.0, 3.0], 0.4);
+        let mut input = PoseInput { cav: &cav, capture_nanos: 5, cloud: &cloud, measured: Some(&pose) };
+        let mut source = PoseSourceConfig::default().build().unwrap();
+        assert_eq!(source.estimate(&input), PoseEstimate::new(pose, 1.0));
+        input.measured = None;
+        assert_eq!(source.estimate(&input), NO_SOURCE);
+    }
+
+    #[test]
+    fn a_scenario_file_names_the_source() {
+        let config: PoseSourceConfig =
+            serde_saphyr::from_str("noisy:\n  mode: autoregressive\n  position_std_m: 0.5\n").unwrap();
+        let PoseSourceConfig::Noisy(noisy) = &config else { panic!("{config:?}") };
+        assert_eq!((noisy.mode, noisy.position_std_m, noisy.seed), (NoiseMode::Autoregressive, 0.5, 25));
+        assert_eq!(serde_saphyr::from_str::<PoseSourceConfig>("recorded").unwrap(), PoseSourceConfig::Recorded);
+        assert!(serde_saphyr::from_str::<PoseSourceConfig>("noisy:\n  posision_std_m: 0.5\n").is_err());
+    }
+}

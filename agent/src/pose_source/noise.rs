@@ -1,0 +1,175 @@
+//! Seeded pose errors that depend on nothing but seed, vehicle and capture time.
+
+use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
+use protocol::{CavId, Pose};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rand_distr::StandardNormal;
+use sha2::{Digest, Sha256};
+
+/// Random words set aside for one draw; four normals take about eight.
+const WORDS_PER_DRAW: u128 = 64;
+
+/// Innovations that have decayed below this share of an error are left out.
+const NEGLIGIBLE: f64 = 1e-3;
+
+/// An error of position and heading.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct PlanarError {
+    /// x, y, z, metres.
+    pub position_m: [f64; 3],
+    /// Heading, radians.
+    pub yaw_rad: f64,
+}
+
+impl PlanarError {
+    /// The pose with this error added to its position in the world and to its yaw, as the reference does.
+    #[must_use]
+    pub fn added_in_world(&self, pose: &Pose) -> Pose {
+        let exact = pose.isometry();
+        let rotation = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), self.yaw_rad) * exact.rotation;
+        let translation = exact.translation.vector + Vector3::from(self.position_m);
+        Isometry3::from_parts(Translation3::from(translation), rotation).into()
+    }
+
+    /// The pose with this error seen from the vehicle: x forward, y left.
+    #[must_use]
+    pub fn added_in_vehicle(&self, pose: &Pose) -> Pose {
+        let error = Isometry3::new(Vector3::from(self.position_m), Vector3::z() * self.yaw_rad);
+        (pose.isometry() * error).into()
+    }
+
+    /// Distance off, metres.
+    #[must_use]
+    pub fn distance_m(&self) -> f64 {
+        Vector3::from(self.position_m).norm()
+    }
+}
+
+/// Normal errors with the same standard deviations throughout.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PoseNoise {
+    position_std_m: f64,
+    yaw_std_rad: f64,
+    seed: u64,
+}
+
+impl PoseNoise {
+    /// Errors with these standard deviations, metres per axis and radians.
+    #[must_use]
+    pub fn new(position_std_m: f64, yaw_std_rad: f64, seed: u64) -> Self {
+        Self { position_std_m, yaw_std_rad, seed }
+    }
+
+    /// The one error of everyone, always.
+    #[must_use]
+    pub fn fixed(&self) -> PlanarError {
+        self.scaled(draw(&self.random(None), 0))
+    }
+
+    /// The error of a vehicle at a step of time, independent of all others.
+    #[must_use]
+    pub fn independent(&self, cav: &CavId, step: u64) -> PlanarError {
+        self.scaled(draw(&self.random(Some(cav)), step))
+    }
+
+    /// The error of a vehicle at a step of time, correlated by `rho` from one step to the next.
+    ///
+    /// `e_k = rho e_{k-1} + sqrt(1 - rho^2) n_k`, written out as the sum of the innovations `n` back to where they have
+    /// decayed: so it depends on no earlier call, and frames may be lost, repeated or begun anywhere.
+    #[must_use]
+    pub fn autoregressive(&self, cav: &CavId, step: u64, rho: f64) -> PlanarError {
+        let random = self.random(Some(cav));
+        let depth = if rho > 0.0 { (NEGLIGIBLE.ln() / rho.ln()).ceil() as u64 } else { 0 };
+        let mut sum = [0.0; 4];
+        let mut weight = (1.0 - rho * rho).sqrt();
+        for back in 0..=depth {
+            // Steps before the scene's zero have innovations too: the error starts in its stationary state.
+            let innovation = draw(&random, step.wrapping_sub(back));
+            for (sum, innovation) in sum.iter_mut().zip(innovation) {
+                *sum += weight * innovation;
+            }
+            weight *= rho;
+        }
+        self.scaled(sum)
+    }
+
+    fn scaled(&self, [x, y, z, yaw]: [f64; 4]) -> PlanarError {
+        PlanarError {
+            position_m: [x, y, z].map(|normal| normal * self.position_std_m),
+            yaw_rad: yaw * self.yaw_std_rad,
+        }
+    }
+
+    fn random(&self, cav: Option<&CavId>) -> ChaCha8Rng {
+        ChaCha8Rng::from_seed(key(self.seed, cav))
+    }
+}
+
+/// A generator's key from seed and vehicle.
+pub(super) fn key(seed: u64, cav: Option<&CavId>) -> [u8; 32] {
+    let mut hash = Sha256::new();
+    hash.update(b"v2vloc pose noise");
+    hash.update(seed.to_le_bytes());
+    hash.update(cav.map_or(b"".as_slice(), |cav| cav.as_str().as_bytes()));
+    hash.finalize().into()
+}
+
+/// Four standard normals, those of `step`.
+fn draw(random: &ChaCha8Rng, step: u64) -> [f64; 4] {
+    let mut random = random.clone();
+    random.set_word_pos(u128::from(step) * WORDS_PER_DRAW);
+    std::array::from_fn(|_| random.sample(StandardNormal))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn cav(name: &str) -> CavId {
+        CavId::new(name).unwrap()
+    }
+
+    fn correlation(pairs: impl Iterator<Item = (f64, f64)>) -> (f64, f64) {
+        let pairs: Vec<_> = pairs.collect();
+        let variance = pairs.iter().map(|(a, _)| a * a).sum::<f64>();
+        (pairs.iter().map(|(a, b)| a * b).sum::<f64>() / variance, (variance / pairs.len() as f64).sqrt())
+    }
+
+    #[test]
+    fn the_fixed_error_is_everyones() {
+        let noise = PoseNoise::new(0.2, 0.01, 25);
+        assert_eq!(noise.fixed(), noise.fixed());
+        assert_ne!(noise.fixed(), PoseNoise::new(0.2, 0.01, 26).fixed());
+    }
+
+    #[test]
+    fn independent_errors_have_the_asked_spread_and_no_memory() {
+        let noise = PoseNoise::new(0.5, 0.02, 1);
+        let x = |step| noise.independent(&cav("a"), step).position_m[0];
+        let (correlation, spread) = correlation((0..4000).map(|step| (x(step), x(step + 1))));
+        assert!((spread - 0.5).abs() < 0.03 && correlation.abs() < 0.05, "{spread} {correlation}");
+        assert_ne!(x(7), noise.independent(&cav("b"), 7).position_m[0]);
+    }
+
+    #[test]
+    fn autoregressive_errors_remember_by_rho() {
+        let noise = PoseNoise::new(0.5, 0.02, 1);
+        let x = |step| noise.autoregressive(&cav("a"), step, 0.9).position_m[0];
+        let (correlation, spread) = correlation((0..4000).map(|step| (x(step), x(step + 1))));
+        assert!((spread - 0.5).abs() < 0.06 && (correlation - 0.9).abs() < 0.03, "{spread} {correlation}");
+        let forgetful = noise.autoregressive(&cav("a"), 3, 0.0);
+        assert_eq!(forgetful, noise.independent(&cav("a"), 3));
+    }
+
+    #[test]
+    fn errors_in_the_vehicle_turn_with_it() {
+        let pose = Pose::from_xyz_yaw([10.0, 0.0, 0.0], std::f64::consts::FRAC_PI_2);
+        let error = PlanarError { position_m: [1.0, 0.0, 0.0], yaw_rad: 0.1 };
+        let forward = error.added_in_vehicle(&pose);
+        assert!((forward.translation_m[0] - 10.0).abs() < 1e-9 && (forward.translation_m[1] - 1.0).abs() < 1e-9);
+        let east = error.added_in_world(&pose);
+        assert!((east.translation_m[0] - 11.0).abs() < 1e-9);
+        assert!((east.yaw_rad() - pose.yaw_rad() - 0.1).abs() < 1e-9);
+    }
+}

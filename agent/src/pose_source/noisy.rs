@@ -1,0 +1,164 @@
+//! The measured pose with an error.
+
+use protocol::{CavId, NoPoseReason, Pose, PoseEstimate};
+
+use super::error_table::{ErrorTable, TableRow};
+use super::noise::{self, PlanarError, PoseNoise};
+use super::{NO_SOURCE, NoiseMode, NoisyPoseConfig, PoseInput, PoseSource, PoseSourceError};
+
+/// The measured pose with an error of one of four kinds.
+///
+/// The error depends on seed, vehicle and capture time alone, so a live run and an offline one see the same poses, and
+/// so does a run that lost frames. The confidence of a drawn error is `1 / (1 + e^2)` of its length in metres, as
+/// Eq. 6 of the paper has it and as its experiments do on recorded data; a replayed error brings its own.
+#[derive(Debug, Clone)]
+pub struct NoisyPose {
+    seed: u64,
+    step_nanos: f64,
+    kind: Kind,
+}
+
+#[derive(Debug, Clone)]
+enum Kind {
+    Fixed(PoseNoise),
+    Independent(PoseNoise),
+    Autoregressive(PoseNoise, f64),
+    Replayed(ErrorTable),
+}
+
+impl NoisyPose {
+    /// Sets the errors up; `replayed` reads its table.
+    ///
+    /// # Errors
+    /// [`PoseSourceError`] names the field or the file.
+    pub fn new(config: &NoisyPoseConfig) -> Result<Self, PoseSourceError> {
+        let within = |field, value: f64, low: f64, high: f64, must| {
+            if (low..=high).contains(&value) { Ok(()) } else { Err(PoseSourceError::Value { field, value, must }) }
+        };
+        within("position_std_m", config.position_std_m, 0.0, 1e3, "0 to 1000")?;
+        within("heading_std_deg", config.heading_std_deg, 0.0, 360.0, "0 to 360")?;
+        within("step_s", config.step_s, 1e-3, 1e3, "0.001 to 1000")?;
+        // The upper bound keeps the sum over past innovations short: seven decay times.
+        within("decay_s", config.decay_s, 0.0, 1e3 * config.step_s, "0 to 1000 steps")?;
+        let noise = PoseNoise::new(config.position_std_m, config.heading_std_deg.to_radians(), config.seed);
+        let kind = match config.mode {
+            NoiseMode::Fixed => Kind::Fixed(noise),
+            NoiseMode::Independent => Kind::Independent(noise),
+            NoiseMode::Autoregressive => Kind::Autoregressive(noise, correlation(config)),
+            NoiseMode::Replayed => {
+                let table = config.table.as_deref().ok_or(PoseSourceError::NoTable)?;
+                Kind::Replayed(ErrorTable::read(table)?)
+            }
+        };
+        Ok(Self { seed: config.seed, step_nanos: config.step_s * 1e9, kind })
+    }
+
+    /// The pose of a vehicle at a capture time when the true one is `pose`.
+    #[must_use]
+    pub fn disturbed(&self, cav: &CavId, capture_nanos: u64, pose: &Pose) -> PoseEstimate {
+        let step = (capture_nanos as f64 / self.step_nanos).round() as u64;
+        let error = match &self.kind {
+            Kind::Fixed(noise) => noise.fixed(),
+            Kind::Independent(noise) => noise.independent(cav, step),
+            Kind::Autoregressive(noise, rho) => noise.autoregressive(cav, step, *rho),
+            Kind::Replayed(table) => return replayed(table.row(self.first_row(cav), step), pose),
+        };
+        PoseEstimate::new(error.added_in_world(pose), confidence(&error))
+    }
+
+    /// Vehicles start at different rows of the table, so that they do not err alike.
+    fn first_row(&self, cav: &CavId) -> u64 {
+        let key = noise::key(self.seed, Some(cav));
+        u64::from_le_bytes(std::array::from_fn(|byte| key[byte]))
+    }
+}
+
+impl PoseSource for NoisyPose {
+    fn estimate(&mut self, input: &PoseInput<'_>) -> PoseEstimate {
+        match input.measured {
+            Some(pose) => self.disturbed(input.cav, input.capture_nanos, pose),
+            None => NO_SOURCE,
+        }
+    }
+}
+
+fn replayed(row: TableRow, pose: &Pose) -> PoseEstimate {
+    match row {
+        TableRow::Pose { error, confidence } => PoseEstimate::new(error.added_in_vehicle(pose), confidence),
+        TableRow::NoPose => PoseEstimate::NoPose { reason: NoPoseReason::TooFewInliers, inlier_count: 0 },
+    }
+}
+
+/// Correlation of an error with the one a step before.
+fn correlation(config: &NoisyPoseConfig) -> f64 {
+    if config.decay_s > 0.0 { (-config.step_s / config.decay_s).exp() } else { 0.0 }
+}
+
+/// Eq. 6: `sigma = 1 / (1 + epsilon^2)`, epsilon in metres.
+fn confidence(error: &PlanarError) -> f32 {
+    (1.0 / (1.0 + error.distance_m().powi(2))) as f32
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const TRUE_POSE: Pose = Pose { translation_m: [100.0, -50.0, 2.0], rotation_wxyz: [1.0, 0.0, 0.0, 0.0] };
+
+    fn source(mode: NoiseMode) -> NoisyPose {
+        NoisyPose::new(&NoisyPoseConfig { mode, position_std_m: 1.0, ..NoisyPoseConfig::default() }).unwrap()
+    }
+
+    fn cav(name: &str) -> CavId {
+        CavId::new(name).unwrap()
+    }
+
+    #[test]
+    fn modes_differ_in_what_the_error_depends_on() {
+        let at =
+            |mode, name: &str, seconds: u64| source(mode).disturbed(&cav(name), seconds * 1_000_000_000, &TRUE_POSE);
+        assert_eq!(at(NoiseMode::Fixed, "a", 1), at(NoiseMode::Fixed, "b", 2));
+        for mode in [NoiseMode::Independent, NoiseMode::Autoregressive] {
+            assert_eq!(at(mode, "a", 1), at(mode, "a", 1), "{mode:?}");
+            assert_ne!(at(mode, "a", 1), at(mode, "a", 2), "{mode:?}");
+            assert_ne!(at(mode, "a", 1), at(mode, "b", 1), "{mode:?}");
+        }
+    }
+
+    #[test]
+    fn a_large_error_has_a_low_confidence() {
+        for step in 0..20 {
+            let PoseEstimate::Pose { world_from_cav, confidence } =
+                source(NoiseMode::Independent).disturbed(&cav("a"), step * 100_000_000, &TRUE_POSE)
+            else {
+                panic!("a measured pose gives a pose")
+            };
+            let off = TRUE_POSE.from_world(&world_from_cav).isometry().translation.vector.norm();
+            assert!((f64::from(confidence) - 1.0 / (1.0 + off * off)).abs() < 1e-6);
+        }
+    }
+
+    #[test]
+    fn replayed_errors_come_from_the_table_and_may_be_none() {
+        let folder = tempfile::tempdir().unwrap();
+        let table = folder.path().join("errors.csv");
+        std::fs::write(&table, "x_m,y_m,z_m,yaw_deg,confidence\n0.5,0,0,0,0.8\nno_pose\n").unwrap();
+        let config = NoisyPoseConfig { mode: NoiseMode::Replayed, table: Some(table), ..NoisyPoseConfig::default() };
+        let source = NoisyPose::new(&config).unwrap();
+        let estimates: Vec<_> = (0..2).map(|k| source.disturbed(&cav("a"), k * 100_000_000, &TRUE_POSE)).collect();
+        assert_eq!(estimates.iter().filter(|estimate| estimate.world_from_cav().is_none()).count(), 1);
+        let pose = estimates.iter().find_map(PoseEstimate::world_from_cav).unwrap();
+        assert!((pose.translation_m[0] - 100.5).abs() < 1e-9);
+        let config = NoisyPoseConfig { table: None, ..config };
+        assert!(matches!(NoisyPose::new(&config), Err(PoseSourceError::NoTable)));
+    }
+
+    #[test]
+    fn numbers_that_make_no_sense_are_named() {
+        let config = NoisyPoseConfig { position_std_m: f64::NAN, ..NoisyPoseConfig::default() };
+        let message = NoisyPose::new(&config).unwrap_err().to_string();
+        assert!(message.contains("position_std_m is NaN"), "{message}");
+        let config = NoisyPoseConfig { step_s: 0.0, ..NoisyPoseConfig::default() };
+        assert!(NoisyPose::new(&config).unwrap_err().to_string().contains("step_s is 0"));
+    }
+}
