@@ -27,6 +27,7 @@ mod protocol_file;
 pub mod radar;
 pub mod random;
 mod recording;
+mod terrain;
 mod traffic;
 pub mod vehicle;
 pub mod weather;

@@ -100,11 +100,16 @@ fn velocity_mps(motion: &Sweep, sweep_s: f64) -> Vector3<f64> {
     (motion.end.position_m - motion.start.position_m) / sweep_s
 }
 
-/// A radial velocity as the red channel holds it, 0..=255; see [`RADAR_VELOCITY_SPAN_MPS`].
+/// A radial velocity as the red channel holds it, 0..1; see [`RADAR_VELOCITY_SPAN_MPS`].
 #[must_use]
-pub fn velocity_to_red(velocity_mps: f32) -> u8 {
-    let share = f64::from(velocity_mps) / (2.0 * RADAR_VELOCITY_SPAN_MPS) + 0.5;
-    (share * 255.0).round().clamp(0.0, 255.0) as u8
+pub fn velocity_to_red(velocity_mps: f32) -> f32 {
+    (velocity_mps / (2.0 * RADAR_VELOCITY_SPAN_MPS as f32) + 0.5).clamp(0.0, 1.0)
+}
+
+/// The way back: metres per second from the red channel, 0..1.
+#[must_use]
+pub fn red_to_velocity(red: f32) -> f32 {
+    (red - 0.5) * 2.0 * RADAR_VELOCITY_SPAN_MPS as f32
 }
 
 #[cfg(test)]
@@ -136,12 +141,11 @@ mod tests {
     }
 
     #[test]
-    fn red_steps_are_half_a_metre_per_second() {
-        assert_eq!(velocity_to_red(-80.0), 0);
-        assert_eq!(velocity_to_red(80.0), 255);
+    fn velocities_survive_the_red_channel() {
+        assert_eq!((velocity_to_red(-80.0), velocity_to_red(80.0)), (0.0, 1.0));
         for velocity in [-30.0f32, 0.0, 12.3] {
-            let back = (f32::from(velocity_to_red(velocity)) / 255.0 - 0.5) * 128.0;
-            assert!((back - velocity).abs() < 0.26);
+            let byte = (velocity_to_red(velocity) * 255.0).round();
+            assert!((red_to_velocity(byte / 255.0) - velocity).abs() < 0.26);
         }
     }
 }

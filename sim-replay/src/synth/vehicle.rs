@@ -47,54 +47,55 @@ struct Stock {
 }
 
 /// Sizes after the vehicles of CARLA. All stay under 2.9 m, so that a box stands within -3..1 m of a LiDAR at 1.95 m.
+/// Trucks and buses are rare: the clean-up of detections in OpenCOOD's protocol drops boxes longer than 6 m.
 const STOCK: [Stock; 7] = [
     Stock {
         kind: VehicleKind::Sedan,
         size_m: [4.65, 1.95, 1.48],
         spread: [0.07, 0.05, 0.04],
-        driving: 0.34,
+        driving: 0.36,
         parked: 0.38,
     },
     Stock {
         kind: VehicleKind::Hatchback,
         size_m: [3.95, 1.85, 1.52],
         spread: [0.08, 0.05, 0.04],
-        driving: 0.20,
+        driving: 0.21,
         parked: 0.26,
     },
     Stock {
         kind: VehicleKind::Suv,
         size_m: [4.65, 2.05, 1.75],
         spread: [0.07, 0.04, 0.06],
-        driving: 0.24,
+        driving: 0.25,
         parked: 0.24,
     },
     Stock {
         kind: VehicleKind::Pickup,
         size_m: [5.30, 2.05, 1.88],
         spread: [0.05, 0.04, 0.04],
-        driving: 0.06,
+        driving: 0.05,
         parked: 0.05,
     },
     Stock {
         kind: VehicleKind::Van,
         size_m: [5.15, 2.05, 2.15],
         spread: [0.08, 0.04, 0.12],
-        driving: 0.09,
+        driving: 0.085,
         parked: 0.07,
     },
     Stock {
         kind: VehicleKind::Truck,
         size_m: [7.10, 2.40, 2.65],
         spread: [0.12, 0.03, 0.05],
-        driving: 0.05,
+        driving: 0.03,
         parked: 0.0,
     },
     Stock {
         kind: VehicleKind::Bus,
         size_m: [10.2, 2.50, 2.82],
         spread: [0.10, 0.02, 0.015],
-        driving: 0.02,
+        driving: 0.015,
         parked: 0.0,
     },
 ];
@@ -301,7 +302,7 @@ mod tests {
 
     fn fleet() -> Vec<Vehicle> {
         let mut random = SplitMix64::new(5);
-        (0..400).map(|_| Vehicle::random_driving(&mut random)).collect()
+        (0..2000).map(|_| Vehicle::random_driving(&mut random)).collect()
     }
 
     #[test]

@@ -1,8 +1,9 @@
 //! A town as the sensors see it.
 
 use super::cast::{Body, BodyShape, Bounds, Part, Placement, Plane, Surface, Sweep};
+use super::terrain::{TerrainSurface, deck_shape};
 use super::traffic::Roads;
-use crate::town::{LaneIndex, Shape, Solid, Town};
+use crate::town::{LaneIndex, Shape, Solid, Terrain, Town};
 
 /// A town made ready for casting and driving.
 pub(crate) struct World<'t> {
@@ -23,12 +24,17 @@ struct Standing {
 
 impl<'t> World<'t> {
     pub(crate) fn new(town: &'t Town) -> Self {
+        let decks = town.ground.decks.iter().filter_map(deck_shape).map(|(shape, center_m)| Standing {
+            radius_m: shape.bounds.radius_m(),
+            shape,
+            placement: Placement::level(center_m, 0.0),
+        });
         Self {
             town,
             roads: Roads::new(&town.lanes),
             lane_index: LaneIndex::new(&town.lanes),
             ground: ground_of(town),
-            standing: town.solids.iter().map(Standing::new).collect(),
+            standing: town.solids.iter().map(Standing::new).chain(decks).collect(),
         }
     }
 
@@ -48,7 +54,10 @@ impl<'t> World<'t> {
 }
 
 fn ground_of(town: &Town) -> Box<dyn Surface + Send + Sync> {
-    Box::new(Plane(town.ground.plane_z_m().unwrap_or(0.0)))
+    match &town.ground.terrain {
+        Terrain::Plane { z_m } => Box::new(Plane(*z_m)),
+        Terrain::Grid(grid) => Box::new(TerrainSurface::new(grid)),
+    }
 }
 
 impl Standing {

@@ -7,6 +7,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 
 use nalgebra::Vector3;
+use protocol::PointCloud;
 
 use super::cast::Placement;
 use super::error::SynthError;
@@ -15,6 +16,7 @@ use super::positioning::Fix;
 use super::radar::velocity_to_red;
 use super::vehicle::{Vehicle, VehicleKind};
 use crate::carla_pose::CarlaPose;
+use crate::pcd::{self, Encoding, IntensityField};
 
 /// A vehicle that an agent's LiDAR hit.
 #[derive(Debug, Clone, Copy)]
@@ -56,37 +58,21 @@ impl AgentFolder {
     }
 
     pub(crate) fn write_lidar(&self, tick: u64, points: &[[f32; 4]]) -> Result<(), SynthError> {
-        let mut bytes = pcd_header("x y z intensity", points.len());
-        for &[x, y, z, intensity] in points {
-            bytes.extend([x, -y, z, intensity].map(f32::to_le_bytes).as_flattened());
-        }
+        let xyzi = points.iter().map(|&[x, y, z, intensity]| [x, -y, z, intensity]).collect();
+        let bytes = pcd::encode(&PointCloud { xyzi }, Encoding::Binary, IntensityField::Intensity);
         write_file(&self.0.join(format!("{tick:06}.pcd")), bytes)
     }
 
-    /// `points` hold radial velocities in metres per second; see [`super::radar::RADAR_VELOCITY_SPAN_MPS`].
+    /// `points` hold radial velocities in metres per second; see [`super::radar::velocity_to_red`].
     pub(crate) fn write_radar(&self, tick: u64, points: &[[f32; 4]]) -> Result<(), SynthError> {
-        let mut bytes = pcd_header("x y z rgb", points.len());
-        for &[x, y, z, velocity] in points {
-            let rgb = u32::from(velocity_to_red(velocity)) << 16;
-            bytes.extend([x, -y, z].map(f32::to_le_bytes).as_flattened());
-            bytes.extend(rgb.to_le_bytes());
-        }
+        let xyzi = points.iter().map(|&[x, y, z, velocity]| [x, -y, z, velocity_to_red(velocity)]).collect();
+        let bytes = pcd::encode(&PointCloud { xyzi }, Encoding::Binary, IntensityField::Red);
         write_file(&self.0.join(format!("{tick:06}_radar.pcd")), bytes)
     }
 
     pub(crate) fn write_facts(&self, tick: u64, facts: &FrameFacts<'_>) -> Result<(), SynthError> {
         write_file(&self.0.join(format!("{tick:06}.yaml")), frame_yaml(facts))
     }
-}
-
-fn pcd_header(fields: &str, points: usize) -> Vec<u8> {
-    let header = format!(
-        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS {fields}\nSIZE 4 4 4 4\nTYPE F F F F\n\
-         COUNT 1 1 1 1\nWIDTH {points}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {points}\nDATA binary\n"
-    );
-    let mut bytes = Vec::with_capacity(header.len() + 16 * points);
-    bytes.extend(header.as_bytes());
-    bytes
 }
 
 fn frame_yaml(facts: &FrameFacts<'_>) -> String {

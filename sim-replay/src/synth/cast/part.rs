@@ -63,6 +63,13 @@ impl Bounds {
         }
     }
 
+    /// Radius of the upright cylinder around the origin that holds the box.
+    #[must_use]
+    pub fn radius_m(&self) -> f64 {
+        let reach = |axis: usize| f64::from(self.min_m[axis].abs().max(self.max_m[axis].abs()));
+        reach(0).hypot(reach(1))
+    }
+
     /// The eight corners.
     #[must_use]
     pub fn corners(&self) -> [[f32; 3]; 8] {

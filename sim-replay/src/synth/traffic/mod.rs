@@ -12,6 +12,8 @@ mod path;
 mod rectangle;
 mod roads;
 mod spawn;
+#[cfg(test)]
+mod tests;
 
 pub(crate) use car::Car;
 pub(crate) use rectangle::{NeighbourIndex, Rectangle};
