@@ -76,6 +76,24 @@ pub struct Frame {
 }
 
 impl Frame {
+    /// A frame with nothing in it.
+    #[must_use]
+    pub fn empty(cav: CavId, capture_nanos: u64, source_handedness: Handedness) -> Self {
+        Self {
+            cav,
+            capture_nanos,
+            points: PointCloud::default(),
+            dropped_points: 0,
+            radar: None,
+            world_from_lidar: None,
+            world_from_vehicle: None,
+            gnss_world_from_vehicle: None,
+            speed_mps: None,
+            objects: Vec::new(),
+            source_handedness,
+        }
+    }
+
     /// The GNSS estimate carried over to the LiDAR by the true mount of the LiDAR on the vehicle.
     #[must_use]
     pub fn gnss_world_from_lidar(&self) -> Option<Pose> {

@@ -104,24 +104,16 @@ pub fn upright_box(object: &Object, target_from_world: &Isometry3<f64>) -> Box3d
 
 #[cfg(test)]
 mod tests {
-    use protocol::{CavId, Handedness, PointCloud, Pose};
+    use protocol::{CavId, Handedness, Pose};
 
     use super::*;
     use crate::frame::ObjectClass;
 
     fn frame(cav: &str, x: f64, objects: Vec<Object>) -> Frame {
         Frame {
-            cav: CavId::new(cav).unwrap(),
-            capture_nanos: 0,
-            points: PointCloud::default(),
-            dropped_points: 0,
-            radar: None,
             world_from_lidar: Some(Pose::from_xyz_yaw([x, 0.0, 2.0], 0.0)),
-            world_from_vehicle: None,
-            gnss_world_from_vehicle: None,
-            speed_mps: None,
             objects,
-            source_handedness: Handedness::Right,
+            ..Frame::empty(CavId::new(cav).unwrap(), 0, Handedness::Right)
         }
     }
 

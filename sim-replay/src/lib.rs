@@ -6,7 +6,6 @@
 
 pub mod bus;
 pub mod carla_pose;
-pub mod crop;
 pub mod dataset;
 pub mod frame;
 pub mod ground_truth;

@@ -2,11 +2,12 @@
 //!
 //! The archives are left-handed. Inputs go through the readers' conversion, results are mirrored back.
 
+use agent::crop::Crop;
+use agent::model_config::DetectorConfig;
 use nalgebra::{Matrix4, Point3};
-use protocol::{CavId, Handedness, PointCloud, Pose};
+use protocol::{CavId, Handedness, Pose};
 use serde_json::Value;
 use sim_replay::carla_pose::{CarlaPose, mirrored_point};
-use sim_replay::crop;
 use sim_replay::frame::{Frame, Object, ObjectClass};
 use sim_replay::ground_truth::{self, GroundTruthRule};
 use tests::fixtures::{Golden, assert_close, golden};
@@ -111,16 +112,20 @@ fn golden_projected_and_cropped_points() {
         .collect();
     assert_close("projected", &projected, &golden.f32("out.points_projected").1, F32_ATOL, 0.0);
 
-    let mirrored = |cloud: &PointCloud| cloud.xyzi.iter().flat_map(|&[x, y, z, i]| [x, -y, z, i]).collect::<Vec<f32>>();
-    let mut without_body = PointCloud { xyzi: xyzi.clone() };
-    crop::remove_own_body(&mut without_body);
-    assert_close("without own body", &mirrored(&without_body), &golden.f32("out.points_ego_masked").1, 0.0, 0.0);
+    let kept_by = |config: DetectorConfig| {
+        let mut kept = Vec::new();
+        Crop::for_detector(&config).keep(&xyzi, &mut kept);
+        kept.into_iter().flat_map(|[x, y, z, i]| [x, -y, z, i]).collect::<Vec<f32>>()
+    };
+    let everywhere = [-1e6, -1e6, -1e6, 1e6, 1e6, 1e6];
+    let without_body = kept_by(DetectorConfig { lidar_range_m: everywhere, ..DetectorConfig::full() });
+    assert_close("without own body", &without_body, &golden.f32("out.points_ego_masked").1, 0.0, 0.0);
 
-    let bounds = to_f32(&numbers_after(note, "range mask ["));
-    let mut in_range = PointCloud { xyzi };
+    let bounds: [f64; 6] = numbers_after(note, "range mask [").try_into().unwrap();
     // y is mirrored, and with it which of its bounds is the lower one.
-    crop::keep_range(&mut in_range, [bounds[0], -bounds[4], bounds[2]], [bounds[3], -bounds[1], bounds[5]]);
-    assert_close("in range", &mirrored(&in_range), &golden.f32("out.points_range_masked").1, 0.0, 0.0);
+    let lidar_range_m = [bounds[0], -bounds[4], bounds[2], bounds[3], -bounds[1], bounds[5]];
+    let in_range = kept_by(DetectorConfig { lidar_range_m, own_body_m: None, ..DetectorConfig::full() });
+    assert_close("in range", &in_range, &golden.f32("out.points_range_masked").1, 0.0, 0.0);
 }
 
 #[test]
@@ -206,17 +211,9 @@ fn golden_world_objects() {
         }
     });
     let ego = Frame {
-        cav: CavId::new("0").unwrap(),
-        capture_nanos: 0,
-        points: PointCloud::default(),
-        dropped_points: 0,
-        radar: None,
         world_from_lidar: Some(poses(&golden, "in.lidar_pose")[0]),
-        world_from_vehicle: None,
-        gnss_world_from_vehicle: None,
-        speed_mps: None,
         objects: objects.collect(),
-        source_handedness: Handedness::Left,
+        ..Frame::empty(CavId::new("0").unwrap(), 0, Handedness::Left)
     };
     let [x_low, y_low, z_low, x_high, y_high, z_high] = range(golden.config());
     let rule = GroundTruthRule {

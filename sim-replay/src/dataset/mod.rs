@@ -15,6 +15,11 @@
 mod agent_folders;
 mod error;
 mod files;
+mod hdf5_poses;
+mod kitti_object;
+mod kitti_odometry;
+mod kitti_text;
+mod localization;
 mod numpy_tags;
 mod open;
 mod opv2v;
@@ -202,5 +207,20 @@ impl Scenario {
     fn no_such(&self, what: &'static str, index: usize, count: usize) -> ReadError {
         let available = format!("there are {count}, counted from 0");
         ReadError::NoSuch { scenario: self.name.clone(), what, asked: index.to_string(), available }
+    }
+}
+
+/// A scenario of a layout that knows one vehicle and does not name it.
+fn single_vehicle(name: String, layout: Layout, ticks: Vec<Tick>, source: Arc<dyn FrameSource>) -> Scenario {
+    Scenario {
+        name,
+        agents: vec![CavId::new("0").expect("a digit is an identifier")],
+        ticks,
+        missing: Vec::new(),
+        lidar_variants: Vec::new(),
+        has_radar: false,
+        layout,
+        source_handedness: Handedness::Right,
+        source,
     }
 }

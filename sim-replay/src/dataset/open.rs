@@ -8,8 +8,10 @@ use protocol::Handedness;
 use super::agent_folders::{self, ScenarioFolder};
 use super::opv2v::{self, Opv2v};
 use super::v2v4real::V2v4Real;
-use super::{Dataset, FrameSource, Layout, ReadError, Scenario, files};
+use super::{Dataset, FrameSource, Layout, ReadError, Scenario, files, kitti_object, kitti_odometry, localization};
 
+/// How far below the opened folder sequences of a single vehicle are looked for.
+const SEQUENCE_DEPTH: usize = 2;
 /// How many frames of a scenario are tried to tell its layout.
 const FRAMES_TO_TRY: usize = 5;
 
@@ -45,7 +47,33 @@ pub fn open_with(dir: &Path, options: &OpenOptions) -> Result<Dataset, ReadError
     if !folders.is_empty() {
         return open_agent_folders(dir, &folders, options);
     }
-    Err(unknown(dir))
+    let mut problems = Vec::new();
+    let mut scenarios = Vec::new();
+    open_single_vehicles(dir, (dir, SEQUENCE_DEPTH), options, &mut scenarios, &mut problems)?;
+    let layout = scenarios.first().map(|scenario: &Scenario| scenario.layout).ok_or_else(|| unknown(dir))?;
+    Ok(Dataset { layout, scenarios, problems })
+}
+
+/// Opens what is a sequence or split of one of the layouts with a single vehicle, at `dir` or below.
+fn open_single_vehicles(
+    root: &Path,
+    (dir, depth): (&Path, usize),
+    options: &OpenOptions,
+    scenarios: &mut Vec<Scenario>,
+    problems: &mut Vec<ReadError>,
+) -> Result<(), ReadError> {
+    if kitti_object::is_split(dir) {
+        scenarios.push(kitti_object::open(root, dir, options)?);
+    } else if kitti_odometry::is_sequence(dir) {
+        scenarios.push(kitti_odometry::open(root, dir, options)?);
+    } else if localization::is_sequence(dir) {
+        scenarios.push(localization::open(root, dir, problems)?);
+    } else if depth > 0 {
+        for folder in files::list(dir)?.folders {
+            open_single_vehicles(root, (&dir.join(folder), depth - 1), options, scenarios, problems)?;
+        }
+    }
+    Ok(())
 }
 
 fn open_agent_folders(
@@ -101,7 +129,9 @@ fn unknown(dir: &Path) -> ReadError {
     let reason = if agent_folders::is_agent(dir) {
         "this is the folder of one agent: open the scenario above it".to_owned()
     } else {
-        "no known layout: expected <split>/<scenario>/<agent>/<frame>.yaml and .pcd (OPV2V and its relatives, V2V4Real)"
+        "no known layout: expected <scenario>/<agent>/<frame>.yaml and .pcd (OPV2V and its relatives, V2V4Real), \
+         <sequence>/velodyne_left or velodyne_sync/<microseconds>.bin (Oxford, NCLT), velodyne and calib.txt (KITTI \
+         odometry) or velodyne and calib (KITTI object), at most three folders down"
             .to_owned()
     };
     ReadError::Layout { path: dir.to_owned(), reason }

@@ -4,7 +4,7 @@
 
 use std::path::{Path, PathBuf};
 
-use protocol::{CavId, Handedness, PointCloud, Pose};
+use protocol::{CavId, Handedness, Pose};
 
 use super::agent_folders::ScenarioFolder;
 use super::yaml::{self, Field};
@@ -50,17 +50,12 @@ fn mirrored(path: &Path) -> Result<PcdCloud, ReadError> {
 fn frame_without_points(agent: &CavId, tick: &Tick, root: &Field<'_>) -> Result<Frame, ReadError> {
     let optional_pose = |key| root.optional(key)?.map(|field| six_numbers(&field)).transpose();
     Ok(Frame {
-        cav: agent.clone(),
-        capture_nanos: tick.capture_nanos,
-        points: PointCloud::default(),
-        dropped_points: 0,
-        radar: None,
         world_from_lidar: Some(six_numbers(&root.required("lidar_pose")?)?),
         world_from_vehicle: optional_pose("true_ego_pos")?,
         gnss_world_from_vehicle: optional_pose("predicted_ego_pos")?,
         speed_mps: root.optional("ego_speed")?.map(|speed| speed_mps(&speed)).transpose()?,
         objects: objects(root)?,
-        source_handedness: Handedness::Left,
+        ..Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Left)
     })
 }
 

@@ -7,7 +7,7 @@
 use std::path::PathBuf;
 
 use nalgebra::{Matrix4, RowVector4};
-use protocol::{CavId, Handedness, PointCloud, Pose};
+use protocol::{CavId, Handedness, Pose};
 
 use super::agent_folders::ScenarioFolder;
 use super::numpy_tags::{self, NumpyArray};
@@ -45,17 +45,12 @@ fn frame_without_points(agent: &CavId, tick: &Tick, root: &Field<'_>) -> Result<
     let world_from_lidar = pose(&root.required("lidar_pose")?)?;
     let optional_pose = |key| root.optional(key)?.map(|field| pose(&field)).transpose();
     Ok(Frame {
-        cav: agent.clone(),
-        capture_nanos: tick.capture_nanos,
-        points: PointCloud::default(),
-        dropped_points: 0,
-        radar: None,
         world_from_lidar: Some(world_from_lidar),
         world_from_vehicle: optional_pose("true_ego_pos")?,
         gnss_world_from_vehicle: optional_pose("predicted_ego_pos")?,
         speed_mps: root.optional("ego_speed")?.map(|speed| number_or_scalar(&speed)).transpose()?,
         objects: objects(agent, root, &world_from_lidar)?,
-        source_handedness: Handedness::Right,
+        ..Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Right)
     })
 }
 

@@ -1,0 +1,223 @@
+//! The HDF5 files in which LightLoc keeps the poses of a localization sequence.
+//!
+//! Datasets `valid_timestamps` (`n`, microseconds) and `poses` (`n x 12`). LightLoc leaves out the first and the last
+//! five entries (`datasets/lidarloc.py`), and so does this reader.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use hdf5_reader::{Dataset, Datatype, Hdf5File, OpenOptions};
+use nalgebra::Matrix4;
+use protocol::Pose;
+
+use super::{ReadError, files};
+
+/// Largest HDF5 file, and largest dataset in it, that is read, bytes: a million poses.
+const MAX_BYTES: usize = 128 << 20;
+/// Entries left out at either end.
+const TRIMMED: usize = 5;
+
+/// How the 12 numbers of a pose are arranged.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum RowOrder {
+    /// A 3x4 matrix row by row, translation at 3, 7, 11 (Oxford, NCLT).
+    Matrix,
+    /// Nine numbers of the rotation row by row, then the translation (QEOxford).
+    RotationFirst,
+}
+
+/// Poses by time stamp in microseconds, in the axes of the file.
+pub(super) fn read(path: &Path, order: RowOrder) -> Result<BTreeMap<u64, Pose>, ReadError> {
+    let bytes = files::read_limited(path, MAX_BYTES as u64)?;
+    parse(path, bytes, order)
+}
+
+fn parse(path: &Path, bytes: Vec<u8>, order: RowOrder) -> Result<BTreeMap<u64, Pose>, ReadError> {
+    let options = OpenOptions::default().with_max_read_bytes(MAX_BYTES).with_max_chunk_bytes(MAX_BYTES);
+    let file = Hdf5File::from_vec_with_options(bytes, options)
+        .map_err(|error| ReadError::malformed(path, format!("no sound HDF5: {error}")))?;
+    let (stamps_shape, stamps) = numbers(path, &file, "valid_timestamps")?;
+    let (poses_shape, poses) = numbers(path, &file, "poses")?;
+    let [count] = stamps_shape[..] else {
+        return Err(wrong(path, "valid_timestamps", format!("shape {stamps_shape:?}, expected [n]")));
+    };
+    if poses_shape != [count, 12] {
+        return Err(wrong(path, "poses", format!("shape {poses_shape:?}, expected [{count}, 12]")));
+    }
+    let (rows, _) = poses.as_chunks::<12>();
+    let kept = TRIMMED..stamps.len().saturating_sub(TRIMMED);
+    let mut by_time = BTreeMap::new();
+    for (index, (stamp, row)) in stamps.iter().zip(rows).enumerate().filter(|(index, _)| kept.contains(index)) {
+        if !(0.0..=1e18).contains(stamp) {
+            return Err(wrong(path, "valid_timestamps", format!("entry {index}: {stamp} are no microseconds")));
+        }
+        let pose = pose(row, order).map_err(|error| wrong(path, "poses", format!("entry {index}: {error}")))?;
+        by_time.insert(*stamp as u64, pose);
+    }
+    Ok(by_time)
+}
+
+fn pose(row: &[f64; 12], order: RowOrder) -> Result<Pose, protocol::PoseError> {
+    let mut matrix = Matrix4::identity();
+    for line in 0..3 {
+        for column in 0..4 {
+            let place = match (order, column) {
+                (RowOrder::Matrix, _) => 4 * line + column,
+                (RowOrder::RotationFirst, 3) => 9 + line,
+                (RowOrder::RotationFirst, _) => 3 * line + column,
+            };
+            matrix[(line, column)] = row[place];
+        }
+    }
+    Pose::from_matrix(&matrix)
+}
+
+fn wrong(path: &Path, field: &str, reason: String) -> ReadError {
+    ReadError::Malformed { path: path.to_owned(), line: None, field: Some(field.to_owned()), reason }
+}
+
+/// Shape and values of a dataset of numbers. Microseconds since 1970 fit a double exactly.
+fn numbers(path: &Path, file: &Hdf5File, name: &str) -> Result<(Vec<u64>, Vec<f64>), ReadError> {
+    let unsound = |error: hdf5_reader::error::Error| wrong(path, name, error.to_string());
+    let dataset = file.dataset(name).map_err(unsound)?;
+    let values = match dataset.dtype() {
+        Datatype::FloatingPoint { size: 4, .. } => values::<f32>(&dataset, f64::from),
+        Datatype::FloatingPoint { .. } => values::<f64>(&dataset, |value| value),
+        Datatype::FixedPoint { signed: false, .. } => values::<u64>(&dataset, |value| value as f64),
+        Datatype::FixedPoint { .. } => values::<i64>(&dataset, |value| value as f64),
+        other => return Err(wrong(path, name, format!("{other:?}, expected numbers"))),
+    };
+    Ok((dataset.shape().to_vec(), values.map_err(unsound)?))
+}
+
+fn values<T: hdf5_reader::H5Type>(
+    dataset: &Dataset,
+    convert: fn(T) -> f64,
+) -> Result<Vec<f64>, hdf5_reader::error::Error> {
+    Ok(dataset.read_array::<T>()?.into_iter().map(convert).collect())
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    /// A message of an object header: type, and data padded to 8 bytes.
+    fn message(kind: u16, mut data: Vec<u8>) -> Vec<u8> {
+        data.resize(data.len().next_multiple_of(8), 0);
+        let mut message = [kind.to_le_bytes(), (data.len() as u16).to_le_bytes()].concat();
+        message.extend([0; 4]);
+        message.extend(data);
+        message
+    }
+
+    fn object_header(messages: &[Vec<u8>]) -> Vec<u8> {
+        let body = messages.concat();
+        let mut header = vec![1, 0];
+        header.extend((messages.len() as u16).to_le_bytes());
+        header.extend(1u32.to_le_bytes());
+        header.extend((body.len() as u32).to_le_bytes());
+        header.extend([0; 4]);
+        header.extend(body);
+        header
+    }
+
+    fn dataset_header(shape: &[u64], datatype: &[u8], address: usize, bytes: usize) -> Vec<u8> {
+        let mut space = vec![1, shape.len() as u8, 0, 0, 0, 0, 0, 0];
+        space.extend(shape.iter().flat_map(|size| size.to_le_bytes()));
+        let mut layout = vec![3, 1];
+        layout.extend((address as u64).to_le_bytes());
+        layout.extend((bytes as u64).to_le_bytes());
+        object_header(&[message(1, space), message(3, datatype.to_vec()), message(8, layout)])
+    }
+
+    fn link(name: &str, address: usize) -> Vec<u8> {
+        let mut link = vec![1, 0, name.len() as u8];
+        link.extend(name.bytes());
+        link.extend((address as u64).to_le_bytes());
+        message(6, link)
+    }
+
+    /// A file of LightLoc's two datasets, built by hand: version 0 superblock, version 1 headers, contiguous data.
+    pub(in crate::dataset) fn file(stamps: &[i64], poses: &[[f64; 12]]) -> Vec<u8> {
+        const I64: [u8; 12] = [0x10, 0x08, 0, 0, 8, 0, 0, 0, 0, 0, 64, 0];
+        const F64: [u8; 20] = [0x11, 0x20, 0x3f, 0, 8, 0, 0, 0, 0, 0, 64, 0, 52, 11, 0, 52, 0xff, 0x03, 0, 0];
+        const UNDEFINED: [u8; 8] = [0xff; 8];
+        let stamp_bytes: Vec<u8> = stamps.iter().flat_map(|stamp| stamp.to_le_bytes()).collect();
+        let pose_bytes: Vec<u8> = poses.iter().flatten().flat_map(|value| value.to_le_bytes()).collect();
+        let link_info = message(2, [&[0, 0][..], &UNDEFINED, &UNDEFINED].concat());
+        let root_of = |a, b| object_header(&[link_info.clone(), link("valid_timestamps", a), link("poses", b)]);
+        let stamp_header = |data| dataset_header(&[stamps.len() as u64], &I64, data, stamp_bytes.len());
+        let pose_header = |data| dataset_header(&[poses.len() as u64, 12], &F64, data, pose_bytes.len());
+        let root = 96;
+        let first = root + root_of(0, 0).len();
+        let second = first + stamp_header(0).len();
+        let data = second + pose_header(0).len();
+        let end = data + stamp_bytes.len() + pose_bytes.len();
+
+        let mut file = b"\x89HDF\r\n\x1a\n".to_vec();
+        file.extend([0, 0, 0, 0, 0, 8, 8, 0, 4, 0, 16, 0, 0, 0, 0, 0]);
+        file.extend(0u64.to_le_bytes());
+        file.extend(UNDEFINED);
+        file.extend((end as u64).to_le_bytes());
+        file.extend(UNDEFINED);
+        file.extend(0u64.to_le_bytes());
+        file.extend((root as u64).to_le_bytes());
+        file.extend([0; 24]);
+        file.extend(root_of(first, second));
+        file.extend(stamp_header(data));
+        file.extend(pose_header(data + stamp_bytes.len()));
+        file.extend(stamp_bytes);
+        file.extend(pose_bytes);
+        file
+    }
+
+    fn parse(bytes: Vec<u8>, order: RowOrder) -> Result<BTreeMap<u64, Pose>, ReadError> {
+        super::parse(Path::new("a.h5"), bytes, order)
+    }
+
+    const MATRIX: [f64; 12] = [0.0, -1.0, 0.0, 4.0, 1.0, 0.0, 0.0, 5.0, 0.0, 0.0, 1.0, 6.0];
+    const ROTATION_FIRST: [f64; 12] = [0.0, -1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 4.0, 5.0, 6.0];
+
+    #[test]
+    fn both_arrangements_say_the_same_and_the_ends_are_left_out() {
+        let stamps: Vec<i64> = (0..12).map(|index| 1_326_652_795_280_148 + index).collect();
+        let by_matrix = parse(file(&stamps, &[MATRIX; 12]), RowOrder::Matrix).unwrap();
+        let by_rotation = parse(file(&stamps, &[ROTATION_FIRST; 12]), RowOrder::RotationFirst).unwrap();
+        assert_eq!(by_matrix, by_rotation);
+        assert_eq!(by_matrix.keys().copied().collect::<Vec<_>>(), [1_326_652_795_280_153, 1_326_652_795_280_154]);
+        let pose = by_matrix[&1_326_652_795_280_153];
+        assert_eq!(pose.translation_m, [4.0, 5.0, 6.0]);
+        assert!((pose.yaw_rad() - std::f64::consts::FRAC_PI_2).abs() < 1e-12);
+    }
+
+    #[test]
+    fn what_is_wrong_is_named() {
+        let message = |bytes, order| parse(bytes, order).unwrap_err().to_string();
+        let stamps: Vec<i64> = (0..11).collect();
+        let scaled = file(&stamps, &[MATRIX.map(|value| 2.0 * value); 11]);
+        assert!(message(scaled, RowOrder::Matrix).starts_with("a.h5: poses: entry 5: pose matrix is not a rotation"));
+        assert!(message(file(&stamps, &[MATRIX; 10]), RowOrder::Matrix).contains("shape [10, 12], expected [11, 12]"));
+        assert!(message(b"no".to_vec(), RowOrder::Matrix).starts_with("a.h5: no sound HDF5"));
+    }
+
+    #[test]
+    fn truncations_are_errors_or_empty_and_never_panic() {
+        let stamps: Vec<i64> = (0..12).collect();
+        let whole = file(&stamps, &[MATRIX; 12]);
+        for length in 0..whole.len() {
+            assert!(parse(whole[..length].to_vec(), RowOrder::Matrix).is_err(), "{length} of {}", whole.len());
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn damage_never_panics(at in any::<prop::sample::Index>(), byte in any::<u8>()) {
+            let mut bytes = file(&(0..12).collect::<Vec<i64>>(), &[MATRIX; 12]);
+            let at = at.index(bytes.len());
+            bytes[at] = byte;
+            let _ = parse(bytes, RowOrder::Matrix);
+        }
+    }
+}

@@ -1,0 +1,124 @@
+//! KITTI's text files: rows of numbers, and calibrations of `NAME: numbers`.
+
+use std::path::{Path, PathBuf};
+
+use nalgebra::Matrix4;
+use protocol::Pose;
+
+use super::{ReadError, files};
+
+/// Largest text file that is read, bytes: poses of a hundred thousand scans.
+const MAX_BYTES: u64 = 32 << 20;
+
+/// A calibration file.
+#[derive(Debug)]
+pub(super) struct Calibration {
+    path: PathBuf,
+    /// Name, line and what follows the name.
+    entries: Vec<(String, u64, String)>,
+}
+
+/// The lines of a text file, with their numbers from 1, blank ones left out.
+pub(super) fn lines(path: &Path) -> Result<Vec<(u64, String)>, ReadError> {
+    let text = files::read_text(path, MAX_BYTES)?;
+    let numbered = (1..).zip(text.lines()).filter(|(_, line)| !line.trim().is_empty());
+    Ok(numbered.map(|(number, line)| (number, line.to_owned())).collect())
+}
+
+pub(super) fn malformed(path: &Path, line: u64, field: Option<&str>, reason: String) -> ReadError {
+    ReadError::Malformed { path: path.to_owned(), line: Some(line), field: field.map(str::to_owned), reason }
+}
+
+/// Exactly `N` finite numbers, separated by blanks.
+pub(super) fn numbers<const N: usize>(
+    path: &Path,
+    line: u64,
+    field: Option<&str>,
+    text: &str,
+) -> Result<[f64; N], ReadError> {
+    let mut numbers = [0.0; N];
+    let mut found = 0;
+    for word in text.split_ascii_whitespace() {
+        let number = word.parse().ok().filter(|number: &f64| number.is_finite());
+        let Some(number) = number else {
+            let word: String = word.chars().take(40).collect();
+            return Err(malformed(path, line, field, format!("{word:?} is no finite number")));
+        };
+        if let Some(place) = numbers.get_mut(found) {
+            *place = number;
+        }
+        found += 1;
+    }
+    if found == N { Ok(numbers) } else { Err(malformed(path, line, field, format!("{found} numbers, expected {N}"))) }
+}
+
+/// A rigid transform from a row-major 3x4 matrix.
+pub(super) fn rigid(path: &Path, line: u64, field: Option<&str>, rows: &[f64; 12]) -> Result<Pose, ReadError> {
+    Pose::from_matrix(&matrix(rows)).map_err(|error| malformed(path, line, field, error.to_string()))
+}
+
+fn matrix(rows: &[f64; 12]) -> Matrix4<f64> {
+    let mut matrix = Matrix4::identity();
+    for (index, value) in rows.iter().enumerate() {
+        matrix[(index / 4, index % 4)] = *value;
+    }
+    matrix
+}
+
+impl Calibration {
+    pub(super) fn read(path: &Path) -> Result<Self, ReadError> {
+        let entries = lines(path)?.into_iter().filter_map(|(number, line)| {
+            let (name, values) = line.split_once(':')?;
+            Some((name.trim().to_owned(), number, values.to_owned()))
+        });
+        Ok(Self { path: path.to_owned(), entries: entries.collect() })
+    }
+
+    fn numbers<const N: usize>(&self, name: &str) -> Result<(u64, [f64; N]), ReadError> {
+        let Some((_, line, values)) = self.entries.iter().find(|(found, ..)| found == name) else {
+            return Err(ReadError::Malformed {
+                path: self.path.clone(),
+                line: None,
+                field: Some(name.to_owned()),
+                reason: "missing".into(),
+            });
+        };
+        Ok((*line, numbers(&self.path, *line, Some(name), values)?))
+    }
+
+    /// A 3x4 transform.
+    pub(super) fn transform(&self, name: &str) -> Result<Pose, ReadError> {
+        let (line, rows) = self.numbers::<12>(name)?;
+        rigid(&self.path, line, Some(name), &rows)
+    }
+
+    /// A 3x3 rotation.
+    pub(super) fn rotation(&self, name: &str) -> Result<Pose, ReadError> {
+        let (line, [a, b, c, d, e, f, g, h, i]) = self.numbers::<9>(name)?;
+        rigid(&self.path, line, Some(name), &[a, b, c, 0.0, d, e, f, 0.0, g, h, i, 0.0])
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn calibrations_are_read_by_name() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("calib.txt");
+        std::fs::write(
+            &path,
+            "P0: 1 2\n\nTr: 0 -1 0 1 0 0 -1 2 1 0 0 3\nR0_rect: 1 0 0 0 1 0 0 0 1\nBad: 1 0 0 0 1 0 0 0 x\n",
+        )
+        .unwrap();
+        let calibration = Calibration::read(&path).unwrap();
+        assert_eq!(calibration.transform("Tr").unwrap().translation_m, [1.0, 2.0, 3.0]);
+        assert_eq!(calibration.rotation("R0_rect").unwrap(), Pose::IDENTITY);
+        let message =
+            |result: Result<Pose, ReadError>| result.unwrap_err().to_string().replace(&*path.to_string_lossy(), "");
+        assert_eq!(message(calibration.rotation("Bad")), ":5: Bad: \"x\" is no finite number");
+        assert_eq!(message(calibration.transform("P0")), ":1: P0: 2 numbers, expected 12");
+        assert_eq!(message(calibration.transform("Q")), ": Q: missing");
+    }
+}

@@ -1,0 +1,254 @@
+//! Localization sequences: NCLT as recorded and as LightLoc converts it, Oxford and QEOxford.
+//!
+//! `<root>/<sequence>/velodyne_left/<microseconds>.bin` (or NCLT's original `velodyne_sync`), with poses in
+//! `velodyne_left_False.h5` or, better aligned, QEOxford's `velodyne_left_calibrateFalse.h5`.
+//!
+//! Sensor and world of these recordings have x forward, y right, z **down**: right-handed. LightLoc negates z of the
+//! points alone, which is a mirror, and leaves the poses as they are. Here points and poses take the same half turn
+//! about x, `C = diag(1, -1, -1)`: a point becomes `C p`, a pose `C M C`. It is a rotation, so distances, chirality and
+//! the motion between scans stay what they were.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use nalgebra::{Isometry3, UnitQuaternion, Vector3};
+use protocol::{CavId, Handedness, Pose};
+
+use super::hdf5_poses::{self, RowOrder};
+use super::{FrameSource, Layout, ReadError, Scenario, Tick, files, points, single_vehicle};
+use crate::frame::Frame;
+use crate::pcd::PcdCloud;
+
+/// Converted points, one file per sweep.
+const CONVERTED: &str = "velodyne_left";
+/// NCLT's own.
+const RAW: &str = "velodyne_sync";
+/// Intensities are bytes of the sensor, also where they are stored as floats.
+const MAX_INTENSITY: f32 = 255.0;
+
+/// How the points of a sequence are stored.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Storage {
+    NcltRaw,
+    NcltConverted,
+    Oxford,
+}
+
+#[derive(Debug)]
+struct Sequence {
+    points_dir: PathBuf,
+    storage: Storage,
+    /// By microseconds; empty where there is no HDF5 file.
+    world_from_lidar: BTreeMap<u64, Pose>,
+}
+
+/// Whether a folder is a sequence.
+pub(super) fn is_sequence(dir: &Path) -> bool {
+    [CONVERTED, RAW].iter().any(|name| holds_sweeps(&dir.join(name)))
+}
+
+fn holds_sweeps(dir: &Path) -> bool {
+    files::list(dir).is_ok_and(|listing| listing.files.iter().any(|name| name.ends_with(".bin")))
+}
+
+/// Opens a sequence. Sweeps without pose and poses without sweep are left out, the latter with a problem.
+pub(super) fn open(root: &Path, dir: &Path, problems: &mut Vec<ReadError>) -> Result<Scenario, ReadError> {
+    let storage = storage(dir);
+    let points_dir = dir.join(if storage == Storage::NcltRaw { RAW } else { CONVERTED });
+    let poses = poses(dir)?;
+    let mut stamps = BTreeMap::new();
+    for stem in files::stems(&files::list(&points_dir)?.files, ".bin") {
+        match stem.parse::<u64>() {
+            Ok(micros) => drop(stamps.insert(micros, stem.to_owned())),
+            Err(_) => {
+                let path = points_dir.join(format!("{stem}.bin"));
+                problems.push(ReadError::malformed(&path, format!("{stem:?} is no time in microseconds: left out")));
+            }
+        }
+    }
+    if let Some((_, poses)) = &poses {
+        for micros in poses.keys().filter(|micros| !stamps.contains_key(micros)) {
+            let path = points_dir.join(format!("{micros}.bin"));
+            problems.push(ReadError::malformed(&path, "does not exist, but there is a pose for it: left out"));
+        }
+        stamps.retain(|micros, _| poses.contains_key(micros));
+    }
+    let tick = |(micros, stem): (u64, String)| Tick { stem, capture_nanos: micros.saturating_mul(1000) };
+    let ticks = stamps.into_iter().map(tick).collect();
+    let layout = if storage == Storage::Oxford { Layout::Oxford } else { Layout::Nclt };
+    let source = Sequence { points_dir, storage, world_from_lidar: poses.map(|(_, poses)| poses).unwrap_or_default() };
+    Ok(single_vehicle(files::name_below(root, dir), layout, ticks, Arc::new(source)))
+}
+
+/// NCLT's sequences are named by the day (`2012-01-22`), Oxford's by day and time and more.
+fn storage(dir: &Path) -> Storage {
+    let name_len = dir.canonicalize().ok().and_then(|dir| dir.file_name().map(|name| name.len())).unwrap_or(0);
+    let is_nclt = dir.join(RAW).is_dir() || name_len == "2012-01-22".len();
+    match (is_nclt, holds_sweeps(&dir.join(CONVERTED))) {
+        (true, true) => Storage::NcltConverted,
+        (true, false) => Storage::NcltRaw,
+        (false, _) => Storage::Oxford,
+    }
+}
+
+/// The poses of the best file there is, turned to z up.
+fn poses(dir: &Path) -> Result<Option<(PathBuf, BTreeMap<u64, Pose>)>, ReadError> {
+    let files =
+        [("velodyne_left_calibrateFalse.h5", RowOrder::RotationFirst), ("velodyne_left_False.h5", RowOrder::Matrix)];
+    let found = files.into_iter().map(|(name, order)| (dir.join(name), order)).find(|(path, _)| path.is_file());
+    let Some((path, order)) = found else { return Ok(None) };
+    let mut poses = hdf5_poses::read(&path, order)?;
+    let turn = half_turn();
+    for pose in poses.values_mut() {
+        *pose = (turn * pose.isometry() * turn.inverse()).into();
+    }
+    Ok(Some((path, poses)))
+}
+
+/// z down to z up: half a turn about x.
+fn half_turn() -> Isometry3<f64> {
+    Isometry3::from_parts(
+        Vector3::zeros().into(),
+        UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI),
+    )
+}
+
+impl FrameSource for Sequence {
+    fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame, ReadError> {
+        let mut frame = Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Right);
+        frame.world_from_lidar = self.world_from_lidar.get(&(tick.capture_nanos / 1000)).copied();
+        Ok(frame)
+    }
+
+    fn points(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> Result<PcdCloud, ReadError> {
+        let path = self.points_path(agent, tick, variant);
+        let mut cloud = match self.storage {
+            Storage::NcltRaw => points::read_nclt_raw(&path)?,
+            Storage::NcltConverted => points::read_interleaved(&path)?,
+            Storage::Oxford => points::read_planar(&path)?,
+        };
+        for [_, y, z, intensity] in &mut cloud.points.xyzi {
+            (*y, *z) = (-*y, -*z);
+            *intensity /= MAX_INTENSITY;
+        }
+        Ok(cloud)
+    }
+
+    fn points_path(&self, _agent: &CavId, tick: &Tick, _variant: Option<&str>) -> PathBuf {
+        self.points_dir.join(format!("{}.bin", tick.stem))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use super::*;
+    use crate::dataset::{self, Dataset, LoadOptions};
+
+    /// First time stamp.
+    const T0: u64 = 1_547_120_000_000_000;
+
+    fn write(root: &Path, name: &str, bytes: &[u8]) {
+        let path = root.join(name);
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        fs::write(path, bytes).unwrap();
+    }
+
+    fn floats(values: &[f32]) -> Vec<u8> {
+        values.iter().flat_map(|value| value.to_le_bytes()).collect()
+    }
+
+    fn stamps() -> Vec<i64> {
+        (0..12).map(|index| (T0 + 50_000 * index) as i64).collect()
+    }
+
+    /// Sensor and world with z down: at entry `i`, `i` metres ahead, 2 m to the right, 1 m below, turned 0.1 rad to
+    /// the right.
+    fn poses() -> Vec<[f64; 12]> {
+        let (sin, cos) = 0.1f64.sin_cos();
+        (0..12).map(|i| [cos, -sin, 0.0, f64::from(i), sin, cos, 0.0, 2.0, 0.0, 0.0, 1.0, 1.0]).collect()
+    }
+
+    fn open(root: &Path) -> Dataset {
+        dataset::open(root).unwrap()
+    }
+
+    #[test]
+    fn oxford_points_and_poses_turn_together() {
+        let dir = tempfile::tempdir().unwrap();
+        let sequence = "Oxford/2019-01-11-14-02-26-radar-oxford-10k";
+        write(dir.path(), &format!("{sequence}/velodyne_left_False.h5"), &hdf5_poses::tests::file(&stamps(), &poses()));
+        for index in [5, 6] {
+            // All x, all y, all z, all intensities; z points down.
+            let points = floats(&[10.0, 20.0, 1.0, 2.0, 1.5, -3.0, 51.0, 255.0]);
+            write(dir.path(), &format!("{sequence}/velodyne_left/{}.bin", T0 + 50_000 * index), &points);
+        }
+        let dataset = open(dir.path());
+        assert_eq!((dataset.layout, dataset.problems.len()), (Layout::Oxford, 0));
+        let scenario = &dataset.scenarios[0];
+        assert_eq!((scenario.name.as_str(), scenario.ticks.len()), (sequence, 2));
+        let frame = scenario.load(0, 0, &LoadOptions::default()).unwrap();
+        assert_eq!(frame.points.xyzi, [[10.0, -1.0, -1.5, 0.2], [20.0, -2.0, 3.0, 1.0]]);
+        assert_eq!(frame.capture_nanos, (T0 + 250_000) * 1000);
+        let pose = frame.world_from_lidar.unwrap();
+        let [x, y, z] = pose.translation_m;
+        assert!((x - 5.0).abs() < 1e-9 && (y + 2.0).abs() < 1e-9 && (z + 1.0).abs() < 1e-9, "{pose:?}");
+        assert!((pose.yaw_rad() + 0.1).abs() < 1e-9, "to the right is negative");
+    }
+
+    #[test]
+    fn a_point_lands_where_the_recording_puts_it() {
+        let dir = tempfile::tempdir().unwrap();
+        let sequence = dir.path().join("2012-01-22");
+        let (down, rows) = ([3.0f32, -4.0, 1.0], poses());
+        write(&sequence, "velodyne_left_False.h5", &hdf5_poses::tests::file(&stamps(), &rows));
+        write(&sequence, &format!("velodyne_left/{}.bin", T0 + 250_000), &floats(&[down[0], down[1], down[2], 0.0]));
+        write(&sequence, &format!("velodyne_left/{}.bin", T0 + 300_000), &[]);
+        let dataset = open(&sequence);
+        assert_eq!(dataset.layout, Layout::Nclt);
+        let frame = dataset.scenarios[0].load(0, 0, &LoadOptions::default()).unwrap();
+        let [x, y, z, _] = frame.points.xyzi[0].map(f64::from);
+        let ours = frame.world_from_lidar.unwrap().isometry() * nalgebra::Point3::new(x, y, z);
+        let theirs: [f64; 3] = std::array::from_fn(|line| {
+            let row = &rows[5][4 * line..4 * line + 4];
+            row[0] * f64::from(down[0]) + row[1] * f64::from(down[1]) + row[2] * f64::from(down[2]) + row[3]
+        });
+        // Their world with its z turned up, and nothing mirrored.
+        assert!((ours - nalgebra::Point3::new(theirs[0], -theirs[1], -theirs[2])).norm() < 1e-6);
+    }
+
+    #[test]
+    fn a_better_file_wins() {
+        let dir = tempfile::tempdir().unwrap();
+        let sequence = dir.path().join("2019-01-14-12-05-52-radar-oxford-10k");
+        write(&sequence, "velodyne_left_False.h5", b"not looked at");
+        let rotation_first = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 7.0, 8.0, 9.0];
+        let poses = hdf5_poses::tests::file(&stamps(), &[rotation_first; 12]);
+        write(&sequence, "velodyne_left_calibrateFalse.h5", &poses);
+        write(&sequence, &format!("velodyne_left/{}.bin", T0 + 250_000), &[]);
+        let frame = open(&sequence).scenarios[0].load(0, 0, &LoadOptions::default()).unwrap();
+        assert_eq!(frame.world_from_lidar.unwrap().translation_m, [7.0, -8.0, -9.0]);
+    }
+
+    #[test]
+    fn raw_nclt_has_no_poses_and_what_lacks_a_sweep_is_said() {
+        let dir = tempfile::tempdir().unwrap();
+        write(dir.path(), "2012-01-15/velodyne_sync/1326652795280148.bin", &[0x20, 0x4e, 0x20, 0x4e, 0, 0, 51, 3]);
+        let dataset = open(dir.path());
+        let frame = dataset.scenarios[0].load(0, 0, &LoadOptions::default()).unwrap();
+        assert_eq!((frame.world_from_lidar, frame.points.xyzi.as_slice()), (None, [[0.0, 0.0, 100.0, 0.2]].as_slice()));
+
+        let sequence = dir.path().join("2012-01-22");
+        write(&sequence, "velodyne_left_False.h5", &hdf5_poses::tests::file(&stamps(), &poses()));
+        write(&sequence, &format!("velodyne_left/{}.bin", T0 + 250_000), &[]);
+        write(&sequence, "velodyne_left/readme.bin", &[]);
+        let dataset = open(&sequence);
+        assert_eq!(dataset.scenarios[0].ticks.len(), 1);
+        let problems: Vec<String> = dataset.problems.iter().map(ToString::to_string).collect();
+        assert!(
+            problems[0].contains("is no time in microseconds") && problems[1].contains("but there is a pose for it")
+        );
+    }
+}
