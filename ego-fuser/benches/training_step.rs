@@ -49,14 +49,17 @@ fn training_step(criterion: &mut Criterion) {
     let mut rng = ChaCha8Rng::seed_from_u64(1);
     let mut voxeliser = Voxeliser::for_detector(&config);
     let pillars: Vec<Pillars> = (0..AGENTS * SAMPLES).map(|_| voxeliser.voxelise(&sweep(&mut rng))).collect();
-    let poses = vec![
-        vec![Pose::IDENTITY, Pose::from_xyz_yaw([12.0, 3.0, 0.0], 0.4), Pose::from_xyz_yaw([-20.0, 5.0, 0.0], 3.0)];
-        SAMPLES
-    ];
+    let poses =
+        vec![
+            vec![Pose::IDENTITY, Pose::from_xyz_yaw([12.0, 3.0, 0.0], 0.4), Pose::from_xyz_yaw([-20.0, 5.0, 0.0], 3.0)];
+            SAMPLES
+        ];
     let mut group = criterion.benchmark_group("training_step/lean/2x3");
     group.sample_size(10).throughput(Throughput::Elements(SAMPLES as u64));
     for (name, precision) in [("f32", ComputePrecision::F32), ("bf16", ComputePrecision::Bf16)] {
-        let model = CooperativeModel::new(&config, Method::Attention, Device::Cpu).expect("lean is a valid configuration");
+        let mut model =
+            CooperativeModel::new(&config, Method::Attention, Device::Cpu).expect("lean is a valid configuration");
+        model.set_precision(precision);
         let mut optimizer = AdamW::new(&model.variables, AdamWConfig::default());
         let assigner = model.assigner().expect("lean has anchors");
         let labels: Vec<_> = (0..SAMPLES).map(|_| assigner.assign(&objects(&mut rng))).collect();
@@ -64,7 +67,7 @@ fn training_step(criterion: &mut Criterion) {
         let batch = PillarBatch::new(&pillars.iter().collect::<Vec<_>>(), model.network().lattice());
         group.bench_function(name, |bencher| {
             bencher.iter(|| {
-                let output = model.forward(&batch, &poses, true, precision).expect("views and poses add up");
+                let output = model.forward(&batch, &poses, true).expect("views and poses add up");
                 let loss = detection_loss(&output.scores, &output.offsets, &labels, &LossConfig::default());
                 optimizer.zero_grad();
                 loss.expect("labels fit").total().backward();

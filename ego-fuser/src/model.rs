@@ -135,6 +135,14 @@ impl CooperativeModel {
         &self.network
     }
 
+    /// In which numbers the convolutions compute from now on.
+    pub fn set_precision(&mut self, precision: ComputePrecision) {
+        self.network.compute = match precision {
+            ComputePrecision::F32 => Kind::Float,
+            ComputePrecision::Bf16 => Kind::BFloat16,
+        };
+    }
+
     /// Where the variables are.
     #[must_use]
     pub fn device(&self) -> Device {
@@ -152,9 +160,9 @@ impl CooperativeModel {
         pillars: &PillarBatch,
         ego_from_cav: &[Vec<Pose>],
         train: bool,
-        precision: ComputePrecision,
     ) -> Result<HeadOutput, ModelError> {
-        let features = self.encode(pillars, train, precision)?;
+        let features = self.network.features(pillars, train);
+        let features = self.network.through_compressor(&features, train);
         let poses: usize = ego_from_cav.iter().map(Vec::len).sum();
         let views = features.size4()?.0;
         if views != poses as i64 {
@@ -213,13 +221,7 @@ impl CooperativeModel {
     /// The limits of the clean-up that go with this network: boxes lie wholly over its area.
     #[must_use]
     pub fn limits(&self) -> PostprocessConfig {
-        let [x_low, y_low, z_low, x_high, y_high, z_high] = self.config().lidar_range_m;
-        PostprocessConfig {
-            score_threshold: SCORE_THRESHOLD,
-            z_range_m: [z_low, z_high],
-            keep_range_m: [x_low, y_low, x_high, y_high],
-            ..PostprocessConfig::default()
-        }
+        PostprocessConfig { score_threshold: SCORE_THRESHOLD, ..PostprocessConfig::for_detector(self.config()) }
     }
 
     /// What finds the targets of a frame among the anchors of the head.
@@ -234,18 +236,6 @@ impl CooperativeModel {
         });
         let shape = [anchors.y_m.len(), anchors.x_m.len(), anchors.yaws_rad.len()];
         TargetAssigner::new(boxes.collect(), shape, TargetRule::default())
-    }
-
-    /// Maps of all views in single precision, `[N, C, H, W]`.
-    fn encode(&self, pillars: &PillarBatch, train: bool, precision: ComputePrecision) -> Result<Tensor, TchError> {
-        let rows = self.network.encoder.forward(pillars, train);
-        let canvas = pillars.scatter(&rows, self.network.lattice());
-        let canvas = match precision {
-            ComputePrecision::F32 => canvas,
-            ComputePrecision::Bf16 => canvas.f_to_kind(Kind::BFloat16)?,
-        };
-        let features = self.network.features_of_canvas(&canvas, train);
-        self.network.through_compressor(&features, train).f_to_kind(Kind::Float)
     }
 }
 

@@ -1,5 +1,6 @@
 //! Training targets, loss, AP, warps and fusion against the reference implementations.
 
+use agent::rotated_iou::Polygon;
 use ego_fuser::Method;
 use ego_fuser::average_precision::{Curve, Ordering, Scorer};
 use ego_fuser::fusion::{self, AlignedViews, regroup};
@@ -7,7 +8,6 @@ use ego_fuser::loss::{LabelTensors, LossConfig, Unassigned, detection_loss};
 use ego_fuser::targets::{BOX_CODE, Labels, Positive, TargetAssigner, TargetRule};
 use ego_fuser::warp::opencood::{self, Interpolation};
 use ego_fuser::warp::{coalign, warp_to_ego};
-use agent::rotated_iou::Polygon;
 use protocol::{BevGrid, Box3d, Pose};
 use tch::{Device, Kind, Tensor};
 use tests::fixtures::{Golden, assert_close, golden};
@@ -24,8 +24,14 @@ fn golden_c3_targets() {
     assert_eq!(config["order"], "hwl");
     let anchors: Vec<Box3d> = anchors.as_chunks().0.iter().map(box_of_hwl).collect();
     let assigner = TargetAssigner::new(anchors, [shape[0], shape[1], shape[2]], rule).unwrap();
-    let objects: Vec<Box3d> =
-        objects.as_chunks().0.iter().zip(&mask).filter(|(_, mask)| **mask == 1.0).map(|(row, _)| box_of_hwl(row)).collect();
+    let objects: Vec<Box3d> = objects
+        .as_chunks()
+        .0
+        .iter()
+        .zip(&mask)
+        .filter(|(_, mask)| **mask == 1.0)
+        .map(|(row, _)| box_of_hwl(row))
+        .collect();
     let labels = assigner.assign(&objects);
 
     let (_, positive) = golden.f64("out.pos_equal_one");
@@ -119,7 +125,8 @@ fn golden_c5_warp_coalign() {
     let size = |name: &str| golden.config()[name].as_i64().unwrap();
     let ratio = number(&golden, "discrete_ratio");
     let pairwise = tensor(&golden, "in.pairwise");
-    let downsampled = coalign::normalized(&pairwise, size("H"), size("W"), ratio * number(&golden, "downsample_rate")).unwrap();
+    let downsampled =
+        coalign::normalized(&pairwise, size("H"), size("W"), ratio * number(&golden, "downsample_rate")).unwrap();
     assert_close("downsampled", &values(&downsampled), &golden.f32("out.normalized_downsampled").1, 1e-4, 1e-5);
     let full = coalign::normalized(&pairwise, size("H0"), size("W0"), ratio).unwrap();
     assert_close("full resolution", &values(&full), &golden.f32("out.normalized_full_res").1, 1e-4, 1e-5);
@@ -156,9 +163,8 @@ fn golden_c5_warp_in_metres_agrees_with_coalign() {
     for sample in 0..features.size()[0] {
         for ego in 0..features.size()[1] {
             // P[ego, cav] takes points of the ego to the frame of the CAV; only its planar part enters a warp.
-            let poses: Vec<Pose> = (0..features.size()[1])
-                .map(|cav| planar_inverse(&pairwise.get(sample).get(ego).get(cav)))
-                .collect();
+            let poses: Vec<Pose> =
+                (0..features.size()[1]).map(|cav| planar_inverse(&pairwise.get(sample).get(ego).get(cav))).collect();
             let warped = warp_to_ego(&features.get(sample), &poses, &grid).unwrap();
             let expected = expected.get(sample).get(ego) * &warped.mask;
             // The reference scales sheared planar parts of tilted poses; ours keeps them rigid.

@@ -246,7 +246,10 @@ impl Observer for Progress {
 
     fn validated(&mut self, step: u64, accuracy: &Accuracy) {
         let [ap_30, ap_50, ap_70] = accuracy.ap_global;
-        let text = format!("step {step}: AP@0.3/0.5/0.7 global {ap_30:.3} {ap_50:.3} {ap_70:.3} on {} frames", accuracy.frames);
+        let text = format!(
+            "step {step}: AP@0.3/0.5/0.7 global {ap_30:.3} {ap_50:.3} {ap_70:.3} on {} frames",
+            accuracy.frames
+        );
         if self.is_watched { self.bar.println(text) } else { eprintln!("{text}") }
     }
 }

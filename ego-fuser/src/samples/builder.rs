@@ -2,6 +2,7 @@
 
 use std::sync::Arc;
 
+use agent::crop::Crop;
 use agent::model_config::DetectorConfig;
 use agent::pillars::{Pillars, Voxeliser};
 use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
@@ -92,6 +93,7 @@ pub struct SampleBuilder {
     config: SampleConfig,
     detector: DetectorConfig,
     assigner: Arc<TargetAssigner>,
+    crop: Crop,
     voxeliser: Voxeliser,
 }
 
@@ -105,7 +107,8 @@ impl SampleBuilder {
         assigner: Arc<TargetAssigner>,
     ) -> Self {
         let voxeliser = Voxeliser::for_detector(&detector);
-        Self { scenes, config, detector, assigner, voxeliser }
+        let crop = Crop::for_detector(&detector);
+        Self { scenes, config, detector, assigner, crop, voxeliser }
     }
 
     /// The scenes it draws from.
@@ -132,8 +135,8 @@ impl SampleBuilder {
         let mut ego_from_cav = Vec::with_capacity(views.len());
         for &agent in views {
             let view = if agent == ego { ego_view } else { scene.view(rng) };
-            let mut points = self.scenes.points(tick, agent)?;
-            self.cut_own_body(&mut points);
+            // Hits on the vehicle that carries the LiDAR are cut out before anything turns.
+            let mut points = self.crop.without_own_body(&self.scenes.points(tick, agent)?);
             view.points(&mut points.xyzi);
             clouds.push(points);
             let pose = if agent == ego {
@@ -189,13 +192,6 @@ impl SampleBuilder {
         })
     }
 
-    /// Hits on the vehicle that carries the LiDAR tell nothing; they are cut out before anything turns.
-    fn cut_own_body(&self, points: &mut PointCloud) {
-        if let Some([x_min, y_min, x_max, y_max]) = self.detector.own_body_m.map(|edges| edges.map(|edge| edge as f32)) {
-            points.xyzi.retain(|&[x, y, _, _]| !(x > x_min && x < x_max && y > y_min && y < y_max));
-        }
-    }
-
     fn disturb(&self, pose: &Pose, rng: &mut impl Rng) -> Pose {
         let noise = self.config.pose_noise;
         if noise == PoseNoise::default() {
@@ -220,9 +216,8 @@ impl SampleBuilder {
             min_corners: 8,
         };
         let views: Vec<&Frame> = annotators.iter().map(|&agent| &frames[agent]).collect();
-        let on_lattice = |object: &Box3d| {
-            (0..2).all(|axis| (range[axis]..range[axis + 3]).contains(&object.center_m[axis]))
-        };
+        let on_lattice =
+            |object: &Box3d| (0..2).all(|axis| (range[axis]..range[axis + 3]).contains(&object.center_m[axis]));
         let merged = ground_truth::merge(&views, 0, &rule);
         merged.iter().map(|(_, object)| ego_view.box3d(object)).filter(on_lattice).collect()
     }

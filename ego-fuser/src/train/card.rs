@@ -22,13 +22,21 @@ pub(super) fn text(
         card.push('\n');
     };
     line(format!("# {} detector, method `{}`\n", detector.name, model.method));
-    line(format!("PointPillars over {:?} m, trained for `{}`: {}.\n", detector.lidar_range_m, model.method, model.method.summary()));
+    line(format!(
+        "PointPillars over {:?} m, trained for `{}`: {}.\n",
+        detector.lidar_range_m,
+        model.method,
+        model.method.summary()
+    ));
     line("| | |\n| --- | --- |".into());
     line(format!("| command | `{}` |", config.command));
     line(format!("| parameters | {parameters} |"));
     line(format!("| weights | SHA-256 `{}` |", summary.sha256));
     let ticks = scenes.ticks().len();
-    line(format!("| data | {ticks} ticks of {} scenarios, listing SHA-256 `{data_sha256}` |", scenes.scenarios().len()));
+    line(format!(
+        "| data | {ticks} ticks of {} scenarios, listing SHA-256 `{data_sha256}` |",
+        scenes.scenarios().len()
+    ));
     line(format!("| seed | {} |", config.seed));
     line(format!("| steps | {} of {} samples |", summary.steps, config.batch));
     line(format!("| convolutions | {:?} |", config.precision));
@@ -41,10 +49,15 @@ pub(super) fn text(
             accuracy.frames, config.samples.comm_range_m
         ));
         line("| AP | 0.3 | 0.5 | 0.7 |\n| --- | --- | --- | --- |".into());
-        for (name, [ap_30, ap_50, ap_70]) in [("global", accuracy.ap_global), ("frame order", accuracy.ap_frame_order)] {
+        for (name, [ap_30, ap_50, ap_70]) in [("global", accuracy.ap_global), ("frame order", accuracy.ap_frame_order)]
+        {
             line(format!("| {name} | {ap_30:.4} | {ap_50:.4} | {ap_70:.4} |"));
         }
     }
-    let _ = write!(card, "\nConfiguration:\n\n```json\n{}\n```\n", serde_json::to_string_pretty(detector).unwrap_or_default());
+    let _ = write!(
+        card,
+        "\nConfiguration:\n\n```json\n{}\n```\n",
+        serde_json::to_string_pretty(detector).unwrap_or_default()
+    );
     card
 }

@@ -72,7 +72,12 @@ pub enum CheckpointError {
 ///
 /// # Errors
 /// [`CheckpointError`] when the file cannot be written.
-pub(super) fn save(path: &Path, variables: &VarStore, optimizer: &AdamW, progress: &Progress) -> Result<(), CheckpointError> {
+pub(super) fn save(
+    path: &Path,
+    variables: &VarStore,
+    optimizer: &AdamW,
+    progress: &Progress,
+) -> Result<(), CheckpointError> {
     let (moments, optimizer_steps) = optimizer.state();
     let parameters = variables.variables().into_iter().map(|(name, tensor)| (format!("parameter.{name}"), tensor));
     let mut stored = Vec::new();

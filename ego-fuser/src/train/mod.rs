@@ -215,10 +215,11 @@ impl<'a> Training<'a> {
         let samples = SampleConfig { kind: sample_kind(config.method)?, ..config.samples.clone() };
         std::fs::create_dir_all(&config.out).map_err(|source| TrainError::Io { path: config.out.clone(), source })?;
         tch::manual_seed(config.seed as i64);
-        let model = match &config.init {
+        let mut model = match &config.init {
             Some(path) => CooperativeModel::load(path, Some(config.method), config.device)?,
             None => CooperativeModel::new(&config.detector, config.method, config.device)?,
         };
+        model.set_precision(config.precision);
         let mut optimizer = AdamW::new(&model.variables, config.optimizer);
         let mut progress = Progress {
             step: 0,
@@ -290,8 +291,10 @@ impl<'a> Training<'a> {
                 self.checkpoint()?;
             }
         }
-        self.validate(observer)?;
-        self.checkpoint()?;
+        if !self.progress.step.is_multiple_of(self.config.validate_every) {
+            self.validate(observer)?;
+            self.checkpoint()?;
+        }
         self.finish()
     }
 
@@ -299,15 +302,13 @@ impl<'a> Training<'a> {
     fn step(&mut self, batch: &Batch) -> Result<Option<[f64; 2]>, TrainError> {
         let pillars = batch.pillars.to_device(self.config.device);
         let labels = LabelTensors::gather(&batch.labels, self.config.loss.unassigned, self.config.device);
-        let output = self.model.forward(&pillars, &batch.ego_from_cav, true, self.config.precision)?;
+        let output = self.model.forward(&pillars, &batch.ego_from_cav, true)?;
         let loss = detection_loss(&output.scores, &output.offsets, &labels, &self.config.loss)?;
         self.optimizer.zero_grad();
         loss.total().f_backward()?;
         let learning_rate = self.schedule.at(self.share_done());
         match self.optimizer.step(learning_rate)? {
-            Step::Taken(_) => {
-                Ok(Some([loss.score.f_double_value(&[])?, loss.boxes.f_double_value(&[])?]))
-            }
+            Step::Taken(_) => Ok(Some([loss.score.f_double_value(&[])?, loss.boxes.f_double_value(&[])?])),
             Step::Skipped => Ok(None),
         }
     }
@@ -348,8 +349,12 @@ impl<'a> Training<'a> {
 
     fn validate(&mut self, observer: &mut dyn Observer) -> Result<(), TrainError> {
         if let Some(validator) = &mut self.validator {
-            let accuracy = validator.measure(&self.model)?;
-            self.curve.validation(self.progress.step, self.seconds_before + self.started.elapsed().as_secs_f64(), &accuracy)?;
+            self.model.set_precision(ComputePrecision::F32);
+            let accuracy = validator.measure(&self.model);
+            self.model.set_precision(self.config.precision);
+            let accuracy = accuracy?;
+            let seconds = self.seconds_before + self.started.elapsed().as_secs_f64();
+            self.curve.validation(self.progress.step, seconds, &accuracy)?;
             observer.validated(self.progress.step, &accuracy);
             self.accuracy = Some(accuracy);
         }

@@ -12,7 +12,7 @@ use tch::no_grad;
 
 use super::TrainError;
 use crate::average_precision::{Ordering, Scorer};
-use crate::model::{ComputePrecision, CooperativeModel};
+use crate::model::CooperativeModel;
 use crate::samples::{Augmentation, Batch, PoseNoise, SampleBuilder, SampleConfig, SampleError, SceneSet, TickRef};
 
 /// AP over the frames of a validation.
@@ -79,7 +79,7 @@ impl Validator {
             let objects: Vec<_> = sample.objects.iter().filter(inside).copied().collect();
             let batch = Batch::collate(vec![sample], model.network().lattice());
             let pillars = batch.pillars.to_device(model.device());
-            let output = no_grad(|| model.forward(&pillars, &batch.ego_from_cav, false, ComputePrecision::F32))?;
+            let output = no_grad(|| model.forward(&pillars, &batch.ego_from_cav, false))?;
             for detections in model.detections(&output, &limits)? {
                 scorer.add(&detections, &objects);
             }
