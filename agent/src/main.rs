@@ -1,3 +1,12 @@
 //! Command line of `agent`.
 
-fn main() {}
+mod cli;
+mod command;
+
+use std::process::ExitCode;
+
+use clap::Parser;
+
+fn main() -> ExitCode {
+    cli::run(cli::Cli::parse())
+}

@@ -62,8 +62,13 @@ impl<K: Ord + Clone, T> Mailbox<K, T> {
 
     /// Puts `item` behind the others of its lane without waiting; a full lane gives up its oldest item.
     pub fn push(&self, key: K, item: T) -> Pushed<T> {
+        self.push_within(self.lane_capacity, key, item)
+    }
+
+    /// [`Self::push`] for a lane of another capacity than the others.
+    pub fn push_within(&self, lane_capacity: usize, key: K, item: T) -> Pushed<T> {
         let mut state = self.lock();
-        let displaced = match self.make_lane(&mut state, &key) {
+        let displaced = match self.make_lane(&mut state, &key, lane_capacity.max(1)) {
             Err(Full::Closed) => return Pushed::Closed(item),
             Err(Full::NoLane) => return Pushed::NoLane(item),
             Err(Full::Lane) => state.lanes.get_mut(&key).and_then(VecDeque::pop_front),
@@ -77,7 +82,7 @@ impl<K: Ord + Clone, T> Mailbox<K, T> {
     pub fn push_waiting(&self, key: K, item: T) -> Pushed<T> {
         let mut state = self.lock();
         loop {
-            match self.make_lane(&mut state, &key) {
+            match self.make_lane(&mut state, &key, self.lane_capacity) {
                 Ok(()) => break,
                 Err(Full::Closed) => return Pushed::Closed(item),
                 Err(Full::NoLane) => return Pushed::NoLane(item),
@@ -143,12 +148,12 @@ impl<K: Ord + Clone, T> Mailbox<K, T> {
         self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    fn make_lane(&self, state: &mut State<K, T>, key: &K) -> Result<(), Full> {
+    fn make_lane(&self, state: &mut State<K, T>, key: &K, capacity: usize) -> Result<(), Full> {
         if state.closed {
             return Err(Full::Closed);
         }
         match state.lanes.get(key) {
-            Some(lane) if lane.len() >= self.lane_capacity => Err(Full::Lane),
+            Some(lane) if lane.len() >= capacity => Err(Full::Lane),
             None if state.lanes.len() >= self.max_lanes => Err(Full::NoLane),
             _ => Ok(()),
         }

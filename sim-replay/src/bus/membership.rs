@@ -104,7 +104,15 @@ impl Bus {
     /// # Errors
     /// [`BusError::Zenoh`] when the session is closed.
     pub fn subscribe(&self, topic: Topic, inbox: &Arc<Inbox>) -> Result<Subscription, BusError> {
-        Subscription::to_key(&self.session, &topic.in_run(&self.identity.run), inbox, &self.notices)
+        Subscription::to_key(&self.session, &topic.in_run(&self.identity.run), (inbox, None), &self.notices)
+    }
+
+    /// [`Self::subscribe`] with another number of places than the inbox's other topics have.
+    ///
+    /// # Errors
+    /// [`BusError::Zenoh`] when the session is closed.
+    pub fn subscribe_keeping(&self, topic: Topic, places: usize, inbox: &Arc<Inbox>) -> Result<Subscription, BusError> {
+        Subscription::to_key(&self.session, &topic.in_run(&self.identity.run), (inbox, Some(places)), &self.notices)
     }
 
     /// Delivers every topic of `selector` into `inbox`.

@@ -89,9 +89,13 @@ impl Inbox {
         arrival.decode(limits).map_err(|error| self.books.rejected(&arrival.topic, &error)).ok()
     }
 
-    fn deliver(&self, topic: &Topic, event: Event) {
+    fn deliver(&self, topic: &Topic, event: Event, places: Option<usize>) {
         let lane = Lane { topic: topic.clone(), is_notice: matches!(event, Event::End { .. }) };
-        let lost = match self.mailbox.push(lane, event) {
+        let pushed = match places {
+            Some(places) => self.mailbox.push_within(places, lane, event),
+            None => self.mailbox.push(lane, event),
+        };
+        let lost = match pushed {
             Pushed::Queued => return,
             Pushed::Displaced(event) | Pushed::NoLane(event) | Pushed::Closed(event) => event,
         };
@@ -111,14 +115,14 @@ impl Subscription {
     pub(super) fn to_key(
         session: &zenoh::Session,
         key: &Key,
-        inbox: &Arc<Inbox>,
+        (inbox, places): (&Arc<Inbox>, Option<usize>),
         notices: &Notices,
     ) -> Result<Self, BusError> {
         if is_booked(&key.topic) {
             inbox.books.subscribed(&key.topic);
         }
         let topic = key.topic.clone();
-        Self::declare(session, &key.to_string(), Door::new(inbox, notices), move |_| Some(topic.clone()))
+        Self::declare(session, &key.to_string(), Door::new(inbox, places, notices), move |_| Some(topic.clone()))
     }
 
     pub(super) fn to_all(
@@ -129,7 +133,7 @@ impl Subscription {
     ) -> Result<Self, BusError> {
         // A key that is none of ours tells of no message of ours either.
         let topic = |sample: &Sample| sample.key_expr().as_str().parse::<Key>().ok().map(|key| key.topic);
-        Self::declare(session, selector.as_str(), Door::new(inbox, notices), topic)
+        Self::declare(session, selector.as_str(), Door::new(inbox, None, notices), topic)
     }
 
     fn declare(
@@ -159,6 +163,7 @@ fn is_booked(topic: &Topic) -> bool {
 /// zenoh.
 struct Door {
     inbox: Arc<Inbox>,
+    places: Option<usize>,
     notices: Notices,
     // The latest sequence of each topic and epoch: a restarted sender begins anew.
     last: Mutex<BTreeMap<(Topic, u64), u64>>,
@@ -168,8 +173,8 @@ struct Door {
 const MAX_REMEMBERED: usize = 1024;
 
 impl Door {
-    fn new(inbox: &Arc<Inbox>, notices: &Notices) -> Self {
-        Self { inbox: Arc::clone(inbox), notices: notices.clone(), last: Mutex::default() }
+    fn new(inbox: &Arc<Inbox>, places: Option<usize>, notices: &Notices) -> Self {
+        Self { inbox: Arc::clone(inbox), places, notices: notices.clone(), last: Mutex::default() }
     }
 
     fn admit(&self, topic: Topic, sample: &Sample) {
@@ -188,8 +193,8 @@ impl Door {
             }
         }
         let payload = sample.payload().clone();
-        self.inbox
-            .deliver(&topic, Event::Message(Arrival { topic: topic.clone(), header, at: Instant::now(), payload }));
+        let arrival = Arrival { topic: topic.clone(), header, at: Instant::now(), payload };
+        self.inbox.deliver(&topic, Event::Message(arrival), self.places);
     }
 
     fn refuse(&self, topic: &Topic, error: &WireError) {
@@ -206,7 +211,7 @@ impl Door {
             Ok((_, Control::Probe)) => self.notices.probed(&topic),
             Ok((_, Control::End { ticks: sent, .. })) => {
                 let end = Event::End { topic: topic.clone(), epoch: header.stamp.epoch, sent };
-                self.inbox.deliver(&topic, end);
+                self.inbox.deliver(&topic, end, None);
             }
             Ok(_) => {}
             Err(error) => self.refuse(&topic, &error),

@@ -1,0 +1,39 @@
+//! The sub-commands and the exit codes they share.
+
+use std::process::ExitCode;
+
+use clap::{Parser, Subcommand};
+
+use crate::command;
+
+/// What one connected vehicle does with its sweeps: where am I, what do I see, what do I tell the others.
+#[derive(Debug, Parser)]
+#[command(version, after_help = "Exit codes: 0 done, 1 failed, 2 bad usage or input.")]
+pub(crate) struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    Run(command::run::Args),
+}
+
+/// Usage or input at fault, and not the program: exit code 2.
+#[derive(Debug, thiserror::Error)]
+#[error(transparent)]
+pub(crate) struct BadInput(pub(crate) anyhow::Error);
+
+/// Runs what was asked for and prints the chain of causes where it failed.
+pub(crate) fn run(cli: Cli) -> ExitCode {
+    let outcome = match cli.command {
+        Command::Run(args) => command::run::run(&args),
+    };
+    match outcome {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("error: {error:#}");
+            if error.is::<BadInput>() { ExitCode::from(2) } else { ExitCode::FAILURE }
+        }
+    }
+}

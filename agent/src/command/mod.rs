@@ -1,0 +1,3 @@
+//! One file per sub-command: its arguments and its `run`.
+
+pub(crate) mod run;

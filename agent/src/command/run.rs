@@ -1,0 +1,196 @@
+//! `agent run`: one vehicle of a live fleet.
+
+use std::path::PathBuf;
+
+use agent::agent::Agent;
+use agent::detector::Detector;
+use agent::node::{self, NodeOptions};
+use agent::pose_source::{NoiseMode, NoisyPoseConfig, PoseSource, PoseSourceConfig};
+use anyhow::Context;
+use clap::ValueEnum;
+use protocol::{CavId, CodecConfig, Dtype, Role, Stream};
+use sim_replay::bus::{BusArgs, STOP_LIMIT, log_to_stderr};
+
+use crate::cli::BadInput;
+
+/// Run one vehicle: its sensors in; pose, feature map, boxes or points out.
+///
+/// Ends when the replay does, or on Ctrl-C or SIGTERM.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    #[command(flatten)]
+    bus: BusArgs,
+    /// The vehicle.
+    #[arg(long, allow_hyphen_values = true)]
+    cav: CavId,
+    /// Weights of the detector (safetensors; its configuration is inside).
+    #[arg(long)]
+    weights: PathBuf,
+    /// Where the vehicle takes its pose from.
+    #[arg(long, value_enum, default_value_t = PoseFrom::Recorded)]
+    pose_source: PoseFrom,
+    #[command(flatten)]
+    noise: NoiseArgs,
+    /// What to send beside the pose.
+    #[arg(long, value_enum, value_delimiter = ',', default_value = "bev")]
+    publish: Vec<Published>,
+    /// How exactly feature values are written.
+    #[arg(long, value_enum, default_value_t = Exactness::F32)]
+    dtype: Exactness,
+    /// Most bytes of a feature map, before packing: the cells with the highest confidence that fit are sent
+    /// [default: all].
+    #[arg(long, value_name = "BYTES")]
+    budget: Option<u64>,
+    /// zstd level, 1 to 22 [default: maps are not packed].
+    #[arg(long, value_name = "LEVEL", value_parser = clap::value_parser!(i32).range(1..=22))]
+    zstd: Option<i32>,
+    /// Threads to compute with; the same number gives the same bits.
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
+    threads: u16,
+    /// Go on when the replay ends, for the next one.
+    #[arg(long)]
+    keep_running: bool,
+    /// Print a JSON summary at the end.
+    #[arg(long)]
+    json: bool,
+}
+
+/// Error on the recorded pose, with --pose-source noisy.
+#[derive(Debug, clap::Args)]
+#[command(next_help_heading = "Noise on the pose (--pose-source noisy)")]
+struct NoiseArgs {
+    /// How the errors of successive frames hang together.
+    #[arg(long, value_enum, default_value_t = Mode::Fixed)]
+    noise_mode: Mode,
+    /// Standard deviation of x, y and z, metres.
+    #[arg(long, default_value_t = NoisyPoseConfig::default().position_std_m)]
+    noise_position_std: f64,
+    /// Standard deviation of yaw, degrees.
+    #[arg(long, default_value_t = NoisyPoseConfig::default().heading_std_deg)]
+    noise_heading_std: f64,
+    /// Same seed, same errors.
+    #[arg(long, default_value_t = NoisyPoseConfig::default().seed)]
+    noise_seed: u64,
+    /// Seconds between two draws, for the modes that depend on time.
+    #[arg(long, default_value_t = NoisyPoseConfig::default().step_s)]
+    noise_step: f64,
+    /// Seconds after which an autoregressive error has decayed to 1/e.
+    #[arg(long, default_value_t = NoisyPoseConfig::default().decay_s)]
+    noise_decay: f64,
+    /// File of errors for the replayed mode.
+    #[arg(long)]
+    noise_table: Option<PathBuf>,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum PoseFrom {
+    /// The recording's own pose.
+    Recorded,
+    /// That pose with an error.
+    Noisy,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Mode {
+    /// One offset, the same for all vehicles and frames.
+    Fixed,
+    /// Drawn anew for every vehicle and frame.
+    Independent,
+    /// Wanders, as a filter's error does.
+    Autoregressive,
+    /// From a file.
+    Replayed,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Published {
+    /// Feature maps.
+    Bev,
+    /// Its own detections.
+    Boxes,
+    /// Its points, for the early-fusion baseline.
+    Points,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Exactness {
+    /// 4 bytes, exact.
+    F32,
+    /// 2 bytes.
+    F16,
+    /// 1 byte and a scale per channel.
+    I8,
+}
+
+/// Loads the models, joins the run and works until the replay ends.
+pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
+    log_to_stderr();
+    tch::set_num_threads(i32::from(args.threads));
+    let agent = args.agent().map_err(BadInput)?;
+    let stop = args.bus.stop().context("installing signal handlers")?;
+    let bus = args.bus.join(Role::Agent, &args.cav)?;
+    tracing::info!(cav = %args.cav, weights = %args.weights.display(), "ready");
+    let report = node::run(&bus, agent, &args.options(), &stop)?;
+    if let Err(overdue) = bus.leave(STOP_LIMIT) {
+        tracing::warn!("{overdue}");
+    }
+    if args.json {
+        println!("{}", serde_json::to_string(&report)?);
+    } else {
+        println!("{} sweeps, {} without a pose, {} failed", report.sweeps, report.no_pose, report.failed);
+    }
+    Ok(())
+}
+
+impl Args {
+    fn agent(&self) -> anyhow::Result<Agent> {
+        let detector = Detector::load(&self.weights).context("weights")?;
+        Ok(Agent::new(self.cav.clone(), self.pose_source()?, detector))
+    }
+
+    fn pose_source(&self) -> anyhow::Result<Box<dyn PoseSource>> {
+        let config = match self.pose_source {
+            PoseFrom::Recorded => PoseSourceConfig::Recorded,
+            PoseFrom::Noisy => PoseSourceConfig::Noisy(self.noise.config()),
+        };
+        Ok(config.build()?)
+    }
+
+    fn options(&self) -> NodeOptions {
+        let stream = |published: &Published| match published {
+            Published::Bev => Stream::Bev,
+            Published::Boxes => Stream::Boxes,
+            Published::Points => Stream::Points,
+        };
+        let dtype = match self.dtype {
+            Exactness::F32 => Dtype::F32,
+            Exactness::F16 => Dtype::F16,
+            Exactness::I8 => Dtype::I8,
+        };
+        NodeOptions {
+            publish: self.publish.iter().map(stream).collect(),
+            codec: CodecConfig { dtype, budget_bytes: self.budget, zstd_level: self.zstd },
+            keeps_running: self.keep_running,
+            ..NodeOptions::default()
+        }
+    }
+}
+
+impl NoiseArgs {
+    fn config(&self) -> NoisyPoseConfig {
+        NoisyPoseConfig {
+            mode: match self.noise_mode {
+                Mode::Fixed => NoiseMode::Fixed,
+                Mode::Independent => NoiseMode::Independent,
+                Mode::Autoregressive => NoiseMode::Autoregressive,
+                Mode::Replayed => NoiseMode::Replayed,
+            },
+            position_std_m: self.noise_position_std,
+            heading_std_deg: self.noise_heading_std,
+            seed: self.noise_seed,
+            step_s: self.noise_step,
+            decay_s: self.noise_decay,
+            table: self.noise_table.clone(),
+        }
+    }
+}

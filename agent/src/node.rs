@@ -1,0 +1,251 @@
+//! An agent on the bus: its vehicle's sensors in; pose, map, boxes or points out.
+//!
+//! It subscribes to the sensors of its own vehicle and to nothing else; the truth in particular it cannot see. One
+//! thread receives, computes and offers; encoding and sending have threads of their own.
+
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use protocol::codec::CodecConfig;
+use protocol::message::{Bev, Boxes, Descriptor, ModelHash, Points};
+use protocol::{DropReason, Dtype, Gnss, Lidar, Limits, PoseEstimate, Role, Stream, Topic, encode_features, wire};
+use sim_replay::bus::mailbox::Taken;
+use sim_replay::bus::shutdown::Stop;
+use sim_replay::bus::{Arrival, Bus, BusError, Event, Inbox, Publisher, PublisherOptions, Subscription, unix_nanos};
+
+use crate::agent::{Agent, AgentInput, Perception};
+use crate::sweep_pairing::{PairedSweep, SweepPairing};
+
+/// How long a sweep waits for its pose, which was sent before it.
+const POSE_PATIENCE: Duration = Duration::from_millis(200);
+/// Poses that may wait in the inbox while a sweep is computed.
+const POSE_PLACES: usize = 32;
+/// How often an agent says what it is going to send, for those that join late.
+const DESCRIPTOR_PERIOD: Duration = Duration::from_secs(1);
+
+/// How an agent takes part.
+#[derive(Debug, Clone)]
+pub struct NodeOptions {
+    /// What it sends beside its pose: any of [`Stream::Bev`], [`Stream::Boxes`] and [`Stream::Points`].
+    pub publish: Vec<Stream>,
+    /// How it writes its maps.
+    pub codec: CodecConfig,
+    /// Whether to go on when the replay has ended, for the next one.
+    pub keeps_running: bool,
+    /// What it takes from the bus.
+    pub limits: Limits,
+}
+
+impl Default for NodeOptions {
+    /// Maps, `f32`, dense.
+    fn default() -> Self {
+        Self {
+            publish: vec![Stream::Bev],
+            codec: CodecConfig { dtype: Dtype::F32, ..CodecConfig::default() },
+            keeps_running: false,
+            limits: Limits::DEFAULT,
+        }
+    }
+}
+
+/// What an agent did.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize)]
+pub struct NodeReport {
+    /// Sweeps computed.
+    pub sweeps: u64,
+    /// Of these, without a pose.
+    pub no_pose: u64,
+    /// Sweeps that could not be computed.
+    pub failed: u64,
+}
+
+/// Runs `agent` on the calling thread until the replay ends or `stop` is requested.
+///
+/// # Errors
+/// [`BusError`] when the bus refuses. What goes wrong with single messages is counted and logged.
+pub fn run(bus: &Bus, agent: Agent, options: &NodeOptions, stop: &Stop) -> Result<NodeReport, BusError> {
+    let mut node = Node::open(bus, agent, options, stop)?;
+    let presence = bus.announce(Role::Agent)?;
+    node.listen(stop);
+    let Node { outlet, report, .. } = node;
+    outlet.finish();
+    presence.withdraw()?;
+    Ok(report)
+}
+
+struct Node<'a> {
+    bus: &'a Bus,
+    agent: Agent,
+    options: &'a NodeOptions,
+    inbox: Arc<Inbox>,
+    lidar: Topic,
+    gnss: Topic,
+    pairing: SweepPairing<Arrival>,
+    outlet: Outlet,
+    report: NodeReport,
+    _subscriptions: [Subscription; 2],
+}
+
+impl<'a> Node<'a> {
+    fn open(bus: &'a Bus, agent: Agent, options: &'a NodeOptions, stop: &Stop) -> Result<Self, BusError> {
+        let topic = |stream| Topic::Stream { cav: agent.cav().clone(), stream };
+        let (lidar, gnss) = (topic(Stream::Lidar), topic(Stream::Gnss));
+        // One place: while a sweep is computed only the newest of those that come is worth keeping.
+        let inbox = bus.inbox(1, 2);
+        stop.on_request({
+            let inbox = Arc::clone(&inbox);
+            move || inbox.close()
+        });
+        let outlet = Outlet::open(bus, &agent, options)?;
+        let subscriptions =
+            [bus.subscribe_keeping(gnss.clone(), POSE_PLACES, &inbox)?, bus.subscribe(lidar.clone(), &inbox)?];
+        let pairing = SweepPairing::new(POSE_PATIENCE);
+        let report = NodeReport::default();
+        Ok(Self { bus, agent, options, inbox, lidar, gnss, pairing, outlet, report, _subscriptions: subscriptions })
+    }
+
+    fn listen(&mut self, stop: &Stop) {
+        while !stop.requested() {
+            self.outlet.describe();
+            let deadline = self.pairing.deadline().unwrap_or(self.outlet.next_descriptor);
+            match self.inbox.take(Some(deadline.min(self.outlet.next_descriptor))) {
+                Taken::Item(_, Event::Message(arrival)) => self.admit(arrival),
+                Taken::Item(topic, Event::End { .. }) if topic == self.lidar && !self.options.keeps_running => {
+                    // Whatever still waits for a pose has waited long enough.
+                    self.advance(Instant::now() + POSE_PATIENCE);
+                    return;
+                }
+                Taken::Item(_, Event::End { .. }) | Taken::TimedOut => {}
+                Taken::Closed => return,
+            }
+            self.advance(Instant::now());
+        }
+    }
+
+    fn admit(&mut self, arrival: Arrival) {
+        let capture_nanos = arrival.header.stamp.capture_nanos;
+        if arrival.topic == self.lidar {
+            let superseded = self.pairing.add_sweep(capture_nanos, arrival, Instant::now());
+            if superseded.is_some() {
+                self.bus.books().dropped(&self.lidar, DropReason::Superseded);
+            }
+        } else if let Some(Gnss { world_from_lidar, .. }) = self.inbox.decode(&arrival, &self.options.limits) {
+            let displaced = self.pairing.add_pose(capture_nanos, world_from_lidar);
+            self.drop_poses(displaced);
+        }
+    }
+
+    fn drop_poses(&self, count: usize) {
+        // Their sweeps were superseded, and they with them.
+        (0..count).for_each(|_| self.bus.books().dropped(&self.gnss, DropReason::Superseded));
+    }
+
+    fn advance(&mut self, now: Instant) {
+        while let Some((PairedSweep { capture_nanos, sweep, pose }, unused)) = self.pairing.next(now) {
+            self.drop_poses(unused);
+            if pose.is_some() {
+                self.bus.books().received(&self.gnss);
+            }
+            let transport = unix_nanos().saturating_sub(sweep.header.stamp.publish_nanos);
+            let Some(Lidar { points }) = self.inbox.decode(&sweep, &self.options.limits) else { continue };
+            self.bus.books().timed("lidar transport", Duration::from_nanos(transport));
+            self.bus.books().received(&self.lidar);
+            self.process(&AgentInput { capture_nanos, cloud: &points, measured_pose: pose.as_ref() });
+        }
+    }
+
+    fn process(&mut self, input: &AgentInput<'_>) {
+        let books = self.bus.books();
+        let began = Instant::now();
+        let pose = self.agent.estimate_pose(input);
+        books.timed("pose", began.elapsed());
+        self.outlet.pose.offer(input.capture_nanos, pose);
+        self.report.no_pose += u64::from(pose.world_from_cav().is_none());
+        match self.agent.perceive(input.cloud) {
+            Ok(perception) => {
+                for stage in perception.times.stages() {
+                    books.timed(&stage.stage, Duration::from_nanos(stage.nanos));
+                }
+                books.timed("agent", began.elapsed());
+                self.report.sweeps += 1;
+                self.outlet.offer(input, pose, perception);
+            }
+            Err(error) => {
+                self.report.failed += 1;
+                tracing::error!(capture_nanos = input.capture_nanos, "a sweep could not be computed: {error}");
+            }
+        }
+    }
+}
+
+/// Everything an agent publishes.
+struct Outlet {
+    pose: Publisher,
+    bev: Option<Publisher>,
+    boxes: Option<Publisher>,
+    points: Option<Publisher>,
+    descriptor: Publisher,
+    codec: CodecConfig,
+    description: Descriptor,
+    next_descriptor: Instant,
+}
+
+impl Outlet {
+    fn open(bus: &Bus, agent: &Agent, options: &NodeOptions) -> Result<Self, BusError> {
+        let publisher = |stream, how| bus.publisher(Topic::Stream { cav: agent.cav().clone(), stream }, how);
+        let wanted = |stream| {
+            options.publish.contains(&stream).then(|| publisher(stream, PublisherOptions::FEATURES)).transpose()
+        };
+        let detector = agent.detector();
+        let description = Descriptor {
+            // A network that was not read from a file has no hash; nobody can share its features anyway.
+            model_hash: detector.sha256().parse().unwrap_or(ModelHash([0; 32])),
+            grid: detector.grid(),
+            channels: u32::try_from(detector.map_shape()[0]).unwrap_or(u32::MAX),
+            dtype: options.codec.dtype,
+            streams: std::iter::once(Stream::Pose).chain(options.publish.iter().copied()).collect(),
+        };
+        Ok(Self {
+            pose: publisher(Stream::Pose, PublisherOptions::POSE)?,
+            bev: wanted(Stream::Bev)?,
+            boxes: wanted(Stream::Boxes)?,
+            points: wanted(Stream::Points)?,
+            descriptor: publisher(Stream::Descriptor, PublisherOptions::POSE)?,
+            codec: options.codec,
+            description,
+            next_descriptor: Instant::now(),
+        })
+    }
+
+    fn describe(&mut self) {
+        let now = Instant::now();
+        if now >= self.next_descriptor {
+            self.next_descriptor = now + DESCRIPTOR_PERIOD;
+            self.descriptor.offer(0, self.description.clone());
+        }
+    }
+
+    fn offer(&self, input: &AgentInput<'_>, pose: PoseEstimate, perception: Perception) {
+        let Perception { features, confidence, detections, .. } = perception;
+        if let Some(bev) = &self.bev {
+            let codec = self.codec;
+            // Selecting, quantising and packing happen on the sending thread.
+            bev.offer_encoded(input.capture_nanos, move |stamp| {
+                let features = encode_features(features, &codec, Some(&confidence))?;
+                wire::encode(stamp, Bev { pose, features })
+            });
+        }
+        if let Some(boxes) = &self.boxes {
+            boxes.offer(input.capture_nanos, Boxes { pose, detections });
+        }
+        if let Some(points) = &self.points {
+            points.offer(input.capture_nanos, Points { pose, points: input.cloud.clone() });
+        }
+    }
+
+    fn finish(self) {
+        let Self { pose, bev, boxes, points, descriptor, .. } = self;
+        let streams = [Some(pose), bev, boxes, points, Some(descriptor)];
+        streams.into_iter().flatten().for_each(Publisher::finish);
+    }
+}

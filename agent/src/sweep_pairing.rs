@@ -1,0 +1,124 @@
+//! Which measured pose belongs to which sweep: the one of the same capture time.
+
+use std::collections::BTreeMap;
+use std::time::{Duration, Instant};
+
+use protocol::Pose;
+
+/// Poses kept for sweeps that have not come: at 10 Hz three seconds.
+const MAX_POSES: usize = 32;
+
+/// A sweep and its pose, if that has come.
+#[derive(Debug, PartialEq)]
+pub struct PairedSweep<S> {
+    /// Capture time, nanoseconds.
+    pub capture_nanos: u64,
+    /// The sweep.
+    pub sweep: S,
+    /// The pose measured at the same time.
+    pub pose: Option<Pose>,
+}
+
+/// Holds the newest sweep until its pose comes, or is known not to.
+#[derive(Debug)]
+pub struct SweepPairing<S> {
+    patience: Duration,
+    waiting: Option<(u64, S, Instant)>,
+    poses: BTreeMap<u64, Pose>,
+}
+
+impl<S> SweepPairing<S> {
+    /// Waits at most `patience` for the pose of a sweep.
+    #[must_use]
+    pub fn new(patience: Duration) -> Self {
+        Self { patience, waiting: None, poses: BTreeMap::new() }
+    }
+
+    /// A pose has come. Returns how many older ones had to go.
+    #[must_use]
+    pub fn add_pose(&mut self, capture_nanos: u64, pose: Pose) -> usize {
+        self.poses.insert(capture_nanos, pose);
+        let too_many = self.poses.len().saturating_sub(MAX_POSES);
+        for _ in 0..too_many {
+            self.poses.pop_first();
+        }
+        too_many
+    }
+
+    /// A sweep has come. Returns the one it takes the place of.
+    #[must_use]
+    pub fn add_sweep(&mut self, capture_nanos: u64, sweep: S, now: Instant) -> Option<S> {
+        self.waiting.replace((capture_nanos, sweep, now)).map(|(_, superseded, _)| superseded)
+    }
+
+    /// The sweep, if there is nothing left to wait for, and how many poses will never find theirs.
+    pub fn next(&mut self, now: Instant) -> Option<(PairedSweep<S>, usize)> {
+        let &(capture_nanos, _, since) = self.waiting.as_ref()?;
+        let pose = self.poses.get(&capture_nanos).copied();
+        // Poses come in order: a later one tells that this sweep's own is lost.
+        let is_lost = self.poses.range(capture_nanos + 1..).next().is_some();
+        if pose.is_none() && !is_lost && now < since + self.patience {
+            return None;
+        }
+        let later = self.poses.split_off(&(capture_nanos + 1));
+        let unused = self.poses.len() - usize::from(pose.is_some());
+        self.poses = later;
+        let (_, sweep, _) = self.waiting.take()?;
+        Some((PairedSweep { capture_nanos, sweep, pose }, unused))
+    }
+
+    /// When to ask again though nothing has come.
+    #[must_use]
+    pub fn deadline(&self) -> Option<Instant> {
+        self.waiting.as_ref().map(|(_, _, since)| *since + self.patience)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const PATIENCE: Duration = Duration::from_millis(200);
+
+    fn at(x_m: f64) -> Pose {
+        Pose::from_xyz_yaw([x_m, 0.0, 0.0], 0.0)
+    }
+
+    fn paired(pairing: &mut SweepPairing<char>, now: Instant) -> Option<(u64, char, Option<f64>, usize)> {
+        let (PairedSweep { capture_nanos, sweep, pose }, unused) = pairing.next(now)?;
+        Some((capture_nanos, sweep, pose.map(|pose| pose.translation_m[0]), unused))
+    }
+
+    #[test]
+    fn a_sweep_meets_its_pose_in_either_order() {
+        let (mut pairing, now) = (SweepPairing::new(PATIENCE), Instant::now());
+        assert_eq!(pairing.add_pose(10, at(1.0)), 0);
+        assert_eq!(pairing.add_sweep(10, 'a', now), None);
+        assert_eq!(paired(&mut pairing, now), Some((10, 'a', Some(1.0), 0)));
+        assert_eq!(pairing.add_sweep(20, 'b', now), None);
+        assert_eq!(paired(&mut pairing, now), None);
+        assert_eq!(pairing.add_pose(20, at(2.0)), 0);
+        assert_eq!(paired(&mut pairing, now), Some((20, 'b', Some(2.0), 0)));
+    }
+
+    #[test]
+    fn a_lost_pose_is_noticed_by_the_next_or_by_the_time() {
+        let (mut pairing, now) = (SweepPairing::new(PATIENCE), Instant::now());
+        assert_eq!(pairing.add_sweep(10, 'a', now), None);
+        assert_eq!(pairing.add_pose(20, at(2.0)), 0);
+        assert_eq!(paired(&mut pairing, now), Some((10, 'a', None, 0)));
+        assert_eq!(pairing.add_sweep(30, 'c', now), None);
+        assert_eq!(paired(&mut pairing, now), None);
+        assert_eq!(pairing.deadline(), Some(now + PATIENCE));
+        assert_eq!(paired(&mut pairing, now + PATIENCE), Some((30, 'c', None, 1)), "the pose of 20 found no sweep");
+    }
+
+    #[test]
+    fn what_is_overtaken_is_given_back() {
+        let (mut pairing, now) = (SweepPairing::new(PATIENCE), Instant::now());
+        assert_eq!(pairing.add_sweep(10, 'a', now), None);
+        assert_eq!(pairing.add_sweep(20, 'b', now), Some('a'));
+        let gone: usize = (0..40).map(|k| pairing.add_pose(100 + k, at(0.0))).sum();
+        assert_eq!(gone, 40 - MAX_POSES);
+    }
+}
