@@ -5,11 +5,13 @@ use std::path::{Path, PathBuf};
 
 use agent::model_config::DetectorConfig;
 use agent::weights::{Weights, WeightsError};
-use protocol::{CavId, Dtype, RunId};
+use protocol::{CavId, Dtype, ProcessId, Role, RunId, Stream, Topic};
+use sim_replay::bus::{Route, process_id};
 use sim_replay::dataset::{self, ReadError};
 use sim_replay::ground_truth::GroundTruthRule;
 
 use crate::scenario::{Launch, NoiseMode, PoseSource, Publish, Scenario};
+use crate::score::scorer_cav;
 use crate::supervise::{Life, ProcessSpec};
 
 /// Vehicles farther than this from the ego do not take part, metres (the rule of the OPV2V family).
@@ -152,10 +154,26 @@ impl Fleet {
         }
     }
 
+    /// Numbers in one feature map of the model.
+    #[must_use]
+    pub fn map_values(&self) -> u64 {
+        let grid = self.detector.feature_grid();
+        u64::from(grid.width) * u64::from(grid.height) * self.detector.feature_channels() as u64
+    }
+
+    /// Where poses come from: the name that all vehicles share, or `mixed`.
+    #[must_use]
+    pub fn pose_source(&self) -> &'static str {
+        let mut names = self.agents.iter().map(|cav| self.scenario.settings_of(cav).pose.name());
+        let first = names.next().unwrap_or("recorded");
+        if names.all(|name| name == first) { first } else { "mixed" }
+    }
+
     /// Every process to start, which all meet at `endpoint`; the programs lie in `programs`.
     #[must_use]
     pub fn processes(&self, run: &RunId, endpoint: &str, programs: &Path) -> Vec<ProcessSpec> {
-        let meeting = Meeting { run, endpoint, programs };
+        let shared_memory_mib = self.scenario.network.shared_memory_mib;
+        let meeting = Meeting { run, endpoint, programs, shared_memory_mib };
         let here = |cav: &&CavId| self.scenario.settings_of(cav).launch == Launch::Here;
         let mut specs: Vec<ProcessSpec> =
             self.agents.iter().filter(here).map(|cav| self.agent(cav, &meeting)).collect();
@@ -175,7 +193,7 @@ impl Fleet {
         let mut args = Arguments::of("run", meeting);
         args.option("--cav", cav.as_str());
         self.model(&mut args);
-        args.option("--publish", settings.publish.unwrap_or(Publish::for_method(self.scenario.method)).name());
+        args.option("--publish", self.publish(cav).name());
         args.option("--pose-source", settings.pose.name());
         if let PoseSource::Noisy(noise) = settings.pose {
             args.option("--noise-mode", noise_mode(noise.mode));
@@ -206,7 +224,7 @@ impl Fleet {
     fn replay(&self, meeting: &Meeting<'_>) -> ProcessSpec {
         let scene = &self.scenario.scene;
         let mut args = Arguments::of("stream", meeting);
-        args.option("--scene", &scene.dir);
+        args.0.push(scene.dir.clone().into());
         if let Some(name) = &scene.scenario {
             args.option("--scenario", name);
         }
@@ -224,10 +242,37 @@ impl Fleet {
             args.flag("--loop");
         }
         if scene.lockstep {
-            args.flag("--lockstep");
+            args.option("--lockstep", self.ego.as_str());
         }
-        args.option("--ready-timeout-s", &self.scenario.timeouts.ready_s.to_string());
+        for route in self.routes() {
+            args.option("--expect", &route.to_string());
+        }
+        args.option("--ready-timeout", &self.scenario.timeouts.ready_s.to_string());
         meeting.process("replay".into(), "sim-replay", args, Life::Task)
+    }
+
+    /// What has to stand before the clock starts, beside the routes from the replay to the agents that it knows itself.
+    fn routes(&self) -> Vec<Route> {
+        let ego = process_id(Role::Ego, &self.ego);
+        let scorer = process_id(Role::Scorer, &scorer_cav());
+        let route = |cav: &CavId, stream, receiver: &ProcessId| Route {
+            topic: Topic::Stream { cav: cav.clone(), stream },
+            receiver: receiver.clone(),
+        };
+        let mut routes = vec![
+            Route { topic: Topic::Truth, receiver: scorer.clone() },
+            route(&self.ego, Stream::Detections, &scorer),
+        ];
+        for cav in &self.agents {
+            routes.push(route(cav, Stream::Pose, &scorer));
+            let publish = self.publish(cav);
+            routes.push(route(cav, publish.stream(), &ego));
+        }
+        routes
+    }
+
+    fn publish(&self, cav: &CavId) -> Publish {
+        self.scenario.settings_of(cav).publish.unwrap_or(Publish::for_method(self.scenario.method))
     }
 
     fn model(&self, args: &mut Arguments) {
@@ -241,6 +286,7 @@ struct Meeting<'a> {
     run: &'a RunId,
     endpoint: &'a str,
     programs: &'a Path,
+    shared_memory_mib: usize,
 }
 
 impl Meeting<'_> {
@@ -257,7 +303,10 @@ impl Arguments {
         let mut args = Self(vec![command.into()]);
         args.option("--connect", meeting.endpoint);
         args.option("--run", meeting.run.as_str());
-        args.flag("--lifeline");
+        args.flag("--supervised");
+        if meeting.shared_memory_mib > 0 {
+            args.option("--shm-mib", &meeting.shared_memory_mib.to_string());
+        }
         args
     }
 

@@ -1,11 +1,21 @@
 //! The operator's side of the fleet: reads a scenario, starts and supervises the processes, scores what the ego
 //! reports and writes it down.
+//!
+//! - [`scenario`]: what is asked for; [`fleet`]: which processes that takes.
+//! - [`up`]: one run, with its [`network`], [`supervise`]d processes and [`score`].
+//! - [`run_folder`], [`metrics`], [`ledger_report`], [`picture`]: what is kept of it.
 
 pub mod fingerprint;
 pub mod fleet;
+pub mod ledger_report;
 pub mod metrics;
+pub mod network;
 pub mod picture;
+pub mod progress;
+pub mod report;
 pub mod run_folder;
 pub mod scenario;
 pub mod score;
+pub mod showcase;
 pub mod supervise;
+pub mod up;

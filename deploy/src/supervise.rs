@@ -19,6 +19,8 @@ use tokio::task::JoinHandle;
 
 /// Exit code of our programs for bad usage or input: starting again cannot help.
 const BAD_INPUT: i32 = 2;
+/// Exit code of our programs when all was done but data were lost.
+const DATA_LOST: i32 = 3;
 /// A process that has lived this long has recovered; its next fall is a first one again.
 const RECOVERED: Duration = Duration::from_secs(10);
 /// First pause before a restart; it doubles up to [`LONGEST_PAUSE`].
@@ -78,7 +80,10 @@ pub enum Happening {
         how: String,
     },
     /// A task is done.
-    Done,
+    Done {
+        /// It says that data were lost.
+        data_lost: bool,
+    },
 }
 
 /// Why a process could not be started at all.
@@ -110,8 +115,14 @@ pub struct StopReport {
 /// The processes of a run. Dropping it kills those that are left.
 pub struct Supervisor {
     runtime: Runtime,
+    watched: Vec<Watched>,
+}
+
+/// One process, as the supervisor holds it.
+struct Watched {
+    name: String,
     stop: watch::Sender<Option<Instant>>,
-    watchers: Vec<(String, JoinHandle<bool>)>,
+    task: JoinHandle<bool>,
 }
 
 impl Supervisor {
@@ -141,30 +152,39 @@ impl Supervisor {
             .enable_all()
             .build()
             .map_err(SuperviseError::Runtime)?;
-        let (stop, told_to_stop) = watch::channel(None);
-        let watchers = specs
+        let watched = specs
             .into_iter()
             .zip(logs)
             .map(|(spec, log)| {
-                let name = spec.name.clone();
-                let watcher =
-                    Watcher { spec, log, restarts, events: events.clone(), stop: told_to_stop.clone(), falls: 0 };
-                (name, runtime.spawn(watcher.run()))
+                let (name, (stop, told_to_stop)) = (spec.name.clone(), watch::channel(None));
+                let watcher = Watcher { spec, log, restarts, events: events.clone(), stop: told_to_stop, falls: 0 };
+                Watched { name, stop, task: runtime.spawn(watcher.run()) }
             })
             .collect();
-        Ok(Self { runtime, stop, watchers })
+        Ok(Self { runtime, watched })
     }
 
-    /// Ends every process: asks with SIGTERM, kills after `grace`. Returns when all are gone.
-    pub fn stop(self, grace: Duration) -> StopReport {
-        self.stop.send_replace(Some(Instant::now() + grace));
+    /// Ends the processes that `which` chooses by name: asks them with SIGTERM, kills what is left at `deadline`.
+    /// Returns when they are gone.
+    pub fn end(&mut self, which: impl Fn(&str) -> bool, deadline: Instant) -> StopReport {
+        let (chosen, others) = self.watched.drain(..).partition(|watched| which(&watched.name));
+        self.watched = others;
+        let chosen: Vec<Watched> = chosen;
+        for watched in &chosen {
+            watched.stop.send_replace(Some(deadline));
+        }
         let mut report = StopReport::default();
-        for (name, watcher) in self.watchers {
-            if self.runtime.block_on(watcher).unwrap_or(true) {
-                report.killed.push(name);
+        for watched in chosen {
+            if self.runtime.block_on(watched.task).unwrap_or(true) {
+                report.killed.push(watched.name);
             }
         }
         report
+    }
+
+    /// Ends all processes within `grace`.
+    pub fn stop(mut self, grace: Duration) -> StopReport {
+        self.end(|_| true, Instant::now() + grace)
     }
 }
 
@@ -213,8 +233,8 @@ impl Watcher {
                     let stop = self.stop.clone();
                     tokio::select! {
                         status = child.wait() => match status {
-                            Ok(status) if status.success() && self.spec.life == Life::Task => {
-                                self.tell(Happening::Done);
+                            Ok(status) if self.spec.life == Life::Task && is_done(status) => {
+                                self.tell(Happening::Done { data_lost: !status.success() });
                                 return false;
                             }
                             Ok(status) if status.code() == Some(BAD_INPUT) => return self.give_up(&in_words(status)),
@@ -288,6 +308,10 @@ async fn end(mut child: Child, deadline: Instant) -> bool {
     true
 }
 
+fn is_done(status: ExitStatus) -> bool {
+    status.success() || status.code() == Some(DATA_LOST)
+}
+
 fn in_words(status: ExitStatus) -> String {
     match (status.code(), status.signal()) {
         (Some(code), _) => format!("ended with code {code}"),
@@ -322,7 +346,7 @@ mod tests {
     fn a_task_that_ends_well_is_done() {
         let (supervisor, events, folder) = start(shell("job", Life::Task, "echo hello"), 3);
         assert!(matches!(next(&events), Happening::Started { .. }));
-        assert_eq!(next(&events), Happening::Done);
+        assert_eq!(next(&events), Happening::Done { data_lost: false });
         assert_eq!(std::fs::read_to_string(folder.path().join("job.log")).unwrap(), "hello\n");
         assert!(supervisor.stop(PATIENCE).killed.is_empty());
     }

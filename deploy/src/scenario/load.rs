@@ -63,6 +63,15 @@ impl Scenario {
         Ok(scenario)
     }
 
+    /// The scenario as a file that [`Self::load`] reads.
+    ///
+    /// # Panics
+    /// Never: every field has a spelling in YAML.
+    #[must_use]
+    pub fn to_yaml(&self) -> String {
+        serde_saphyr::to_string(self).expect("plain structs, texts and numbers")
+    }
+
     fn read(path: &Path) -> Result<Self, ScenarioError> {
         let unreadable = |source| ScenarioError::Read { path: path.into(), source };
         let size = std::fs::metadata(path).map_err(unreadable)?.len();
@@ -239,7 +248,6 @@ mod tests {
         let mut scenario = parse(SMALL).unwrap();
         scenario.agents.publish = Some(Publish::Boxes);
         scenario.agents.pose = PoseSource::Noisy(super::super::PoseNoise::default());
-        let text = serde_saphyr::to_string(&scenario).unwrap();
-        assert_eq!(parse(&text).unwrap(), scenario);
+        assert_eq!(parse(&scenario.to_yaml()).unwrap(), scenario);
     }
 }

@@ -9,10 +9,12 @@ use std::collections::BTreeMap;
 use std::path::PathBuf;
 
 use ego_fuser::{Exchange, Method};
-use protocol::{CavId, CodecConfig, RunId};
+use protocol::{CavId, CodecConfig, RunId, Stream};
 use serde::{Deserialize, Serialize};
 
 pub use load::ScenarioError;
+
+use crate::fingerprint::Provenance;
 
 /// A deployment: which scene, which vehicles, which method, which network.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -46,6 +48,9 @@ pub struct Scenario {
     /// How long to wait for what.
     #[serde(default)]
     pub timeouts: Timeouts,
+    /// What a run was made of: written into the run folder, not read.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub provenance: Option<Provenance>,
 }
 
 /// The recording that drives the fleet, and how it is played.
@@ -142,6 +147,16 @@ impl Publish {
             Self::Bev => "bev",
             Self::Boxes => "boxes",
             Self::Points => "points",
+        }
+    }
+
+    /// The stream it goes to.
+    #[must_use]
+    pub fn stream(self) -> Stream {
+        match self {
+            Self::Bev => Stream::Bev,
+            Self::Boxes => Stream::Boxes,
+            Self::Points => Stream::Points,
         }
     }
 }
@@ -285,11 +300,13 @@ pub struct Network {
     pub listen: String,
     /// A router that runs already (`zenohd`), for example `tcp/10.0.0.1:7447`; no router is started then.
     pub connect: Option<String>,
+    /// Shared memory for large messages between processes of one machine, MiB; 0: everything takes the socket.
+    pub shared_memory_mib: usize,
 }
 
 impl Default for Network {
     fn default() -> Self {
-        Self { listen: "tcp/127.0.0.1:0".into(), connect: None }
+        Self { listen: "tcp/127.0.0.1:0".into(), connect: None, shared_memory_mib: 0 }
     }
 }
 

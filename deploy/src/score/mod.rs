@@ -4,4 +4,4 @@ mod board;
 mod node;
 
 pub use board::{Board, FrameRecord, JudgedFrame, true_boxes};
-pub use node::{ProcessBooks, Progress, SCORER, Scored, ScorerError, ScorerNode};
+pub use node::{ProcessBooks, Progress, Scored, ScorerError, ScorerNode, scorer_cav};

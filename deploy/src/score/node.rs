@@ -13,13 +13,13 @@ use protocol::{
     Stats, Stream, Topic, Truth,
 };
 use sim_replay::bus::mailbox::Taken;
-use sim_replay::bus::{Arrival, Bus, BusError, Event, Identity, Inbox, Presence, Subscription};
+use sim_replay::bus::{Arrival, Bus, BusError, Event, Identity, Inbox, Presence, Subscription, process_id};
 use zenoh::Session;
 
 use super::Board;
 
 /// Name of the scorer in keys, ledgers and routes.
-pub const SCORER: &str = "scorer";
+const SCORER: &str = "scorer";
 /// Messages of one topic that may wait: seconds of a run.
 const PLACES: usize = 256;
 /// How long the end of the session may take.
@@ -120,7 +120,8 @@ impl ScorerNode {
         board: Board,
         detections_file: PathBuf,
     ) -> Result<Self, ScorerError> {
-        let (process, cav) = (SCORER.parse().map_err(id_error)?, CavId::new(SCORER).map_err(id_error)?);
+        let cav = scorer_cav();
+        let process = process_id(Role::Scorer, &cav);
         let bus = Bus::over(session, Identity { run: run.clone(), process, cav })?;
         let inbox = bus.inbox(PLACES, 4 * agents.len() + 64);
         let detections = Topic::Stream { cav: ego.clone(), stream: Stream::Detections };
@@ -178,8 +179,13 @@ impl ScorerNode {
     }
 }
 
-fn id_error(error: protocol::IdError) -> ScorerError {
-    ScorerError::Io { what: "the scorer's name".into(), source: std::io::Error::other(error) }
+/// The scorer's name in place of a vehicle's.
+///
+/// # Panics
+/// Never: the name is an identifier.
+#[must_use]
+pub fn scorer_cav() -> CavId {
+    CavId::new(SCORER).expect("six lower-case letters")
 }
 
 /// The scorer's thread.

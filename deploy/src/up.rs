@@ -1,0 +1,312 @@
+//! One run from beginning to end: plan, start, watch, end, score, write.
+
+use std::path::{Path, PathBuf};
+use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant};
+
+use protocol::{Balance, Ledger, RunId};
+use sim_replay::bus::shutdown::Stop;
+use sim_replay::bus::{BusError, Endpoint};
+
+use crate::fingerprint::Provenance;
+use crate::fleet::{Fleet, FleetError};
+use crate::metrics::{Messages, Metrics};
+use crate::network::MeetingPlace;
+use crate::progress::Display;
+use crate::run_folder::{RunFolder, RunFolderError, name_of_now};
+use crate::scenario::Scenario;
+use crate::score::{Board, Progress, Scored, ScorerError, ScorerNode};
+use crate::supervise::{Happening, ProcessEvent, SuperviseError, Supervisor};
+
+/// How often the display is brought up to date, and conditions are looked at.
+const BEAT: Duration = Duration::from_millis(100);
+/// Of the time for ending: until the replay must be gone.
+const REPLAY_SHARE: f64 = 0.25;
+/// Of the time for ending: until the last results must have come.
+const DRAIN_SHARE: f64 = 0.5;
+
+/// What a run needs beside its scenario.
+#[derive(Debug, Clone)]
+pub struct UpOptions {
+    /// Folder of the run folders.
+    pub runs: PathBuf,
+    /// Folder of the programs `agent`, `ego-fuser` and `sim-replay`.
+    pub programs: PathBuf,
+    /// First part of the name of a run that has none.
+    pub prefix: &'static str,
+}
+
+/// What a run has come to.
+#[derive(Debug)]
+pub struct RunResult {
+    /// Where everything is.
+    pub folder: RunFolder,
+    /// The numbers.
+    pub metrics: Metrics,
+    /// Whether every message is accounted for.
+    pub balance: Balance,
+    /// Ticks of which the ego never told anything.
+    pub missed: u64,
+    /// Someone ended it before it was over.
+    pub interrupted: bool,
+    /// Processes that did not end in time and were killed.
+    pub killed: Vec<String>,
+    /// The picture of one fused frame, where there was one to draw.
+    pub picture: Option<PathBuf>,
+}
+
+impl RunResult {
+    /// Whether data were lost beyond what the link dropped.
+    #[must_use]
+    pub fn lost_data(&self) -> bool {
+        let by_link = |reason: &str| reason.starts_with("link_");
+        let dropped = self.metrics.messages.dropped.iter().any(|(reason, count)| !by_link(reason) && *count > 0);
+        dropped || self.missed > 0 || !self.balance.is_exact()
+    }
+}
+
+/// Why a run came to nothing.
+#[derive(Debug, thiserror::Error)]
+pub enum UpError {
+    /// The scenario makes no fleet.
+    #[error(transparent)]
+    Fleet(#[from] FleetError),
+    /// The run folder cannot be used.
+    #[error(transparent)]
+    Folder(#[from] RunFolderError),
+    /// The processes cannot meet.
+    #[error(transparent)]
+    Network(#[from] BusError),
+    /// The scorer cannot work.
+    #[error("scorer: {0}")]
+    Scorer(#[from] ScorerError),
+    /// The processes cannot be started.
+    #[error(transparent)]
+    Supervise(#[from] SuperviseError),
+    /// Signals cannot be caught.
+    #[error("cannot catch Ctrl-C: {0}")]
+    Signals(std::io::Error),
+    /// A process stays down.
+    #[error("{process} {how} (log: {})", log.display())]
+    Process {
+        /// Which.
+        process: String,
+        /// How it ended.
+        how: String,
+        /// Its log.
+        log: PathBuf,
+    },
+}
+
+impl UpError {
+    /// Whether the input is at fault, and not the run.
+    #[must_use]
+    pub fn is_bad_input(&self) -> bool {
+        matches!(self, Self::Fleet(_) | Self::Folder(RunFolderError::Taken(_)))
+    }
+}
+
+/// How the watch over a run ended.
+enum Ending {
+    /// The scene is over.
+    Over,
+    /// Someone asked to end.
+    Asked,
+    /// A process stays down.
+    Failed { process: String, how: String },
+}
+
+/// Runs a scenario to its end, or until Ctrl-C.
+///
+/// # Errors
+/// [`UpError`] when the run cannot start, or a process stays down.
+pub fn up(scenario: &Scenario, options: &UpOptions) -> Result<RunResult, UpError> {
+    let fleet = Fleet::plan(scenario)?;
+    let run = fleet.scenario.run.clone().unwrap_or_else(|| name_of_now(options.prefix));
+    let folder = RunFolder::create(&options.runs, &run)?;
+    let stop = Stop::new();
+    stop.on_signals().map_err(UpError::Signals)?;
+    let fingerprint = fingerprint(&fleet, &options.programs);
+
+    let place = MeetingPlace::open(&fleet.scenario.network)?;
+    let board = Board::new(fleet.ego.clone(), fleet.ground_truth_rule(), fleet.map_values());
+    let detections = folder.file("detections.jsonl");
+    let scorer = ScorerNode::start(place.session.clone(), &run, &fleet.agents, &fleet.ego, board, detections)?;
+    let watched = watch(&fleet, &run, &place.endpoint, &options.programs, &folder, &scorer, &stop);
+    let scored = scorer.finish();
+    if let Err(overdue) = place.close() {
+        tracing::warn!("{overdue}");
+    }
+    let (ending, killed) = watched?;
+
+    let result = write(&fleet, &run, folder, scored, &ending, killed, fingerprint)?;
+    match ending {
+        Ending::Over | Ending::Asked => Ok(result),
+        Ending::Failed { process, how } => {
+            let log = result.folder.log_dir().join(format!("{process}.log"));
+            Err(UpError::Process { process, how, log })
+        }
+    }
+}
+
+/// Starts the processes, follows the run to its end, and ends the processes. Returns how it ended and who had to be
+/// killed.
+fn watch(
+    fleet: &Fleet,
+    run: &RunId,
+    endpoint: &Endpoint,
+    programs: &Path,
+    folder: &RunFolder,
+    scorer: &ScorerNode,
+    stop: &Stop,
+) -> Result<(Ending, Vec<String>), UpError> {
+    let (events, happened) = channel();
+    let specs = fleet.processes(run, endpoint.as_str(), programs);
+    let restarts = fleet.scenario.timeouts.restarts;
+    let mut display = Display::new(fleet.ticks);
+    display.say(&format!("run {run} at {endpoint}: {} processes, logs in {}", specs.len(), folder.log_dir().display()));
+    let mut supervisor = Supervisor::start(specs, &folder.log_dir(), restarts, &events)?;
+    let ending = follow(&happened, scorer, stop, &mut display);
+    let limits = Limits::of(fleet, &ending);
+    let mut killed = supervisor.end(|name| name == "replay", limits.replay).killed;
+    drain(scorer, limits.drain, &mut display);
+    killed.extend(supervisor.end(|name| name.starts_with("agent"), limits.all).killed);
+    killed.extend(supervisor.end(|_| true, limits.all).killed);
+    display.finish();
+    Ok((ending, killed))
+}
+
+/// Shows what happens until the scene is over, someone asks to end, or a process stays down.
+fn follow(happened: &Receiver<ProcessEvent>, scorer: &ScorerNode, stop: &Stop, display: &mut Display) -> Ending {
+    loop {
+        if stop.requested() {
+            display.say("ending");
+            return Ending::Asked;
+        }
+        display.update(&scorer.progress());
+        let ProcessEvent { name, what } = match happened.recv_timeout(BEAT) {
+            Ok(event) => event,
+            Err(RecvTimeoutError::Timeout) => continue,
+            // Not before the supervisor is gone, which outlives this.
+            Err(RecvTimeoutError::Disconnected) => return Ending::Asked,
+        };
+        match what {
+            Happening::Started { pid } => display.say(&format!("{name} runs (pid {pid})")),
+            Happening::Fell { how, again_after } => {
+                display.say(&format!("{name} {how}; starting it again in {:.1} s", again_after.as_secs_f64()));
+            }
+            Happening::GaveUp { how } => return Ending::Failed { process: name, how },
+            Happening::Done { data_lost } => {
+                if data_lost {
+                    display.say(&format!("{name}: some of the scene could not be played; see its log"));
+                }
+                return Ending::Over;
+            }
+        }
+    }
+}
+
+/// Moments until which each step of the end has time.
+struct Limits {
+    replay: Instant,
+    drain: Instant,
+    all: Instant,
+}
+
+impl Limits {
+    /// After Ctrl-C everything has to end within `stop_s`; a run that is over waits for its last results first.
+    fn of(fleet: &Fleet, ending: &Ending) -> Self {
+        let timeouts = &fleet.scenario.timeouts;
+        let now = Instant::now();
+        let after = |seconds: f64| now + Duration::from_secs_f64(seconds);
+        match ending {
+            Ending::Over => {
+                Self { replay: now, drain: after(timeouts.drain_s), all: after(timeouts.drain_s + timeouts.stop_s) }
+            }
+            Ending::Asked => Self {
+                replay: after(timeouts.stop_s * REPLAY_SHARE),
+                drain: after(timeouts.stop_s * DRAIN_SHARE),
+                all: after(timeouts.stop_s),
+            },
+            Ending::Failed { .. } => Self { replay: after(timeouts.stop_s), drain: now, all: after(timeouts.stop_s) },
+        }
+    }
+}
+
+/// Waits until the ego has told of every tick, or the time is over.
+fn drain(scorer: &ScorerNode, until: Instant, display: &mut Display) {
+    loop {
+        let progress: Progress = scorer.progress();
+        display.update(&progress);
+        if progress.frames >= progress.ticks || Instant::now() >= until {
+            return;
+        }
+        std::thread::sleep(BEAT.min(until.saturating_duration_since(Instant::now())));
+    }
+}
+
+/// Hashes what the run is made of while the run goes.
+fn fingerprint(fleet: &Fleet, programs: &Path) -> JoinHandle<std::io::Result<Provenance>> {
+    let (programs, weights) = (Fleet::programs(programs), fleet.scenario.models.weights.clone());
+    let scene = fleet.scene_dir.clone();
+    std::thread::spawn(move || Provenance::collect(&programs, &weights, &scene))
+}
+
+/// Writes the run folder.
+fn write(
+    fleet: &Fleet,
+    run: &RunId,
+    folder: RunFolder,
+    scored: Scored,
+    ending: &Ending,
+    killed: Vec<String>,
+    fingerprint: JoinHandle<std::io::Result<Provenance>>,
+) -> Result<RunResult, UpError> {
+    let Scored { board, books, progress } = scored;
+    let mut sum = Ledger::default();
+    for process in &books {
+        sum.merge(&process.ledger);
+    }
+    let balance = sum.balance();
+    let metrics = metrics(fleet, &board, &progress, &sum);
+    folder.write_json("metrics.json", &metrics)?;
+    folder.write_frames(board.records())?;
+    folder.write_json("ledger.json", &crate::ledger_report::LedgerReport::new(&books, &sum, &balance))?;
+    let provenance = match fingerprint.join() {
+        Ok(Ok(provenance)) => Some(provenance),
+        Ok(Err(error)) => {
+            tracing::warn!("no hashes in scenario.yaml: {error}");
+            None
+        }
+        Err(_) => None,
+    };
+    let resolved = Scenario { run: Some(run.clone()), provenance, ..fleet.scenario.clone() };
+    folder.write("scenario.yaml", &resolved.to_yaml())?;
+    let picture = crate::showcase::draw(fleet, &board, &folder.file("frame.png"));
+    let interrupted = matches!(ending, Ending::Asked);
+    Ok(RunResult { folder, metrics, balance, missed: board.missed(), interrupted, killed, picture })
+}
+
+fn metrics(fleet: &Fleet, board: &Board, progress: &Progress, sum: &Ledger) -> Metrics {
+    let total = sum.total();
+    let (ap_global, ap_frame_order) = board.average_precision();
+    Metrics {
+        frames: board.records().len() as u64,
+        seconds: progress.span.map_or(0.0, |(first, last)| last.duration_since(first).as_secs_f64()),
+        clock: "wall".into(),
+        method: fleet.scenario.method.name().into(),
+        pose_source: fleet.pose_source().into(),
+        ap_global,
+        ap_frame_order,
+        pose: board.pose_errors(),
+        latency_ms: board.latencies(),
+        comm: board.communication(),
+        messages: Messages {
+            sent: total.sent,
+            received: total.received,
+            in_flight: total.in_flight,
+            dropped: total.dropped.iter().map(|(reason, count)| (reason.to_string(), *count)).collect(),
+        },
+    }
+}
