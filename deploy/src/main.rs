@@ -1,3 +1,32 @@
-//! Command line of `deploy`.
+//! Command line of `v2vloc`.
 
-fn main() {}
+mod command;
+
+use std::process::ExitCode;
+
+use clap::Parser;
+
+/// Collaborative perception without GNSS as a distributed system: run it, judge it, look at it.
+#[derive(Debug, Parser)]
+#[command(
+    name = "v2vloc",
+    version,
+    arg_required_else_help = true,
+    after_help = "Exit codes: 0 done, 1 failed, 2 bad usage or input, 3 finished but data was lost beyond what the \
+                  link dropped."
+)]
+struct CommandLine {
+    #[command(subcommand)]
+    command: command::Command,
+}
+
+fn main() -> ExitCode {
+    sim_replay::bus::log_to_stderr();
+    match CommandLine::parse().command.run() {
+        Ok(outcome) => outcome.into(),
+        Err(error) => {
+            eprintln!("v2vloc: {error:#}");
+            command::exit_code(&error)
+        }
+    }
+}

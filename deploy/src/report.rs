@@ -9,9 +9,14 @@ use crate::up::RunResult;
 /// A run as a table: what was found, how fast, at which price.
 #[must_use]
 pub fn run_table(result: &RunResult) -> String {
-    let metrics = &result.metrics;
-    let mut text = table(std::slice::from_ref(metrics));
-    let messages = &metrics.messages;
+    table(std::slice::from_ref(&result.metrics)) + &run_notes(result)
+}
+
+/// What there is to say of one run below its line in the table.
+#[must_use]
+pub fn run_notes(result: &RunResult) -> String {
+    let mut text = String::new();
+    let messages = &result.metrics.messages;
     // Writing to a string cannot fail.
     let _ = writeln!(
         text,

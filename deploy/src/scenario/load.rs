@@ -72,7 +72,11 @@ impl Scenario {
         serde_saphyr::to_string(self).expect("plain structs, texts and numbers")
     }
 
-    fn read(path: &Path) -> Result<Self, ScenarioError> {
+    /// Reads a scenario without checking it: for callers that fill in or replace some of it first.
+    ///
+    /// # Errors
+    /// [`ScenarioError`] when the file cannot be read or is no scenario.
+    pub fn read(path: &Path) -> Result<Self, ScenarioError> {
         let unreadable = |source| ScenarioError::Read { path: path.into(), source };
         let size = std::fs::metadata(path).map_err(unreadable)?.len();
         if size > MAX_BYTES {
@@ -249,5 +253,20 @@ mod tests {
         scenario.agents.publish = Some(Publish::Boxes);
         scenario.agents.pose = PoseSource::Noisy(super::super::PoseNoise::default());
         assert_eq!(parse(&scenario.to_yaml()).unwrap(), scenario);
+    }
+
+    #[test]
+    fn the_samples_are_scenarios_and_say_what_the_defaults_are() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("scenarios");
+        let samples: Vec<_> = std::fs::read_dir(&folder).unwrap().map(|entry| entry.unwrap().path()).collect();
+        assert!(samples.len() >= 2, "{samples:?}");
+        for sample in samples {
+            Scenario::read(&sample).unwrap();
+        }
+        let demo = Scenario::read(&folder.join("demo.yaml")).unwrap();
+        let mut plain = parse(SMALL).unwrap();
+        (plain.scene.dir, plain.models.weights) = (demo.scene.dir.clone(), demo.models.weights.clone());
+        plain.agents.codec.dtype = Dtype::F16;
+        assert_eq!(demo, plain);
     }
 }

@@ -1,0 +1,134 @@
+//! `v2vloc demo`.
+
+use std::path::PathBuf;
+use std::time::Instant;
+
+use anyhow::Context;
+use deploy::report;
+use deploy::run_folder::name_of_now;
+use deploy::scenario::Scenario;
+use deploy::up::{RunResult, UpOptions, up};
+use ego_fuser::Method;
+use protocol::RunId;
+use sim_replay::synth::{self, Subset, SynthError, SynthOptions};
+
+use super::{BadInput, Outcome, programs};
+
+/// Seeds from here on are never trained with.
+const SEED: u64 = 1000;
+/// The scenario of the demo, in the checkout that this program was built from.
+const SCENARIO: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/scenarios/demo.yaml");
+
+#[derive(Debug, clap::Args)]
+pub(crate) struct Arguments {
+    /// The scenario to run on the generated scene.
+    #[arg(long, default_value = SCENARIO, hide_default_value = true)]
+    scenario: PathBuf,
+    /// Folder of the generated scenes; one that is there already is used again.
+    #[arg(long, default_value = "scenes")]
+    scenes: PathBuf,
+    /// Folder of the run folders.
+    #[arg(long, default_value = "runs")]
+    runs: PathBuf,
+    /// Name of the run [default: the time]. With several methods each appends its own.
+    #[arg(long)]
+    name: Option<RunId>,
+    /// Seed of the scene; below 1000 are scenes that the detector may have been trained with.
+    #[arg(long, default_value_t = SEED)]
+    seed: u64,
+    /// Frames of the scene, at 10 Hz.
+    #[arg(long, default_value_t = 60)]
+    frames: usize,
+    /// Vehicles that connect, 2 to 4.
+    #[arg(long, default_value_t = 2, value_parser = clap::value_parser!(u8).range(2..=4))]
+    agents: u8,
+    /// Fusion methods, one run each.
+    #[arg(long, value_delimiter = ',', default_values_t = [Method::None, Method::Late, Method::Attention])]
+    methods: Vec<Method>,
+    /// Print the metrics of the last method's run as JSON instead of a table of all.
+    #[arg(long)]
+    json: bool,
+}
+
+impl Arguments {
+    /// Generates, runs, prints.
+    pub(crate) fn run(self) -> anyhow::Result<Outcome> {
+        let mut scenario = Scenario::read(&self.scenario)?;
+        scenario.scene.dir = self.scene()?;
+        let name = self.name.clone().unwrap_or_else(|| name_of_now("demo"));
+        let mut results = Vec::new();
+        for &method in &self.methods {
+            scenario.method = method;
+            scenario.run = Some(RunId::new(&format!("{name}-{method}")).map_err(|error| BadInput(error.to_string()))?);
+            scenario.check(&self.scenario)?;
+            let options = UpOptions { runs: self.runs.clone(), programs: programs()?, prefix: "demo" };
+            let result = up(&scenario, &options).with_context(|| format!("method {method}"))?;
+            let interrupted = result.interrupted;
+            results.push(result);
+            if interrupted {
+                break;
+            }
+        }
+        self.print(&results)?;
+        Ok(Outcome::of(results.iter().any(RunResult::lost_data)))
+    }
+
+    /// The scene's folder, generated if it is not there.
+    fn scene(&self) -> anyhow::Result<PathBuf> {
+        let scenes = std::path::absolute(&self.scenes)?;
+        let name = format!("v2vdet-{}-{}x{}", self.seed, self.agents, self.frames);
+        let folder = scenes.join(&name);
+        if folder.is_dir() {
+            return Ok(folder);
+        }
+        eprintln!(
+            "generating {} frames of {} vehicles (seed {}) into {}",
+            self.frames,
+            self.agents,
+            self.seed,
+            folder.display()
+        );
+        let began = Instant::now();
+        // Under its name only when it is whole: a run that is cut off must not leave half a scene to the next one.
+        let unfinished = scenes.join(format!("{name}.unfinished"));
+        generate(&self.options(unfinished.clone()))?;
+        std::fs::rename(&unfinished, &folder).with_context(|| format!("keeping {}", folder.display()))?;
+        eprintln!("generated in {:.1} s", began.elapsed().as_secs_f64());
+        Ok(folder)
+    }
+
+    fn options(&self, out: PathBuf) -> SynthOptions {
+        let agents = usize::from(self.agents);
+        SynthOptions {
+            frames: self.frames,
+            agents: agents..=agents,
+            threads: std::thread::available_parallelism().map_or(1, usize::from),
+            force: true,
+            ..SynthOptions::new(Subset::V2vdet, self.seed, out)
+        }
+    }
+
+    fn print(&self, results: &[RunResult]) -> anyhow::Result<()> {
+        let Some(last) = results.last() else { return Ok(()) };
+        if self.json {
+            println!("{}", serde_json::to_string_pretty(&last.metrics)?);
+            return Ok(());
+        }
+        let metrics: Vec<_> = results.iter().map(|result| result.metrics.clone()).collect();
+        print!("{}", report::table(&metrics));
+        print!("{}", report::run_notes(last));
+        Ok(())
+    }
+}
+
+/// Generates a scene with a progress bar.
+fn generate(options: &SynthOptions) -> anyhow::Result<()> {
+    let bar = indicatif::ProgressBar::new(1000 * options.scenarios() as u64);
+    let generated = synth::generate(options, &|thousandths| bar.set_position(thousandths));
+    bar.finish_and_clear();
+    match generated {
+        Ok(_) => Ok(()),
+        Err(error @ (SynthError::Write { .. } | SynthError::Alone { .. })) => Err(error.into()),
+        Err(error) => Err(BadInput(error.to_string()).into()),
+    }
+}

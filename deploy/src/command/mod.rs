@@ -1,0 +1,77 @@
+//! One file per subcommand: its arguments, and the call into the library.
+
+mod demo;
+mod up;
+
+use std::path::PathBuf;
+use std::process::ExitCode;
+
+use anyhow::Context;
+use deploy::fleet::FleetError;
+use deploy::scenario::ScenarioError;
+use deploy::up::UpError;
+
+/// What `v2vloc` can be asked to do.
+#[derive(Debug, clap::Subcommand)]
+pub(crate) enum Command {
+    /// Generate a scene if there is none, run a fleet over it, print what came of it.
+    Demo(demo::Arguments),
+    /// Start a fleet: processes, scene, models, network; Ctrl-C ends it.
+    Up(up::Arguments),
+}
+
+impl Command {
+    /// Does what was asked.
+    pub(crate) fn run(self) -> anyhow::Result<Outcome> {
+        match self {
+            Self::Demo(arguments) => arguments.run(),
+            Self::Up(arguments) => arguments.run(),
+        }
+    }
+}
+
+/// How a command that did not fail ended.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Outcome {
+    /// All went well.
+    Done,
+    /// Finished, but data was lost beyond what the link dropped.
+    DataLost,
+}
+
+impl Outcome {
+    pub(crate) fn of(lost_data: bool) -> Self {
+        if lost_data { Self::DataLost } else { Self::Done }
+    }
+}
+
+impl From<Outcome> for ExitCode {
+    fn from(outcome: Outcome) -> Self {
+        match outcome {
+            Outcome::Done => Self::SUCCESS,
+            Outcome::DataLost => Self::from(3),
+        }
+    }
+}
+
+/// Usage or input at fault, and not the program.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+pub(crate) struct BadInput(pub(crate) String);
+
+/// Exit code of a failed command: 2 for bad usage or input, 1 otherwise.
+pub(crate) fn exit_code(error: &anyhow::Error) -> ExitCode {
+    let is_bad_input = error.chain().any(|cause| {
+        cause.is::<BadInput>()
+            || cause.is::<ScenarioError>()
+            || cause.is::<FleetError>()
+            || cause.downcast_ref::<UpError>().is_some_and(UpError::is_bad_input)
+    });
+    if is_bad_input { ExitCode::from(2) } else { ExitCode::FAILURE }
+}
+
+/// The folder of the programs: they are built and installed together.
+pub(crate) fn programs() -> anyhow::Result<PathBuf> {
+    let own = std::env::current_exe().context("where this program lies")?;
+    Ok(own.parent().context("this program lies nowhere")?.to_path_buf())
+}

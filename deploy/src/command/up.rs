@@ -1,0 +1,50 @@
+//! `v2vloc up`.
+
+use std::path::PathBuf;
+
+use deploy::report;
+use deploy::scenario::Scenario;
+use deploy::up::{UpOptions, up};
+use ego_fuser::Method;
+use protocol::RunId;
+
+use super::{Outcome, programs};
+
+#[derive(Debug, clap::Args)]
+pub(crate) struct Arguments {
+    /// The scenario; deploy/scenarios holds commented samples.
+    scenario: PathBuf,
+    /// Name of the run, 1 to 32 characters of a-z, 0-9, '_' and '-' [default: the scenario's, else the time].
+    #[arg(long)]
+    name: Option<RunId>,
+    /// Folder of the run folders.
+    #[arg(long, default_value = "runs")]
+    runs: PathBuf,
+    /// Fusion method in place of the scenario's: none, late, early, max, attention.
+    #[arg(long)]
+    method: Option<Method>,
+    /// Ticks to play in place of the scenario's.
+    #[arg(long)]
+    frames: Option<usize>,
+    /// Print metrics.json instead of a table.
+    #[arg(long)]
+    json: bool,
+}
+
+impl Arguments {
+    /// Runs the scenario and prints what came of it.
+    pub(crate) fn run(self) -> anyhow::Result<Outcome> {
+        let mut scenario = Scenario::load(&self.scenario)?;
+        scenario.run = self.name.or(scenario.run);
+        scenario.method = self.method.unwrap_or(scenario.method);
+        scenario.scene.frames = self.frames.or(scenario.scene.frames);
+        scenario.check(&self.scenario)?;
+        let result = up(&scenario, &UpOptions { runs: self.runs, programs: programs()?, prefix: "up" })?;
+        if self.json {
+            println!("{}", serde_json::to_string_pretty(&result.metrics)?);
+        } else {
+            print!("{}", report::run_table(&result));
+        }
+        Ok(Outcome::of(result.lost_data()))
+    }
+}
