@@ -17,11 +17,11 @@ use tch::{Kind, TchError, Tensor};
 pub fn attend_ego(maps: &Tensor, valid: Option<&Tensor>) -> Result<Tensor, TchError> {
     let (_, channels, _, _) = maps.size4()?;
     let query = maps.f_narrow(0, 0, 1)?;
-    let mut scores = (maps * query).f_sum_dim_intlist([1_i64].as_slice(), false, Kind::Float)?;
-    scores = scores / (channels as f64).sqrt();
-    if let Some(valid) = valid {
-        scores = scores.f_masked_fill(&valid.f_logical_not()?, f64::NEG_INFINITY)?;
-    }
+    let scores = (maps * query).f_sum_dim_intlist([1_i64].as_slice(), false, Kind::Float)? / (channels as f64).sqrt();
+    let scores = match valid {
+        Some(valid) => scores.f_masked_fill(&valid.f_logical_not()?, f64::NEG_INFINITY)?,
+        None => scores,
+    };
     let weights = scores.f_softmax(0, Kind::Float)?.f_unsqueeze(1)?;
     (maps * weights).f_sum_dim_intlist([0_i64].as_slice(), false, Kind::Float)
 }

@@ -32,7 +32,6 @@ impl BevBackbone {
     }
 
     /// `[N, C, H, W]` to the concatenated levels `[N, sum of C_up, H', W']`.
-    #[must_use]
     pub fn forward(&self, x: &Tensor, train: bool) -> Tensor {
         let unfused = |level: &Tensor| Ok(level.shallow_clone());
         self.run(x, train, unfused).expect("a backbone without fusion has no shape from outside")

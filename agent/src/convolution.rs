@@ -51,7 +51,6 @@ impl Norm {
     }
 
     /// Normalises `[N, C]` or `[N, C, H, W]`; with `train` by the statistics of this batch, which enter the running ones.
-    #[must_use]
     pub fn forward(&self, x: &Tensor, train: bool) -> Tensor {
         let (weight, bias) = (Some(&self.weight), Some(&self.bias));
         let (mean, var) = (Some(&self.running_mean), Some(&self.running_var));
@@ -59,13 +58,11 @@ impl Norm {
     }
 
     /// Shift `[C]` that is learnt.
-    #[must_use]
     pub fn bias(&self) -> &Tensor {
         &self.bias
     }
 
     /// What the norm does with the running statistics: `x * scale + shift`, both `[C]`.
-    #[must_use]
     pub fn scale_shift(&self) -> (Tensor, Tensor) {
         let scale = &self.weight / (&self.running_var + self.eps).sqrt();
         let shift = &self.bias - &self.running_mean * &scale;
@@ -138,7 +135,6 @@ impl ConvLayer {
     ///
     /// The convolution is computed in the precision of `x`; the parameters stay `f32`, and so do the statistics of the
     /// norm.
-    #[must_use]
     pub fn forward(&self, x: &Tensor, train: bool) -> Tensor {
         let (stride, padding) = ([self.stride; 2], [self.padding; 2]);
         // In f32 both are the parameters themselves: a conversion to the same kind copies nothing.
@@ -160,24 +156,22 @@ impl ConvLayer {
     #[must_use]
     pub fn folded(&self) -> Self {
         let output_dim = if self.direction == Direction::Down { 0 } else { 1 };
-        let mut weight = self.weight.detach();
-        let mut bias = self.bias.as_ref().map(Tensor::detach);
-        if let Some(norm) = &self.norm {
-            let (scale, shift) = norm.scale_shift();
-            let mut shape = [1_i64; 4];
-            shape[output_dim] = -1;
-            weight = weight * scale.view(shape);
-            bias = Some(match bias {
-                Some(bias) => bias * scale + shift,
-                None => shift,
-            });
-        }
+        let bias = self.bias.as_ref().map(Tensor::detach);
+        let (weight, bias) = match &self.norm {
+            None => (self.weight.detach(), bias),
+            Some(norm) => {
+                let (scale, shift) = norm.scale_shift();
+                let mut shape = [1_i64; 4];
+                shape[output_dim] = -1;
+                let shift = bias.map_or_else(|| shift.shallow_clone(), |bias| bias * &scale + &shift);
+                (&self.weight * scale.view(shape), Some(shift))
+            }
+        };
         Self { weight: channels_last(&weight.detach()), bias: bias.map(|bias| bias.detach()), norm: None, ..*self }
     }
 }
 
 /// The same values with the channels innermost in memory.
-#[must_use]
 pub fn channels_last(x: &Tensor) -> Tensor {
     x.permute([0, 2, 3, 1]).contiguous().permute([0, 3, 1, 2])
 }

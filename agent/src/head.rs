@@ -54,7 +54,6 @@ impl DetectionHead {
 
 impl HeadOutput {
     /// How sure the head is that a vehicle stands around each cell: `[B, H, W]`, 0..1, the best of its anchors.
-    #[must_use]
     pub fn confidence(&self) -> Tensor {
         self.scores.amax([1], false).sigmoid().to_kind(Kind::Float)
     }

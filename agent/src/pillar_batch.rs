@@ -123,7 +123,6 @@ impl PillarBatch {
     /// - `rows`: `[M, C]`
     /// - returns: `[B, C, H, W]`, zero where no pillar stands; channels are innermost in memory, the layout that
     ///   convolutions on a CPU read fastest
-    #[must_use]
     pub fn scatter(&self, rows: &Tensor, lattice: &PillarLattice) -> Tensor {
         let (height, width) = (lattice.height as i64, lattice.width as i64);
         let channels = rows.size()[1];

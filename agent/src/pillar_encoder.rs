@@ -28,7 +28,6 @@ impl PillarEncoder {
     }
 
     /// Features of every pillar: `[M, C]`.
-    #[must_use]
     pub fn forward(&self, batch: &PillarBatch, train: bool) -> Tensor {
         let points = batch.points();
         let zero_row = batch.features.new_zeros([1, POINT_FEATURES as i64], (batch.features.kind(), batch.device()));
@@ -40,7 +39,6 @@ impl PillarEncoder {
     }
 
     /// The linear layer with the running statistics folded in: weight `[C, 10]`, bias `[C]`.
-    #[must_use]
     pub fn folded(&self) -> (Tensor, Tensor) {
         let (scale, shift) = self.norm.scale_shift();
         ((&self.linear * scale.unsqueeze(1)).detach(), shift.detach())

@@ -59,14 +59,12 @@ impl PointPillars {
     }
 
     /// The map of every sweep that crosses the air: `[B, C, H, W]`, before the compressor.
-    #[must_use]
     pub fn features(&self, batch: &PillarBatch, train: bool) -> Tensor {
         let canvas = batch.scatter(&self.encoder.forward(batch, train), &self.lattice);
         self.features_of_canvas(&canvas, train)
     }
 
     /// From the canvas `[B, C_pillar, H, W]` on: backbone and shrink, `f32`.
-    #[must_use]
     pub fn features_of_canvas(&self, canvas: &Tensor, train: bool) -> Tensor {
         let wide = self.backbone.forward(&canvas.to_kind(self.compute), train);
         let features = match &self.shrink {
@@ -77,7 +75,6 @@ impl PointPillars {
     }
 
     /// What the compressor loses: `[B, C, H, W]` squeezed and widened again; unchanged without a compressor.
-    #[must_use]
     pub fn through_compressor(&self, features: &Tensor, train: bool) -> Tensor {
         match &self.compressor {
             Some(compressor) => compressor.decode(&compressor.encode(features, train), train),

@@ -30,7 +30,6 @@ impl Shrink {
     }
 
     /// `[N, C_in, H, W]` to `[N, C, H', W']`.
-    #[must_use]
     pub fn forward(&self, x: &Tensor, train: bool) -> Tensor {
         chain(&self.layers, x, train)
     }
@@ -66,13 +65,11 @@ impl Compressor {
     }
 
     /// `[N, C, H, W]` to the code `[N, C / ratio, H, W]`.
-    #[must_use]
     pub fn encode(&self, x: &Tensor, train: bool) -> Tensor {
         self.encoder.forward(x, train)
     }
 
     /// The code back to `[N, C, H, W]`.
-    #[must_use]
     pub fn decode(&self, code: &Tensor, train: bool) -> Tensor {
         chain(&self.decoder, code, train)
     }
