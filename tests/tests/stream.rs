@@ -1,0 +1,262 @@
+//! Scenes as live traffic: order, pace, steering, what is missing, what is unreadable.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use protocol::{CavId, Control, Gnss, Lidar, Limits, Stream, Topic, Truth};
+use sim_replay::bus::shutdown::Stop;
+use sim_replay::bus::{Bus, Event, Inbox, Subscription, mailbox::Taken};
+use sim_replay::dataset::{self, Scenario};
+use sim_replay::stream::{Replay, StreamError, StreamOptions, StreamReport};
+use tests::bus::{PATIENCE, TestRouter, next_event};
+use tests::scene;
+
+const AGENTS: [&str; 2] = ["10", "20"];
+
+fn scenario(dir: &Path) -> Scenario {
+    dataset::open(dir).unwrap().scenarios.remove(0)
+}
+
+fn topic(cav: &str, stream: Stream) -> Topic {
+    Topic::Stream { cav: CavId::new(cav).unwrap(), stream }
+}
+
+/// Listens to everything a replay publishes, under the names of the agents it waits for.
+struct Listener {
+    buses: Vec<Bus>,
+    inbox: Arc<Inbox>,
+    _subscriptions: Vec<Subscription>,
+}
+
+impl Listener {
+    fn new(router: &TestRouter) -> Self {
+        let buses: Vec<Bus> = AGENTS.iter().map(|cav| router.join(&format!("agent-{cav}"), cav)).collect();
+        let inbox = buses[0].inbox(1000, 16);
+        let mut subscriptions = vec![buses[0].subscribe(Topic::Truth, &inbox).unwrap()];
+        for (bus, cav) in buses.iter().zip(AGENTS) {
+            for stream in [Stream::Lidar, Stream::Gnss] {
+                subscriptions.push(bus.subscribe(topic(cav, stream), &inbox).unwrap());
+            }
+        }
+        Self { buses, inbox, _subscriptions: subscriptions }
+    }
+
+    /// Capture times by topic, once every topic has ended.
+    fn captures(&self) -> BTreeMap<Topic, Vec<u64>> {
+        let mut captures: BTreeMap<Topic, Vec<u64>> = BTreeMap::new();
+        let mut ended = 0;
+        while ended < 5 {
+            match next_event(&self.inbox) {
+                (topic, Event::Message(arrival)) => {
+                    captures.entry(topic).or_default().push(arrival.header.stamp.capture_nanos);
+                }
+                (_, Event::End { .. }) => ended += 1,
+            }
+        }
+        captures
+    }
+}
+
+fn play(router: &TestRouter, scenario: &Scenario, options: StreamOptions) -> StreamReport {
+    let bus = router.join("replay", "replay");
+    let replay = Replay::prepare(&bus, scenario, options, &Stop::new()).unwrap();
+    replay.wait_until_ready().unwrap();
+    let report = replay.play();
+    bus.leave(PATIENCE).unwrap();
+    report
+}
+
+#[test]
+fn every_tick_reaches_every_agent_in_order() {
+    let folder = tempfile::tempdir().unwrap();
+    scene::write(folder.path(), &AGENTS, 6);
+    let (router, scenario) = (TestRouter::open(), scenario(folder.path()));
+    let listener = Listener::new(&router);
+    let report = play(&router, &scenario, StreamOptions { rate: 0.0, ..StreamOptions::default() });
+    let recorded: Vec<u64> = scenario.ticks.iter().map(|tick| tick.capture_nanos).collect();
+    let captures = listener.captures();
+    assert_eq!(captures.len(), 5);
+    for (topic, captures) in captures {
+        assert_eq!(captures, recorded, "{topic}");
+    }
+    assert_eq!((report.ticks, report.unreadable_frames), (6, 0));
+    assert!(report.sent.iter().all(|count| count.messages == 6) && report.is_complete());
+}
+
+#[test]
+fn what_is_published_is_what_was_recorded() {
+    let folder = tempfile::tempdir().unwrap();
+    scene::write(folder.path(), &AGENTS, 1);
+    let (router, scenario) = (TestRouter::open(), scenario(folder.path()));
+    let listener = Listener::new(&router);
+    play(&router, &scenario, StreamOptions::default());
+    let frame = scenario.load(1, 0, &dataset::LoadOptions::default()).unwrap();
+    let (mut seen, books) = (0, &listener.inbox);
+    while seen < 3 {
+        let (found, Event::Message(arrival)) = next_event(&listener.inbox) else { continue };
+        if found == topic("20", Stream::Lidar) {
+            assert_eq!(books.decode::<Lidar>(&arrival, &Limits::DEFAULT).unwrap().points, frame.points);
+            seen += 1;
+        } else if found == topic("20", Stream::Gnss) {
+            let gnss: Gnss = books.decode(&arrival, &Limits::DEFAULT).unwrap();
+            assert_eq!(Some(gnss.world_from_lidar), frame.world_from_lidar);
+            seen += 1;
+        } else if found == Topic::Truth {
+            let truth: Truth = books.decode(&arrival, &Limits::DEFAULT).unwrap();
+            assert_eq!(truth.agents.len(), 2);
+            assert_eq!(truth.agents[1].objects.len(), frame.objects.len());
+            assert_eq!(truth.agents[1].objects[0].class, "car");
+            seen += 1;
+        }
+    }
+}
+
+#[test]
+fn the_pace_is_the_recorded_one_times_the_rate() {
+    let folder = tempfile::tempdir().unwrap();
+    scene::write(folder.path(), &AGENTS, 11);
+    let (router, scenario) = (TestRouter::open(), scenario(folder.path()));
+    let listener = Listener::new(&router);
+    let report = play(&router, &scenario, StreamOptions { rate: 2.0, ..StreamOptions::default() });
+    // Ten steps of 100 ms at twice the speed.
+    assert!((0.5..1.5).contains(&report.seconds), "{} s", report.seconds);
+    assert_eq!(listener.captures()[&Topic::Truth].len(), 11);
+}
+
+#[test]
+fn pause_step_seek_and_resume_steer_the_clock() {
+    let folder = tempfile::tempdir().unwrap();
+    scene::write(folder.path(), &AGENTS, 8);
+    let (router, scenario) = (TestRouter::open(), scenario(folder.path()));
+    let listener = Listener::new(&router);
+    let operator = router.join("operator", "operator");
+    let next_truth = || loop {
+        if let (Topic::Truth, Event::Message(arrival)) = next_event(&listener.inbox) {
+            let truth: Truth = listener.inbox.decode(&arrival, &Limits::DEFAULT).unwrap();
+            return (truth.frame_index, arrival.header.stamp.capture_nanos);
+        }
+    };
+    std::thread::scope(|scope| {
+        let playing = scope.spawn(|| {
+            let bus = router.join("replay", "replay");
+            let replay = Replay::prepare(&bus, &scenario, StreamOptions::default(), &Stop::new()).unwrap();
+            // Its subscriptions stand: what is said from here on is heard.
+            operator.say(Control::Pause, 0);
+            operator.say(Control::Step { ticks: 2 }, 0);
+            replay.wait_until_ready().unwrap();
+            let report = replay.play();
+            bus.leave(PATIENCE).unwrap();
+            report
+        });
+        let first = next_truth();
+        let mut seen = vec![first.0];
+        while seen.len() < 2 {
+            seen.push(next_truth().0);
+        }
+        let recorded = scenario.ticks.iter().map(|tick| tick.capture_nanos).collect::<Vec<_>>();
+        operator.say(Control::Seek { frame_index: 6 }, 0);
+        operator.say(Control::Step { ticks: 1 }, 0);
+        // Anything but tick 6 can only be one that ran before the pause arrived.
+        let (index, capture) = loop {
+            let (index, capture) = next_truth();
+            if index == 6 {
+                break (index, capture);
+            }
+            assert!(index < 6);
+        };
+        assert_eq!((index, capture), (6, recorded[6]));
+        operator.say(Control::Seek { frame_index: 99 }, 0);
+        operator.say(Control::Seek { frame_index: 1 }, 0);
+        operator.say(Control::Resume, 0);
+        let (index, capture) = next_truth();
+        assert_eq!(index, 1);
+        assert!(capture > recorded[6], "time goes on over a jump back");
+        let report = playing.join().unwrap();
+        assert!(report.ticks >= 2 + 1 + 7, "{} ticks", report.ticks);
+    });
+}
+
+#[test]
+fn an_agent_that_does_not_come_is_named() {
+    let folder = tempfile::tempdir().unwrap();
+    scene::write(folder.path(), &AGENTS, 1);
+    let (router, scenario) = (TestRouter::open(), scenario(folder.path()));
+    let agent = router.join("agent-10", "10");
+    let inbox = agent.inbox(8, 8);
+    let _subscriptions =
+        [Stream::Lidar, Stream::Gnss].map(|stream| agent.subscribe(topic("10", stream), &inbox).unwrap());
+    let bus = router.join("replay", "replay");
+    let options = StreamOptions { patience: Duration::from_millis(400), ..StreamOptions::default() };
+    let replay = Replay::prepare(&bus, &scenario, options, &Stop::new()).unwrap();
+    let error = replay.wait_until_ready().unwrap_err().to_string();
+    assert!(error.contains("20/lidar>agent-20, 20/gnss>agent-20") && !error.contains("10/"), "{error}");
+}
+
+#[test]
+fn what_the_scene_does_not_have_is_named() {
+    let folder = tempfile::tempdir().unwrap();
+    scene::write(folder.path(), &AGENTS, 2);
+    let (router, scenario) = (TestRouter::open(), scenario(folder.path()));
+    let bus = router.join("replay", "replay");
+    let refused = |options| Replay::prepare(&bus, &scenario, options, &Stop::new()).err().unwrap();
+    let error = refused(StreamOptions { agents: vec![CavId::new("30").unwrap()], ..StreamOptions::default() });
+    assert!(error.to_string().contains("no agent 30; it has 10, 20"), "{error}");
+    let error = refused(StreamOptions { seek: 2, ..StreamOptions::default() });
+    assert!(matches!(error, StreamError::NoTick { asked: 2, ticks: 2, .. }), "{error}");
+    assert!(matches!(refused(StreamOptions { rate: f64::NAN, ..StreamOptions::default() }), StreamError::Rate(_)));
+}
+
+#[test]
+fn an_unreadable_frame_is_named_and_the_rest_goes_on() {
+    let folder = tempfile::tempdir().unwrap();
+    scene::write(folder.path(), &AGENTS, 3);
+    let broken = folder.path().join("scene/20/000062.pcd");
+    let bytes = std::fs::read(&broken).unwrap();
+    std::fs::write(&broken, &bytes[..bytes.len() / 2]).unwrap();
+    let (router, scenario) = (TestRouter::open(), scenario(folder.path()));
+    let listener = Listener::new(&router);
+    let report = play(&router, &scenario, StreamOptions { rate: 0.0, ..StreamOptions::default() });
+    assert_eq!((report.ticks, report.unreadable_frames, report.is_complete()), (3, 1, false));
+    assert!(report.unreadable[0].error.contains("000062.pcd"), "{}", report.unreadable[0].error);
+    let captures = listener.captures();
+    assert_eq!(captures[&topic("10", Stream::Lidar)].len(), 3);
+    assert_eq!(captures[&topic("20", Stream::Lidar)].len(), 2);
+    assert_eq!(captures[&Topic::Truth].len(), 3);
+}
+
+#[test]
+fn a_request_to_stop_ends_a_loop_without_end() {
+    let folder = tempfile::tempdir().unwrap();
+    scene::write(folder.path(), &AGENTS, 2);
+    let (router, scenario) = (TestRouter::open(), scenario(folder.path()));
+    let listener = Listener::new(&router);
+    let stop = Stop::new();
+    let bus = router.join("replay", "replay");
+    let options = StreamOptions { repeats: true, rate: 10.0, ..StreamOptions::default() };
+    let replay = Replay::prepare(&bus, &scenario, options, &stop).unwrap();
+    replay.wait_until_ready().unwrap();
+    let report = std::thread::scope(|scope| {
+        let playing = scope.spawn(|| replay.play());
+        let mut truths = 0;
+        while truths < 5 {
+            truths += u32::from(matches!(next_event(&listener.inbox), (Topic::Truth, Event::Message(_))));
+        }
+        let asked = Instant::now();
+        stop.request();
+        let report = playing.join().unwrap();
+        assert!(asked.elapsed() < Duration::from_secs(5));
+        report
+    });
+    assert!(report.ticks >= 5);
+    // Capture times rise over every loop.
+    let mut last = 0;
+    while let Taken::Item(found, event) = listener.inbox.take(Some(Instant::now() + Duration::from_millis(200))) {
+        if let (Topic::Truth, Event::Message(arrival)) = (found, event) {
+            assert!(arrival.header.stamp.capture_nanos > last);
+            last = arrival.header.stamp.capture_nanos;
+        }
+    }
+    assert_eq!(listener.buses.len(), 2);
+}
