@@ -1,7 +1,7 @@
 //! A 2D convolution with what follows it: batch norm and ReLU.
 
-use tch::Tensor;
 use tch::nn::{self, BatchNormConfig, Init};
+use tch::{TchError, Tensor};
 
 /// Epsilon of every batch norm of PointPillars.
 pub const NORM_EPS: f64 = 1e-3;
@@ -151,6 +151,27 @@ impl ConvLayer {
         if self.relu { x.relu_() } else { x }
     }
 
+    /// [`Self::forward`] of one map in inference, the result contiguous as `[1, C_out, H', W']`.
+    ///
+    /// A 1x1 layer is one matrix product, whose result can be written in either order at no cost, while turning a
+    /// finished map around takes longer than computing it.
+    ///
+    /// # Errors
+    /// The tensor library's.
+    pub fn forward_contiguous(&self, x: &Tensor) -> Result<Tensor, TchError> {
+        let (batch, input, height, width) = x.size4()?;
+        let kernel = self.weight.size();
+        let pointwise = batch == 1 && kernel[2..] == [1, 1] && self.stride == 1 && self.direction == Direction::Down;
+        let (true, Some(bias), None) = (pointwise, &self.bias, &self.norm) else {
+            return self.forward(x, false).f_contiguous();
+        };
+        let cells = x.f_permute([0, 2, 3, 1])?.f_reshape([height * width, input])?;
+        let weight = self.weight.f_reshape([kernel[0], input])?;
+        let mut rows = bias.f_unsqueeze(1)?.f_addmm(&weight, &cells.f_tr()?)?;
+        let rows = if self.relu { rows.f_relu_()? } else { rows };
+        rows.f_view([1, kernel[0], height, width])
+    }
+
     /// The same layer for inference: the norm's running statistics go into weight and bias, so one pass over the map
     /// is saved; weights lie channels-last, as the maps do.
     #[must_use]
@@ -174,4 +195,38 @@ impl ConvLayer {
 /// The same values with the channels innermost in memory.
 pub fn channels_last(x: &Tensor) -> Tensor {
     x.permute([0, 2, 3, 1]).contiguous().permute([0, 3, 1, 2])
+}
+
+#[cfg(test)]
+mod tests {
+    use tch::nn::VarStore;
+    use tch::{Device, Kind};
+
+    use super::*;
+
+    #[test]
+    fn folded_and_contiguous_layers_compute_the_same() {
+        tch::set_num_threads(1);
+        tch::manual_seed(2);
+        let network = VarStore::new(Device::Cpu);
+        let root = network.root();
+        let layers = [
+            ConvLayer::normed(&(&root / "a"), &(&root / "an"), [12, 20], 1, 1),
+            ConvLayer::normed(&(&root / "b"), &(&root / "bn"), [12, 20], 3, 2),
+            ConvLayer::upsampling(&(&root / "c"), &(&root / "cn"), [12, 20], 4),
+            ConvLayer::biased(&(&root / "d"), [12, 20], 1, 1).with_norm(&(&root / "dn"), 20),
+        ];
+        for (name, mut variable) in network.variables() {
+            let low = if name.contains("var") { 0.3 } else { -0.5 };
+            let _ = tch::no_grad(|| variable.uniform_(low, 0.9));
+        }
+        let x = channels_last(&Tensor::randn([1, 12, 8, 6], (Kind::Float, Device::Cpu)));
+        for (index, layer) in layers.iter().enumerate() {
+            let expected = tch::no_grad(|| layer.forward(&x, false));
+            let folded = tch::no_grad(|| layer.folded());
+            let contiguous = folded.forward_contiguous(&x).unwrap();
+            assert!(folded.forward(&x, false).allclose(&expected, 1e-5, 1e-5, false), "{index}");
+            assert!(contiguous.is_contiguous() && contiguous.allclose(&expected, 1e-5, 1e-5, false), "{index}");
+        }
+    }
 }

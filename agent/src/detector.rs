@@ -220,10 +220,9 @@ impl Detector {
         let features = tch::no_grad(|| {
             let wide = self.backbone.forward(&canvas, false);
             match &self.shrink {
-                Some(shrink) => shrink.forward(&wide, false),
-                None => wide,
+                Some(shrink) => shrink.forward_contiguous(&wide),
+                None => wide.f_contiguous(),
             }
-            .f_contiguous()
         })?;
         let times = EncodeTimes { voxelise, pillars: pillar_time, backbone: clock.lap() };
         Ok(Encoded { features, points: self.cropped.len(), pillars: pillars.len(), times })

@@ -1,6 +1,6 @@
 //! From the wide backbone map to the one that crosses the air, and a learnt compressor of its channels.
 
-use tch::{Tensor, nn};
+use tch::{TchError, Tensor, nn};
 
 use crate::convolution::ConvLayer;
 use crate::model_config::ShrinkConfig;
@@ -32,6 +32,17 @@ impl Shrink {
     /// `[N, C_in, H, W]` to `[N, C, H', W']`.
     pub fn forward(&self, x: &Tensor, train: bool) -> Tensor {
         chain(&self.layers, x, train)
+    }
+
+    /// [`Self::forward`] of one map in inference, contiguous.
+    ///
+    /// # Errors
+    /// The tensor library's.
+    pub fn forward_contiguous(&self, x: &Tensor) -> Result<Tensor, TchError> {
+        match self.layers.split_last() {
+            Some((last, rest)) => last.forward_contiguous(&chain(rest, x, false)),
+            None => x.f_contiguous(),
+        }
     }
 
     /// The same for inference, norms folded in.
