@@ -119,7 +119,7 @@ pub enum TownError {
 pub fn build(source: &TownSource, town_seed: u64) -> Result<Town, TownError> {
     match source {
         TownSource::Town1 => Ok(furnish("town1".into(), &layout::town1(town_seed), town_seed)),
-        TownSource::Town4 => Ok(furnish("town4".into(), &layout::town1(town_seed), town_seed)),
+        TownSource::Town4 => Ok(furnish("town4".into(), &layout::town4(town_seed), town_seed)),
         TownSource::OpenDrive(path) => {
             let network = read_map(path)?;
             let name = path.file_stem().map_or_else(|| "map".into(), |stem| stem.to_string_lossy().to_lowercase());

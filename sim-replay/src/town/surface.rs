@@ -21,8 +21,6 @@ pub(crate) struct CrossSection {
     pub carriageway_m: [f64; 2],
     /// The same with pavements and verges.
     pub paved_m: [f64; 2],
-    /// The same for driving lanes only.
-    pub driving_m: [f64; 2],
     /// Section of the road.
     pub section: usize,
 }
@@ -155,15 +153,7 @@ fn cut(road: &Road, section: usize, s_m: f64, inside_m: f64) -> CrossSection {
     let paved = range(|kind| kind != LaneKind::Other && kind != LaneKind::Median);
     let carriageway_m = carriageway.or(driving).unwrap_or([origin; 2]);
     let paved_m = paved.unwrap_or(carriageway_m);
-    CrossSection {
-        s_m,
-        pose: road.pose_at(s_m),
-        z_m: road.elevation.at(s_m),
-        carriageway_m,
-        paved_m,
-        driving_m: driving.unwrap_or([origin; 2]),
-        section,
-    }
+    CrossSection { s_m, pose: road.pose_at(s_m), z_m: road.elevation.at(s_m), carriageway_m, paved_m, section }
 }
 
 #[cfg(test)]

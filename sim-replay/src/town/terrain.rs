@@ -1,7 +1,7 @@
 //! The ground from the roads: level or shaped to meet every road, with hills away from them, and decks where a road
 //! passes above.
 
-use super::convex::{Rectangle, bounds};
+use super::convex::{Quad, Rectangle, bounds, overlap};
 use super::ground::{Ground, HeightGrid, Terrain, Triangle};
 use super::noise::hills_m;
 use super::surface::{Patch, Surface};
@@ -18,6 +18,12 @@ const LEVEL_M: f64 = 0.05;
 const DECK_M: f64 = 0.12;
 /// Where hills begin and where they are full, distance from the nearest road in metres.
 const HILLS_FROM_M: [f64; 2] = [14.0, 90.0];
+/// Roads that differ by more than this at one place pass above each other, metres.
+const LEVELS_M: f32 = 0.8;
+/// A road this far above another is on a bridge near it, metres.
+const BRIDGE_M: f32 = 4.0;
+/// How far bridges reach beyond the lower road's edges, metres.
+const OPENING_M: f64 = 8.0;
 /// Rounds of smoothing at each level between the roads.
 const SMOOTHING: usize = 12;
 
@@ -45,27 +51,72 @@ fn empty_grid(surface: &Surface) -> HeightGrid {
     HeightGrid { origin_m, cell_m, columns, rows, heights_m: vec![f32::NAN; columns * rows] }
 }
 
-/// Sets every node within a cell of a road to the height of the lowest road there; returns which are set.
+/// Sets every node within a cell of a road to the height of the nearest road there, or of the lowest where roads pass
+/// above each other; returns which are set.
 fn fix_under_roads(grid: &mut HeightGrid, surface: &Surface) -> Vec<bool> {
-    let cell = grid.cell_m;
+    let nodes = grid.heights_m.len();
+    let (mut nearest_m, mut lowest_m) = (vec![f32::INFINITY; nodes], vec![f32::INFINITY; nodes]);
     for patch in &surface.patches {
-        let [low, high] = bounds(&patch.quad);
-        let place = |value: f64, axis: usize| ((value - grid.origin_m[axis]) / cell).max(0.0);
-        let rows = place(low[1] - cell, 1).floor() as usize..=place(high[1] + cell, 1).ceil() as usize;
-        let columns = place(low[0] - cell, 0).floor() as usize..=place(high[0] + cell, 0).ceil() as usize;
-        for row in rows {
-            for column in columns.clone() {
-                let node = [grid.origin_m[0] + column as f64 * cell, grid.origin_m[1] + row as f64 * cell];
-                let around = Rectangle { center_m: node, half_m: [cell; 2], yaw_rad: 0.0 };
-                if super::convex::overlap(&around.corners(), &patch.quad) {
-                    let height = &mut grid.heights_m[row * grid.columns + column];
-                    // f32::min takes the number where the other is NaN.
-                    *height = height.min(patch.height_m(node) as f32);
-                }
+        for (place, node) in nodes_within(grid, &patch.quad, grid.cell_m) {
+            let (height, distance) = (patch.height_m(node) as f32, distance_m(node, &patch.quad) as f32);
+            lowest_m[place] = lowest_m[place].min(height);
+            if distance < nearest_m[place] {
+                (nearest_m[place], grid.heights_m[place]) = (distance, height);
             }
         }
     }
+    for (height, &lowest) in grid.heights_m.iter_mut().zip(&lowest_m) {
+        if *height > lowest + LEVELS_M {
+            *height = lowest;
+        }
+    }
+    open_under_bridges(grid, surface);
     grid.heights_m.iter().map(|height| !height.is_nan()).collect()
+}
+
+/// Lets go of nodes that an upper road has set close to a lower one, so that bridges reach beyond the lower road's edges.
+fn open_under_bridges(grid: &mut HeightGrid, surface: &Surface) {
+    for patch in &surface.patches {
+        let level = patch.z_m[0].max(patch.z_m[1]) as f32;
+        for (place, _) in nodes_within(grid, &patch.quad, OPENING_M) {
+            if grid.heights_m[place] > level + BRIDGE_M {
+                grid.heights_m[place] = f32::NAN;
+            }
+        }
+    }
+}
+
+/// Nodes whose square of half side `reach_m` overlaps an outline, with their places in the plane.
+fn nodes_within(grid: &HeightGrid, quad: &Quad, reach_m: f64) -> Vec<(usize, [f64; 2])> {
+    let [low, high] = bounds(quad);
+    let place = |value: f64, axis: usize| ((value - grid.origin_m[axis]) / grid.cell_m).max(0.0);
+    let range =
+        |axis: usize| place(low[axis] - reach_m, axis).ceil() as usize..=place(high[axis] + reach_m, axis) as usize;
+    let mut nodes = Vec::new();
+    for row in range(1) {
+        for column in range(0) {
+            let node = [grid.origin_m[0] + column as f64 * grid.cell_m, grid.origin_m[1] + row as f64 * grid.cell_m];
+            let around = Rectangle { center_m: node, half_m: [reach_m; 2], yaw_rad: 0.0 };
+            if overlap(&around.corners(), quad) {
+                nodes.push((row * grid.columns + column, node));
+            }
+        }
+    }
+    nodes
+}
+
+/// Distance of a place from a convex outline, 0 inside, metres.
+fn distance_m(place: [f64; 2], quad: &Quad) -> f64 {
+    let sides = (0..4).map(|i| (quad[i], quad[(i + 1) % 4]));
+    let (mut inside, mut least) = (true, f64::INFINITY);
+    for (a, b) in sides {
+        let (dx, dy) = (b[0] - a[0], b[1] - a[1]);
+        let (px, py) = (place[0] - a[0], place[1] - a[1]);
+        inside &= dx * py - dy * px >= 0.0;
+        let share = ((px * dx + py * dy) / (dx * dx + dy * dy).max(1e-12)).clamp(0.0, 1.0);
+        least = least.min((px - share * dx).hypot(py - share * dy));
+    }
+    if inside { 0.0 } else { least }
 }
 
 /// Gives the nodes between the roads heights that pass smoothly from road to road: averages of ever coarser grids fill

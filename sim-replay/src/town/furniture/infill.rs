@@ -31,6 +31,10 @@ pub(super) fn place_islands(site: &mut Site, islands: &[[f64; 3]], rng: &mut Cha
             let species = if rng.random_bool(0.5) { Species::Bush } else { Species::random(rng) };
             plant(site, pose, species, rng.random_range(0.5..0.8), rng);
         }
+        // No houses here.
+        let island = Rectangle { center_m: [x, y], half_m: [radius * 0.7; 2], yaw_rad: 0.0 };
+        let z = site.ground_m([x, y]);
+        site.take(&island, [z - 1.0, z + 40.0]);
     }
 }
 

@@ -39,13 +39,13 @@ pub(super) fn furnish(
         rng
     };
     bridges::place(&mut site);
+    infill::place_islands(&mut site, &layout.islands, &mut stream(7));
     barriers::place(&mut site, &mut stream(1));
     parking::place_along_kerbs(&mut site, &mut stream(2));
     poles::place(&mut site, &mut stream(3));
     motorway::place(&mut site, &mut stream(4));
     trees::place_along_streets(&mut site, &mut stream(5));
     plots::place(&mut site, &mut stream(6));
-    infill::place_islands(&mut site, &layout.islands, &mut stream(7));
     infill::place(&mut site, &mut stream(8));
     (site.solids, site.parking)
 }

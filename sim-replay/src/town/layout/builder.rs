@@ -91,6 +91,20 @@ impl Builder {
         id
     }
 
+    /// Lets one road follow another, lane by lane on the right.
+    pub(super) fn follow(&mut self, before: usize, after: usize) {
+        let road = &mut self.network.roads[before];
+        road.successor = Some(RoadLink::Road { road: after, contact: Contact::Start });
+        for (place, lane) in road.sections[0].right.iter_mut().enumerate() {
+            lane.successor = Some(-(place as i32 + 1));
+        }
+        let road = &mut self.network.roads[after];
+        road.predecessor = Some(RoadLink::Road { road: before, contact: Contact::End });
+        for (place, lane) in road.sections[0].right.iter_mut().enumerate() {
+            lane.predecessor = Some(-(place as i32 + 1));
+        }
+    }
+
     /// Adds a one-lane road through `junction` from one lane to another.
     pub(super) fn connect(&mut self, junction: usize, from: LaneEnd, to: LaneEnd, limit_mps: f64) {
         let (exit, entry) = (self.lane_edge(from, true), self.lane_edge(to, false));

@@ -4,6 +4,7 @@ use rand::Rng;
 use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
 
+use super::super::curve::Pose2;
 use super::streets::{Node, StreetGraph};
 
 /// What a grid of streets is made from.
@@ -29,14 +30,41 @@ pub(super) fn spread(low: f64, high: f64, count: usize, share: f64, rng: &mut Ch
 }
 
 /// A grid whose column at `x` reaches over `y_range(x)`. Every street can be left at both ends: no place has just one
-/// street, and all hang together.
-pub(super) fn grid(plan: &GridPlan, y_range: impl Fn(f64) -> [f64; 2], rng: &mut ChaCha8Rng) -> StreetGraph {
-    let rows = spread(0.0, 1.0, plan.rows, 0.2, rng);
+/// street, and all hang together. With a `port`, the place nearest to it has a street to it.
+pub(super) fn grid(
+    plan: &GridPlan,
+    y_range: impl Fn(f64) -> [f64; 2],
+    port: Option<Pose2>,
+    rng: &mut ChaCha8Rng,
+) -> StreetGraph {
+    let mut calm = 1.0;
+    loop {
+        let mut graph = full_grid(plan, &y_range, calm, rng);
+        leave_out(&mut graph, plan.left_out, rng);
+        if let Some(port) = port {
+            attach(&mut graph, port);
+        }
+        // Without any jitter the grid is as good as its plan: take it as it is.
+        if graph.has_room() || calm < 0.05 {
+            return graph;
+        }
+        calm *= 0.9;
+    }
+}
+
+/// All streets of a plan, with its irregularity times `calm`.
+fn full_grid(plan: &GridPlan, y_range: impl Fn(f64) -> [f64; 2], calm: f64, rng: &mut ChaCha8Rng) -> StreetGraph {
+    let rows = spread(0.0, 1.0, plan.rows, 0.2 * calm, rng);
+    let jitter = (plan.jitter_m * calm).max(1e-3);
     let mut graph = StreetGraph::default();
-    for &x in &plan.columns_m {
-        let [low, high] = y_range(x);
+    let ranges: Vec<[f64; 2]> = plan.columns_m.iter().map(|&x| y_range(x)).collect();
+    // The calmer, the more all columns keep to what they have in common: then the rows are at right angles to them.
+    let common =
+        ranges.iter().fold([f64::NEG_INFINITY, f64::INFINITY], |[a, b], [low, high]| [a.max(*low), b.min(*high)]);
+    for (&x, own) in plan.columns_m.iter().zip(&ranges) {
+        let [low, high] = [0, 1].map(|end| common[end] + calm * (own[end] - common[end]));
         for &row in &rows {
-            let [dx, dy] = [(); 2].map(|()| rng.random_range(-plan.jitter_m..plan.jitter_m));
+            let [dx, dy] = [(); 2].map(|()| rng.random_range(-jitter..jitter));
             graph.nodes.push(Node { x: x + dx, y: low + row * (high - low) + dy, port: None });
         }
     }
@@ -51,8 +79,15 @@ pub(super) fn grid(plan: &GridPlan, y_range: impl Fn(f64) -> [f64; 2], rng: &mut
             }
         }
     }
-    leave_out(&mut graph, plan.left_out, rng);
     graph
+}
+
+/// Ties the node nearest to `port` to it.
+fn attach(graph: &mut StreetGraph, port: Pose2) {
+    let distance = |node: usize| (graph.nodes[node].x - port.x).hypot(graph.nodes[node].y - port.y);
+    let nearest = (0..graph.nodes.len()).min_by(|&a, &b| distance(a).total_cmp(&distance(b))).unwrap_or(0);
+    graph.nodes.push(Node { x: port.x, y: port.y, port: Some(port) });
+    graph.edges.push([nearest, graph.nodes.len() - 1]);
 }
 
 fn leave_out(graph: &mut StreetGraph, share: f64, rng: &mut ChaCha8Rng) {

@@ -2,12 +2,17 @@
 
 mod builder;
 mod grid;
+mod motorway;
+mod ring;
+mod roundabout;
 mod streets;
 mod town1;
+mod town4;
 
 use super::road::RoadNetwork;
 
 pub(super) use town1::lay_out as town1;
+pub(super) use town4::lay_out as town4;
 
 /// A road network, and what belongs to its shape but to no road.
 pub(super) struct Layout {
@@ -16,3 +21,6 @@ pub(super) struct Layout {
     /// Middles of roundabouts: x, y and the radius free of traffic, metres.
     pub islands: Vec<[f64; 3]>,
 }
+
+#[cfg(test)]
+mod tests;

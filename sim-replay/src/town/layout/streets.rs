@@ -15,6 +15,11 @@ const WIGGLE_MIN_M: f64 = 55.0;
 /// Kerb radius at junctions, metres.
 const KERB_RADIUS_M: f64 = 5.0;
 
+/// Half width of a broad street, metres.
+const BROAD_M: f64 = 10.0;
+/// Least length of a street between its junctions, metres.
+const LEAST_STREET_M: f64 = 12.0;
+
 /// A place where streets meet, turn or end.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Node {
@@ -52,6 +57,20 @@ impl StreetGraph {
 
     fn distance_m(&self, a: usize, b: usize) -> f64 {
         (self.nodes[b].x - self.nodes[a].x).hypot(self.nodes[b].y - self.nodes[a].y)
+    }
+
+    /// Whether every street is long enough for the junctions and corners at its ends, even a broad one.
+    pub(super) fn has_room(&self) -> bool {
+        let radius = |node: usize| {
+            if self.nodes[node].port.is_some() {
+                return 0.0;
+            }
+            let around = self.edges.iter().filter(|edge| edge.contains(&node));
+            let others = around.map(|&[a, b]| if a == node { b } else { a });
+            let arms: Vec<(f64, f64)> = others.map(|other| (self.angle(node, other), BROAD_M)).collect();
+            junction_radius_m(&arms)
+        };
+        self.edges.iter().all(|&[a, b]| self.distance_m(a, b) > radius(a) + radius(b) + LEAST_STREET_M)
     }
 
     /// A node at which streets end: three or more meet there, or it is a port.
@@ -162,20 +181,22 @@ fn junction_radii(graph: &StreetGraph, chains: &[Chain]) -> Vec<f64> {
         arms[chain.nodes[0]].push((graph.angle(chain.nodes[0], chain.nodes[1]), half));
         arms[chain.nodes[last]].push((graph.angle(chain.nodes[last], chain.nodes[last - 1]), half));
     }
-    let radius = |arms: &Vec<(f64, f64)>| {
-        let mut radius = arms.iter().map(|&(_, half)| half).fold(0.0, f64::max) + KERB_RADIUS_M;
-        for (i, &(angle_a, half_a)) in arms.iter().enumerate() {
-            for &(angle_b, half_b) in &arms[i + 1..] {
-                let between = wrap_angle(angle_b - angle_a).abs() - 2.0 * WIGGLE_RAD;
-                if between < 1.5 {
-                    let corner = (half_a.max(half_b) * (1.0 + between.cos())) / between.max(0.4).sin();
-                    radius = radius.max(corner + 2.0);
-                }
+    arms.iter().map(|arms| junction_radius_m(arms)).collect()
+}
+
+/// The same for one junction, from the directions and half widths of its arms.
+fn junction_radius_m(arms: &[(f64, f64)]) -> f64 {
+    let mut radius = arms.iter().map(|&(_, half)| half).fold(0.0, f64::max) + KERB_RADIUS_M;
+    for (i, &(angle_a, half_a)) in arms.iter().enumerate() {
+        for &(angle_b, half_b) in &arms[i + 1..] {
+            let between = wrap_angle(angle_b - angle_a).abs() - 2.0 * WIGGLE_RAD;
+            if between < 1.5 {
+                let corner = (half_a.max(half_b) * (1.0 + between.cos())) / between.max(0.4).sin();
+                radius = radius.max(corner + 2.0);
             }
         }
-        radius
-    };
-    arms.iter().map(radius).collect()
+    }
+    radius
 }
 
 /// Poses through which a street's reference line leads.

@@ -1,0 +1,136 @@
+//! Carriageways along a ring, and ramps between them and the roads below.
+
+use std::f64::consts::PI;
+
+use super::super::curve::Pose2;
+use super::super::road::{Contact, LaneKind, Profile, RoadStructure};
+use super::builder::{Builder, CrossProfile, LaneEnd, RoadEnd, path};
+use super::ring::Ring;
+
+/// Distance between the poses that a carriageway's clothoids connect, metres.
+const KNOT_M: f64 = 35.0;
+/// Lane width, metres.
+const LANE_M: f64 = 3.5;
+/// Speed limits: 65 mph, and 18 m/s on ramps.
+const LIMIT_MPS: f64 = 29.06;
+const RAMP_LIMIT_MPS: f64 = 18.0;
+/// Length of the stretch where a ramp leaves or joins, metres.
+pub(super) const RAMP_ZONE_M: f64 = 55.0;
+/// Distance between the outer lane's left edge and the ramp's at the end of that stretch, metres, and the angle between
+/// them, radians.
+const RAMP_OFFSET_M: f64 = 6.2;
+const RAMP_ANGLE_RAD: f64 = 0.1;
+
+/// The two carriageways.
+pub(super) struct Motorway {
+    pub ring: Ring,
+    pub lanes: usize,
+    /// Distance from the middle to the left edge of each carriageway's first lane, metres.
+    pub median_m: f64,
+}
+
+/// One direction: 1 along the ring, -1 against it.
+pub(super) type Direction = f64;
+
+impl Motorway {
+    /// A carriageway from one length of the ring to another, in driving direction (to rising lengths along the ring, to
+    /// falling ones against it).
+    pub(super) fn carriageway(&self, builder: &mut Builder, from_m: f64, to_m: f64, direction: Direction) -> usize {
+        let steps = ((to_m - from_m).abs() / KNOT_M).ceil().max(1.0) as usize;
+        let at = |step: usize| from_m + (to_m - from_m) * step as f64 / steps as f64;
+        let poses: Vec<Pose2> = (0..=steps).map(|step| self.left_edge(at(step), direction)).collect();
+        let curves = path(&poses);
+        let records = (0..steps).map(|step| {
+            let (a, b) = (at(step), at(step + 1));
+            let length = curves[step].length_m;
+            // Slopes per metre of the ring, in driving direction, onto the longer or shorter carriageway.
+            let scale = (b - a) / length;
+            let ends = [a, b].map(|s| [self.ring.height_m(s), self.ring.slope(s) * scale]);
+            Profile::hermite(curves[step].s_m, length, ends[0], ends[1])
+        });
+        let elevation = Profile { records: records.collect() };
+        let mut right = vec![(LaneKind::Driving, LANE_M); self.lanes];
+        right.push((LaneKind::Shoulder, 2.5));
+        let profile = CrossProfile { left: vec![(LaneKind::Shoulder, 0.75)], right };
+        builder.road(curves, elevation, &profile, LIMIT_MPS)
+    }
+
+    /// Carriageways one after the other through `stops_m`, linked; returns the first and the last.
+    pub(super) fn carriageways(&self, builder: &mut Builder, stops_m: &[f64], direction: Direction) -> [usize; 2] {
+        let roads: Vec<usize> =
+            stops_m.windows(2).map(|pair| self.carriageway(builder, pair[0], pair[1], direction)).collect();
+        for pair in roads.windows(2) {
+            builder.follow(pair[0], pair[1]);
+        }
+        [roads[0], roads[roads.len() - 1]]
+    }
+
+    /// Lets `ramp` leave between two carriageways: all lanes go on, the outermost one also into the ramp.
+    pub(super) fn diverge(&self, builder: &mut Builder, before: usize, after: usize, ramp: usize) {
+        let junction = builder.junction();
+        self.go_on(builder, junction, before, after);
+        let outer = LaneEnd { end: RoadEnd { road: before, contact: Contact::End }, lane: -(self.lanes as i32) };
+        let ramp = LaneEnd { end: RoadEnd { road: ramp, contact: Contact::Start }, lane: -1 };
+        builder.connect(junction, outer, ramp, LIMIT_MPS);
+    }
+
+    /// Lets `ramp` join between two carriageways.
+    pub(super) fn merge(&self, builder: &mut Builder, before: usize, after: usize, ramp: usize) {
+        let junction = builder.junction();
+        self.go_on(builder, junction, before, after);
+        let ramp = LaneEnd { end: RoadEnd { road: ramp, contact: Contact::End }, lane: -1 };
+        let outer = LaneEnd { end: RoadEnd { road: after, contact: Contact::Start }, lane: -(self.lanes as i32) };
+        builder.connect(junction, ramp, outer, LIMIT_MPS);
+    }
+
+    /// A ramp that left at `s_m` down to `port` (which looks away from its roundabout).
+    pub(super) fn off_ramp(&self, builder: &mut Builder, s_m: f64, direction: Direction, port: Pose2) -> usize {
+        let start = self.ramp_pose(s_m, direction, -RAMP_ANGLE_RAD);
+        self.ramp(
+            builder,
+            [start, port.reversed()],
+            [[self.ring.height_m(s_m), direction * self.ring.slope(s_m)], [0.0; 2]],
+        )
+    }
+
+    /// A ramp from `port` up to `s_m`, where it joins.
+    pub(super) fn on_ramp(&self, builder: &mut Builder, s_m: f64, direction: Direction, port: Pose2) -> usize {
+        let end = self.ramp_pose(s_m, direction, RAMP_ANGLE_RAD);
+        self.ramp(builder, [port, end], [[0.0; 2], [self.ring.height_m(s_m), direction * self.ring.slope(s_m)]])
+    }
+
+    /// Puts a tunnel over a whole carriageway.
+    pub(super) fn cover(builder: &mut Builder, road: usize) {
+        let length_m = builder.network.roads[road].length_m;
+        builder.network.roads[road].structures.push(RoadStructure { tunnel: true, s_m: 0.0, length_m });
+    }
+
+    fn ramp(&self, builder: &mut Builder, poses: [Pose2; 2], heights: [[f64; 2]; 2]) -> usize {
+        let curves = path(&poses);
+        let elevation = Profile { records: vec![Profile::hermite(0.0, curves[0].length_m, heights[0], heights[1])] };
+        let profile = CrossProfile {
+            left: vec![(LaneKind::Shoulder, 0.4)],
+            right: vec![(LaneKind::Driving, 4.0), (LaneKind::Shoulder, 1.0)],
+        };
+        builder.road(curves, elevation, &profile, RAMP_LIMIT_MPS)
+    }
+
+    /// Left edge of the first lane, in driving direction.
+    fn left_edge(&self, s_m: f64, direction: Direction) -> Pose2 {
+        let middle = self.ring.pose(s_m);
+        if direction > 0.0 { middle.moved(0.0, -self.median_m, 0.0) } else { middle.moved(0.0, self.median_m, PI) }
+    }
+
+    fn ramp_pose(&self, s_m: f64, direction: Direction, turn_rad: f64) -> Pose2 {
+        let outer = (self.lanes as f64 - 1.0) * LANE_M;
+        self.left_edge(s_m, direction).moved(0.0, -outer - RAMP_OFFSET_M, turn_rad)
+    }
+
+    fn go_on(&self, builder: &mut Builder, junction: usize, before: usize, after: usize) {
+        for lane in 1..=self.lanes as i32 {
+            let from = LaneEnd { end: RoadEnd { road: before, contact: Contact::End }, lane: -lane };
+            let to = LaneEnd { end: RoadEnd { road: after, contact: Contact::Start }, lane: -lane };
+            builder.connect(junction, from, to, LIMIT_MPS);
+        }
+    }
+}
