@@ -22,7 +22,7 @@ pub(crate) struct ParkedVehicle {
 /// Parks vehicles on the spots of a town; how full the town is differs from seed to seed.
 pub(crate) fn park(town: &Town, lanes: &LaneIndex, seed: u64) -> Vec<ParkedVehicle> {
     let mut random = SplitMix64::new(seed);
-    let occupancy = random.between(0.4, 0.85);
+    let occupancy = random.between(0.3, 0.7);
     let mut parked: Vec<ParkedVehicle> = Vec::new();
     for (number, spot) in town.parking.iter().enumerate() {
         // A stream of its own for each spot: a spot that is added does not reshuffle all that follow.

@@ -110,7 +110,7 @@ fn simulate(
     let footprints: Vec<Rectangle> =
         parked.iter().map(|parked| Rectangle::new(&parked.placement, &parked.vehicle.size_m)).collect();
     let options = TrafficOptions {
-        vehicles_per_km: random.between(18.0, 44.0),
+        vehicles_per_km: random.between(7.0, 21.0),
         radius_m: TRAFFIC_RADIUS_M,
         focus_explores: spec.explores,
     };
