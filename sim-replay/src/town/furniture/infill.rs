@@ -22,7 +22,7 @@ const MAX_ATTEMPTS: u32 = 60_000;
 /// Plants and monuments on the middles of roundabouts: x, y, free radius.
 pub(super) fn place_islands(site: &mut Site, islands: &[[f64; 3]], rng: &mut ChaCha8Rng) {
     for &[x, y, radius] in islands {
-        let middle = Pose2::new(x, y, rng.random_range(0.0..6.28));
+        let middle = Pose2::new(x, y, rng.random_range(0.0..std::f64::consts::TAU));
         let parts = monument(Foot::new(middle, site.ground_m([x, y])), rng);
         site.try_place(&parts, 0.0, true);
         for _ in 0..rng.random_range(3..=9) {

@@ -188,7 +188,7 @@ fn green(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) -> Option<f
     let lot = free_lot(site, side, s, [width, depth], 1.0)?;
     let spot = |rng: &mut ChaCha8Rng| {
         let (u, v) = (rng.random_range(-0.45..0.45) * width, rng.random_range(-0.42..0.42) * depth);
-        lot.foot.pose.moved(u, v, rng.random_range(0.0..6.28))
+        lot.foot.pose.moved(u, v, rng.random_range(0.0..std::f64::consts::TAU))
     };
     for _ in 0..rng.random_range(3..=9) {
         let (pose, species) = (spot(rng), Species::random(rng));

@@ -46,7 +46,7 @@ pub(super) fn tree(foot: Foot, species: Species, size: f64, rng: &mut ChaCha8Rng
             ];
             // Large crowns are lobed.
             if size > 0.9 {
-                let turn: f64 = rng.random_range(0.0..6.28);
+                let turn: f64 = rng.random_range(0.0..std::f64::consts::TAU);
                 let at = [0.6 * rx * turn.cos(), 0.6 * ry * turn.sin(), clear + rz * rng.random_range(1.1..1.6)];
                 parts.push(crown(at, [0.7 * rx, 0.7 * ry, 0.7 * rz]));
             }
