@@ -1,15 +1,20 @@
 //! The ego's side of collaborative perception: views of several CAVs in, boxes around the ego out.
 //!
+//! - [`ego`]: the pipeline, the same live and offline; [`pairing`] says which messages belong to a frame.
+//! - [`model`], [`samples`], [`train`]: how a method learns; [`evaluate`]: what it has learnt.
 //! - [`targets`] and [`loss`]: what a detector is trained towards.
 //! - [`warp`] and [`fusion`]: maps of neighbours on the ego's lattice, and many maps made one.
 //!
 //! Conventions of axes, units and boxes are those of [`protocol`].
 
 pub mod average_precision;
+pub mod ego;
+pub mod evaluate;
 pub mod fusion;
 pub mod loss;
 pub mod method;
 pub mod model;
+pub mod pairing;
 pub mod samples;
 pub mod targets;
 pub mod train;

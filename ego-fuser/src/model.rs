@@ -25,7 +25,7 @@ use crate::warp::{WarpError, warp_to_ego};
 pub const METHOD_KEY: &str = "method";
 
 /// Detections below this score are not decoded.
-const SCORE_THRESHOLD: f32 = 0.1;
+pub const SCORE_THRESHOLD: f32 = 0.1;
 
 /// Why a model cannot be built, loaded or run.
 #[derive(Debug, thiserror::Error)]
@@ -193,7 +193,7 @@ impl CooperativeModel {
         confidence: &[f64],
         age_secs: &[f64],
     ) -> Result<Tensor, ModelError> {
-        let warped = warp_to_ego(features, ego_from_cav, &self.network.config.feature_grid())?;
+        let warped = warp_to_ego(features, None, ego_from_cav, &self.network.config.feature_grid())?;
         let views = AlignedViews { features: &warped.features, mask: &warped.mask, confidence, age_secs };
         Ok(self.fusion.fuse(&views)?)
     }

@@ -165,7 +165,7 @@ fn golden_c5_warp_in_metres_agrees_with_coalign() {
             // P[ego, cav] takes points of the ego to the frame of the CAV; only its planar part enters a warp.
             let poses: Vec<Pose> =
                 (0..features.size()[1]).map(|cav| planar_inverse(&pairwise.get(sample).get(ego).get(cav))).collect();
-            let warped = warp_to_ego(&features.get(sample), &poses, &grid).unwrap();
+            let warped = warp_to_ego(&features.get(sample), None, &poses, &grid).unwrap();
             let expected = expected.get(sample).get(ego) * &warped.mask;
             // The reference scales sheared planar parts of tilted poses; ours keeps them rigid.
             let difference = (&warped.features - expected).abs().mean(Kind::Float).double_value(&[]);

@@ -1,5 +1,6 @@
 //! One file per subcommand: its arguments, and the call into the library.
 
+mod eval;
 mod methods;
 mod train;
 
@@ -10,6 +11,8 @@ use std::process::ExitCode;
 pub(crate) enum Command {
     /// List the collaboration methods and what each sends.
     Methods(methods::Arguments),
+    /// Measure AP on recorded scenes.
+    Eval(eval::Arguments),
     /// Train a method on scenes.
     Train(Box<train::Arguments>),
 }
@@ -19,6 +22,7 @@ impl Command {
     pub(crate) fn run(self) -> anyhow::Result<()> {
         match self {
             Self::Methods(arguments) => arguments.run(),
+            Self::Eval(arguments) => arguments.run(),
             Self::Train(arguments) => arguments.run(),
         }
     }

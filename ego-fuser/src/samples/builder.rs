@@ -225,9 +225,9 @@ impl SampleBuilder {
 
 /// The points of several sweeps in the frame of the ego.
 #[must_use]
-pub fn merge_points(clouds: &[PointCloud], ego_from_cav: &[Pose]) -> PointCloud {
-    let mut merged = PointCloud { xyzi: Vec::with_capacity(clouds.iter().map(PointCloud::len).sum()) };
-    for (cloud, pose) in clouds.iter().zip(ego_from_cav) {
+pub fn merge_points<'a>(clouds: impl IntoIterator<Item = &'a PointCloud>, ego_from_cav: &[Pose]) -> PointCloud {
+    let mut merged = PointCloud::default();
+    for (cloud, pose) in clouds.into_iter().zip(ego_from_cav) {
         if *pose == Pose::IDENTITY {
             merged.xyzi.extend(&cloud.xyzi);
             continue;

@@ -48,7 +48,7 @@ mod tests {
         let cav_from_ego = Tensor::from_slice(cav_from_ego.transpose().as_slice()).view([1, 4, 4]);
         let features = Tensor::randn([1, 3, 16, 32], (Kind::Float, Device::Cpu));
         let theirs = warp_affine(&features, &normalized(&cav_from_ego, 16, 32, 0.5).unwrap()).unwrap();
-        let ours = warp_to_ego(&features, &[ego_from_cav], &grid).unwrap();
+        let ours = warp_to_ego(&features, None, &[ego_from_cav], &grid).unwrap();
         assert!((ours.features - theirs * ours.mask).abs().max().double_value(&[]) < 1e-5);
     }
 }

@@ -47,7 +47,8 @@ pub enum WarpError {
 pub struct Warped {
     /// `[N, C, H, W]`, zero wherever the mask is.
     pub features: Tensor,
-    /// `[N, 1, H, W]` of the same kind: 1 where the ego's cell centre lies inside the CAV's map, else 0.
+    /// `[N, 1, H, W]` of the same kind: 1 where the ego's cell centre lies on a cell that the CAV
+    /// sent, else 0.
     pub mask: Tensor,
 }
 
@@ -58,6 +59,7 @@ pub struct Warped {
 ///
 /// # Shapes
 /// - `features`: `[N, C, H, W]`; row grows with y, column with x
+/// - `sent`: `[N, 1, H, W]`, 1 for cells that a CAV sent and 0 for those it left out; absent: all were sent
 /// - `ego_from_cav`: N poses
 ///
 /// # Frames and units
@@ -65,7 +67,12 @@ pub struct Warped {
 ///
 /// # Errors
 /// [`WarpError`] when the features do not lie on `grid` or their number is not that of the poses.
-pub fn warp_to_ego(features: &Tensor, ego_from_cav: &[Pose], grid: &BevGrid) -> Result<Warped, WarpError> {
+pub fn warp_to_ego(
+    features: &Tensor,
+    sent: Option<&Tensor>,
+    ego_from_cav: &[Pose],
+    grid: &BevGrid,
+) -> Result<Warped, WarpError> {
     let size = features.size();
     let &[maps, _, height, width] = size.as_slice() else { return Err(shape_error(size, grid)) };
     if (height, width) != (i64::from(grid.height), i64::from(grid.width)) {
@@ -74,23 +81,28 @@ pub fn warp_to_ego(features: &Tensor, ego_from_cav: &[Pose], grid: &BevGrid) -> 
     if maps != ego_from_cav.len() as i64 {
         return Err(WarpError::PoseCount { maps, poses: ego_from_cav.len() });
     }
-    let ones = Tensor::f_ones([1, 1, height, width], (features.kind(), features.device()))?;
+    let sent = match sent {
+        Some(sent) => sent.f_view([maps, 1, height, width])?,
+        None => Tensor::f_ones([1, 1, height, width], (Kind::Float, features.device()))?
+            .f_expand([maps, 1, height, width], false)?,
+    };
     let affine: Vec<_> = ego_from_cav.iter().map(|pose| cav_from_ego_normalized(pose, grid)).collect();
     if affine.iter().all(|&affine| affine == UNMOVED) {
-        return Ok(Warped { features: features.shallow_clone(), mask: ones.f_repeat([maps, 1, 1, 1])? });
+        return Ok(Warped { features: features.shallow_clone(), mask: sent.f_to_kind(features.kind())? });
     }
     let mut moved = Vec::with_capacity(ego_from_cav.len());
     let mut masks = Vec::with_capacity(ego_from_cav.len());
     for (index, affine) in affine.iter().enumerate() {
         let map = features.f_narrow(0, index as i64, 1)?;
+        let sent = sent.f_narrow(0, index as i64, 1)?;
         if *affine == UNMOVED {
             moved.push(map);
-            masks.push(ones.shallow_clone());
+            masks.push(sent.f_to_kind(features.kind())?);
             continue;
         }
         let theta = Tensor::from_slice(affine).f_view([1, 2, 3])?.f_to_device(features.device())?;
         let lattice = Tensor::f_affine_grid_generator(&theta, [1, 1, height, width], false)?;
-        let inside = ones.f_to_kind(Kind::Float)?.f_grid_sampler(&lattice, NEAREST, PADDING_ZEROS, false)?;
+        let inside = sent.f_grid_sampler(&lattice, NEAREST, PADDING_ZEROS, false)?;
         let mask = inside.f_to_kind(features.kind())?;
         let lattice = lattice.f_to_kind(features.kind())?;
         moved.push(map.f_grid_sampler(&lattice, BILINEAR, PADDING_ZEROS, false)? * &mask);
@@ -146,7 +158,7 @@ mod tests {
         let features = Tensor::randn([2, 3, 16, 32], (Kind::Float, Device::Cpu));
         let shifted = Pose::from_xyz_yaw([1.0, 0.0, 0.0], 0.1);
         let height_only = Pose::from_xyz_yaw([0.0, 0.0, 0.4], 0.0);
-        let warped = warp_to_ego(&features, &[height_only, shifted], &GRID).unwrap();
+        let warped = warp_to_ego(&features, None, &[height_only, shifted], &GRID).unwrap();
         assert_eq!(warped.features.get(0), features.get(0));
         assert_ne!(warped.features.get(1), features.get(1));
         assert_eq!(warped.mask.get(0).min().double_value(&[]), 1.0);
@@ -156,7 +168,7 @@ mod tests {
     fn a_shift_of_whole_cells_moves_cells() {
         // The CAV stands 2 m ahead of the ego: what it has at its own x, the ego has four columns on.
         let pose = Pose::from_xyz_yaw([2.0, -1.0, 0.3], 0.0);
-        let warped = warp_to_ego(&one_hot(6, 10), &[pose], &GRID).unwrap();
+        let warped = warp_to_ego(&one_hot(6, 10), None, &[pose], &GRID).unwrap();
         assert!((at(&warped.features, 4, 14) - 1.0).abs() < 1e-4);
         assert!((warped.features.sum(Kind::Float).double_value(&[]) - 1.0).abs() < 1e-3);
         // Its map does not reach the ego's first four columns, nor the last two rows.
@@ -170,13 +182,13 @@ mod tests {
     fn a_quarter_turn_takes_forward_to_left() {
         // Cell centre (x, y) = (2.25, 0.75) of a CAV turned left by 90 degrees lies at (-0.75, 2.25) of the ego.
         let turned = Pose::from_xyz_yaw([0.0, 0.0, 0.0], FRAC_PI_2);
-        let warped = warp_to_ego(&one_hot(9, 20), &[turned], &GRID).unwrap();
+        let warped = warp_to_ego(&one_hot(9, 20), None, &[turned], &GRID).unwrap();
         assert!((at(&warped.features, 12, 14) - 1.0).abs() < 1e-4);
     }
 
     #[test]
     fn half_a_cell_shares_between_two() {
-        let warped = warp_to_ego(&one_hot(8, 16), &[Pose::from_xyz_yaw([0.25, 0.0, 0.0], 0.0)], &GRID).unwrap();
+        let warped = warp_to_ego(&one_hot(8, 16), None, &[Pose::from_xyz_yaw([0.25, 0.0, 0.0], 0.0)], &GRID).unwrap();
         assert!((at(&warped.features, 8, 16) - 0.5).abs() < 1e-4);
         assert!((at(&warped.features, 8, 17) - 0.5).abs() < 1e-4);
     }
@@ -185,15 +197,15 @@ mod tests {
     fn two_half_turns_give_the_map_back() {
         let features = Tensor::randn([1, 2, 16, 32], (Kind::Float, Device::Cpu));
         let turn = [Pose::from_xyz_yaw([0.0, 0.0, 0.0], PI)];
-        let once = warp_to_ego(&features, &turn, &GRID).unwrap().features;
-        let twice = warp_to_ego(&once, &turn, &GRID).unwrap().features;
+        let once = warp_to_ego(&features, None, &turn, &GRID).unwrap().features;
+        let twice = warp_to_ego(&once, None, &turn, &GRID).unwrap().features;
         assert!((twice - features).abs().max().double_value(&[]) < 1e-3);
     }
 
     #[test]
     fn a_neighbour_out_of_reach_leaves_nothing() {
         let features = Tensor::ones([1, 2, 16, 32], (Kind::Float, Device::Cpu));
-        let warped = warp_to_ego(&features, &[Pose::from_xyz_yaw([500.0, 0.0, 0.0], 1.0)], &GRID).unwrap();
+        let warped = warp_to_ego(&features, None, &[Pose::from_xyz_yaw([500.0, 0.0, 0.0], 1.0)], &GRID).unwrap();
         assert_eq!(warped.features.abs().max().double_value(&[]), 0.0);
         assert_eq!(warped.mask.max().double_value(&[]), 0.0);
     }
@@ -201,9 +213,9 @@ mod tests {
     #[test]
     fn maps_of_another_lattice_are_refused() {
         let features = Tensor::zeros([1, 2, 16, 31], (Kind::Float, Device::Cpu));
-        let error = warp_to_ego(&features, &[Pose::IDENTITY], &GRID).unwrap_err().to_string();
+        let error = warp_to_ego(&features, None, &[Pose::IDENTITY], &GRID).unwrap_err().to_string();
         assert!(error.contains("[1, 2, 16, 31]") && error.contains("16 rows and 32 columns"), "{error}");
         let features = Tensor::zeros([2, 2, 16, 32], (Kind::Float, Device::Cpu));
-        assert!(matches!(warp_to_ego(&features, &[Pose::IDENTITY], &GRID), Err(WarpError::PoseCount { .. })));
+        assert!(matches!(warp_to_ego(&features, None, &[Pose::IDENTITY], &GRID), Err(WarpError::PoseCount { .. })));
     }
 }

@@ -1,0 +1,137 @@
+//! `ego-fuser eval`: AP of a method on recorded scenes.
+
+use std::io::IsTerminal;
+use std::ops::ControlFlow;
+use std::path::PathBuf;
+
+use agent::pose_source::PoseSourceConfig;
+use anyhow::Result;
+use ego_fuser::Method;
+use ego_fuser::average_precision::{Ordering, Scorer, THRESHOLDS};
+use ego_fuser::evaluate::{EvaluateConfig, EvaluatedFrame, Evaluator};
+use indicatif::{ProgressBar, ProgressStyle};
+use protocol::CodecConfig;
+use serde_json::json;
+use sim_replay::dataset::{self, Scenario};
+
+use super::BadInput;
+
+/// Measures AP on datasets, with true poses, nothing late and nothing lost.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Arguments {
+    /// Datasets, splits or scenarios.
+    #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
+    data: Vec<PathBuf>,
+    /// Weights of encoder and head.
+    #[arg(long, value_name = "FILE")]
+    weights: PathBuf,
+    /// Methods, one after another; none named: that of the weights.
+    #[arg(long, num_args = 1..)]
+    method: Vec<Method>,
+    /// At most so many frames of every scenario.
+    #[arg(long)]
+    frames: Option<usize>,
+    /// Torch threads.
+    #[arg(long, default_value_t = 1)]
+    threads: u16,
+    /// Print JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+impl Arguments {
+    /// Evaluates and prints a line per method.
+    pub(crate) fn run(self) -> Result<()> {
+        tch::set_num_threads(i32::from(self.threads.max(1)));
+        let mut scenarios = Vec::new();
+        for folder in &self.data {
+            let found = dataset::open(folder).map_err(|error| BadInput(error.to_string()))?.scenarios;
+            scenarios.extend(found);
+        }
+        let methods =
+            if self.method.is_empty() { vec![None] } else { self.method.iter().map(|method| Some(*method)).collect() };
+        let mut rows = Vec::new();
+        for method in methods {
+            let config = EvaluateConfig {
+                weights: self.weights.clone(),
+                method,
+                pose_source: PoseSourceConfig::Recorded,
+                codec: CodecConfig::default(),
+                rule: None,
+            };
+            rows.push(evaluate(config, &scenarios, self.frames.unwrap_or(usize::MAX), self.json)?);
+        }
+        if self.json {
+            println!("{}", serde_json::to_string_pretty(&rows)?);
+        }
+        Ok(())
+    }
+}
+
+fn evaluate(config: EvaluateConfig, scenarios: &[Scenario], frames: usize, json: bool) -> Result<serde_json::Value> {
+    let mut evaluator = Evaluator::new(config)?;
+    let ticks: usize = scenarios.iter().map(|scenario| scenario.ticks.len().min(frames)).sum();
+    let bar = if std::io::stderr().is_terminal() { ProgressBar::new(ticks as u64) } else { ProgressBar::hidden() };
+    if let Ok(style) = ProgressStyle::with_template("{msg} {wide_bar} {pos}/{len} eta {eta}") {
+        bar.set_style(style);
+    }
+    let method = evaluator.ego().method();
+    bar.set_message(method.name());
+    let mut tally = Tally::default();
+    for scenario in scenarios {
+        let mut done = 0;
+        let _ = evaluator.run(scenario, &mut |frame| {
+            tally.add(&frame);
+            bar.inc(1);
+            done += 1;
+            if done < frames { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
+        })?;
+    }
+    bar.finish_and_clear();
+    let row = tally.row(method);
+    if !json {
+        let ap =
+            |name: &str| THRESHOLDS.map(|iou| format!("{:.4}", row[name][format!("{iou}")].as_f64().unwrap_or(0.0)));
+        let (global, frame) = (ap("ap_global").join(" "), ap("ap_frame_order").join(" "));
+        println!(
+            "{method:<10} AP@0.3/0.5/0.7 global {global}, frame order {frame}, {} frames, {} bytes a neighbour",
+            row["frames"], row["payload_bytes_mean"]
+        );
+    }
+    Ok(row)
+}
+
+/// What the frames of one method add up to.
+#[derive(Default)]
+struct Tally {
+    scorer: Scorer,
+    frames: usize,
+    payload_bytes: Vec<u64>,
+}
+
+impl Tally {
+    fn add(&mut self, frame: &EvaluatedFrame) {
+        self.frames += 1;
+        self.scorer.add(&frame.result.detections, &frame.objects);
+        self.payload_bytes.extend(frame.result.fused.iter().map(|neighbour| neighbour.payload_bytes));
+    }
+
+    fn row(&self, method: Method) -> serde_json::Value {
+        let by_iou = |ordering| {
+            let found = self.scorer.average_precisions(ordering);
+            THRESHOLDS
+                .iter()
+                .zip(found)
+                .map(|(iou, ap)| (iou.to_string(), json!(ap)))
+                .collect::<serde_json::Map<_, _>>()
+        };
+        let bytes = self.payload_bytes.iter().sum::<u64>() as f64 / self.payload_bytes.len().max(1) as f64;
+        json!({
+            "method": method,
+            "frames": self.frames,
+            "ap_global": by_iou(Ordering::Global),
+            "ap_frame_order": by_iou(Ordering::Frame),
+            "payload_bytes_mean": bytes,
+        })
+    }
+}

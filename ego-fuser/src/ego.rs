@@ -1,0 +1,524 @@
+//! The ego's pipeline: its own view and those of its neighbours in, boxes around it out.
+//!
+//! Synchronous and without any network: live process, offline evaluation, tests and benches run the same lines, and the
+//! same views give the same bits.
+
+use std::path::Path;
+use std::time::Instant;
+
+use agent::decode::Decoded;
+use agent::detector::{Detector, DetectorError};
+use agent::postprocess::{AgentBoxes, PostprocessConfig, postprocess};
+use agent::weights::{Weights, WeightsError};
+use nalgebra::Isometry3;
+use protocol::{BevGrid, CavId, DecodedFeatures, Detection, DropReason, PointCloud, Pose, PoseEstimate, StageTiming};
+use tch::{Kind, TchError, Tensor, no_grad};
+
+use crate::fusion::{self, AlignedViews, Fusion};
+use crate::method::{Exchange, Method, UnknownMethod};
+use crate::model::{METHOD_KEY, SCORE_THRESHOLD};
+use crate::samples::merge_points;
+use crate::warp::{WarpError, warp_to_ego};
+
+/// What one vehicle sees, as it arrived.
+#[derive(Debug, Clone, PartialEq)]
+pub struct View {
+    /// Who.
+    pub cav: CavId,
+    /// Where it believes to be.
+    pub pose: PoseEstimate,
+    /// Capture time of the ego's sweep less that of this view's, nanoseconds; 0 for the ego.
+    pub age_nanos: i64,
+    /// What it sees, in its own LiDAR frame.
+    pub content: Content,
+}
+
+/// What crosses the air, by method.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Content {
+    /// A feature map: `none`, `max`, `attention`.
+    Features(DecodedFeatures),
+    /// Detections: `late`.
+    Boxes(Vec<Detection>),
+    /// Points, without those on the sender's own body: `early`.
+    Points(PointCloud),
+}
+
+impl Content {
+    /// What has to be exchanged for it.
+    #[must_use]
+    pub fn exchange(&self) -> Exchange {
+        match self {
+            Self::Features(_) => Exchange::Features,
+            Self::Boxes(_) => Exchange::Boxes,
+            Self::Points(_) => Exchange::Points,
+        }
+    }
+}
+
+/// Why a neighbour is not in a result.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Skipped {
+    /// The method exchanges nothing.
+    NotNeeded,
+    /// It is farther away than vehicles talk to each other.
+    OutOfRange,
+    /// Its message cannot be used.
+    Unusable(DropReason),
+}
+
+/// One frame's result.
+#[derive(Debug, Clone, PartialEq)]
+pub struct EgoOutput {
+    /// Boxes in the ego's LiDAR frame, best first.
+    pub detections: Vec<Detection>,
+    /// Indices of the neighbours that are in it.
+    pub fused: Vec<usize>,
+    /// The other neighbours, each with its reason.
+    pub skipped: Vec<(usize, Skipped)>,
+    /// Where the time went.
+    pub stages: Vec<StageTiming>,
+}
+
+/// Why the ego has no result at all. What is wrong with a neighbour never leads here.
+#[derive(Debug, thiserror::Error)]
+pub enum EgoError {
+    /// The weights are not readable.
+    #[error(transparent)]
+    Weights(#[from] WeightsError),
+    /// The detector refused.
+    #[error(transparent)]
+    Detector(#[from] DetectorError),
+    /// The weights name a method that is not known.
+    #[error(transparent)]
+    Method(#[from] UnknownMethod),
+    /// Own maps cannot be aligned.
+    #[error(transparent)]
+    Warp(#[from] WarpError),
+    /// The ego's own view is not what the method takes.
+    #[error("method {method} needs the ego's own {needed:?}, not {found:?}")]
+    OwnContent {
+        /// The method.
+        method: Method,
+        /// What it needs.
+        needed: Exchange,
+        /// What came.
+        found: Exchange,
+    },
+    /// The ego's own map is of another network.
+    #[error("the ego's own map is {channels} x {found}, the network's is {expected_channels} x {expected}")]
+    OwnMap {
+        /// Channels found.
+        channels: u32,
+        /// Lattice found.
+        found: BevGrid,
+        /// Channels of the network.
+        expected_channels: i64,
+        /// Lattice of the network.
+        expected: BevGrid,
+    },
+    /// The tensor library refused.
+    #[error("fusion: {0}")]
+    Torch(#[from] TchError),
+}
+
+/// Fuses views and detects.
+#[derive(Debug)]
+pub struct Ego {
+    method: Method,
+    detector: Detector,
+    fusion: Box<dyn Fusion>,
+    limits: PostprocessConfig,
+    comm_range_m: f64,
+}
+
+impl Ego {
+    /// The communication range of OPV2V and its relatives, metres.
+    pub const COMM_RANGE_M: f64 = 70.0;
+
+    /// Reads the weights; `method` overrides the one that the file names.
+    ///
+    /// # Errors
+    /// [`EgoError`] names the file, the tensor and both shapes.
+    pub fn load(path: &Path, method: Option<Method>) -> Result<Self, EgoError> {
+        let weights = Weights::load(path)?;
+        let method = match (method, weights.metadata(METHOD_KEY)) {
+            (Some(method), _) => method,
+            (None, Some(name)) => name.parse()?,
+            (None, None) => Method::None,
+        };
+        Ok(Self::new(Detector::from_weights(&weights, &weights.config()?)?, method))
+    }
+
+    /// The pipeline of a method around a detector.
+    #[must_use]
+    pub fn new(detector: Detector, method: Method) -> Self {
+        let limits = PostprocessConfig::for_detector(detector.config());
+        let limits = PostprocessConfig { score_threshold: SCORE_THRESHOLD, ..limits };
+        Self { method, detector, fusion: fusion::build(method), limits, comm_range_m: Self::COMM_RANGE_M }
+    }
+
+    /// The same with other limits of the clean-up.
+    #[must_use]
+    pub fn with_limits(self, limits: PostprocessConfig) -> Self {
+        Self { limits, ..self }
+    }
+
+    /// The same with another communication range, metres.
+    #[must_use]
+    pub fn with_comm_range(self, comm_range_m: f64) -> Self {
+        Self { comm_range_m, ..self }
+    }
+
+    /// Its method.
+    #[must_use]
+    pub fn method(&self) -> Method {
+        self.method
+    }
+
+    /// Its detector.
+    #[must_use]
+    pub fn detector(&self) -> &Detector {
+        &self.detector
+    }
+
+    /// Detects around the ego. Neighbours that cannot be used are left out; with none left the ego goes on alone.
+    ///
+    /// # Errors
+    /// [`EgoError`] when the ego's own view is not what the method takes.
+    pub fn detect(&mut self, own: &View, neighbours: &[View]) -> Result<EgoOutput, EgoError> {
+        let needed = own_content(self.method);
+        if own.content.exchange() != needed {
+            return Err(EgoError::OwnContent { method: self.method, needed, found: own.content.exchange() });
+        }
+        let mut aligned = vec![Aligned { view: own, ego_from_cav: Pose::IDENTITY }];
+        let mut fused = Vec::new();
+        let mut skipped = Vec::new();
+        for (index, view) in neighbours.iter().enumerate() {
+            match self.align(own, view) {
+                Ok(ego_from_cav) => {
+                    aligned.push(Aligned { view, ego_from_cav });
+                    fused.push(index);
+                }
+                Err(reason) => skipped.push((index, reason)),
+            }
+        }
+        let mut stages = Stages::start();
+        let detections = no_grad(|| match needed {
+            Exchange::Boxes => Ok(self.merge_boxes(&aligned, &mut stages)),
+            Exchange::Points => self.merge_points(&aligned, &mut stages),
+            Exchange::Features | Exchange::Nothing => self.merge_features(&aligned, &mut stages),
+        })?;
+        Ok(EgoOutput { detections, fused, skipped, stages: stages.timings })
+    }
+
+    /// Where a neighbour stands relative to the ego, or why it has no part.
+    fn align(&self, own: &View, view: &View) -> Result<Pose, Skipped> {
+        if self.method == Method::None {
+            return Err(Skipped::NotNeeded);
+        }
+        let no_pose = Skipped::Unusable(DropReason::NoPose);
+        let world_from_ego = own.pose.world_from_cav().ok_or(no_pose)?;
+        let world_from_cav = view.pose.world_from_cav().ok_or(no_pose)?;
+        let [dx, dy] = [0, 1].map(|axis| world_from_cav.translation_m[axis] - world_from_ego.translation_m[axis]);
+        if dx.hypot(dy) > self.comm_range_m {
+            return Err(Skipped::OutOfRange);
+        }
+        let fits = match &view.content {
+            Content::Features(map) => self.is_own_shape(map),
+            Content::Boxes(_) | Content::Points(_) => true,
+        };
+        if view.content.exchange() != own.content.exchange() || !fits {
+            return Err(Skipped::Unusable(DropReason::Shape));
+        }
+        Ok(world_from_ego.from_world(world_from_cav))
+    }
+
+    fn is_own_shape(&self, map: &DecodedFeatures) -> bool {
+        let DecodedFeatures { features, sent } = map;
+        let [channels, ..] = self.detector.map_shape();
+        let cells = features.grid.cells();
+        features.grid == self.detector.grid()
+            && i64::from(features.channels) == channels
+            && features.values.len() == cells * features.channels as usize
+            && sent.as_ref().is_none_or(|sent| sent.len() == cells)
+    }
+
+    /// Intermediate fusion, and the ego alone.
+    fn merge_features(&self, aligned: &[Aligned<'_>], stages: &mut Stages) -> Result<Vec<Detection>, EgoError> {
+        let mut maps = Vec::with_capacity(aligned.len());
+        let mut sent = Vec::with_capacity(aligned.len());
+        for Aligned { view, .. } in aligned {
+            let Content::Features(map) = &view.content else { continue };
+            if !self.is_own_shape(map) {
+                return Err(EgoError::OwnMap {
+                    channels: map.features.channels,
+                    found: map.features.grid,
+                    expected_channels: self.detector.map_shape()[0],
+                    expected: self.detector.grid(),
+                });
+            }
+            let [channels, height, width] = self.detector.map_shape();
+            maps.push(Tensor::f_from_slice(&map.features.values)?.f_view([1, channels, height, width])?);
+            sent.push(sent_cells(map, maps.len() == 1, [height, width])?);
+        }
+        let (maps, sent) = (Tensor::f_cat(&maps, 0)?, Tensor::f_cat(&sent, 0)?);
+        let poses: Vec<Pose> = aligned.iter().map(|view| view.ego_from_cav).collect();
+        let warped = warp_to_ego(&maps, Some(&sent), &poses, &self.detector.grid())?;
+        stages.lap("align");
+        let confidence: Vec<f64> = aligned.iter().map(|view| f64::from(view.view.pose.confidence())).collect();
+        let age_secs: Vec<f64> = aligned.iter().map(|view| view.view.age_nanos as f64 * 1e-9).collect();
+        let views = AlignedViews {
+            features: &warped.features,
+            mask: &warped.mask,
+            confidence: &confidence,
+            age_secs: &age_secs,
+        };
+        let fused = self.fusion.fuse(&views)?.f_unsqueeze(0)?.f_contiguous()?;
+        stages.lap("fuse");
+        self.boxes_of(&fused, stages)
+    }
+
+    /// Early fusion: one cloud in the ego frame.
+    fn merge_points(&mut self, aligned: &[Aligned<'_>], stages: &mut Stages) -> Result<Vec<Detection>, EgoError> {
+        let clouds = aligned.iter().filter_map(|Aligned { view, .. }| match &view.content {
+            Content::Points(points) => Some(points),
+            Content::Features(_) | Content::Boxes(_) => None,
+        });
+        let poses: Vec<Pose> = aligned.iter().map(|view| view.ego_from_cav).collect();
+        let merged = merge_points(clouds, &poses);
+        stages.lap("align");
+        let features = self.detector.encode_merged(&merged)?.features;
+        stages.lap("encode");
+        self.boxes_of(&features, stages)
+    }
+
+    /// Late fusion: the boxes of all in the ego frame, the best of those that overlap.
+    fn merge_boxes(&self, aligned: &[Aligned<'_>], stages: &mut Stages) -> Vec<Detection> {
+        let decoded: Vec<(Vec<Decoded>, Isometry3<f64>)> = (aligned.iter())
+            .map(|Aligned { view, ego_from_cav }| {
+                let found = if let Content::Boxes(found) = &view.content { found.as_slice() } else { &[] };
+                let found = found.iter().filter(|found| found.score > self.limits.score_threshold);
+                let boxes = found.map(|found| Decoded { anchor: 0, score: found.score, box3d: found.box3d });
+                (boxes.collect(), ego_from_cav.isometry())
+            })
+            .collect();
+        let boxes: Vec<AgentBoxes<'_>> = (decoded.iter())
+            .map(|(boxes, output_from_agent)| AgentBoxes { boxes, output_from_agent: *output_from_agent })
+            .collect();
+        let merged = postprocess(&boxes, &self.limits);
+        let detections =
+            merged.iter().map(|found| found.detection(Some(aligned[found.agent].view.cav.clone()))).collect();
+        stages.lap("boxes");
+        detections
+    }
+
+    fn boxes_of(&self, features: &Tensor, stages: &mut Stages) -> Result<Vec<Detection>, EgoError> {
+        let heads = self.detector.heads(features)?;
+        stages.lap("head");
+        let decoded = self.detector.boxes(&heads, self.limits.score_threshold)?;
+        let boxes = AgentBoxes { boxes: &decoded, output_from_agent: Isometry3::identity() };
+        let detections = postprocess(&[boxes], &self.limits).iter().map(|found| found.detection(None)).collect();
+        stages.lap("boxes");
+        Ok(detections)
+    }
+}
+
+/// What the ego needs of itself: like its neighbours, and its own map where it is alone.
+#[must_use]
+pub fn own_content(method: Method) -> Exchange {
+    match method.exchange() {
+        Exchange::Nothing => Exchange::Features,
+        other => other,
+    }
+}
+
+/// A view and where it lies.
+struct Aligned<'a> {
+    view: &'a View,
+    ego_from_cav: Pose,
+}
+
+/// `[1, 1, H, W]`: 1 where the sender sent its cell. The ego has all of its own map.
+fn sent_cells(map: &DecodedFeatures, is_ego: bool, [height, width]: [i64; 2]) -> Result<Tensor, TchError> {
+    match &map.sent {
+        Some(sent) if !is_ego => Tensor::f_from_slice(sent)?.f_to_kind(Kind::Float)?.f_view([1, 1, height, width]),
+        _ => Tensor::f_ones([1, 1, height, width], (Kind::Float, tch::Device::Cpu)),
+    }
+}
+
+/// Times of the stages, lap by lap.
+struct Stages {
+    last: Instant,
+    timings: Vec<StageTiming>,
+}
+
+impl Stages {
+    fn start() -> Self {
+        Self { last: Instant::now(), timings: Vec::new() }
+    }
+
+    fn lap(&mut self, stage: &str) {
+        let now = Instant::now();
+        self.timings.push(StageTiming::new(stage, now - self.last));
+        self.last = now;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use agent::agent::{Agent, AgentInput};
+    use agent::model_config::DetectorConfig;
+    use agent::point_pillars::PointPillars;
+    use agent::pose_source::RecordedPose;
+    use protocol::NoPoseReason;
+    use tch::Device;
+    use tch::nn::VarStore;
+
+    use super::*;
+
+    const HERE: Pose = Pose { translation_m: [100.0, 50.0, 2.0], rotation_wxyz: [1.0, 0.0, 0.0, 0.0] };
+
+    /// The same network every time, with a head that believes in vehicles, so that there is something to clean up.
+    fn detector() -> Detector {
+        tch::set_num_threads(1);
+        let config = DetectorConfig { lidar_range_m: [-12.8, -6.4, -3.0, 12.8, 6.4, 1.0], ..DetectorConfig::lean() };
+        let network = VarStore::new(Device::Cpu);
+        let pillars = PointPillars::new(&network.root(), &config).unwrap();
+        for (name, mut variable) in network.variables() {
+            // No generator that tests running beside this one could disturb: values from the shape alone.
+            let count = variable.numel() as i64;
+            let wave = (Tensor::arange(count, (Kind::Float, Device::Cpu)) * 0.7).sin().view(variable.size().as_slice());
+            let new = match name.as_str() {
+                name if name.contains("running") || name.ends_with("norm.weight") => continue,
+                "cls_head.bias" => wave * 0.1 + 0.3,
+                // Small, so that scores are spread rather than all close to one.
+                "cls_head.weight" => wave * 0.01,
+                // Boxes are the anchors themselves, which the clean-up takes for vehicles.
+                "reg_head.weight" | "reg_head.bias" => wave * 0.0,
+                _ if variable.dim() > 1 => wave * (2.0 / (count as f64 / variable.size()[0] as f64).sqrt()),
+                _ => continue,
+            };
+            no_grad(|| variable.copy_(&new));
+        }
+        Detector::from_network(pillars)
+    }
+
+    fn cloud(phase: f32) -> PointCloud {
+        let points = (0..3000).map(|k| {
+            [(k % 83) as f32 * 0.3 - 12.0 + phase, (k % 41) as f32 * 0.3 - 6.0, -1.5 + (k % 7) as f32 * 0.1, 0.2]
+        });
+        PointCloud { xyzi: points.collect() }
+    }
+
+    fn view(name: &str, world_from_cav: Pose, method: Method, phase: f32) -> View {
+        let cav = CavId::new(name).unwrap();
+        let mut agent = Agent::new(cav.clone(), Box::new(RecordedPose), detector());
+        let cloud = cloud(phase);
+        let input = AgentInput { capture_nanos: 0, cloud: &cloud, measured_pose: Some(&world_from_cav) };
+        let output = agent.process(&input).unwrap();
+        let content = match own_content(method) {
+            Exchange::Boxes => Content::Boxes(output.perception.detections),
+            Exchange::Points => Content::Points(agent.detector().crop().without_own_body(&cloud)),
+            _ => Content::Features(DecodedFeatures { features: output.perception.features, sent: None }),
+        };
+        View { cav, pose: output.pose, age_nanos: 0, content }
+    }
+
+    fn near() -> Pose {
+        Pose::from_xyz_yaw([104.0, 51.0, 2.0], 0.3)
+    }
+
+    #[test]
+    fn a_neighbour_changes_what_is_seen_and_the_same_views_give_the_same_bits() {
+        for method in [Method::Early, Method::Max, Method::Attention] {
+            let (own, other) = (view("a", HERE, method, 0.0), view("b", near(), method, 0.15));
+            let mut ego = Ego::new(detector(), method);
+            let alone = ego.detect(&own, &[]).unwrap();
+            let together = ego.detect(&own, std::slice::from_ref(&other)).unwrap();
+            assert_eq!(together.fused, [0], "{method}");
+            assert!(!together.detections.is_empty(), "{method}");
+            assert!(alone.detections != together.detections, "{method}: the neighbour changed nothing");
+            let again = Ego::new(detector(), method).detect(&own, std::slice::from_ref(&other)).unwrap();
+            assert_eq!(again.detections, together.detections, "{method}");
+        }
+    }
+
+    #[test]
+    fn late_fusion_moves_boxes_and_keeps_the_better_of_two() {
+        let found = |x: f64, score: f32| Detection {
+            box3d: protocol::Box3d { center_m: [x, 0.0, -1.0], size_m: [4.0, 1.8, 1.5], heading_rad: 0.0 },
+            score,
+            source: None,
+        };
+        let boxes = |name: &str, world_from_cav: Pose, found: Vec<Detection>| View {
+            cav: CavId::new(name).unwrap(),
+            pose: PoseEstimate::new(world_from_cav, 1.0),
+            age_nanos: 0,
+            content: Content::Boxes(found),
+        };
+        // The other stands 4 m ahead: its box at 1 m is the ego's at 5 m, the one at -10 m only it has seen.
+        let own = boxes("a", HERE, vec![found(5.2, 0.6)]);
+        let ahead = Pose { translation_m: [104.0, 50.0, 2.0], ..HERE };
+        let other = boxes("b", ahead, vec![found(1.0, 0.9), found(-10.0, 0.5), found(-6.0, 0.05)]);
+        let output = Ego::new(detector(), Method::Late).detect(&own, &[other]).unwrap();
+        let seen: Vec<_> = (output.detections.iter())
+            .map(|found| (found.box3d.center_m[0].round(), found.source.as_ref().unwrap().as_str()))
+            .collect();
+        assert_eq!(seen, [(5.0, "b"), (-6.0, "b")]);
+    }
+
+    #[test]
+    fn with_none_left_the_maps_of_every_method_are_those_of_the_ego_alone() {
+        let own = view("a", HERE, Method::None, 0.0);
+        let alone = Ego::new(detector(), Method::None).detect(&own, &[]).unwrap().detections;
+        assert!(!alone.is_empty());
+        let far = view("b", Pose::from_xyz_yaw([200.0, 50.0, 2.0], 0.0), Method::Max, 0.0);
+        let lost =
+            View { pose: PoseEstimate::NoPose { reason: NoPoseReason::NoSource, inlier_count: 0 }, ..far.clone() };
+        for method in [Method::Max, Method::Attention] {
+            let output = Ego::new(detector(), method).detect(&own, &[far.clone(), lost.clone()]).unwrap();
+            assert_eq!(output.detections, alone, "{method}");
+            let reasons = [(0, Skipped::OutOfRange), (1, Skipped::Unusable(DropReason::NoPose))];
+            assert_eq!((output.fused, output.skipped), (vec![], reasons.to_vec()), "{method}");
+        }
+    }
+
+    #[test]
+    fn an_ego_without_pose_goes_on_alone() {
+        let own = view("a", HERE, Method::Max, 0.0);
+        let lost =
+            View { pose: PoseEstimate::NoPose { reason: NoPoseReason::NoSource, inlier_count: 0 }, ..own.clone() };
+        let mut ego = Ego::new(detector(), Method::Max);
+        let output = ego.detect(&lost, &[view("b", near(), Method::Max, 0.1)]).unwrap();
+        assert_eq!(output.detections, ego.detect(&own, &[]).unwrap().detections);
+        assert_eq!(output.skipped, [(0, Skipped::Unusable(DropReason::NoPose))]);
+    }
+
+    #[test]
+    fn cells_that_were_not_sent_have_no_part() {
+        let own = view("a", HERE, Method::Attention, 0.0);
+        let mut other = view("b", near(), Method::Attention, 0.1);
+        let mut ego = Ego::new(detector(), Method::Attention);
+        let Content::Features(map) = &mut other.content else { panic!("attention exchanges maps") };
+        map.sent = Some(vec![false; map.features.grid.cells()]);
+        let output = ego.detect(&own, &[other]).unwrap();
+        assert_eq!(output.fused, [0]);
+        assert_eq!(output.detections, ego.detect(&own, &[]).unwrap().detections);
+    }
+
+    #[test]
+    fn maps_of_another_network_are_left_out_and_named_where_they_are_the_egos_own() {
+        let own = view("a", HERE, Method::Max, 0.0);
+        let mut other = view("b", near(), Method::Max, 0.1);
+        let Content::Features(map) = &mut other.content else { panic!("max exchanges maps") };
+        map.features.channels = 3;
+        let mut ego = Ego::new(detector(), Method::Max);
+        let output = ego.detect(&own, std::slice::from_ref(&other)).unwrap();
+        assert_eq!(output.skipped, [(0, Skipped::Unusable(DropReason::Shape))]);
+        assert!(ego.detect(&other, &[]).unwrap_err().to_string().contains("3 x"));
+        let boxes = View { content: Content::Boxes(vec![]), ..own.clone() };
+        assert!(matches!(ego.detect(&boxes, &[]), Err(EgoError::OwnContent { .. })));
+        assert_eq!(ego.detect(&own, &[boxes]).unwrap().skipped, [(0, Skipped::Unusable(DropReason::Shape))]);
+    }
+}

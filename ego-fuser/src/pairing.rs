@@ -1,0 +1,246 @@
+//! Which message of each CAV belongs to a frame of the ego: by capture time, never by arrival.
+//!
+//! For every CAV the newest message that is not younger than the ego's frame is taken, unless it is too old. What is
+//! younger waits for its frame. A message that served one frame may serve the next one too, should nothing newer come
+//! in time; it is counted as received once.
+
+use std::collections::{BTreeMap, VecDeque};
+
+use protocol::{CavId, DropReason};
+
+/// When messages count.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct PairingConfig {
+    /// A message captured longer before the ego's frame is not used, nanoseconds.
+    pub max_age_nanos: u64,
+    /// A message captured so little after the ego's frame still counts as of its time, nanoseconds: sensors of
+    /// different vehicles do not turn in step.
+    pub max_lead_nanos: u64,
+    /// Messages that wait per CAV at most.
+    pub depth: usize,
+}
+
+impl Default for PairingConfig {
+    /// Three frames of 10 Hz of age, half a frame of lead, eight messages.
+    fn default() -> Self {
+        Self { max_age_nanos: 300_000_000, max_lead_nanos: 50_000_000, depth: 8 }
+    }
+}
+
+/// A message that will not be used, and why.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Dropped {
+    /// Who sent it.
+    pub cav: CavId,
+    /// When it was captured, nanoseconds.
+    pub capture_nanos: u64,
+    /// Why.
+    pub reason: DropReason,
+}
+
+/// A message that belongs to the ego's frame.
+#[derive(Debug, PartialEq)]
+pub struct Paired<'a, T> {
+    /// Who sent it.
+    pub cav: &'a CavId,
+    /// Capture time of the ego's frame less that of the message, nanoseconds.
+    pub age_nanos: i64,
+    /// Whether it has not served an earlier frame: then it counts as received now.
+    pub is_first_use: bool,
+    /// The message.
+    pub message: &'a T,
+}
+
+/// Messages that wait for the ego's frame.
+#[derive(Debug)]
+pub struct Pairing<T> {
+    config: PairingConfig,
+    waiting: BTreeMap<CavId, VecDeque<Waiting<T>>>,
+}
+
+#[derive(Debug)]
+struct Waiting<T> {
+    capture_nanos: u64,
+    is_used: bool,
+    message: T,
+}
+
+impl<T> Pairing<T> {
+    /// Nothing waits yet.
+    #[must_use]
+    pub fn new(config: PairingConfig) -> Self {
+        Self { config, waiting: BTreeMap::new() }
+    }
+
+    /// Takes a message in. What has to go for it is returned: the message itself when it came before or is older than
+    /// one that served already, or the oldest that waits when there are too many.
+    #[must_use = "what was dropped has to be counted"]
+    pub fn insert(&mut self, cav: &CavId, capture_nanos: u64, message: T) -> Option<Dropped> {
+        let dropped = |capture_nanos, reason| Some(Dropped { cav: cav.clone(), capture_nanos, reason });
+        let queue = self.waiting.entry(cav.clone()).or_default();
+        if queue.iter().any(|held| held.capture_nanos == capture_nanos) {
+            return dropped(capture_nanos, DropReason::Duplicate);
+        }
+        if queue.iter().any(|held| held.is_used && held.capture_nanos > capture_nanos) {
+            return dropped(capture_nanos, DropReason::Superseded);
+        }
+        // Messages may overtake each other on the air.
+        let place = queue.partition_point(|held| held.capture_nanos < capture_nanos);
+        queue.insert(place, Waiting { capture_nanos, is_used: false, message });
+        if queue.len() <= self.config.depth.max(1) {
+            return None;
+        }
+        let oldest = queue.pop_front()?;
+        if oldest.is_used { None } else { dropped(oldest.capture_nanos, DropReason::Superseded) }
+    }
+
+    /// The messages that belong to the ego's frame, by CAV, and those that will never be used.
+    pub fn pair(&mut self, ego_capture_nanos: u64) -> (Vec<Paired<'_, T>>, Vec<Dropped>) {
+        let PairingConfig { max_age_nanos, max_lead_nanos, .. } = self.config;
+        let latest = ego_capture_nanos.saturating_add(max_lead_nanos);
+        let earliest = ego_capture_nanos.saturating_sub(max_age_nanos);
+        let mut paired = Vec::new();
+        let mut dropped = Vec::new();
+        for (cav, queue) in &mut self.waiting {
+            let due = queue.partition_point(|held| held.capture_nanos <= latest);
+            let newest = due.checked_sub(1).filter(|&newest| queue[newest].capture_nanos >= earliest);
+            // All before the newest that is due have missed their frame; without one young enough, so have all.
+            for held in queue.drain(..newest.unwrap_or(due)) {
+                let is_old = held.capture_nanos < earliest;
+                let reason = if is_old { DropReason::Stale } else { DropReason::Superseded };
+                if !held.is_used {
+                    dropped.push(Dropped { cav: cav.clone(), capture_nanos: held.capture_nanos, reason });
+                }
+            }
+            if newest.is_some()
+                && let Some(held) = queue.front_mut()
+            {
+                let is_first_use = !std::mem::replace(&mut held.is_used, true);
+                let age_nanos = ego_capture_nanos as i64 - held.capture_nanos as i64;
+                paired.push(Paired { cav, age_nanos, is_first_use, message: &held.message });
+            }
+        }
+        (paired, dropped)
+    }
+
+    /// The capture times of messages of a CAV that wait, oldest first.
+    pub fn capture_times(&self, cav: &CavId) -> impl Iterator<Item = u64> + '_ {
+        self.waiting.get(cav).into_iter().flatten().map(|held| held.capture_nanos)
+    }
+
+    /// Forgets a CAV that has left; how many of its messages were never used.
+    pub fn forget(&mut self, cav: &CavId) -> usize {
+        self.waiting.remove(cav).map_or(0, |queue| queue.iter().filter(|held| !held.is_used).count())
+    }
+
+    /// Messages that wait and were never used, at the end of a run: what the books call in flight.
+    #[must_use]
+    pub fn unused(&self) -> usize {
+        self.waiting.values().flatten().filter(|held| !held.is_used).count()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    const FRAME: u64 = 100_000_000;
+
+    fn cav(name: &str) -> CavId {
+        CavId::new(name).unwrap()
+    }
+
+    fn pairing() -> Pairing<u64> {
+        Pairing::new(PairingConfig::default())
+    }
+
+    fn ages(pairing: &mut Pairing<u64>, ego: u64) -> (Vec<i64>, Vec<DropReason>) {
+        let (paired, dropped) = pairing.pair(ego);
+        (paired.iter().map(|found| found.age_nanos).collect(), dropped.iter().map(|lost| lost.reason).collect())
+    }
+
+    #[test]
+    fn the_message_of_the_same_time_is_taken_whatever_came_last() {
+        let mut pairing = pairing();
+        for frame in [11, 10, 12] {
+            assert_eq!(pairing.insert(&cav("a"), frame * FRAME, frame), None);
+        }
+        let (paired, dropped) = pairing.pair(11 * FRAME);
+        assert_eq!((*paired[0].message, paired[0].age_nanos, paired[0].is_first_use), (11, 0, true));
+        assert_eq!(
+            dropped.iter().map(|lost| (lost.capture_nanos / FRAME, lost.reason)).collect::<Vec<_>>(),
+            [(10, DropReason::Superseded)]
+        );
+        assert_eq!(ages(&mut pairing, 12 * FRAME), (vec![0], vec![]));
+    }
+
+    #[test]
+    fn a_late_neighbour_serves_again_until_it_is_too_old() {
+        let mut pairing = pairing();
+        assert_eq!(pairing.insert(&cav("a"), 10 * FRAME, 10), None);
+        for (frame, first) in [(10, true), (11, false), (13, false)] {
+            let (paired, dropped) = pairing.pair(frame * FRAME);
+            assert_eq!((paired[0].age_nanos, paired[0].is_first_use), ((frame as i64 - 10) * FRAME as i64, first));
+            assert!(dropped.is_empty());
+        }
+        // It was received, so its end is no loss.
+        assert_eq!(ages(&mut pairing, 14 * FRAME), (vec![], vec![]));
+        assert_eq!(pairing.unused(), 0);
+    }
+
+    #[test]
+    fn what_was_never_young_enough_is_stale() {
+        let mut pairing = pairing();
+        assert_eq!(pairing.insert(&cav("a"), FRAME, 1), None);
+        assert_eq!(ages(&mut pairing, 9 * FRAME), (vec![], vec![DropReason::Stale]));
+    }
+
+    #[test]
+    fn the_future_waits_and_a_little_lead_counts() {
+        let mut pairing = pairing();
+        assert_eq!(pairing.insert(&cav("a"), 10 * FRAME + FRAME / 4, 1), None);
+        assert_eq!(ages(&mut pairing, 9 * FRAME), (vec![], vec![]));
+        assert_eq!(ages(&mut pairing, 10 * FRAME), (vec![-(FRAME as i64) / 4], vec![]));
+    }
+
+    #[test]
+    fn duplicates_and_the_overtaken_are_told_apart() {
+        let mut pairing = pairing();
+        assert_eq!(pairing.insert(&cav("a"), 10 * FRAME, 10), None);
+        assert_eq!(pairing.insert(&cav("a"), 10 * FRAME, 10).unwrap().reason, DropReason::Duplicate);
+        let _ = pairing.pair(10 * FRAME);
+        assert_eq!(pairing.insert(&cav("a"), 10 * FRAME, 10).unwrap().reason, DropReason::Duplicate);
+        assert_eq!(pairing.insert(&cav("a"), 9 * FRAME, 9).unwrap().reason, DropReason::Superseded);
+    }
+
+    #[test]
+    fn a_flood_pushes_the_oldest_out() {
+        let mut pairing = pairing();
+        let lost: Vec<_> = (0..20).filter_map(|frame| pairing.insert(&cav("a"), frame * FRAME, frame)).collect();
+        assert_eq!(lost.len(), 12);
+        assert_eq!(pairing.capture_times(&cav("a")).next(), Some(12 * FRAME));
+        assert_eq!(pairing.forget(&cav("a")), 8);
+    }
+
+    proptest! {
+        /// Received, dropped and waiting add up to what came in, whatever comes in whatever order.
+        #[test]
+        fn the_books_balance(events in prop::collection::vec((0u64..40, 0u8..3, any::<bool>()), 0..200)) {
+            let mut pairing = pairing();
+            let (mut sent, mut received, mut lost) = (0, 0, 0);
+            for (frame, sender, is_message) in events {
+                if is_message {
+                    sent += 1;
+                    lost += usize::from(pairing.insert(&cav(&sender.to_string()), frame * FRAME, frame).is_some());
+                } else {
+                    let (paired, dropped) = pairing.pair(frame * FRAME);
+                    received += paired.iter().filter(|found| found.is_first_use).count();
+                    lost += dropped.len();
+                }
+            }
+            prop_assert_eq!(sent, received + lost + pairing.unused());
+        }
+    }
+}
