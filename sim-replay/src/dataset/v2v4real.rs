@@ -135,3 +135,92 @@ fn class(field: &Field<'_>) -> Result<ObjectClass, ReadError> {
         _ => ObjectClass::Other,
     })
 }
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use super::super::numpy_tags::tests::pickled_matrix;
+    use super::super::opv2v::tests::write_frame;
+    use crate::dataset::{self, Layout, LoadOptions, ReadError};
+    use crate::frame::{Frame, ObjectClass};
+    use crate::ground_truth::{GroundTruthRule, merge};
+
+    /// 30 m ahead, half a turn.
+    const PARTNER: [f64; 16] = [-1.0, 0.0, 0.0, 30.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0];
+    const EGO: [f64; 16] = [1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0];
+
+    fn object(id: i64, x: f64, y: f64, keys: &str) -> String {
+        format!(
+            "  {id}:\n    angle: [0, 90, 0]\n    center: [0, 0, 0]\n    extent: [2, 1, 0.75]\n    location: [{x}, {y}, -1]\n{keys}"
+        )
+    }
+
+    fn write(root: &Path, agent: &str, pose: &str, objects: &str) {
+        let yaml = format!("{pose}true_ego_pos: [0, 0, 0, 0, 0, 0]\nego_speed: 3.6\nvehicles:\n{objects}");
+        write_frame(root, &format!("{agent}/000000"), &yaml, &[[1.0, 2.0, 3.0, 0.5]]);
+    }
+
+    fn load(root: &Path, agent: usize) -> Result<Frame, ReadError> {
+        let dataset = dataset::open(root).unwrap();
+        assert_eq!(dataset.layout, Layout::V2v4Real);
+        dataset.scenarios[0].load(agent, 0, &LoadOptions::default())
+    }
+
+    #[test]
+    fn objects_of_both_agents_meet_in_the_world() {
+        let dir = tempfile::tempdir().unwrap();
+        let matched = "    ass_id: 5\n    obj_type: Truck\n";
+        let walker = object(9, 3.0, 0.0, "    ass_id: 9\n    obj_type: Pedestrian\n");
+        write(dir.path(), "0", &pickled_matrix(&EGO), &(object(1, 10.0, 4.0, matched) + &walker));
+        let lonely = object(7, 25.0, 0.0, "    ass_id: -1\n");
+        write(dir.path(), "1", &pickled_matrix(&PARTNER), &(object(2, 20.0, -4.0, matched) + &lonely));
+        let (ego, partner) = (load(dir.path(), 0).unwrap(), load(dir.path(), 1).unwrap());
+        assert_eq!(ego.points.xyzi, [[1.0, 2.0, 3.0, 0.5]], "nothing is mirrored");
+        assert_eq!(ego.speed_mps, Some(1.0));
+        assert_eq!(ego.objects[0].class, ObjectClass::Truck);
+        let place = |frame: &Frame| frame.objects[0].world_from_object.translation_m;
+        for (a, b) in place(&ego).iter().zip(place(&partner)) {
+            assert!((a - b).abs() < 1e-9, "the same truck: {:?} {:?}", place(&ego), place(&partner));
+        }
+        // Without partner: object id + 100 * agent id. The pedestrian does not count.
+        let ids: Vec<i64> =
+            merge(&[&ego, &partner], 0, &GroundTruthRule::V2V4REAL).into_iter().map(|(id, _)| id).collect();
+        assert_eq!(ids, [5, 107]);
+        let heading = ego.objects[0].world_from_object.yaw_rad().to_degrees();
+        assert!((heading - 90.0).abs() < 1e-9, "right-handed as it stands: {heading}");
+    }
+
+    #[test]
+    fn nested_lists_and_six_numbers_are_poses_too() {
+        let dir = tempfile::tempdir().unwrap();
+        let object = object(1, 10.0, 4.0, "    ass_id: 1\n");
+        for pose in [
+            "lidar_pose: [[-1, 0, 0, 30], [0, -1, 0, 0], [0, 0, 1, 0], [0, 0, 1e-17, 1]]\n",
+            "lidar_pose: [30, 0, 0, 0, 180, 0]\n",
+        ] {
+            write(dir.path(), "0", pose, &object);
+            let [x, y, z] = load(dir.path(), 0).unwrap().objects[0].world_from_object.translation_m;
+            assert!((x - 20.0).abs() < 1e-9 && (y + 4.0).abs() < 1e-9 && (z + 1.0).abs() < 1e-9, "{x} {y} {z}");
+        }
+    }
+
+    #[test]
+    fn what_is_no_pose_is_named() {
+        let dir = tempfile::tempdir().unwrap();
+        let mut scaled = PARTNER;
+        scaled[0] = -1.1;
+        for (pose, expected) in [
+            (pickled_matrix(&scaled), "000000.yaml:2: lidar_pose: pose matrix is not a rotation"),
+            (
+                "lidar_pose: [[1, 0], [0, 1]]\n".into(),
+                "lidar_pose: a list of 2, expected 4 rows of a matrix or 6 numbers",
+            ),
+            (pickled_matrix(&EGO).replace("_reconstruct", "evil"), "is none of those that are known"),
+        ] {
+            write(dir.path(), "0", &pose, &object(1, 10.0, 4.0, ""));
+            let error = load(dir.path(), 0).unwrap_err().to_string();
+            assert!(error.contains(expected), "{error}");
+        }
+    }
+}

@@ -226,3 +226,91 @@ fn summarize_agent(id: &CavId, frames: &[&FrameFindings]) -> AgentReport {
         distance_m: (!positions.is_empty()).then(|| positions.windows(2).map(step).fold(0.0, |sum, step| sum + step)),
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+    use std::path::PathBuf;
+
+    use super::*;
+    use crate::pcd::{Encoding, IntensityField, encode};
+
+    const YAML: &str = "lidar_pose: [0, 0, 2, 0, 0, 0]\nvehicles:\n  7: {location: [10, 0, 0], center: [0, 0, 0.7], \
+                        angle: [0, 0, 0], extent: [2, 1, 0.7]}\n";
+
+    fn write(root: &Path, name: &str, bytes: &[u8]) -> PathBuf {
+        let path = root.join(name);
+        fs::create_dir_all(path.parent().unwrap()).unwrap();
+        fs::write(&path, bytes).unwrap();
+        path
+    }
+
+    fn sweep(points: &[[f32; 4]]) -> Vec<u8> {
+        encode(&PointCloud { xyzi: points.to_vec() }, Encoding::Ascii, IntensityField::Intensity)
+    }
+
+    fn survey(root: &Path) -> (Report, Vec<String>) {
+        let report = inspect(root, &|_, _| {});
+        let root = root.to_string_lossy();
+        let messages = report.problems.iter().map(|problem| problem.message.replace(&*root, "")).collect();
+        (report, messages)
+    }
+
+    #[test]
+    fn sound_frames_are_counted() {
+        let dir = tempfile::tempdir().unwrap();
+        for (stem, points) in [("000010", vec![[10.0, 0.0, -1.3, 0.5]]), ("000012", vec![[1.0, 0.0, 0.0, 0.5]; 3])] {
+            write(dir.path(), &format!("1/{stem}.yaml"), YAML.as_bytes());
+            write(dir.path(), &format!("1/{stem}.pcd"), &sweep(&points));
+        }
+        let (report, messages) = survey(dir.path());
+        assert!(messages.is_empty(), "{messages:?}");
+        let scenario = &report.scenarios[0];
+        assert_eq!((scenario.frames, scenario.rate_hz), (2, Some(10.0)));
+        let agent = &scenario.agents[0];
+        assert_eq!(agent.points, Some(Summary { min: 1, mean: 2.0, max: 3 }));
+        assert_eq!(agent.boxes_without_points, 1, "the second sweep has no point in the box");
+        assert_eq!(agent.distance_m, Some(0.0));
+        assert!(report.to_string().contains("ground truth of ego 1: 1 alone"), "{report}");
+    }
+
+    #[test]
+    fn all_that_is_wrong_is_said_and_the_rest_is_counted() {
+        let dir = tempfile::tempdir().unwrap();
+        let root = dir.path();
+        let whole = sweep(&[[10.0, 0.0, -1.3, 0.5], [1.0, 2.0, 3.0, 0.5]]);
+        // A cut sweep, a NaN, a wrong pose, a missing YAML and a sound frame.
+        write(root, "1/000010.yaml", YAML.as_bytes());
+        write(root, "1/000010.pcd", &whole[..whole.len() - 3]);
+        write(root, "1/000012.yaml", YAML.as_bytes());
+        write(root, "1/000012.pcd", &sweep(&[[1.0, 2.0, f32::NAN, 0.5], [1.0, 2.0, 3.0, 0.5]]));
+        write(root, "1/000014.yaml", YAML.replace("[0, 0, 2, 0, 0, 0]", "[0, 0, 2]").as_bytes());
+        write(root, "1/000014.pcd", &whole);
+        write(root, "1/000016.pcd", &whole);
+        write(root, "1/000018.yaml", YAML.as_bytes());
+        write(root, "1/000018.pcd", &whole);
+        let (report, messages) = survey(root);
+        assert_eq!(
+            messages,
+            [
+                "/1/000010.pcd:13: intensity: \"5e\" is no number: the file is cut off here, after 1 of 2 POINTS",
+                "/1/000012.pcd: 1 of 2 points are not finite and are left out, the first in line 12",
+                "/1/000014.yaml:1: lidar_pose: a list of 3, expected 6 numbers",
+                "/1/000016.yaml: does not exist beside 000016.pcd: the frame is left out",
+            ]
+        );
+        assert_eq!((report.problems[2].line, report.problems[2].field.as_deref()), (Some(1), Some("lidar_pose")));
+        let agent = &report.scenarios[0].agents[0];
+        assert_eq!((agent.points, agent.dropped_points), (Summary::of(&[1, 2, 2]), 1));
+        assert_eq!(report.ticks.len(), 3, "annotations of sound YAML count even where the sweep is broken");
+    }
+
+    #[test]
+    fn what_is_no_dataset_is_a_problem() {
+        let dir = tempfile::tempdir().unwrap();
+        let (report, messages) = survey(dir.path());
+        assert_eq!(report.layout, None);
+        assert!(messages[0].contains("no known layout"), "{messages:?}");
+        assert!(report.to_string().contains("1 problem:"));
+    }
+}

@@ -22,7 +22,7 @@ pub(super) fn decode(header: &Header, body: &[u8]) -> Result<PcdCloud, PcdError>
     let labelled = matches!(header.intensity, IntensitySource::Red(_));
     let mut collector = Collector::with_capacity(header.points.min(possible), labelled);
     let mut read = 0;
-    for (line, text) in (header.lines + 1..).zip(body.split(|&byte| byte == b'\n')) {
+    for (line, text) in (header.lines + 1..).zip(body.split_inclusive(|&byte| byte == b'\n')) {
         let mut tokens = text.split(u8::is_ascii_whitespace).filter(|token| !token.is_empty()).peekable();
         if tokens.peek().is_none() {
             continue;
@@ -30,7 +30,9 @@ pub(super) fn decode(header: &Header, body: &[u8]) -> Result<PcdCloud, PcdError>
         if read == header.points {
             return Err(PcdError::at(line, "POINTS", format!("{} stated, but here is another point", header.points)));
         }
-        let (point, label) = parse_point(header, &columns, tokens, line)?;
+        let is_complete = text.ends_with(b"\n");
+        let (point, label) = parse_point(header, &columns, tokens, line)
+            .map_err(|error| if is_complete { error } else { cut_off(error, read, header.points) })?;
         collector.push(point, labelled.then_some(label), Place::Line(line));
         read += 1;
     }
@@ -38,6 +40,12 @@ pub(super) fn decode(header: &Header, body: &[u8]) -> Result<PcdCloud, PcdError>
         return Err(PcdError::of("POINTS", format!("{} stated, {read} found: the file is cut off", header.points)));
     }
     Ok(collector.finish())
+}
+
+/// A last line that is wrong and does not end is no typing mistake.
+fn cut_off(error: PcdError, read: usize, stated: usize) -> PcdError {
+    let reason = format!("{}: the file is cut off here, after {read} of {stated} POINTS", error.reason);
+    PcdError { reason, ..error }
 }
 
 fn columns(header: &Header) -> Vec<Column> {
@@ -204,6 +212,11 @@ mod tests {
         let text = String::from_utf8(file("x y z", "F F F", &["1 2 3", "4 5 6"])).unwrap();
         let cut = text.replace("4 5 6\n", "");
         assert_eq!(decode(cut.as_bytes()).unwrap_err().to_string(), "POINTS: 2 stated, 1 found: the file is cut off");
+        let inside = text.strip_suffix("5 6\n").unwrap();
+        assert_eq!(
+            decode(inside.as_bytes()).unwrap_err().to_string(),
+            "line 12: y: 1 values in the line, expected 3: the file is cut off here, after 1 of 2 POINTS"
+        );
         let long = text + "7 8 9\n";
         assert_eq!(
             decode(long.as_bytes()).unwrap_err().to_string(),
