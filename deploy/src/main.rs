@@ -25,8 +25,20 @@ fn main() -> ExitCode {
     match CommandLine::parse().command.run() {
         Ok(outcome) => outcome.into(),
         Err(error) => {
-            eprintln!("v2vloc: {error:#}");
+            eprintln!("v2vloc: {}", in_words(&error));
             command::exit_code(&error)
         }
     }
+}
+
+/// The chain of causes on one line, without those that the message above them quotes already.
+fn in_words(error: &anyhow::Error) -> String {
+    error.chain().fold(String::new(), |words, cause| {
+        let cause = cause.to_string();
+        match words.as_str() {
+            "" => cause,
+            said if said.contains(&cause) => words,
+            said => format!("{said}: {cause}"),
+        }
+    })
 }
