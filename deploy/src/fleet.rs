@@ -17,6 +17,9 @@ use crate::supervise::{Life, ProcessSpec};
 /// Vehicles farther than this from the ego do not take part, metres (the rule of the OPV2V family).
 const COMM_RANGE_M: f64 = 70.0;
 
+/// Name of the process that plays the scene.
+pub const REPLAY: &str = "replay";
+
 /// Why a scenario makes no fleet.
 #[derive(Debug, thiserror::Error)]
 pub enum FleetError {
@@ -197,16 +200,16 @@ impl Fleet {
         args.option("--pose-source", settings.pose.name());
         if let PoseSource::Noisy(noise) = settings.pose {
             args.option("--noise-mode", noise_mode(noise.mode));
-            args.option("--noise-std-m", &noise.std_m.to_string());
-            args.option("--noise-std-deg", &noise.std_deg.to_string());
+            args.option("--noise-position-std", &noise.std_m.to_string());
+            args.option("--noise-heading-std", &noise.std_deg.to_string());
             args.option("--noise-seed", &noise.seed.to_string());
         }
         args.option("--dtype", dtype(settings.codec.dtype));
         if let Some(bytes) = settings.codec.budget_bytes {
-            args.option("--budget-bytes", &bytes.to_string());
+            args.option("--budget", &bytes.to_string());
         }
         if let Some(level) = settings.codec.zstd_level {
-            args.option("--zstd-level", &level.to_string());
+            args.option("--zstd", &level.to_string());
         }
         meeting.process(format!("agent-{cav}"), "agent", args, Life::Service)
     }
@@ -248,7 +251,7 @@ impl Fleet {
             args.option("--expect", &route.to_string());
         }
         args.option("--ready-timeout", &self.scenario.timeouts.ready_s.to_string());
-        meeting.process("replay".into(), "sim-replay", args, Life::Task)
+        meeting.process(REPLAY.into(), "sim-replay", args, Life::Task)
     }
 
     /// What has to stand before the clock starts, beside the routes from the replay to the agents that it knows itself.

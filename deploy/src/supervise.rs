@@ -44,9 +44,9 @@ pub struct ProcessSpec {
 /// What the end of a process means.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Life {
-    /// It should never end by itself; when it does, it is started again.
+    /// When it fails, it is started again.
     Service,
-    /// It has one job; its end, good or bad, is reported and final.
+    /// It has one job, which cannot be taken up in the middle; when it fails, it stays down.
     Task,
 }
 
@@ -79,7 +79,7 @@ pub enum Happening {
         /// How it ended, in words, with the last line of its log.
         how: String,
     },
-    /// A task is done.
+    /// It ended by itself, as it should.
     Done {
         /// It says that data were lost.
         data_lost: bool,
@@ -164,6 +164,12 @@ impl Supervisor {
         Ok(Self { runtime, watched })
     }
 
+    /// Whether every process has ended for good.
+    #[must_use]
+    pub fn all_ended(&self) -> bool {
+        self.watched.iter().all(|watched| watched.task.is_finished())
+    }
+
     /// Ends the processes that `which` chooses by name: asks them with SIGTERM, kills what is left at `deadline`.
     /// Returns when they are gone.
     pub fn end(&mut self, which: impl Fn(&str) -> bool, deadline: Instant) -> StopReport {
@@ -233,7 +239,7 @@ impl Watcher {
                     let stop = self.stop.clone();
                     tokio::select! {
                         status = child.wait() => match status {
-                            Ok(status) if self.spec.life == Life::Task && is_done(status) => {
+                            Ok(status) if is_done(status) => {
                                 self.tell(Happening::Done { data_lost: !status.success() });
                                 return false;
                             }
@@ -343,10 +349,10 @@ mod tests {
     }
 
     #[test]
-    fn a_task_that_ends_well_is_done() {
-        let (supervisor, events, folder) = start(shell("job", Life::Task, "echo hello"), 3);
+    fn who_ends_well_is_done() {
+        let (supervisor, events, folder) = start(shell("job", Life::Service, "echo hello; exit 3"), 3);
         assert!(matches!(next(&events), Happening::Started { .. }));
-        assert_eq!(next(&events), Happening::Done { data_lost: false });
+        assert_eq!(next(&events), Happening::Done { data_lost: true });
         assert_eq!(std::fs::read_to_string(folder.path().join("job.log")).unwrap(), "hello\n");
         assert!(supervisor.stop(PATIENCE).killed.is_empty());
     }

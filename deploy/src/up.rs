@@ -10,7 +10,7 @@ use sim_replay::bus::shutdown::Stop;
 use sim_replay::bus::{BusError, Endpoint};
 
 use crate::fingerprint::Provenance;
-use crate::fleet::{Fleet, FleetError};
+use crate::fleet::{Fleet, FleetError, REPLAY};
 use crate::metrics::{Messages, Metrics};
 use crate::network::MeetingPlace;
 use crate::progress::Display;
@@ -169,8 +169,8 @@ fn watch(
     let mut supervisor = Supervisor::start(specs, &folder.log_dir(), restarts, &events)?;
     let ending = follow(&happened, scorer, stop, &mut display);
     let limits = Limits::of(fleet, &ending);
-    let mut killed = supervisor.end(|name| name == "replay", limits.replay).killed;
-    drain(scorer, limits.drain, &mut display);
+    let mut killed = supervisor.end(|name| name == REPLAY, limits.replay).killed;
+    drain(&supervisor, scorer, limits.drain, &mut display);
     killed.extend(supervisor.end(|name| name.starts_with("agent"), limits.all).killed);
     killed.extend(supervisor.end(|_| true, limits.all).killed);
     display.finish();
@@ -199,9 +199,12 @@ fn follow(happened: &Receiver<ProcessEvent>, scorer: &ScorerNode, stop: &Stop, d
             Happening::GaveUp { how } => return Ending::Failed { process: name, how },
             Happening::Done { data_lost } => {
                 if data_lost {
-                    display.say(&format!("{name}: some of the scene could not be played; see its log"));
+                    display.say(&format!("{name} says that data were lost; see its log"));
                 }
-                return Ending::Over;
+                // The replay is the clock of the run; the others follow it.
+                if name == REPLAY {
+                    return Ending::Over;
+                }
             }
         }
     }
@@ -234,14 +237,11 @@ impl Limits {
     }
 }
 
-/// Waits until the ego has told of every tick, or the time is over.
-fn drain(scorer: &ScorerNode, until: Instant, display: &mut Display) {
-    loop {
-        let progress: Progress = scorer.progress();
-        display.update(&progress);
-        if progress.frames >= progress.ticks || Instant::now() >= until {
-            return;
-        }
+/// Waits until the end of the scene has passed through the fleet: agents end when the replay has, the ego when they
+/// have, and everyone's last word is in. What is left when the time is over is not waited for.
+fn drain(supervisor: &Supervisor, scorer: &ScorerNode, until: Instant, display: &mut Display) {
+    while !supervisor.all_ended() && Instant::now() < until {
+        display.update(&scorer.progress());
         std::thread::sleep(BEAT.min(until.saturating_duration_since(Instant::now())));
     }
 }
