@@ -3,8 +3,10 @@
 //!
 //! - [`scenario`]: what is asked for; [`fleet`]: which processes that takes.
 //! - [`up`]: one run, with its [`network`], [`supervise`]d processes and [`score`].
+//! - [`evaluation`]: the same numbers without a network.
 //! - [`run_folder`], [`metrics`], [`ledger_report`], [`picture`]: what is kept of it.
 
+pub mod evaluation;
 pub mod fingerprint;
 pub mod fleet;
 pub mod ledger_report;

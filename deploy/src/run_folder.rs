@@ -103,7 +103,7 @@ fn frames_csv(records: &[FrameRecord]) -> String {
         "frame_index,capture_nanos,latency_ms,detected,truth,found,fused,skipped,payload_bytes,wire_bytes,ego_error_m,\
          ego_error_deg\n",
     );
-    let optional = |number: Option<f64>| number.map_or(String::new(), |number| format!("{number:.4}"));
+    let optional = |number: &Option<f64>| number.map_or(String::new(), |number| format!("{number:.4}"));
     for record in records {
         // Destructured in full, so that a new column stops the build here.
         let FrameRecord {
@@ -120,11 +120,11 @@ fn frames_csv(records: &[FrameRecord]) -> String {
             ego_error_m,
             ego_error_deg,
         } = record;
-        let (error_m, error_deg) = (optional(*ego_error_m), optional(*ego_error_deg));
+        let [latency_ms, error_m, error_deg] = [latency_ms, ego_error_m, ego_error_deg].map(optional);
         // Writing to a string cannot fail.
         let _ = writeln!(
             text,
-            "{frame_index},{capture_nanos},{latency_ms:.3},{detected},{truth},{found},{fused},{skipped},\
+            "{frame_index},{capture_nanos},{latency_ms},{detected},{truth},{found},{fused},{skipped},\
              {payload_bytes},{wire_bytes},{error_m},{error_deg}"
         );
     }
@@ -178,7 +178,7 @@ mod tests {
         let record = FrameRecord {
             frame_index: 3,
             capture_nanos: 300_000_000,
-            latency_ms: 81.25,
+            latency_ms: Some(81.25),
             detected: 20,
             truth: 22,
             found: 18,
@@ -191,7 +191,7 @@ mod tests {
         };
         let text = frames_csv(&[record]);
         let lines: Vec<&str> = text.lines().collect();
-        assert_eq!(lines[1], "3,300000000,81.250,20,22,18,1,0,1000,1300,0.2500,");
+        assert_eq!(lines[1], "3,300000000,81.2500,20,22,18,1,0,1000,1300,0.2500,");
         assert_eq!(lines[0].matches(',').count(), lines[1].matches(',').count());
     }
 

@@ -237,11 +237,15 @@ impl Limits {
     }
 }
 
-/// Waits until the end of the scene has passed through the fleet: agents end when the replay has, the ego when they
-/// have, and everyone's last word is in. What is left when the time is over is not waited for.
+/// Waits until the ego has told of every tick there was, or the time is over.
 fn drain(supervisor: &Supervisor, scorer: &ScorerNode, until: Instant, display: &mut Display) {
     while !supervisor.all_ended() && Instant::now() < until {
-        display.update(&scorer.progress());
+        let progress = scorer.progress();
+        display.update(&progress);
+        // The number of ticks is known for certain only after the replay's last word on them.
+        if progress.ended && progress.frames >= progress.ticks {
+            return;
+        }
         std::thread::sleep(BEAT.min(until.saturating_duration_since(Instant::now())));
     }
 }

@@ -2,4 +2,5 @@
 
 pub mod bus;
 pub mod fixtures;
+pub mod fleet;
 pub mod scene;

@@ -1,12 +1,14 @@
 //! One file per subcommand: its arguments, and the call into the library.
 
 mod demo;
+mod eval;
 mod up;
 
 use std::path::PathBuf;
 use std::process::ExitCode;
 
 use anyhow::Context;
+use deploy::evaluation::EvaluationError;
 use deploy::fleet::FleetError;
 use deploy::scenario::ScenarioError;
 use deploy::up::UpError;
@@ -16,6 +18,8 @@ use deploy::up::UpError;
 pub(crate) enum Command {
     /// Generate a scene if there is none, run a fleet over it, print what came of it.
     Demo(demo::Arguments),
+    /// Judge methods on recorded scenes without a network: AP, pose errors, bytes.
+    Eval(eval::Arguments),
     /// Start a fleet: processes, scene, models, network; Ctrl-C ends it.
     Up(up::Arguments),
 }
@@ -25,6 +29,7 @@ impl Command {
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
         match self {
             Self::Demo(arguments) => arguments.run(),
+            Self::Eval(arguments) => arguments.run(),
             Self::Up(arguments) => arguments.run(),
         }
     }
@@ -65,6 +70,7 @@ pub(crate) fn exit_code(error: &anyhow::Error) -> ExitCode {
         cause.is::<BadInput>()
             || cause.is::<ScenarioError>()
             || cause.is::<FleetError>()
+            || cause.is::<EvaluationError>()
             || cause.downcast_ref::<UpError>().is_some_and(UpError::is_bad_input)
     });
     if is_bad_input { ExitCode::from(2) } else { ExitCode::FAILURE }

@@ -326,6 +326,6 @@ pub struct Timeouts {
 
 impl Default for Timeouts {
     fn default() -> Self {
-        Self { ready_s: 60.0, drain_s: 5.0, stop_s: 4.0, restarts: 5 }
+        Self { ready_s: 60.0, drain_s: 3.0, stop_s: 4.0, restarts: 5 }
     }
 }

@@ -22,8 +22,8 @@ pub struct FrameRecord {
     pub frame_index: u64,
     /// Capture time on the scene's clock, nanoseconds.
     pub capture_nanos: u64,
-    /// From the publication of the tick to that of its detections, milliseconds.
-    pub latency_ms: f64,
+    /// From the publication of the tick to that of its detections, milliseconds; none where nothing was published.
+    pub latency_ms: Option<f64>,
     /// Boxes detected.
     pub detected: usize,
     /// Boxes there were.
@@ -102,6 +102,11 @@ impl Board {
         }
     }
 
+    /// Goes on with the results of another vehicle: in another scenario.
+    pub fn change_ego(&mut self, ego: &CavId) {
+        self.ego.clone_from(ego);
+    }
+
     /// What was there at a tick.
     pub fn truth(&mut self, stamp: &Stamp, truth: Truth) {
         if let Some(tick) = self.tick(stamp.capture_nanos) {
@@ -173,7 +178,7 @@ impl Board {
     /// Delays of all frames.
     #[must_use]
     pub fn latencies(&self) -> Latencies {
-        let sample: Vec<f64> = self.records.iter().map(|record| record.latency_ms).collect();
+        let sample: Vec<f64> = self.records.iter().filter_map(|record| record.latency_ms).collect();
         Latencies { capture_to_detection: Percentiles::of(&sample) }
     }
 
@@ -200,21 +205,49 @@ impl Board {
     fn judge(&mut self, capture_nanos: u64, tick: Tick) {
         self.judged_until = Some(capture_nanos);
         let Some((began_nanos, truth)) = tick.truth else { return };
-        self.judge_poses(&tick.poses, &truth);
+        let world_from_lidar: Vec<(CavId, Pose)> =
+            truth.agents.iter().map(|agent| (agent.cav.clone(), agent.world_from_lidar)).collect();
+        self.judge_poses(&tick.poses, &world_from_lidar);
         let Some((done_nanos, result)) = tick.result else {
             self.missed += 1;
             return;
         };
         let boxes = true_boxes(&truth, &self.ego, &self.rule);
+        let latency_ms = (done_nanos as f64 - began_nanos as f64) / 1e6;
+        self.judge_result(capture_nanos, Some(latency_ms), result, boxes, world_from_lidar);
+    }
+
+    /// Judges a frame whose truth is known already, at once; `poses` are everyone's estimates. Nothing that
+    /// [`Self::truth`], [`Self::result`] and [`Self::pose`] take may be given for it.
+    pub fn judge_whole(
+        &mut self,
+        capture_nanos: u64,
+        result: Detections,
+        boxes: Vec<Box3d>,
+        poses: &[(CavId, PoseEstimate)],
+        world_from_lidar: Vec<(CavId, Pose)>,
+    ) {
+        self.judge_poses(poses, &world_from_lidar);
+        self.judge_result(capture_nanos, None, result, boxes, world_from_lidar);
+    }
+
+    fn judge_result(
+        &mut self,
+        capture_nanos: u64,
+        latency_ms: Option<f64>,
+        result: Detections,
+        boxes: Vec<Box3d>,
+        world_from_lidar: Vec<(CavId, Pose)>,
+    ) {
         let found = self.score(&result, &boxes);
         let bytes: Vec<(u64, u64)> =
             result.fused.iter().map(|neighbour| (neighbour.payload_bytes, neighbour.wire_bytes)).collect();
-        let ego_error = result.pose.world_from_cav().zip(true_pose(&truth, &self.ego));
+        let ego_error = result.pose.world_from_cav().zip(true_pose(&world_from_lidar, &self.ego));
         let ego_error = ego_error.map(|(found, truth)| PoseError::between(found, truth));
         self.records.push(FrameRecord {
             frame_index: result.frame_index,
             capture_nanos,
-            latency_ms: (done_nanos as f64 - began_nanos as f64) / 1e6,
+            latency_ms,
             detected: result.detections.len(),
             truth: boxes.len(),
             found,
@@ -226,7 +259,7 @@ impl Board {
             ego_error_deg: ego_error.map(|error| error.angle_deg),
         });
         self.bytes.extend(bytes);
-        self.keep_showpiece(result, boxes, &truth);
+        self.keep_showpiece(result, boxes, world_from_lidar);
     }
 
     /// Adds a frame to the score; returns how many detections count as found.
@@ -241,7 +274,7 @@ impl Board {
         tally(&self.scorer)
     }
 
-    fn judge_poses(&mut self, poses: &[(CavId, PoseEstimate)], truth: &Truth) {
+    fn judge_poses(&mut self, poses: &[(CavId, PoseEstimate)], truth: &[(CavId, Pose)]) {
         for (cav, estimate) in poses {
             match (estimate.world_from_cav(), true_pose(truth, cav)) {
                 (Some(found), Some(truth)) => self.pose_errors.push(PoseError::between(found, truth)),
@@ -252,21 +285,19 @@ impl Board {
         }
     }
 
-    fn keep_showpiece(&mut self, result: Detections, boxes: Vec<Box3d>, truth: &Truth) {
+    fn keep_showpiece(&mut self, result: Detections, boxes: Vec<Box3d>, world_from_lidar: Vec<(CavId, Pose)>) {
         let worth = |fused: usize, boxes: usize| (fused, boxes);
         let better = self.best.as_ref().is_none_or(|best| {
             worth(result.fused.len(), boxes.len()) > worth(best.result.fused.len(), best.truth.len())
         });
         if better {
-            let world_from_lidar =
-                truth.agents.iter().map(|agent| (agent.cav.clone(), agent.world_from_lidar)).collect();
             self.best = Some(JudgedFrame { frame_index: result.frame_index, result, truth: boxes, world_from_lidar });
         }
     }
 }
 
-fn true_pose<'a>(truth: &'a Truth, cav: &CavId) -> Option<&'a Pose> {
-    truth.agents.iter().find(|agent| agent.cav == *cav).map(|agent| &agent.world_from_lidar)
+fn true_pose<'a>(truth: &'a [(CavId, Pose)], cav: &CavId) -> Option<&'a Pose> {
+    truth.iter().find(|(known, _)| known == cav).map(|(_, pose)| pose)
 }
 
 /// The boxes the ego is expected to find, in its LiDAR frame.
@@ -384,7 +415,7 @@ mod tests {
         board.close();
         let record = &board.records()[0];
         assert_eq!((record.truth, record.detected, record.found), (2, 3, 2), "the pedestrian does not count");
-        assert_eq!((record.latency_ms, record.payload_bytes, record.wire_bytes), (80.0, 1000, 1300));
+        assert_eq!((record.latency_ms, record.payload_bytes, record.wire_bytes), (Some(80.0), 1000, 1300));
         assert_eq!(record.ego_error_m, Some(1.0));
         let (global, _) = board.average_precision();
         assert_eq!(global.at_50, Some(1.0), "the false box has the same score and comes last");
@@ -426,7 +457,7 @@ mod tests {
         board.result(&stamp("e", 1, 90), result(1, &[]));
         board.close();
         assert_eq!((board.missed(), board.records().len()), (2, 1));
-        assert_eq!((board.records()[0].latency_ms, board.records()[0].detected), (50.0, 1));
+        assert_eq!((board.records()[0].latency_ms, board.records()[0].detected), (Some(50.0), 1));
     }
 
     #[test]

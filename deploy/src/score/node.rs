@@ -210,9 +210,6 @@ impl Worker {
                 Taken::Closed => break,
             }
         }
-        if let Err(error) = self.detections.flush() {
-            tracing::error!("detections.jsonl is incomplete: {error}");
-        }
         self.board.close();
         (self.board, self.books)
     }
@@ -247,7 +244,9 @@ impl Worker {
         let result: Detections = self.inbox.decode(arrival, &Limits::DEFAULT)?;
         let stamp = &arrival.header.stamp;
         let report = DetectionsReport::new(stamp, result.clone());
-        if let Err(error) = writeln!(self.detections, "{}", report.to_json()) {
+        // Flushed line by line: someone may be following the file.
+        let written = writeln!(self.detections, "{}", report.to_json()).and_then(|()| self.detections.flush());
+        if let Err(error) = written {
             tracing::error!("detections.jsonl is incomplete: {error}");
         }
         let began = self.published.get(&stamp.capture_nanos);

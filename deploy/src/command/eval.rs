@@ -1,0 +1,147 @@
+//! `v2vloc eval`.
+
+use std::path::PathBuf;
+
+use agent::pose_source::{NoiseMode, NoisyPoseConfig, PoseSourceConfig};
+use clap::ValueEnum;
+use deploy::evaluation::{EvaluationOptions, evaluate, frame_count};
+use deploy::report;
+use ego_fuser::Method;
+use indicatif::{ProgressBar, ProgressStyle};
+use protocol::{CodecConfig, Dtype};
+
+use super::{BadInput, Outcome};
+
+#[derive(Debug, clap::Args)]
+pub(crate) struct Arguments {
+    /// Data set, split or scenario; the layout is found out. The first vehicle of each scenario is the ego.
+    #[arg(long, value_name = "DIR")]
+    dataset: PathBuf,
+    /// Fusion methods: none, late, early, max, attention; several give one table.
+    #[arg(long, value_name = "NAME", value_delimiter = ',', required = true)]
+    method: Vec<Method>,
+    /// Weights of the detector, or a folder with a file *-METHOD.safetensors for each method.
+    #[arg(long, value_name = "FILE")]
+    weights: PathBuf,
+    /// Where the vehicles' poses come from.
+    #[arg(long, value_enum, default_value_t = PoseFrom::Recorded)]
+    pose_source: PoseFrom,
+    /// Standard deviation of x, y and z, metres (--pose-source noisy).
+    #[arg(long, default_value_t = NoisyPoseConfig::default().position_std_m)]
+    noise_position_std: f64,
+    /// Standard deviation of yaw, degrees (--pose-source noisy).
+    #[arg(long, default_value_t = NoisyPoseConfig::default().heading_std_deg)]
+    noise_heading_std: f64,
+    /// How the errors of successive frames hang together (--pose-source noisy).
+    #[arg(long, value_enum, default_value_t = Mode::Fixed)]
+    noise_mode: Mode,
+    /// Same seed, same errors (--pose-source noisy).
+    #[arg(long, default_value_t = NoisyPoseConfig::default().seed)]
+    noise_seed: u64,
+    /// How exactly feature values cross the air.
+    #[arg(long, value_enum, default_value_t = Exactness::F32)]
+    dtype: Exactness,
+    /// Most bytes of a feature map, before packing [default: all cells].
+    #[arg(long, value_name = "BYTES")]
+    budget: Option<u64>,
+    /// zstd level, 1 to 22 [default: maps are not packed].
+    #[arg(long, value_name = "LEVEL", value_parser = clap::value_parser!(i32).range(1..=22))]
+    zstd: Option<i32>,
+    /// Frames to judge at most, over all scenarios [default: all].
+    #[arg(long, value_parser = clap::value_parser!(u64).range(1..))]
+    frames: Option<u64>,
+    /// Threads to compute with.
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
+    threads: u16,
+    /// Print JSON in the shape of metrics.json (a list of them for several methods) instead of a table.
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum PoseFrom {
+    /// The recording's own pose.
+    Recorded,
+    /// That pose with an error.
+    Noisy,
+    /// From the LiDAR sweep by the pose generator.
+    Pgc,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Mode {
+    /// One offset, the same for all vehicles and frames.
+    Fixed,
+    /// Drawn anew for every vehicle and frame.
+    Independent,
+    /// Wanders, as a filter's error does.
+    Autoregressive,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Exactness {
+    /// 4 bytes, exact.
+    F32,
+    /// 2 bytes.
+    F16,
+    /// 1 byte and a scale per channel.
+    I8,
+}
+
+impl Arguments {
+    /// Evaluates every method and prints the numbers.
+    pub(crate) fn run(self) -> anyhow::Result<Outcome> {
+        tch::set_num_threads(i32::from(self.threads));
+        let options = self.options()?;
+        let bar = ProgressBar::new((self.method.len() * frame_count(&options)?) as u64)
+            .with_style(ProgressStyle::with_template("{bar:30} {pos}/{len} frames  {msg}  {eta} left")?);
+        let mut all = Vec::new();
+        for &method in &self.method {
+            bar.set_message(method.name());
+            all.push(evaluate(&options, method, &mut || bar.inc(1))?);
+        }
+        bar.finish_and_clear();
+        match (self.json, &all[..]) {
+            (true, [one]) => println!("{}", serde_json::to_string_pretty(one)?),
+            (true, several) => println!("{}", serde_json::to_string_pretty(several)?),
+            (false, several) => print!("{}", report::table(several)),
+        }
+        Ok(Outcome::Done)
+    }
+
+    fn options(&self) -> Result<EvaluationOptions, BadInput> {
+        Ok(EvaluationOptions {
+            dataset: self.dataset.clone(),
+            weights: self.weights.clone(),
+            pose_source: self.pose_source()?,
+            codec: CodecConfig {
+                dtype: match self.dtype {
+                    Exactness::F32 => Dtype::F32,
+                    Exactness::F16 => Dtype::F16,
+                    Exactness::I8 => Dtype::I8,
+                },
+                budget_bytes: self.budget,
+                zstd_level: self.zstd,
+            },
+            frames: self.frames.map(|frames| usize::try_from(frames).unwrap_or(usize::MAX)),
+        })
+    }
+
+    fn pose_source(&self) -> Result<PoseSourceConfig, BadInput> {
+        match self.pose_source {
+            PoseFrom::Recorded => Ok(PoseSourceConfig::Recorded),
+            PoseFrom::Noisy => Ok(PoseSourceConfig::Noisy(NoisyPoseConfig {
+                mode: match self.noise_mode {
+                    Mode::Fixed => NoiseMode::Fixed,
+                    Mode::Independent => NoiseMode::Independent,
+                    Mode::Autoregressive => NoiseMode::Autoregressive,
+                },
+                position_std_m: self.noise_position_std,
+                heading_std_deg: self.noise_heading_std,
+                seed: self.noise_seed,
+                ..NoisyPoseConfig::default()
+            })),
+            PoseFrom::Pgc => Err(BadInput("--pose-source pgc: this version has no pose generator".into())),
+        }
+    }
+}

@@ -1,0 +1,170 @@
+//! A method on recorded scenes without a network: the numbers of a run in which nothing is late.
+
+use std::ops::ControlFlow;
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use agent::pose_source::PoseSourceConfig;
+use ego_fuser::Method;
+use ego_fuser::evaluate::{EvaluateConfig, EvaluateError, EvaluatedFrame, Evaluator};
+use protocol::{CavId, CodecConfig};
+use sim_replay::dataset::{self, ReadError};
+
+use crate::metrics::{Messages, Metrics};
+use crate::score::Board;
+
+/// What to evaluate.
+#[derive(Debug, Clone)]
+pub struct EvaluationOptions {
+    /// Data set, split or scenario.
+    pub dataset: PathBuf,
+    /// Weights of the detector, or a folder that holds a file `<name>-<method>.safetensors` for each method.
+    pub weights: PathBuf,
+    /// Where the vehicles' poses come from.
+    pub pose_source: PoseSourceConfig,
+    /// How feature maps are written.
+    pub codec: CodecConfig,
+    /// Frames to judge at most, over all scenarios.
+    pub frames: Option<usize>,
+}
+
+/// Why an evaluation came to nothing.
+#[derive(Debug, thiserror::Error)]
+pub enum EvaluationError {
+    /// The data set cannot be read.
+    #[error(transparent)]
+    Dataset(#[from] ReadError),
+    /// The data set has no frame to judge.
+    #[error("{}: there is no frame in it", .0.display())]
+    Empty(PathBuf),
+    /// The folder of weights has none, or several, for a method.
+    #[error("{}: {found} files named *-{method}.safetensors, one is needed", folder.display())]
+    NoWeights {
+        /// The folder.
+        folder: PathBuf,
+        /// The method.
+        method: Method,
+        /// How many there are.
+        found: usize,
+    },
+    /// The pipeline refused.
+    #[error(transparent)]
+    Evaluate(#[from] EvaluateError),
+}
+
+/// Frames there are to judge in a data set, over all scenarios.
+///
+/// # Errors
+/// [`EvaluationError`] when the data set cannot be read.
+pub fn frame_count(options: &EvaluationOptions) -> Result<usize, EvaluationError> {
+    let ticks = dataset::open(&options.dataset)?.scenarios.iter().map(|scenario| scenario.ticks.len()).sum();
+    Ok(options.frames.map_or(ticks, |frames| frames.min(ticks)))
+}
+
+/// Runs one method over all scenarios, the first vehicle of each being the ego; `on_frame` is told of every frame.
+///
+/// # Errors
+/// [`EvaluationError`] at the first frame that cannot be read, and when there is none.
+pub fn evaluate(
+    options: &EvaluationOptions,
+    method: Method,
+    on_frame: &mut dyn FnMut(),
+) -> Result<Metrics, EvaluationError> {
+    let began = Instant::now();
+    let dataset = dataset::open(&options.dataset)?;
+    let mut evaluator = Evaluator::new(EvaluateConfig {
+        weights: weights_of(&options.weights, method)?,
+        method: Some(method),
+        pose_source: options.pose_source.clone(),
+        codec: options.codec,
+        rule: None,
+    })?;
+    let grid = evaluator.ego().detector().config().feature_grid();
+    let channels = evaluator.ego().detector().config().feature_channels();
+    let map_values = u64::from(grid.width) * u64::from(grid.height) * u64::try_from(channels).unwrap_or(0);
+    let left = options.frames.unwrap_or(usize::MAX);
+    let mut board: Option<Board> = None;
+    for scenario in &dataset.scenarios {
+        let Some(ego) = scenario.agents.first() else { continue };
+        let board = board.get_or_insert_with(|| Board::new(ego.clone(), *evaluator.rule(), map_values));
+        board.change_ego(ego);
+        let judged = evaluator.run(scenario, &mut |frame| {
+            judge(board, frame);
+            on_frame();
+            if board.records().len() >= left { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
+        })?;
+        if judged.is_break() {
+            break;
+        }
+    }
+    let board =
+        board.filter(|board| !board.records().is_empty()).ok_or(EvaluationError::Empty(options.dataset.clone()))?;
+    Ok(metrics(&board, method, &options.pose_source, began))
+}
+
+fn judge(board: &mut Board, frame: EvaluatedFrame) {
+    let EvaluatedFrame { stamp, result, frames, poses, objects } = frame;
+    let poses: Vec<_> = frames.iter().map(|frame| frame.cav.clone()).zip(poses).collect();
+    let truth: Vec<(CavId, _)> =
+        frames.iter().filter_map(|frame| Some((frame.cav.clone(), frame.world_from_lidar?))).collect();
+    board.judge_whole(stamp.capture_nanos, result, objects, &poses, truth);
+}
+
+fn metrics(board: &Board, method: Method, pose_source: &PoseSourceConfig, began: Instant) -> Metrics {
+    let (ap_global, ap_frame_order) = board.average_precision();
+    let pose_source = match pose_source {
+        PoseSourceConfig::Recorded => "recorded",
+        PoseSourceConfig::Noisy(_) => "noisy",
+    };
+    Metrics {
+        frames: board.records().len() as u64,
+        seconds: began.elapsed().as_secs_f64(),
+        clock: "offline".into(),
+        method: method.name().into(),
+        pose_source: pose_source.into(),
+        ap_global,
+        ap_frame_order,
+        pose: board.pose_errors(),
+        latency_ms: board.latencies(),
+        comm: board.communication(),
+        messages: Messages::default(),
+    }
+}
+
+/// The weights of a method: `path` itself, or the one file of its name in the folder `path`.
+fn weights_of(path: &Path, method: Method) -> Result<PathBuf, EvaluationError> {
+    if !path.is_dir() {
+        return Ok(path.to_path_buf());
+    }
+    let ending = format!("-{method}.safetensors");
+    let entries = std::fs::read_dir(path).map_err(|source| ReadError::io(path, source))?;
+    let mut files: Vec<PathBuf> = entries
+        .filter_map(|entry| Some(entry.ok()?.path()))
+        .filter(|file| file.file_name().is_some_and(|name| name.to_string_lossy().ends_with(&ending)))
+        .collect();
+    match (files.pop(), files.len()) {
+        (Some(file), 0) => Ok(file),
+        (file, more) => {
+            let found = more + usize::from(file.is_some());
+            Err(EvaluationError::NoWeights { folder: path.to_path_buf(), method, found })
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_folder_holds_one_file_per_method() {
+        let folder = tempfile::tempdir().unwrap();
+        for name in ["lean-none.safetensors", "lean-max.safetensors", "full-max.safetensors", "lean-none.md"] {
+            std::fs::write(folder.path().join(name), b"").unwrap();
+        }
+        let of = |method| weights_of(folder.path(), method);
+        assert!(of(Method::None).unwrap().ends_with("lean-none.safetensors"));
+        assert!(of(Method::Max).unwrap_err().to_string().contains("2 files named *-max.safetensors"));
+        assert!(of(Method::Late).unwrap_err().to_string().contains("0 files"));
+        assert_eq!(weights_of(Path::new("w.safetensors"), Method::Late).unwrap(), Path::new("w.safetensors"));
+    }
+}

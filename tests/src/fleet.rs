@@ -1,0 +1,224 @@
+//! Whole fleets as processes: `v2vloc up` on small scenes, with detectors that have learnt nothing.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::io::{BufRead, BufReader};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, ExitStatus, Stdio};
+use std::sync::mpsc::{Receiver, channel};
+use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
+use std::time::{Duration, Instant};
+
+use agent::model_config::{DetectorConfig, ShrinkConfig};
+use ego_fuser::Method;
+use ego_fuser::model::CooperativeModel;
+use serde_json::Value;
+
+/// Longer than anything takes here, under whatever load.
+pub const PATIENCE: Duration = Duration::from_secs(120);
+
+/// The folder of the programs under test, built if they are not.
+///
+/// # Panics
+/// When they cannot be built.
+pub fn programs() -> &'static Path {
+    static PROGRAMS: OnceLock<PathBuf> = OnceLock::new();
+    PROGRAMS.get_or_init(|| {
+        // target/<profile>/deps/<this test>
+        let test = std::env::current_exe().expect("a test has a file");
+        let folder = test.ancestors().nth(2).expect("a folder of the profile").to_path_buf();
+        // `cargo test` builds the programs of other packages only by chance: make sure they are there and fresh.
+        if let Some(cargo) = std::env::var_os("CARGO") {
+            let mut build = Command::new(cargo);
+            build.args(["build", "--quiet", "--workspace", "--bins"]).current_dir(env!("CARGO_MANIFEST_DIR"));
+            if folder.ends_with("release") {
+                build.arg("--release");
+            }
+            assert!(build.status().expect("cargo runs").success(), "the programs cannot be built");
+        }
+        folder
+    })
+}
+
+/// Only one fleet at a time: on two cores several would time each other out.
+pub fn alone() -> MutexGuard<'static, ()> {
+    static ALONE: Mutex<()> = Mutex::new(());
+    ALONE.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Writes weights of a small detector with random parameters, the same every time.
+///
+/// # Panics
+/// When the disk refuses.
+pub fn write_weights(path: &Path) {
+    tch::manual_seed(7);
+    tch::set_num_threads(1);
+    let config = DetectorConfig {
+        name: "tiny".into(),
+        lidar_range_m: [-25.6, -25.6, -3.0, 25.6, 25.6, 1.0],
+        pillar_channels: 8,
+        layer_nums: vec![1, 1, 1],
+        num_filters: vec![8, 8, 8],
+        num_upsample_filters: vec![8; 3],
+        shrink: Some(ShrinkConfig::Pointwise { channels: 8 }),
+        ..DetectorConfig::lean()
+    };
+    let model = CooperativeModel::new(&config, Method::Max, tch::Device::Cpu).expect("a configuration that fits");
+    model.save(path, &BTreeMap::new(), agent::weights::Precision::Single).expect("a writable folder");
+}
+
+/// A folder with a scene of two vehicles, weights and a scenario.
+///
+/// # Panics
+/// When the disk refuses.
+pub fn write_scenario(folder: &Path, ticks: usize, scene: &str, rest: &str) -> PathBuf {
+    crate::scene::write(folder, &["4279", "4288"], ticks);
+    write_weights(&folder.join("weights.safetensors"));
+    let path = folder.join("scenario.yaml");
+    let text = format!(
+        "run: test\nscene: {{dir: scene, {scene}}}\nmodels: {{weights: weights.safetensors}}\nmethod: max\n{rest}\n"
+    );
+    fs::write(&path, text).expect("a writable folder");
+    path
+}
+
+/// A running `v2vloc up`.
+pub struct Up {
+    child: Child,
+    lines: Receiver<String>,
+    said: Vec<String>,
+    /// Its run folder.
+    pub folder: PathBuf,
+}
+
+impl Up {
+    /// Starts `v2vloc up` on a scenario named `test`, with run folders in `<folder>/runs`.
+    ///
+    /// # Panics
+    /// When it cannot be started.
+    #[must_use]
+    pub fn start(folder: &Path, scenario: &Path) -> Self {
+        let runs = folder.join("runs");
+        let mut child = Command::new(programs().join("v2vloc"))
+            .arg("up")
+            .arg(scenario)
+            .arg("--runs")
+            .arg(&runs)
+            .stderr(Stdio::piped())
+            .stdout(Stdio::null())
+            .spawn()
+            .expect("v2vloc runs");
+        let (send, lines) = channel();
+        let stderr = BufReader::new(child.stderr.take().expect("piped above"));
+        std::thread::spawn(move || {
+            for line in stderr.lines().map_while(Result::ok) {
+                eprintln!("{line}");
+                let _ = send.send(line);
+            }
+        });
+        Self { child, lines, said: Vec::new(), folder: runs.join("test") }
+    }
+
+    /// Waits until it says a line that contains `text`, and returns the line.
+    ///
+    /// # Panics
+    /// When it does not in time.
+    pub fn wait_for_line(&mut self, text: &str) -> String {
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            let left = deadline.saturating_duration_since(Instant::now());
+            let line =
+                self.lines.recv_timeout(left).unwrap_or_else(|_| panic!("no line with {text:?}: {:?}", self.said));
+            self.said.push(line.clone());
+            if line.contains(text) {
+                return line;
+            }
+        }
+    }
+
+    /// Waits until `condition` holds for the results so far, oldest first.
+    ///
+    /// # Panics
+    /// When it does not in time.
+    pub fn wait_for_results(&mut self, what: &str, condition: impl Fn(&[Value]) -> bool) {
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            let results = results(&self.folder);
+            if condition(&results) {
+                return;
+            }
+            assert!(Instant::now() < deadline, "{what}: {} results", results.len());
+            assert!(self.child.try_wait().expect("a child").is_none(), "v2vloc ended before {what}");
+            std::thread::sleep(Duration::from_millis(50));
+        }
+    }
+
+    /// Process ids of everything it has said to run, last start of each.
+    #[must_use]
+    pub fn pids(&mut self) -> BTreeMap<String, u32> {
+        self.said.extend(self.lines.try_iter());
+        let started = |line: &String| {
+            let (name, rest) = line.split_once(" runs (pid ")?;
+            Some((name.to_owned(), rest.trim_end_matches(')').parse().ok()?))
+        };
+        self.said.iter().filter_map(started).collect()
+    }
+
+    /// Its own process id.
+    #[must_use]
+    pub fn pid(&self) -> u32 {
+        self.child.id()
+    }
+
+    /// Waits until it ends.
+    ///
+    /// # Panics
+    /// When it does not in time.
+    pub fn wait(&mut self) -> ExitStatus {
+        let deadline = Instant::now() + PATIENCE;
+        loop {
+            if let Some(status) = self.child.try_wait().expect("a child") {
+                return status;
+            }
+            assert!(Instant::now() < deadline, "v2vloc does not end");
+            std::thread::sleep(Duration::from_millis(20));
+        }
+    }
+}
+
+impl Drop for Up {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+/// The whole lines of a run's `detections.jsonl`.
+#[must_use]
+pub fn results(run: &Path) -> Vec<Value> {
+    let text = fs::read_to_string(run.join("detections.jsonl")).unwrap_or_default();
+    let whole = text.rfind('\n').map_or("", |end| &text[..end]);
+    whole.lines().filter_map(|line| serde_json::from_str(line).ok()).collect()
+}
+
+/// How many neighbours a result was fused from.
+#[must_use]
+pub fn fused(result: &Value) -> usize {
+    result["fused"].as_array().map_or(0, Vec::len)
+}
+
+/// Sends a signal, for example `INT`.
+///
+/// # Panics
+/// When there is no `kill`.
+pub fn signal(pid: u32, name: &str) {
+    let status = Command::new("kill").arg(format!("-{name}")).arg(pid.to_string()).status().expect("kill runs");
+    assert!(status.success(), "kill -{name} {pid}");
+}
+
+/// Whether a process runs; one that is only waited for does not.
+#[must_use]
+pub fn is_running(pid: u32) -> bool {
+    let stat = fs::read_to_string(format!("/proc/{pid}/stat")).unwrap_or_default();
+    stat.rsplit(')').next().is_some_and(|rest| !rest.is_empty() && !rest.trim_start().starts_with('Z'))
+}

@@ -1,0 +1,99 @@
+//! `v2vloc up` as a person runs it: to the end of a scene, ended by hand, with a vehicle or the launcher killed.
+
+use std::fs;
+use std::time::{Duration, Instant};
+
+use deploy::scenario::Scenario;
+use serde_json::Value;
+use tests::fleet::{PATIENCE, Up, alone, fused, is_running, results, signal, write_scenario};
+
+fn json(path: &std::path::Path) -> Value {
+    serde_json::from_str(&fs::read_to_string(path).unwrap()).unwrap()
+}
+
+#[test]
+fn a_fleet_plays_its_scene_and_accounts_for_every_message() {
+    let _alone = alone();
+    let folder = tempfile::tempdir().unwrap();
+    let scenario = write_scenario(folder.path(), 6, "lockstep: true", "");
+    let mut up = Up::start(folder.path(), &scenario);
+    let status = up.wait();
+    let run = &up.folder;
+    let ledger = json(&run.join("ledger.json"));
+    assert_eq!(ledger["balances"], true, "{}", ledger["balance"]);
+    assert_eq!(status.code(), Some(0), "{}", ledger["total"]);
+
+    let metrics = json(&run.join("metrics.json"));
+    assert_eq!((&metrics["frames"], &metrics["method"], &metrics["clock"]), (&6.into(), &"max".into(), &"wall".into()));
+    assert_eq!(metrics["pose"]["success_3m"], 1.0);
+    assert!(metrics["latency_ms"]["capture_to_detection"]["p50"].as_f64().unwrap() > 0.0);
+    // An f32 map of 8 channels on 64 x 64 cells, and a little more.
+    let payload = metrics["comm"]["payload_bytes_mean"].as_f64().unwrap();
+    assert!((131_072.0..140_000.0).contains(&payload), "{payload}");
+
+    let results = results(run);
+    assert_eq!(results.len(), 6);
+    assert!(results.iter().all(|result| fused(result) == 1), "in lockstep nobody is late");
+    assert_eq!(fs::read_to_string(run.join("frames.csv")).unwrap().lines().count(), 7);
+    assert!(fs::metadata(run.join("frame.png")).unwrap().len() > 1_000);
+    for process in ["agent-4279", "agent-4288", "ego-4279", "replay"] {
+        assert!(run.join(format!("log/{process}.log")).exists(), "{process}");
+    }
+    let resolved = Scenario::load(&run.join("scenario.yaml")).unwrap();
+    assert_eq!(resolved.scene.agents.len(), 2);
+    assert_eq!(resolved.provenance.unwrap().scene_files, 24);
+}
+
+#[test]
+fn ctrl_c_ends_everything_within_five_seconds() {
+    let _alone = alone();
+    let folder = tempfile::tempdir().unwrap();
+    let scenario = write_scenario(folder.path(), 3, "loop: true", "");
+    let mut up = Up::start(folder.path(), &scenario);
+    up.wait_for_results("five results", |results| results.len() >= 5);
+    let pids = up.pids();
+    assert_eq!(pids.len(), 4, "{pids:?}");
+
+    let asked = Instant::now();
+    signal(up.pid(), "INT");
+    let status = up.wait();
+    assert!(asked.elapsed() < Duration::from_secs(5), "{:?}", asked.elapsed());
+    assert!(matches!(status.code(), Some(0 | 3)), "{status}");
+    assert!(pids.values().all(|pid| !is_running(*pid)), "{pids:?}");
+    let metrics = json(&up.folder.join("metrics.json"));
+    assert!(metrics["frames"].as_u64().unwrap() >= 5, "the run is written all the same: {metrics}");
+}
+
+#[test]
+fn a_killed_agent_is_started_again_and_fused_again() {
+    let _alone = alone();
+    let folder = tempfile::tempdir().unwrap();
+    let scenario = write_scenario(folder.path(), 3, "loop: true", "");
+    let mut up = Up::start(folder.path(), &scenario);
+    let is_fused = |result: &Value| fused(result) == 1;
+    up.wait_for_results("a fused result", |results| results.last().is_some_and(is_fused));
+    signal(up.pids()["agent-4288"], "KILL");
+    up.wait_for_results("the ego going on alone", |results| results.last().is_some_and(|last| !is_fused(last)));
+    let fallen = up.wait_for_line("agent-4288 was ended by signal 9");
+    assert!(fallen.contains("starting it again"), "{fallen}");
+    up.wait_for_results("the agent being fused again", |results| results.last().is_some_and(is_fused));
+    signal(up.pid(), "INT");
+    assert_eq!(up.wait().code(), Some(3), "what was lost with the agent is not hidden");
+}
+
+#[test]
+fn the_death_of_the_launcher_ends_the_fleet() {
+    let _alone = alone();
+    let folder = tempfile::tempdir().unwrap();
+    let scenario = write_scenario(folder.path(), 3, "loop: true", "");
+    let mut up = Up::start(folder.path(), &scenario);
+    up.wait_for_results("a result", |results| !results.is_empty());
+    let pids = up.pids();
+    signal(up.pid(), "KILL");
+    up.wait();
+    let deadline = Instant::now() + PATIENCE;
+    while pids.values().any(|pid| is_running(*pid)) {
+        assert!(Instant::now() < deadline, "orphans: {pids:?}");
+        std::thread::sleep(Duration::from_millis(50));
+    }
+}
