@@ -1,20 +1,15 @@
-//! The detector against the reference implementation: encoder, voxelisation, anchors, decoding, suppression.
+//! The detector against the reference implementation: encoder and voxelisation.
 
 use std::collections::BTreeMap;
 
-use agent::anchors::Anchors;
 use agent::backbone::BevBackbone;
-use agent::decode::{decode, decode_box, sigmoid};
 use agent::head::DetectionHead;
-use agent::model_config::{AnchorConfig, DetectorConfig, ShrinkConfig};
-use agent::nms::rotated_nms;
+use agent::model_config::{DetectorConfig, ShrinkConfig};
 use agent::pillar_batch::{PillarBatch, PillarLattice};
 use agent::pillar_encoder::PillarEncoder;
+use agent::pillar_projection::PillarProjection;
 use agent::pillars::{Pillars, Voxeliser};
-use agent::postprocess::{self, AgentBoxes, Candidate, PostprocessConfig, corners_to_box, footprint};
 use agent::shrink::{Compressor, Shrink};
-use nalgebra::{Isometry3, Matrix4};
-use protocol::{Box3d, Pose};
 use serde_json::Value;
 use tch::nn::VarStore;
 use tch::{Device, Tensor};
@@ -37,6 +32,16 @@ fn golden_c1_pointpillar() {
     let canvas = case.batch.scatter(&pillar_features, &case.lattice);
     let (_, expected) = golden.f32("out.spatial_features_ch0_7");
     assert_close("spatial_features", &values(&canvas.narrow(1, 0, 8)), &expected, ATOL, RTOL);
+
+    // The detector's own pillar encoder works without tensors, sweep by sweep.
+    let projection = PillarProjection::new(&case.encoder);
+    let size = case.lattice.width * case.lattice.height * projection.channels();
+    let mut canvases = vec![0.0; case.sweeps.len() * size];
+    for (pillars, canvas) in case.sweeps.iter().zip(canvases.chunks_exact_mut(size)) {
+        projection.scatter(pillars, &case.lattice, canvas);
+    }
+    let projected = Tensor::from_slice(&canvases).reshape(canvas.permute([0, 2, 3, 1]).size()).permute([0, 3, 1, 2]);
+    assert_close("projected", &values(&projected.narrow(1, 0, 8)), &expected, ATOL, RTOL);
 
     for backbone in [None, Some(case.backbone.folded())] {
         let backbone = backbone.as_ref().unwrap_or(&case.backbone);
@@ -105,119 +110,10 @@ fn golden_c2_voxelise() {
     }
 }
 
-#[test]
-fn golden_c3_anchors_full() {
-    let Some(golden) = golden("c3_anchors_full") else { return };
-    for (name, range, stride) in [
-        ("opv2v_stride2", [-140.8, -40.0, -3.0, 140.8, 40.0, 1.0], 2),
-        ("v2xvit_stride4", [-140.8, -38.4, -3.0, 140.8, 38.4, 1.0], 4),
-    ] {
-        let voxel = [0.4, 0.4, 4.0];
-        let anchors = Anchors::new(range, voxel, pillar_grid(range, voxel), stride, &AnchorConfig::default());
-        assert_close(name, &anchors.x_m, &golden.f64(&format!("{name}.x")).1, 1e-9, 0.0);
-        assert_close(name, &anchors.y_m, &golden.f64(&format!("{name}.y")).1, 1e-9, 0.0);
-        let (_, shape) = golden.i64(&format!("{name}.shape"));
-        assert_eq!(shape, [anchors.y_m.len(), anchors.x_m.len(), anchors.yaws_rad.len(), 7].map(|size| size as i64));
-        let (_, first) = golden.f64(&format!("{name}.first_cell"));
-        for (anchor, expected) in first.as_chunks::<7>().0.iter().enumerate() {
-            assert_close(name, &anchors.get(anchor), expected, 1e-9, 0.0);
-        }
-    }
-}
-
-#[test]
-fn golden_c3_postprocess() {
-    let Some(golden) = golden("c3_postprocess") else { return };
-    let case = PostprocessCase::new(&golden);
-    let agents = integer(&golden.config()["agents"]) as usize;
-    let decoded: Vec<_> = (0..agents).map(|agent| case.check_decoding(&golden, agent)).collect();
-    let boxes: Vec<AgentBoxes<'_>> = (decoded.iter())
-        .map(|(boxes, output_from_agent)| AgentBoxes { boxes, output_from_agent: *output_from_agent })
-        .collect();
-
-    let projected: Vec<Candidate> = (boxes.iter().enumerate())
-        .flat_map(|(agent, boxes)| {
-            boxes.boxes.iter().map(move |decoded| Candidate {
-                corners: project(&boxes.output_from_agent, &decoded.box3d),
-                score: decoded.score,
-                agent,
-            })
-        })
-        .collect();
-    let (_, kept_mask) = golden.u8("out.kept_size_z");
-    let kept: Vec<u8> = (projected.iter())
-        .map(|candidate| postprocess::is_vehicle_sized(&candidate.corners, &case.config).into())
-        .collect();
-    assert_eq!(kept, kept_mask, "size and height filter");
-
-    let candidates: Vec<Candidate> =
-        projected.into_iter().zip(&kept).filter(|(_, kept)| **kept == 1).map(|(candidate, _)| candidate).collect();
-    assert_corners("out.nms_boxes", &golden, &candidates);
-    let polygons: Vec<_> = candidates.iter().map(|candidate| footprint(&candidate.corners)).collect();
-    let scores: Vec<f32> = candidates.iter().map(|candidate| candidate.score).collect();
-    assert_close("nms scores", &scores, &golden.f32("out.nms_scores").1, 1e-6, 0.0);
-    let best = (0..scores.len()).max_by(|&a, &b| scores[a].total_cmp(&scores[b])).expect("candidates");
-    let best_row: Vec<f32> = polygons.iter().map(|other| polygons[best].iou(other) as f32).collect();
-    assert_close("IoU of the best", &best_row, &golden.f32("out.nms_iou_first_row").1, 1e-5, 0.0);
-    let picks = rotated_nms(&polygons, &scores, case.config.nms_iou, case.config.nms_max_candidates);
-    assert_eq!(picks.iter().map(|&pick| pick as i64).collect::<Vec<_>>(), golden.i64("out.nms_pick").1, "picks");
-
-    let found = postprocess::postprocess(&boxes, &case.config);
-    assert_corners("out.final_corners", &golden, &found);
-    let scores: Vec<f32> = found.iter().map(|candidate| candidate.score).collect();
-    assert_close("final scores", &scores, &golden.f32("out.final_scores").1, 1e-6, 0.0);
-}
-
-#[test]
-fn golden_c3_boxes_iou_nms() {
-    let Some(golden) = golden("c3_boxes_iou_nms") else { return };
-    let (_, boxes) = golden.f64("in.boxes_hwl");
-    let boxes: Vec<Box3d> = boxes.as_chunks().0.iter().map(|&code| box_of_hwl(code)).collect();
-    let corners: Vec<_> = boxes.iter().map(Box3d::corners).collect();
-    let flat: Vec<f32> = corners.iter().flatten().flatten().map(|&value| value as f32).collect();
-    assert_close("corners", &flat, &golden.f32("out.corners").1, 1e-4, 0.0);
-    let polygons: Vec<_> = corners.iter().map(footprint).collect();
-    let iou: Vec<f32> = polygons.iter().flat_map(|a| polygons.iter().map(|b| a.iou(b) as f32)).collect();
-    assert_close("IoU", &iou, &golden.f32("out.iou").1, 1e-5, 0.0);
-    check_picks(&golden, &polygons);
-    check_corners_to_box(&golden, &boxes);
-}
-
-/// The picks at every stored threshold; their names hold two digits of it.
-fn check_picks(golden: &Golden, polygons: &[agent::rotated_iou::Polygon]) {
-    let (_, scores) = golden.f32("in.scores");
-    let thresholds = golden.config()["thresholds"].as_array().expect("thresholds").clone();
-    assert!(!thresholds.is_empty());
-    for threshold in thresholds {
-        let threshold = threshold.as_f64().expect("a number");
-        let picks = rotated_nms(polygons, &scores, threshold, 1000);
-        let (_, expected) = golden.i64(&format!("out.pick_{:02.0}", threshold * 100.0));
-        assert_eq!(picks.iter().map(|&pick| pick as i64).collect::<Vec<_>>(), expected, "threshold {threshold}");
-    }
-}
-
-/// Corners to box, apart from the yaw of boxes that point backwards, where the reference's mean of angles breaks.
-fn check_corners_to_box(golden: &Golden, boxes: &[Box3d]) {
-    let (_, stored_corners) = golden.f32("out.corners");
-    let (_, expected) = golden.f32("out.corner_to_center_hwl");
-    for (index, (expected, corners)) in
-        expected.as_chunks::<7>().0.iter().zip(stored_corners.as_chunks::<24>().0).enumerate()
-    {
-        let corners: [[f64; 3]; 8] = std::array::from_fn(|c| std::array::from_fn(|a| f64::from(corners[3 * c + a])));
-        let actual = corners_to_box(&corners);
-        let what = format!("box {index}");
-        let [x, y, z, h, w, l, yaw] = expected.map(f64::from);
-        assert_close(&what, &actual.center_m, &[x, y, z], 1e-4, 0.0);
-        assert_close(&what, &actual.size_m, &[l, w, h], 1e-4, 0.0);
-        assert!(angle_between(actual.heading_rad, boxes[index].heading_rad) < 1e-5, "{what}: heading");
-        let backwards = std::f64::consts::PI - boxes[index].heading_rad.abs() < 1e-5;
-        assert!(backwards || angle_between(actual.heading_rad, yaw) < 1e-5, "{what}: heading of the reference");
-    }
-}
-
 /// A whole encoder with the weights of a case, and its input.
 struct EncoderCase {
     lattice: PillarLattice,
+    sweeps: Vec<Pillars>,
     batch: PillarBatch,
     /// Row of the batch for every pillar in the order of the file.
     row_of_pillar: Vec<usize>,
@@ -240,7 +136,7 @@ impl EncoderCase {
         let lattice = PillarLattice::new(&config);
         let (sweeps, row_of_pillar) = pillars(golden);
         let batch = PillarBatch::new(&sweeps.iter().collect::<Vec<_>>(), &lattice);
-        Self { lattice, batch, row_of_pillar, encoder, backbone, head }
+        Self { lattice, sweeps, batch, row_of_pillar, encoder, backbone, head }
     }
 
     /// Compares the concatenated levels and the heads.
@@ -303,97 +199,6 @@ fn pillars(golden: &Golden) -> (Vec<Pillars>, Vec<usize>) {
     (pillars, rows)
 }
 
-/// What the chain of a case needs.
-struct PostprocessCase {
-    anchors: Anchors,
-    config: PostprocessConfig,
-}
-
-impl PostprocessCase {
-    fn new(golden: &Golden) -> Self {
-        let config = golden.config();
-        let number = |name: &str| config[name].as_f64().unwrap_or_else(|| panic!("config {name}"));
-        let (range, voxel) = (array(&config["lidar_range"]), array(&config["voxel"]));
-        let anchor_config = AnchorConfig {
-            size_lwh_m: [number("l"), number("w"), number("h")],
-            yaws_deg: config["r"].as_array().expect("yaws").iter().filter_map(Value::as_f64).collect(),
-            ..AnchorConfig::default()
-        };
-        let stride = integer(&config["stride"]) as usize;
-        let anchors = Anchors::new(range, voxel, pillar_grid(range, voxel), stride, &anchor_config);
-        let (_, expected) = golden.f64("anchors");
-        assert_eq!(expected.len(), anchors.len() * 7);
-        for (index, expected) in expected.as_chunks::<7>().0.iter().enumerate() {
-            assert_close("anchor", &anchors.get(index), expected, 1e-9, 0.0);
-        }
-        let keep: [f64; 6] = array(&config["gt_range"]);
-        let config = PostprocessConfig {
-            score_threshold: number("score_threshold") as f32,
-            nms_iou: number("nms_thresh"),
-            keep_range_m: [keep[0], keep[1], keep[3], keep[4]],
-            ..PostprocessConfig::default()
-        };
-        Self { anchors, config }
-    }
-
-    /// Decodes one agent and compares every step up to its corners in the output frame.
-    fn check_decoding(&self, golden: &Golden, agent: usize) -> (Vec<agent::decode::Decoded>, Isometry3<f64>) {
-        let (_, scores) = golden.f32(&format!("in.{agent}.psm"));
-        let (_, offsets) = golden.f32(&format!("in.{agent}.rm"));
-        let (per_cell, cells) = (self.anchors.yaws_rad.len(), scores.len() / self.anchors.yaws_rad.len());
-        let (_, all) = golden.f32(&format!("out.{agent}.decoded"));
-        let (_, probabilities) = golden.f32(&format!("out.{agent}.prob"));
-        for index in 0..self.anchors.len() {
-            let (cell, anchor) = (index / per_cell, index % per_cell);
-            let offsets = std::array::from_fn(|component| offsets[(7 * anchor + component) * cells + cell]);
-            let code = hwl_of_box(&decode_box(offsets, self.anchors.get(index)).expect("finite"));
-            let expected: [f64; 7] = std::array::from_fn(|component| f64::from(all[index * 7 + component]));
-            assert_close("decoded", &code, &expected, 1e-4, 0.0);
-            assert!((sigmoid(scores[anchor * cells + cell]) - probabilities[index]).abs() < 1e-6);
-        }
-        let boxes = decode(&scores, &offsets, &self.anchors, self.config.score_threshold).unwrap();
-        let mut selected = vec![0; self.anchors.len()];
-        boxes.iter().for_each(|decoded| selected[decoded.anchor] = 1);
-        assert_eq!(selected, golden.u8(&format!("out.{agent}.selected")).1, "agent {agent}: selected");
-
-        let transform = golden.f32(&format!("in.{agent}.transform")).1;
-        let matrix = Matrix4::from_row_iterator(transform.iter().map(|&value| f64::from(value)));
-        let output_from_agent = Pose::from_matrix(&matrix).expect("a rigid transform").isometry();
-        for (name, frame) in [("corners", Isometry3::identity()), ("corners_projected", output_from_agent)] {
-            let actual: Vec<f32> = (boxes.iter())
-                .flat_map(|decoded| project(&frame, &decoded.box3d).into_iter().flatten().map(|value| value as f32))
-                .collect();
-            assert_close(name, &actual, &golden.f32(&format!("out.{agent}.{name}")).1, 1e-4, 0.0);
-        }
-        (boxes, output_from_agent)
-    }
-}
-
-fn project(frame: &Isometry3<f64>, box3d: &Box3d) -> [[f64; 3]; 8] {
-    box3d.corners().map(|corner| (frame * nalgebra::Point3::from(corner)).into())
-}
-
-fn assert_corners(name: &str, golden: &Golden, candidates: &[Candidate]) {
-    let actual: Vec<f32> =
-        candidates.iter().flat_map(|candidate| candidate.corners).flatten().map(|value| value as f32).collect();
-    assert_close(name, &actual, &golden.f32(name).1, 1e-4, 0.0);
-}
-
-fn box_of_hwl([x, y, z, h, w, l, heading_rad]: [f64; 7]) -> Box3d {
-    Box3d { center_m: [x, y, z], size_m: [l, w, h], heading_rad }
-}
-
-fn hwl_of_box(box3d: &Box3d) -> [f64; 7] {
-    let ([x, y, z], [l, w, h]) = (box3d.center_m, box3d.size_m);
-    [x, y, z, h, w, l, box3d.heading_rad]
-}
-
-/// Smallest turn from one heading to another, radians.
-fn angle_between(a: f64, b: f64) -> f64 {
-    let turn = (a - b).rem_euclid(2.0 * std::f64::consts::PI);
-    turn.min(2.0 * std::f64::consts::PI - turn)
-}
-
 /// Copies the `w.*` tensors of a case into the network; each parameter must be there.
 fn load(network: &VarStore, golden: &Golden) {
     let variables: BTreeMap<String, Tensor> = network.variables().into_iter().collect();
@@ -424,8 +229,4 @@ fn list(value: &Value) -> Vec<i64> {
 fn array<const N: usize>(value: &Value) -> [f64; N] {
     let values: Vec<f64> = value.as_array().expect("a list").iter().filter_map(Value::as_f64).collect();
     values.try_into().unwrap_or_else(|_| panic!("{value} has not {N} numbers"))
-}
-
-fn pillar_grid(range: [f64; 6], voxel: [f64; 3]) -> [usize; 3] {
-    std::array::from_fn(|axis| ((range[axis + 3] - range[axis]) / voxel[axis]).round() as usize)
 }

@@ -1,91 +1,33 @@
 //! The detector for inference: one sweep in, the map for the air and boxes out.
 
+mod error;
+mod output;
+
 use std::path::Path;
 use std::time::{Duration, Instant};
 
 use protocol::{BevFeatures, BevGrid, PointCloud};
 use tch::nn::VarStore;
-use tch::{Device, TchError, Tensor};
+use tch::{Device, Tensor};
+
+pub use error::DetectorError;
+pub(crate) use error::first_line;
+pub use output::{EncodeTimes, Encoded, Heads};
+
+use output::flat;
 
 use crate::anchors::Anchors;
 use crate::backbone::BevBackbone;
 use crate::crop::Crop;
-use crate::decode::{DecodeError, Decoded, decode};
-use crate::head::{DetectionHead, HeadOutput};
-use crate::model_config::{ConfigError, DetectorConfig};
+use crate::decode::{Decoded, decode};
+use crate::head::DetectionHead;
+use crate::model_config::DetectorConfig;
 use crate::pillar_batch::PillarLattice;
 use crate::pillar_projection::PillarProjection;
 use crate::pillars::Voxeliser;
 use crate::point_pillars::PointPillars;
 use crate::shrink::{Compressor, Shrink};
-use crate::weights::{Weights, WeightsError};
-
-/// Why a detector cannot be made or a map not be read by it.
-#[derive(Debug, thiserror::Error)]
-pub enum DetectorError {
-    /// The weights are not readable or made for something else.
-    #[error(transparent)]
-    Weights(#[from] WeightsError),
-    /// The configuration is not one of a network.
-    #[error(transparent)]
-    Config(#[from] ConfigError),
-    /// A map has not the shape of this detector's.
-    #[error("{what} is {found:?}, this detector's is {expected:?} (channels, height, width)")]
-    Shape {
-        /// Which map.
-        what: &'static str,
-        /// Its shape.
-        found: Vec<i64>,
-        /// The shape of this detector's.
-        expected: [i64; 3],
-    },
-    /// The output of the head does not fit the anchors.
-    #[error(transparent)]
-    Decode(#[from] DecodeError),
-    /// The tensor library refused.
-    #[error("tensor library: {}", first_line(.0))]
-    Tensor(#[from] TchError),
-}
-
-/// What the tensor library says, without its stack of C++ calls.
-fn first_line(error: &TchError) -> String {
-    error.to_string().lines().next().unwrap_or_default().to_owned()
-}
-
-/// Time that each stage of [`Detector::encode`] took.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct EncodeTimes {
-    /// Crop and sorting into pillars.
-    pub voxelise: Duration,
-    /// Pillar features on the canvas.
-    pub pillars: Duration,
-    /// 2D convolutions.
-    pub backbone: Duration,
-}
-
-/// What the encoder makes of one sweep.
-#[derive(Debug)]
-pub struct Encoded {
-    /// `[1, C, H, W]` `f32`, contiguous: what crosses the air.
-    pub features: Tensor,
-    /// Points inside the area.
-    pub points: usize,
-    /// Pillars on them.
-    pub pillars: usize,
-    /// Where the time went.
-    pub times: EncodeTimes,
-}
-
-/// What the head makes of a map.
-#[derive(Debug, Clone, PartialEq)]
-pub struct Heads {
-    /// `[A, H, W]` logits.
-    pub scores: Vec<f32>,
-    /// `[7 A, H, W]` offsets.
-    pub offsets: Vec<f32>,
-    /// `[H, W]`, 0..1: how sure the head is of a vehicle around each cell.
-    pub confidence: Vec<f32>,
-}
+use crate::weights::Weights;
 
 /// A trained PointPillars network in its fastest form, for one sweep at a time.
 ///
@@ -273,25 +215,6 @@ impl Detector {
         let values = flat(features)?;
         Ok(BevFeatures { grid: self.grid(), channels: channels as u32, values })
     }
-}
-
-impl Heads {
-    /// Takes the output for one map to plain values.
-    ///
-    /// # Errors
-    /// The tensor library's.
-    pub fn new(output: &HeadOutput) -> Result<Self, DetectorError> {
-        Ok(Self {
-            scores: flat(&output.scores)?,
-            offsets: flat(&output.offsets)?,
-            confidence: flat(&output.confidence())?,
-        })
-    }
-}
-
-/// The values of a tensor in row-major order.
-fn flat(tensor: &Tensor) -> Result<Vec<f32>, TchError> {
-    Vec::try_from(&tensor.f_contiguous()?.f_view([-1])?)
 }
 
 /// Time from lap to lap.

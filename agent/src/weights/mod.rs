@@ -3,126 +3,25 @@
 //! A file is complete alone: the key `config` of its metadata holds the JSON of the configuration that the network is
 //! built from. Names of the tensors are those of the reference's state dictionary.
 
-use std::collections::{BTreeMap, HashMap};
+mod error;
+mod save;
+
+use std::collections::BTreeMap;
 use std::fs;
-use std::io;
 use std::path::{Path, PathBuf};
 
-use half::f16;
-use safetensors::tensor::{Dtype, SafeTensorError, SafeTensors, TensorView};
+use half::{bf16, f16};
+use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::de::DeserializeOwned;
 use sha2::{Digest, Sha256};
+use tch::Tensor;
 use tch::nn::VarStore;
-use tch::{Kind, TchError, Tensor};
+
+pub use error::WeightsError;
+pub use save::{Precision, save};
 
 /// Metadata key of the configuration.
 pub const CONFIG_KEY: &str = "config";
-
-/// Why parameters could not be read or written. Every message begins with the file.
-#[derive(Debug, thiserror::Error)]
-pub enum WeightsError {
-    /// The file is missing or not readable, or the folder not writable.
-    #[error("{}: {source}", path.display())]
-    Io {
-        /// The file.
-        path: PathBuf,
-        /// What the system said.
-        source: io::Error,
-    },
-    /// The file is cut off or no safetensors file.
-    #[error("{}: not a whole safetensors file ({size} bytes): {source}", path.display())]
-    Format {
-        /// The file.
-        path: PathBuf,
-        /// Its size.
-        size: usize,
-        /// What is wrong.
-        source: SafeTensorError,
-    },
-    /// The metadata has no such key.
-    #[error("{}: metadata has no key {key:?}; it has {found:?}", path.display())]
-    NoMetadata {
-        /// The file.
-        path: PathBuf,
-        /// The key looked for.
-        key: String,
-        /// The keys there are.
-        found: Vec<String>,
-    },
-    /// The JSON under a metadata key does not say what is needed.
-    #[error("{}: metadata {key:?}: {source}", path.display())]
-    Metadata {
-        /// The file.
-        path: PathBuf,
-        /// The key.
-        key: String,
-        /// What is wrong.
-        source: serde_json::Error,
-    },
-    /// The network has a parameter that the file lacks.
-    #[error("{}: tensor {name:?} is missing (the network expects shape {expected:?})", path.display())]
-    MissingTensor {
-        /// The file.
-        path: PathBuf,
-        /// Name of the tensor.
-        name: String,
-        /// Shape in the network.
-        expected: Vec<i64>,
-    },
-    /// A tensor of the file was made for another configuration.
-    #[error("{}: tensor {name:?} has shape {found:?}, the network expects {expected:?}", path.display())]
-    Shape {
-        /// The file.
-        path: PathBuf,
-        /// Name of the tensor.
-        name: String,
-        /// Shape in the file.
-        found: Vec<i64>,
-        /// Shape in the network.
-        expected: Vec<i64>,
-    },
-    /// A tensor is of a type that parameters are not stored in.
-    #[error("{}: tensor {name:?} is of type {dtype:?}; parameters are F16, BF16, F32 or F64", path.display())]
-    Dtype {
-        /// The file.
-        path: PathBuf,
-        /// Name of the tensor.
-        name: String,
-        /// Its type.
-        dtype: Dtype,
-    },
-    /// A parameter is NaN or infinite.
-    #[error("{}: tensor {name:?} holds {value} at index {index}", path.display())]
-    NotFinite {
-        /// The file.
-        path: PathBuf,
-        /// Name of the tensor.
-        name: String,
-        /// Where.
-        index: usize,
-        /// What.
-        value: f32,
-    },
-    /// The tensor library refused.
-    #[error("{}: tensor {name:?}: {source}", path.display())]
-    Tensor {
-        /// The file.
-        path: PathBuf,
-        /// Name of the tensor.
-        name: String,
-        /// What it said.
-        source: TchError,
-    },
-}
-
-/// How parameters lie on disk.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Precision {
-    /// Every bit: checkpoints.
-    Single,
-    /// Half the size: shipped weights. Vectors (norms, biases) and what does not fit into `f16` stay `f32`.
-    Half,
-}
 
 /// One file of parameters, read and checked.
 #[derive(Debug)]
@@ -256,69 +155,12 @@ impl Weights {
     }
 }
 
-/// Writes all variables of a network.
-///
-/// `metadata` holds texts for the header; the configuration belongs under [`CONFIG_KEY`]. The file appears under its
-/// name only when it is whole.
-///
-/// Returns the SHA-256 of the file.
-///
-/// # Errors
-/// [`WeightsError`] when a parameter is not finite or the file cannot be written.
-pub fn save(
-    path: &Path,
-    network: &VarStore,
-    metadata: &BTreeMap<String, String>,
-    precision: Precision,
-) -> Result<String, WeightsError> {
-    let mut stored = Vec::new();
-    for (name, variable) in network.variables() {
-        stored.push(store(path, name, &variable, precision)?);
-    }
-    let size = stored.iter().map(|tensor| tensor.bytes.len()).sum();
-    let format = |source| WeightsError::Format { path: path.to_owned(), size, source };
-    let views: Result<Vec<_>, _> = (stored.iter())
-        .map(|tensor| Ok((&tensor.name, TensorView::new(tensor.dtype, tensor.shape.clone(), &tensor.bytes)?)))
-        .collect();
-    let header: HashMap<_, _> = metadata.clone().into_iter().collect();
-    let bytes = safetensors::serialize(views.map_err(format)?, Some(header)).map_err(format)?;
-    let io = |source| WeightsError::Io { path: path.to_owned(), source };
-    let unfinished = path.with_extension("unfinished");
-    fs::write(&unfinished, &bytes).and_then(|()| fs::rename(&unfinished, path)).map_err(io)?;
-    Ok(hex(&Sha256::digest(&bytes)))
-}
-
-struct Stored {
-    name: String,
-    dtype: Dtype,
-    shape: Vec<usize>,
-    bytes: Vec<u8>,
-}
-
-fn store(path: &Path, name: String, variable: &Tensor, precision: Precision) -> Result<Stored, WeightsError> {
-    let shape: Vec<usize> = variable.size().iter().map(|&size| size as usize).collect();
-    let flat = tch::no_grad(|| variable.f_to_kind(Kind::Float).and_then(|values| values.f_reshape([-1])));
-    let values = flat.and_then(|flat| Vec::<f32>::try_from(&flat));
-    let values = match values {
-        Ok(values) => values,
-        Err(source) => return Err(WeightsError::Tensor { path: path.to_owned(), name, source }),
-    };
-    check_finite(path, &name, &values)?;
-    let fits = values.iter().all(|value| value.abs() <= f16::MAX.to_f32());
-    let (dtype, bytes) = if precision == Precision::Half && shape.len() > 1 && fits {
-        (Dtype::F16, values.iter().flat_map(|&value| f16::from_f32(value).to_le_bytes()).collect())
-    } else {
-        (Dtype::F32, values.iter().flat_map(|value| value.to_le_bytes()).collect())
-    };
-    Ok(Stored { name, dtype, shape, bytes })
-}
-
 /// The values of one tensor as `f32`; `None` for integers.
 fn read_values(path: &Path, name: &str, view: &TensorView<'_>) -> Result<Option<Vec<f32>>, WeightsError> {
     let data = view.data();
     let values: Vec<f32> = match view.dtype() {
         Dtype::F16 => data.as_chunks().0.iter().map(|&bytes| f16::from_le_bytes(bytes).to_f32()).collect(),
-        Dtype::BF16 => data.as_chunks().0.iter().map(|&bytes| half::bf16::from_le_bytes(bytes).to_f32()).collect(),
+        Dtype::BF16 => data.as_chunks().0.iter().map(|&bytes| bf16::from_le_bytes(bytes).to_f32()).collect(),
         Dtype::F32 => data.as_chunks().0.iter().map(|&bytes| f32::from_le_bytes(bytes)).collect(),
         Dtype::F64 => data.as_chunks().0.iter().map(|&bytes| f64::from_le_bytes(bytes) as f32).collect(),
         Dtype::I64 | Dtype::I32 => return Ok(None),

@@ -1,0 +1,80 @@
+//! Writing parameters.
+
+use std::collections::{BTreeMap, HashMap};
+use std::fs;
+use std::path::Path;
+
+use half::f16;
+use safetensors::tensor::{Dtype, TensorView};
+use sha2::{Digest, Sha256};
+use tch::nn::VarStore;
+use tch::{Kind, Tensor};
+
+use super::error::WeightsError;
+use super::{check_finite, hex};
+
+/// How parameters lie on disk.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Precision {
+    /// Every bit: checkpoints.
+    Single,
+    /// Half the size: shipped weights. Vectors (norms, biases) and what does not fit into `f16` stay `f32`.
+    Half,
+}
+
+/// Writes all variables of a network.
+///
+/// `metadata` holds texts for the header; the configuration belongs under [`CONFIG_KEY`]. The file appears under its
+/// name only when it is whole.
+///
+/// Returns the SHA-256 of the file.
+///
+/// # Errors
+/// [`WeightsError`] when a parameter is not finite or the file cannot be written.
+pub fn save(
+    path: &Path,
+    network: &VarStore,
+    metadata: &BTreeMap<String, String>,
+    precision: Precision,
+) -> Result<String, WeightsError> {
+    let mut stored = Vec::new();
+    for (name, variable) in network.variables() {
+        stored.push(store(path, name, &variable, precision)?);
+    }
+    let size = stored.iter().map(|tensor| tensor.bytes.len()).sum();
+    let format = |source| WeightsError::Format { path: path.to_owned(), size, source };
+    let views: Result<Vec<_>, _> = (stored.iter())
+        .map(|tensor| Ok((&tensor.name, TensorView::new(tensor.dtype, tensor.shape.clone(), &tensor.bytes)?)))
+        .collect();
+    let header: HashMap<_, _> = metadata.clone().into_iter().collect();
+    let bytes = safetensors::serialize(views.map_err(format)?, Some(header)).map_err(format)?;
+    let io = |source| WeightsError::Io { path: path.to_owned(), source };
+    let unfinished = path.with_extension("unfinished");
+    fs::write(&unfinished, &bytes).and_then(|()| fs::rename(&unfinished, path)).map_err(io)?;
+    Ok(hex(&Sha256::digest(&bytes)))
+}
+
+struct Stored {
+    name: String,
+    dtype: Dtype,
+    shape: Vec<usize>,
+    bytes: Vec<u8>,
+}
+
+fn store(path: &Path, name: String, variable: &Tensor, precision: Precision) -> Result<Stored, WeightsError> {
+    let shape: Vec<usize> = variable.size().iter().map(|&size| size as usize).collect();
+    let flat = tch::no_grad(|| variable.f_to_kind(Kind::Float).and_then(|values| values.f_reshape([-1])));
+    let values = flat.and_then(|flat| Vec::<f32>::try_from(&flat));
+    let values = match values {
+        Ok(values) => values,
+        Err(source) => return Err(WeightsError::Tensor { path: path.to_owned(), name, source }),
+    };
+    check_finite(path, &name, &values)?;
+    let fits = values.iter().all(|value| value.abs() <= f16::MAX.to_f32());
+    let (dtype, bytes) = if precision == Precision::Half && shape.len() > 1 && fits {
+        (Dtype::F16, values.iter().flat_map(|&value| f16::from_f32(value).to_le_bytes()).collect())
+    } else {
+        (Dtype::F32, values.iter().flat_map(|value| value.to_le_bytes()).collect())
+    };
+    Ok(Stored { name, dtype, shape, bytes })
+}
