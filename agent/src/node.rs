@@ -14,6 +14,7 @@ use sim_replay::bus::shutdown::Stop;
 use sim_replay::bus::{Arrival, Bus, BusError, Event, Inbox, Publisher, PublisherOptions, Subscription, unix_nanos};
 
 use crate::agent::{Agent, AgentInput, Perception};
+use crate::crop::Crop;
 use crate::sweep_pairing::{PairedSweep, SweepPairing};
 
 /// How long a sweep waits for its pose, which was sent before it.
@@ -186,6 +187,7 @@ struct Outlet {
     points: Option<Publisher>,
     descriptor: Publisher,
     codec: CodecConfig,
+    crop: Crop,
     description: Descriptor,
     next_descriptor: Instant,
 }
@@ -212,6 +214,7 @@ impl Outlet {
             points: wanted(Stream::Points)?,
             descriptor: publisher(Stream::Descriptor, PublisherOptions::POSE)?,
             codec: options.codec,
+            crop: *detector.crop(),
             description,
             next_descriptor: Instant::now(),
         })
@@ -239,7 +242,7 @@ impl Outlet {
             boxes.offer(input.capture_nanos, Boxes { pose, detections });
         }
         if let Some(points) = &self.points {
-            points.offer(input.capture_nanos, Points { pose, points: input.cloud.clone() });
+            points.offer(input.capture_nanos, Points { pose, points: self.crop.without_own_body(input.cloud) });
         }
     }
 

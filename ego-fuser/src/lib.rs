@@ -14,6 +14,8 @@ pub mod fusion;
 pub mod loss;
 pub mod method;
 pub mod model;
+mod neighbourhood;
+pub mod node;
 pub mod pairing;
 pub mod samples;
 pub mod targets;

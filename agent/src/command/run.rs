@@ -39,15 +39,15 @@ pub(crate) struct Args {
     dtype: Exactness,
     /// Most bytes of a feature map, before packing: the cells with the highest confidence that fit are sent
     /// [default: all].
-    #[arg(long, value_name = "BYTES")]
+    #[arg(long, value_name = "BYTES", visible_alias = "budget-bytes")]
     budget: Option<u64>,
     /// zstd level, 1 to 22 [default: maps are not packed].
-    #[arg(long, value_name = "LEVEL", value_parser = clap::value_parser!(i32).range(1..=22))]
+    #[arg(long, value_name = "LEVEL", visible_alias = "zstd-level", value_parser = clap::value_parser!(i32).range(1..=22))]
     zstd: Option<i32>,
     /// Threads to compute with; the same number gives the same bits.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
     threads: u16,
-    /// Go on when the replay ends, for the next one.
+    /// Go on when the replay ends, for the next one; always so with --supervised.
     #[arg(long)]
     keep_running: bool,
     /// Print a JSON summary at the end.
@@ -64,10 +64,10 @@ struct NoiseArgs {
     noise_mode: Mode,
     /// Standard deviation of x, y and z, metres.
     #[arg(long, default_value_t = NoisyPoseConfig::default().position_std_m)]
-    noise_position_std: f64,
+    noise_std_m: f64,
     /// Standard deviation of yaw, degrees.
     #[arg(long, default_value_t = NoisyPoseConfig::default().heading_std_deg)]
-    noise_heading_std: f64,
+    noise_std_deg: f64,
     /// Same seed, same errors.
     #[arg(long, default_value_t = NoisyPoseConfig::default().seed)]
     noise_seed: u64,
@@ -170,7 +170,7 @@ impl Args {
         NodeOptions {
             publish: self.publish.iter().map(stream).collect(),
             codec: CodecConfig { dtype, budget_bytes: self.budget, zstd_level: self.zstd },
-            keeps_running: self.keep_running,
+            keeps_running: self.keep_running || self.bus.supervised,
             ..NodeOptions::default()
         }
     }
@@ -185,8 +185,8 @@ impl NoiseArgs {
                 Mode::Autoregressive => NoiseMode::Autoregressive,
                 Mode::Replayed => NoiseMode::Replayed,
             },
-            position_std_m: self.noise_position_std,
-            heading_std_deg: self.noise_heading_std,
+            position_std_m: self.noise_std_m,
+            heading_std_deg: self.noise_std_deg,
             seed: self.noise_seed,
             step_s: self.noise_step,
             decay_s: self.noise_decay,

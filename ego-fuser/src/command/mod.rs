@@ -2,6 +2,7 @@
 
 mod eval;
 mod methods;
+mod run;
 mod train;
 
 use std::process::ExitCode;
@@ -13,6 +14,8 @@ pub(crate) enum Command {
     Methods(methods::Arguments),
     /// Measure AP on recorded scenes.
     Eval(eval::Arguments),
+    /// Run the fusing vehicle of a live fleet.
+    Run(run::Arguments),
     /// Train a method on scenes.
     Train(Box<train::Arguments>),
 }
@@ -23,6 +26,7 @@ impl Command {
         match self {
             Self::Methods(arguments) => arguments.run(),
             Self::Eval(arguments) => arguments.run(),
+            Self::Run(arguments) => arguments.run(),
             Self::Train(arguments) => arguments.run(),
         }
     }

@@ -1,0 +1,104 @@
+//! Who is around: agents found by their liveliness tokens, and the subscriptions to them.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+use std::time::Instant;
+
+use protocol::{CavId, Role, Stream, Topic};
+use sim_replay::bus::mailbox::{Mailbox, Pushed, Taken};
+use sim_replay::bus::{Bus, BusError, Inbox, Sighting, Subscription, Watch};
+
+/// Neighbours that an ego listens to at most: a flood of tokens must not become a flood of subscriptions.
+const MAX_NEIGHBOURS: usize = 64;
+/// Frames in a row without a word after which a neighbour is not waited for any more, until it speaks again.
+const SILENT_AFTER: u32 = 3;
+
+/// The other agents of the run.
+pub(crate) struct Neighbourhood {
+    ego: CavId,
+    stream: Stream,
+    allowed: Option<BTreeSet<CavId>>,
+    sightings: Arc<Mailbox<CavId, bool>>,
+    members: BTreeMap<CavId, Member>,
+    _watch: Watch,
+}
+
+struct Member {
+    silent_frames: u32,
+    _subscription: Subscription,
+}
+
+impl Neighbourhood {
+    /// Watches for agents other than `ego`'s own; `allowed` restricts them.
+    pub(crate) fn watch(
+        bus: &Bus,
+        ego: &CavId,
+        stream: Stream,
+        allowed: Option<BTreeSet<CavId>>,
+    ) -> Result<Self, BusError> {
+        let sightings = Arc::new(Mailbox::new(1, 2 * MAX_NEIGHBOURS));
+        let watch = bus.watch(Role::Agent, {
+            let sightings = Arc::clone(&sightings);
+            move |sighting| {
+                let (cav, is_there) = match sighting {
+                    Sighting::Appeared { cav, .. } => (cav, true),
+                    Sighting::Vanished { cav, .. } => (cav, false),
+                };
+                if let Pushed::NoLane(_) = sightings.push(cav.clone(), is_there) {
+                    tracing::warn!(%cav, "more agents come and go than can be followed");
+                }
+            }
+        })?;
+        Ok(Self { ego: ego.clone(), stream, allowed, sightings, members: BTreeMap::new(), _watch: watch })
+    }
+
+    /// Follows up on who came and went; those who went are returned.
+    pub(crate) fn update(&mut self, bus: &Bus, inbox: &Arc<Inbox>) -> Result<Vec<CavId>, BusError> {
+        let mut gone = Vec::new();
+        while let Taken::Item(cav, is_there) = self.sightings.take(Some(Instant::now())) {
+            if !is_there {
+                if self.members.remove(&cav).is_some() {
+                    tracing::info!(%cav, "a neighbour has left");
+                    gone.push(cav);
+                }
+            } else if self.is_wanted(&cav) {
+                tracing::info!(%cav, "a neighbour has come");
+                let topic = Topic::Stream { cav: cav.clone(), stream: self.stream };
+                let subscription = bus.subscribe(topic, inbox)?;
+                self.members.insert(cav, Member { silent_frames: 0, _subscription: subscription });
+            }
+        }
+        Ok(gone)
+    }
+
+    fn is_wanted(&self, cav: &CavId) -> bool {
+        *cav != self.ego
+            && self.members.len() < MAX_NEIGHBOURS
+            && !self.members.contains_key(cav)
+            && self.allowed.as_ref().is_none_or(|allowed| allowed.contains(cav))
+    }
+
+    /// Everyone who is there.
+    pub(crate) fn members(&self) -> impl Iterator<Item = &CavId> {
+        self.members.keys()
+    }
+
+    /// Those whose word a frame waits for.
+    pub(crate) fn awaited(&self) -> impl Iterator<Item = &CavId> {
+        self.members.iter().filter(|(_, member)| member.silent_frames < SILENT_AFTER).map(|(cav, _)| cav)
+    }
+
+    /// A message came from `cav`.
+    pub(crate) fn spoke(&mut self, cav: &CavId) {
+        if let Some(member) = self.members.get_mut(cav) {
+            member.silent_frames = 0;
+        }
+    }
+
+    /// A frame was decided without a word of `cav` for it.
+    pub(crate) fn was_silent(&mut self, cav: &CavId) {
+        if let Some(member) = self.members.get_mut(cav) {
+            member.silent_frames = member.silent_frames.saturating_add(1);
+        }
+    }
+}

@@ -1,0 +1,363 @@
+//! A fleet through real zenoh sessions: replay, agents and ego in one process, each on a session of its own.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::{Mutex, PoisonError};
+use std::thread::{Scope, ScopedJoinHandle};
+use std::time::{Duration, Instant};
+
+use agent::agent::{Agent, AgentInput};
+use agent::detector::Detector;
+use agent::model_config::DetectorConfig;
+use agent::node as agent_node;
+use agent::point_pillars::PointPillars;
+use agent::pose_source::RecordedPose;
+use ego_fuser::Method;
+use ego_fuser::ego::{Content, Ego, View, own_content};
+use ego_fuser::node as ego_node;
+use ego_fuser::{Exchange, pairing::PairingConfig};
+use protocol::{Account, CavId, DecodedFeatures, Detection, Detections, DropReason, Ledger, Limits, Stream, Topic};
+use sim_replay::bus::mailbox::Taken;
+use sim_replay::bus::shutdown::Stop;
+use sim_replay::bus::{Bus, Event, PublisherOptions, Route, process_id};
+use sim_replay::dataset::{self, LoadOptions, Scenario};
+use sim_replay::stream::{Replay, StreamOptions};
+use tch::Device;
+use tch::nn::VarStore;
+use tests::bus::{PATIENCE, TestRouter};
+use tests::scene;
+use zenoh::Wait;
+
+const AGENTS: [&str; 3] = ["10", "20", "30"];
+const TICKS: usize = 6;
+
+fn cav(text: &str) -> CavId {
+    CavId::new(text).unwrap()
+}
+
+fn topic(cav_id: &str, stream: Stream) -> Topic {
+    Topic::Stream { cav: cav(cav_id), stream }
+}
+
+/// The same random network every time, with a head that believes in vehicles everywhere.
+fn detector() -> Detector {
+    // The seed is that of the whole process: nobody else may draw between it and the last parameter.
+    static SEEDING: Mutex<()> = Mutex::new(());
+    let _alone = SEEDING.lock().unwrap_or_else(PoisonError::into_inner);
+    tch::set_num_threads(1);
+    tch::manual_seed(5);
+    let config = DetectorConfig { lidar_range_m: [-25.6, -12.8, -3.0, 25.6, 12.8, 1.0], ..DetectorConfig::lean() };
+    let network = VarStore::new(Device::Cpu);
+    let pillars = PointPillars::new(&network.root(), &config).unwrap();
+    let _ = tch::no_grad(|| network.variables()["cls_head.bias"].shallow_clone().fill_(0.3));
+    Detector::from_network(pillars)
+}
+
+fn agent(cav_id: &str) -> Agent {
+    Agent::new(cav(cav_id), Box::new(RecordedPose), detector())
+}
+
+fn published(method: Method) -> Stream {
+    match own_content(method) {
+        Exchange::Boxes => Stream::Boxes,
+        Exchange::Points => Stream::Points,
+        Exchange::Features | Exchange::Nothing => Stream::Bev,
+    }
+}
+
+/// Runs an agent on a session of its own until `stop`; gives its books.
+fn run_agent<'scope>(
+    scope: &'scope Scope<'scope, '_>,
+    router: &'scope TestRouter,
+    cav_id: &'static str,
+    stream: Stream,
+    stop: &Stop,
+) -> ScopedJoinHandle<'scope, Ledger> {
+    let stop = stop.clone();
+    scope.spawn(move || {
+        let bus = router.join(&format!("agent-{cav_id}"), cav_id);
+        let options = agent_node::NodeOptions { publish: vec![stream], ..agent_node::NodeOptions::default() };
+        let report = agent_node::run(&bus, agent(cav_id), &options, &stop).unwrap();
+        assert_eq!(report.failed, 0);
+        leave(bus)
+    })
+}
+
+fn leave(bus: Bus) -> Ledger {
+    let books = bus.books().clone();
+    bus.leave(PATIENCE).unwrap();
+    books.ledger()
+}
+
+/// Listens to an ego's detections until it ends.
+fn listen<'scope>(
+    scope: &'scope Scope<'scope, '_>,
+    router: &'scope TestRouter,
+    ego: &'static str,
+) -> ScopedJoinHandle<'scope, (Vec<(u64, Detections)>, Ledger)> {
+    let bus = router.join("scorer", "scorer");
+    let inbox = bus.inbox(1000, 2);
+    let subscription = bus.subscribe(topic(ego, Stream::Detections), &inbox).unwrap();
+    scope.spawn(move || {
+        let mut results = Vec::new();
+        loop {
+            match inbox.take(Some(Instant::now() + PATIENCE)) {
+                Taken::Item(_, Event::Message(arrival)) => {
+                    let result: Detections = inbox.decode(&arrival, &Limits::DEFAULT).unwrap();
+                    bus.books().received(&arrival.topic);
+                    results.push((arrival.header.stamp.capture_nanos, result));
+                }
+                Taken::Item(_, Event::End { .. }) => break,
+                other => panic!("{other:?}"),
+            }
+        }
+        drop(subscription);
+        (results, leave(bus))
+    })
+}
+
+/// Plays the scene in step with the ego; gives what the ego told and everyone's books added up.
+fn play_in_lockstep(dir: &Path, method: Method) -> (Vec<(u64, Detections)>, Ledger) {
+    let scenario = dataset::open(dir).unwrap().scenarios.remove(0);
+    let (router, stop) = (TestRouter::open(), Stop::new());
+    let stream = published(method);
+    std::thread::scope(|scope| {
+        let listening = listen(scope, &router, "10");
+        let agents = AGENTS.map(|cav_id| run_agent(scope, &router, cav_id, stream, &stop));
+        let ego = scope.spawn(|| {
+            let bus = router.join("ego-10", "10");
+            let options = ego_node::NodeOptions { deadline: PATIENCE, ..ego_node::NodeOptions::default() };
+            let report = ego_node::run(&bus, &cav("10"), Ego::new(detector(), method), &options, &stop).unwrap();
+            assert_eq!((report.frames, report.at_deadline, report.failed), (TICKS as u64, 0, 0));
+            leave(bus)
+        });
+        let replay = router.join("replay", "replay");
+        let heard_by_ego = AGENTS.iter().filter(|cav_id| method != Method::None || **cav_id == "10");
+        let expect =
+            heard_by_ego.map(|cav_id| Route { topic: topic(cav_id, stream), receiver: "ego-10".parse().unwrap() });
+        let scorer = Route { topic: topic("10", Stream::Detections), receiver: "scorer".parse().unwrap() };
+        let options = StreamOptions {
+            expect: expect.chain([scorer]).collect(),
+            lockstep: vec![cav("10")],
+            ..StreamOptions::default()
+        };
+        let playing = Replay::prepare(&replay, &scenario, options, &Stop::new()).unwrap();
+        playing.wait_until_ready().unwrap();
+        let report = playing.play();
+        assert!(report.is_complete() && report.ticks == TICKS as u64, "{report:?}");
+        let mut ledger = leave(replay);
+        agents.into_iter().for_each(|agent| ledger.merge(&agent.join().unwrap()));
+        ledger.merge(&ego.join().unwrap());
+        let (results, books) = listening.join().unwrap();
+        ledger.merge(&books);
+        (results, ledger)
+    })
+}
+
+/// The same pipelines without any network.
+fn play_offline(scenario: &Scenario, method: Method) -> Vec<(u64, Vec<Detection>)> {
+    let mut agents: Vec<Agent> = AGENTS.iter().map(|cav_id| agent(cav_id)).collect();
+    let mut ego = Ego::new(detector(), method);
+    let mut results = Vec::new();
+    for (tick_index, tick) in scenario.ticks.iter().enumerate() {
+        let views: Vec<View> = (agents.iter_mut().enumerate())
+            .map(|(index, agent)| {
+                let frame = scenario.load(index, tick_index, &LoadOptions::default()).unwrap();
+                let input = AgentInput {
+                    capture_nanos: tick.capture_nanos,
+                    cloud: &frame.points,
+                    measured_pose: frame.world_from_lidar.as_ref(),
+                };
+                let output = agent.process(&input).unwrap();
+                let content = match own_content(method) {
+                    Exchange::Boxes => Content::Boxes(output.perception.detections),
+                    Exchange::Points => Content::Points(agent.detector().crop().without_own_body(&frame.points)),
+                    Exchange::Features | Exchange::Nothing => {
+                        Content::Features(DecodedFeatures { features: output.perception.features, sent: None })
+                    }
+                };
+                View { cav: agent.cav().clone(), pose: output.pose, age_nanos: 0, content }
+            })
+            .collect();
+        let detected = ego.detect(&views[0], &views[1..]).unwrap();
+        results.push((tick.capture_nanos, detected.detections));
+    }
+    results
+}
+
+#[test]
+fn live_in_lockstep_equals_offline_bit_by_bit_and_the_books_balance() {
+    let folder = tempfile::tempdir().unwrap();
+    scene::write(folder.path(), &AGENTS, TICKS);
+    let scenario = dataset::open(folder.path()).unwrap().scenarios.remove(0);
+    for method in Method::ALL {
+        let (live, ledger) = play_in_lockstep(folder.path(), method);
+        let offline = play_offline(&scenario, method);
+        assert!(offline.iter().any(|(_, detections)| !detections.is_empty()), "{method}: nothing to compare");
+        assert_eq!(live.len(), offline.len(), "{method}");
+        for ((live_capture, live), (capture, offline)) in live.iter().zip(&offline) {
+            assert_eq!((live_capture, live.detections.len()), (capture, offline.len()), "{method}");
+            for (live, offline) in live.detections.iter().zip(offline) {
+                assert_eq!(live, offline, "{method} at {capture}");
+            }
+        }
+        let expected = if method == Method::None { 0 } else { AGENTS.len() - 1 };
+        assert!(live.iter().all(|(_, result)| result.fused.len() == expected && result.skipped.is_empty()), "{method}");
+        assert!(live.iter().all(|(_, result)| result.fused.iter().all(|fused| fused.age_nanos == 0)), "{method}");
+
+        let balance = ledger.balance();
+        assert!(balance.is_exact(), "{method}: {balance:?}");
+        let total = ledger.total();
+        assert_eq!((total.in_flight, total.dropped_total()), (0, 0), "{method}: {ledger:?}");
+    }
+}
+
+/// Sends a fleet's maps by hand, so that the test decides who is late, wrong or gone.
+struct Puppet {
+    bus: Bus,
+    publisher: sim_replay::bus::Publisher,
+    agent: Agent,
+    index: usize,
+    _presence: sim_replay::bus::Presence,
+}
+
+impl Puppet {
+    fn new(router: &TestRouter, index: usize) -> Self {
+        let bus = router.join(&format!("agent-{}", AGENTS[index]), AGENTS[index]);
+        let publisher =
+            bus.publisher(topic(AGENTS[index], Stream::Bev), PublisherOptions::FEATURES.lossless(8)).unwrap();
+        let presence = bus.announce(protocol::Role::Agent).unwrap();
+        Self { bus, publisher, agent: agent(AGENTS[index]), index, _presence: presence }
+    }
+
+    fn send(&mut self, scenario: &Scenario, tick_index: usize) {
+        let tick = &scenario.ticks[tick_index];
+        let frame = scenario.load(self.index, tick_index, &LoadOptions::default()).unwrap();
+        let input = AgentInput {
+            capture_nanos: tick.capture_nanos,
+            cloud: &frame.points,
+            measured_pose: frame.world_from_lidar.as_ref(),
+        };
+        let output = self.agent.process(&input).unwrap();
+        let pose = output.pose;
+        self.publisher.offer_encoded(tick.capture_nanos, move |stamp| {
+            let features =
+                protocol::encode_features(output.perception.features, &protocol::CodecConfig::default(), None)?;
+            protocol::wire::encode(stamp, protocol::message::Bev { pose, features })
+        });
+    }
+
+    fn wait_until_heard(&self, receiver: &str) {
+        let route = Route { topic: self.publisher.topic().clone(), receiver: receiver.parse().unwrap() };
+        sim_replay::bus::Barrier::new([route]).attend(&self.bus).unwrap().wait(PATIENCE).unwrap();
+    }
+}
+
+#[test]
+fn late_killed_and_lying_neighbours_are_named_and_the_ego_goes_on() {
+    let folder = tempfile::tempdir().unwrap();
+    scene::write(folder.path(), &AGENTS, TICKS);
+    let scenario = dataset::open(folder.path()).unwrap().scenarios.remove(0);
+    let router = TestRouter::open();
+    let stop = Stop::new();
+    let mut fleet: Vec<Puppet> = (0..3).map(|index| Puppet::new(&router, index)).collect();
+    let scorer = router.join("scorer", "scorer");
+    let inbox = scorer.inbox(100, 1);
+    let _subscription = scorer.subscribe(topic("10", Stream::Detections), &inbox).unwrap();
+    let next = || match inbox.take(Some(Instant::now() + PATIENCE)) {
+        Taken::Item(_, Event::Message(arrival)) => inbox.decode::<Detections>(&arrival, &Limits::DEFAULT).unwrap(),
+        other => panic!("{other:?}"),
+    };
+    let names = |result: &Detections| result.fused.iter().map(|fused| fused.cav.to_string()).collect::<Vec<_>>();
+
+    let ledger = std::thread::scope(|scope| {
+        let ego = scope.spawn(|| {
+            let bus = router.join("ego-10", "10");
+            let options = ego_node::NodeOptions {
+                deadline: Duration::from_millis(400),
+                pairing: PairingConfig { max_age_nanos: 150_000_000, ..PairingConfig::default() },
+                keeps_running: true,
+                ..ego_node::NodeOptions::default()
+            };
+            ego_node::run(&bus, &cav("10"), Ego::new(detector(), Method::Max), &options, &stop).unwrap();
+            leave(bus)
+        });
+        fleet.iter().for_each(|puppet| puppet.wait_until_heard("ego-10"));
+
+        // All there.
+        for index in [1, 2, 0] {
+            fleet[index].send(&scenario, 0);
+        }
+        assert_eq!(names(&next()), ["20", "30"]);
+
+        // 30 is late: its message of the tick before is still young enough, and is used with its age.
+        fleet[1].send(&scenario, 1);
+        fleet[0].send(&scenario, 1);
+        let result = next();
+        assert_eq!(names(&result), ["20", "30"]);
+        assert_eq!(result.fused[1].age_nanos, 100_000_000);
+
+        // Still silent: too old now, masked and named.
+        fleet[1].send(&scenario, 2);
+        fleet[0].send(&scenario, 2);
+        let result = next();
+        assert_eq!(names(&result), ["20"]);
+        assert_eq!((result.skipped[0].cav.as_str(), result.skipped[0].reason), ("30", None));
+
+        // 20 sends garbage under its own name: counted, and the ego goes on without it.
+        let key = fleet[1].bus.key(topic("20", Stream::Bev)).to_string();
+        fleet[1].bus.session().put(&key, vec![0xAB; 4096]).wait().unwrap();
+        fleet[2].send(&scenario, 3);
+        fleet[0].send(&scenario, 3);
+        let result = next();
+        assert!(names(&result).contains(&"30".to_owned()), "{result:?}");
+
+        // 20 dies without a word.
+        let dead = fleet.remove(1);
+        dead.bus.session().close().wait().unwrap();
+        for tick in 4..6 {
+            fleet[1].send(&scenario, tick);
+            fleet[0].send(&scenario, tick);
+            assert!(names(&next()).contains(&"30".to_owned()));
+        }
+        stop.request();
+        ego.join().unwrap()
+    });
+    let from_20 = ledger.get(&Account::towards(topic("20", Stream::Bev), &process_id(protocol::Role::Ego, &cav("10"))));
+    let from_20 = from_20.unwrap();
+    assert_eq!(from_20.dropped.get(&DropReason::Decode), Some(&1), "{from_20:?}");
+    assert_eq!(from_20.received, 3);
+    let own = ledger.get(&Account::towards(topic("10", Stream::Bev), &process_id(protocol::Role::Ego, &cav("10"))));
+    assert_eq!(own.unwrap().received, 6);
+}
+
+#[test]
+fn an_agent_hears_its_own_sensors_only_and_says_so_when_it_has_no_pose() {
+    let folder = tempfile::tempdir().unwrap();
+    scene::write(folder.path(), &AGENTS, 3);
+    let scenario = dataset::open(folder.path()).unwrap().scenarios.remove(0);
+    let (router, stop) = (TestRouter::open(), Stop::new());
+    let ledger = std::thread::scope(|scope| {
+        let running = run_agent(scope, &router, "20", Stream::Bev, &stop);
+        let replay = router.join("replay", "replay");
+        let lidar =
+            |cav_id| replay.publisher(topic(cav_id, Stream::Lidar), PublisherOptions::SENSOR.lossless(8)).unwrap();
+        let (own, other) = (lidar("20"), lidar("10"));
+        let route = Route { topic: topic("20", Stream::Lidar), receiver: "agent-20".parse().unwrap() };
+        sim_replay::bus::Barrier::new([route]).attend(&replay).unwrap().wait(PATIENCE).unwrap();
+        let frame = scenario.load(1, 0, &LoadOptions::default()).unwrap();
+        // A sweep whose pose never comes.
+        other.offer(1, protocol::Lidar { points: frame.points.clone() });
+        own.offer(1, protocol::Lidar { points: frame.points });
+        other.finish();
+        own.finish();
+        running.join().unwrap()
+    });
+    let heard: BTreeMap<String, u64> = (ledger.iter())
+        .filter(|(account, _)| account.to.is_some())
+        .map(|(account, counts)| (account.topic.to_string(), counts.received))
+        .collect();
+    assert_eq!(heard, BTreeMap::from([("20/gnss".to_owned(), 0), ("20/lidar".to_owned(), 1)]));
+    let sent = |stream| ledger.get(&Account::published(topic("20", stream))).unwrap().sent;
+    assert_eq!((sent(Stream::Pose), sent(Stream::Bev)), (1, 1), "it says that it has none");
+}
