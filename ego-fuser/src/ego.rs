@@ -14,7 +14,7 @@ use nalgebra::Isometry3;
 use protocol::{BevGrid, CavId, DecodedFeatures, Detection, DropReason, PointCloud, Pose, PoseEstimate, StageTiming};
 use tch::{Kind, TchError, Tensor, no_grad};
 
-use crate::fusion::{self, AlignedViews, Fusion};
+use crate::fusion::{self, AlignedViews, Fusion, Steering};
 use crate::method::{Exchange, Method, UnknownMethod};
 use crate::model::{METHOD_KEY, SCORE_THRESHOLD};
 use crate::samples::merge_points;
@@ -128,6 +128,7 @@ pub struct Ego {
     method: Method,
     detector: Detector,
     fusion: Box<dyn Fusion>,
+    steering: Option<Steering>,
     limits: PostprocessConfig,
     comm_range_m: f64,
 }
@@ -147,15 +148,18 @@ impl Ego {
             (None, Some(name)) => name.parse()?,
             (None, None) => Method::None,
         };
-        Ok(Self::new(Detector::from_weights(&weights, &weights.config()?)?, method))
+        let ego = Self::new(Detector::from_weights(&weights, &weights.config()?)?, method);
+        let steering = Steering::from_weights(&weights, ego.detector.map_shape()[0])?;
+        Ok(Self { steering, ..ego })
     }
 
-    /// The pipeline of a method around a detector.
+    /// The pipeline of a method around a detector, with the channels of neighbours as they come.
     #[must_use]
     pub fn new(detector: Detector, method: Method) -> Self {
         let limits = PostprocessConfig::for_detector(detector.config());
         let limits = PostprocessConfig { score_threshold: SCORE_THRESHOLD, ..limits };
-        Self { method, detector, fusion: fusion::build(method), limits, comm_range_m: Self::COMM_RANGE_M }
+        let fusion = fusion::build(method);
+        Self { method, detector, fusion, steering: None, limits, comm_range_m: Self::COMM_RANGE_M }
     }
 
     /// The same with other limits of the clean-up.
@@ -264,6 +268,10 @@ impl Ego {
         }
         let (maps, sent) = (Tensor::f_cat(&maps, 0)?, Tensor::f_cat(&sent, 0)?);
         let poses: Vec<Pose> = aligned.iter().map(|view| view.ego_from_cav).collect();
+        let maps = match &self.steering {
+            Some(steering) => steering.turn(&maps, &poses)?,
+            None => maps,
+        };
         let warped = warp_to_ego(&maps, Some(&sent), &poses, &self.detector.grid())?;
         stages.lap("align");
         let confidence: Vec<f64> = aligned.iter().map(|view| f64::from(view.view.pose.confidence())).collect();

@@ -16,8 +16,8 @@ use protocol::{Box3d, Detection, Pose};
 use tch::nn::VarStore;
 use tch::{Device, Kind, TchError, Tensor};
 
-use crate::fusion::{self, AlignedViews, Fusion};
-use crate::method::{Method, UnknownMethod};
+use crate::fusion::{self, AlignedViews, Fusion, Steering, steering};
+use crate::method::{Exchange, Method, UnknownMethod};
 use crate::targets::{LatticeError, TargetAssigner, TargetRule};
 use crate::warp::{WarpError, warp_to_ego};
 
@@ -77,6 +77,7 @@ pub struct CooperativeModel {
     network: PointPillars,
     anchors: Anchors,
     fusion: Box<dyn Fusion>,
+    steering: Option<Steering>,
 }
 
 impl CooperativeModel {
@@ -87,7 +88,10 @@ impl CooperativeModel {
     pub fn new(config: &DetectorConfig, method: Method, device: Device) -> Result<Self, ModelError> {
         let variables = VarStore::new(device);
         let network = PointPillars::new(&variables.root(), config)?;
-        Ok(Self { method, network, variables, anchors: Anchors::for_detector(config), fusion: fusion::build(method) })
+        let shares_maps = method.exchange() == Exchange::Features;
+        let steering = shares_maps.then(|| Steering::new(&variables.root(), config.feature_channels()));
+        let anchors = Anchors::for_detector(config);
+        Ok(Self { method, network, variables, anchors, fusion: fusion::build(method), steering })
     }
 
     /// Builds the model of a weights file; `method` overrides the one that the file names.
@@ -102,7 +106,8 @@ impl CooperativeModel {
             (None, None) => Method::None,
         };
         let model = Self::new(&weights.config()?, method, device)?;
-        weights.copy_into(&model.variables)?;
+        // A network that was trained alone becomes a cooperative one whose steering has everything to learn.
+        weights.copy_some_into(&model.variables, |name| name != steering::WEIGHT || weights.contains(name))?;
         Ok(model)
     }
 
@@ -193,6 +198,10 @@ impl CooperativeModel {
         confidence: &[f64],
         age_secs: &[f64],
     ) -> Result<Tensor, ModelError> {
+        let features = match &self.steering {
+            Some(steering) => &steering.turn(features, ego_from_cav)?,
+            None => features,
+        };
         let warped = warp_to_ego(features, None, ego_from_cav, &self.network.config.feature_grid())?;
         let views = AlignedViews { features: &warped.features, mask: &warped.mask, confidence, age_secs };
         Ok(self.fusion.fuse(&views)?)

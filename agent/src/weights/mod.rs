@@ -79,6 +79,12 @@ impl Weights {
         self.tensors.keys().map(String::as_str)
     }
 
+    /// Whether there is a tensor of that name.
+    #[must_use]
+    pub fn contains(&self, name: &str) -> bool {
+        self.tensors.contains_key(name)
+    }
+
     /// Number of parameters.
     #[must_use]
     pub fn parameters(&self) -> usize {
@@ -121,7 +127,16 @@ impl Weights {
     /// # Errors
     /// [`WeightsError::MissingTensor`] or [`WeightsError::Shape`] name what does not fit; nothing is copied then.
     pub fn copy_into(&self, network: &VarStore) -> Result<(), WeightsError> {
-        let variables: BTreeMap<String, Tensor> = network.variables().into_iter().collect();
+        self.copy_some_into(network, |_| true)
+    }
+
+    /// The same for the parameters whose name is `wanted`; the network's others keep their values.
+    ///
+    /// # Errors
+    /// As [`Self::copy_into`].
+    pub fn copy_some_into(&self, network: &VarStore, wanted: impl Fn(&str) -> bool) -> Result<(), WeightsError> {
+        let variables: BTreeMap<String, Tensor> =
+            network.variables().into_iter().filter(|(name, _)| wanted(name)).collect();
         for (name, variable) in &variables {
             self.checked(name, variable.size())?;
         }

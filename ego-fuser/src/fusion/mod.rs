@@ -2,6 +2,7 @@
 
 mod attention;
 mod max;
+pub(crate) mod steering;
 
 use std::fmt::Debug;
 
@@ -9,6 +10,7 @@ use tch::{TchError, Tensor};
 
 pub use attention::AttentionFusion;
 pub use max::MaxFusion;
+pub use steering::Steering;
 
 use crate::Method;
 

@@ -1,0 +1,117 @@
+//! What a neighbour's features mean in the ego's frame.
+//!
+//! An encoder writes headings and offsets into its channels relative to its own axes. The reference codes train and test
+//! with clouds that were projected to the ego's frame before encoding, so that all maps share its axes; a vehicle that
+//! broadcasts one map to everyone cannot do that. Resampling moves cells and leaves what stands in them unturned, so the
+//! channels are turned here: by a learnt matrix that depends on the relative heading.
+
+use agent::weights::{Weights, WeightsError};
+use protocol::Pose;
+use tch::nn::{self, Init, VarStore};
+use tch::{Device, Kind, TchError, Tensor};
+
+/// Name of the parameter in weights files. Those that were trained without it, alone or elsewhere, do not have it.
+pub(crate) const WEIGHT: &str = "steering.weight";
+/// 1, cos, sin, cos 2, sin 2 of the heading: directions turn with the first pair, axes (which look the same from both
+/// ends, as anchors do) with the second.
+const BASIS: i64 = 5;
+
+/// Turns the channels of neighbours: `f + sum_k basis_k(heading) * W_k f`, then ReLU as after the encoder.
+#[derive(Debug)]
+pub struct Steering {
+    /// `[BASIS, C, C]`.
+    weight: Tensor,
+}
+
+impl Steering {
+    /// Changes nothing before it is trained; its parameter is `steering.weight`, `[5, C, C]`, under `path`.
+    #[must_use]
+    pub fn new(path: &nn::Path<'_>, channels: i64) -> Self {
+        let weight = (path / "steering").var("weight", &[BASIS, channels, channels], Init::Const(0.0));
+        Self { weight }
+    }
+
+    /// The steering of a weights file; `None` for weights that were trained without.
+    ///
+    /// # Errors
+    /// [`WeightsError::Shape`] when it was made for another number of channels.
+    pub fn from_weights(weights: &Weights, channels: i64) -> Result<Option<Self>, WeightsError> {
+        if !weights.contains(WEIGHT) {
+            return Ok(None);
+        }
+        let variables = VarStore::new(Device::Cpu);
+        let steering = Self::new(&variables.root(), channels);
+        weights.copy_into(&variables)?;
+        Ok(Some(steering))
+    }
+
+    /// Turns maps `[N, C, H, W]` into the axes of the ego; those at the identity, the ego's own, stay as they are.
+    ///
+    /// # Errors
+    /// [`TchError`] when the channels are not those it was made for, or there is not one pose per map.
+    pub fn turn(&self, features: &Tensor, ego_from_cav: &[Pose]) -> Result<Tensor, TchError> {
+        let mut turned = Vec::with_capacity(ego_from_cav.len());
+        for (index, pose) in ego_from_cav.iter().enumerate() {
+            let map = features.f_narrow(0, index as i64, 1)?;
+            turned.push(if *pose == Pose::IDENTITY { map } else { self.turn_one(&map, pose.yaw_rad())? });
+        }
+        Tensor::f_cat(&turned, 0)
+    }
+
+    fn turn_one(&self, map: &Tensor, yaw_rad: f64) -> Result<Tensor, TchError> {
+        let ((sin, cos), (sin_2, cos_2)) = (yaw_rad.sin_cos(), (2.0 * yaw_rad).sin_cos());
+        let basis = [1.0, cos, sin, cos_2, sin_2].map(|value| value as f32);
+        let basis = Tensor::f_from_slice(&basis)?.f_view([BASIS, 1, 1])?.f_to_device(map.device())?;
+        let matrix = (&self.weight * basis).f_sum_dim_intlist([0i64].as_slice(), false, Kind::Float)?;
+        let change = map.f_conv2d(
+            &matrix.f_unsqueeze(-1)?.f_unsqueeze(-1)?,
+            None::<Tensor>,
+            [1, 1].as_slice(),
+            [0, 0].as_slice(),
+            [1, 1].as_slice(),
+            1,
+        )?;
+        (map + change).f_relu()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::f64::consts::{FRAC_PI_2, PI};
+
+    use super::*;
+
+    const FLOAT: (Kind, Device) = (Kind::Float, Device::Cpu);
+
+    fn turned(yaw_rad: f64) -> Pose {
+        Pose::from_xyz_yaw([3.0, 1.0, 0.0], yaw_rad)
+    }
+
+    #[test]
+    fn untrained_it_changes_nothing() {
+        let variables = VarStore::new(Device::Cpu);
+        let steering = Steering::new(&variables.root(), 4);
+        let features = Tensor::rand([2, 4, 3, 5], FLOAT);
+        assert_eq!(steering.turn(&features, &[Pose::IDENTITY, turned(1.0)]).unwrap(), features);
+    }
+
+    #[test]
+    fn only_neighbours_are_turned_and_only_by_their_heading() {
+        let weight = Tensor::zeros([BASIS, 2, 2], FLOAT);
+        // Channel 0 gains sin(heading) of channel 1: what lay along y now also lies along x.
+        let _ = weight.get(2).get(0).get(1).fill_(1.0);
+        let steering = Steering { weight };
+        let features = Tensor::ones([3, 2, 1, 1], FLOAT);
+        let poses = [Pose::IDENTITY, turned(FRAC_PI_2), turned(PI)];
+        let out = Vec::<f32>::try_from(steering.turn(&features, &poses).unwrap().view(-1)).unwrap();
+        let expected = [1.0, 1.0, 2.0, 1.0, 1.0, 1.0];
+        assert!(out.iter().zip(expected).all(|(found, expected)| (found - expected).abs() < 1e-6), "{out:?}");
+    }
+
+    #[test]
+    fn another_number_of_channels_is_refused() {
+        let variables = VarStore::new(Device::Cpu);
+        let steering = Steering::new(&variables.root(), 4);
+        assert!(steering.turn(&Tensor::ones([1, 3, 2, 2], FLOAT), &[turned(0.5)]).is_err());
+    }
+}
