@@ -1,7 +1,7 @@
 //! A method on recorded scenes without a network: the numbers of a run in which nothing is late.
 
 use std::ops::ControlFlow;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::time::Instant;
 
 use agent::pose_source::PoseSourceConfig;
@@ -12,6 +12,7 @@ use sim_replay::dataset::{self, ReadError};
 
 use crate::metrics::{Messages, Metrics};
 use crate::score::Board;
+use crate::weights_choice::{WeightsChoiceError, weights_of};
 
 /// What to evaluate.
 #[derive(Debug, Clone)]
@@ -37,16 +38,9 @@ pub enum EvaluationError {
     /// The data set has no frame to judge.
     #[error("{}: there is no frame in it", .0.display())]
     Empty(PathBuf),
-    /// The folder of weights has none, or several, for a method.
-    #[error("{}: {found} files named *-{method}.safetensors, one is needed", folder.display())]
-    NoWeights {
-        /// The folder.
-        folder: PathBuf,
-        /// The method.
-        method: Method,
-        /// How many there are.
-        found: usize,
-    },
+    /// There are no weights for a method.
+    #[error(transparent)]
+    Weights(#[from] WeightsChoiceError),
     /// The pipeline refused.
     #[error(transparent)]
     Evaluate(#[from] EvaluateError),
@@ -128,43 +122,5 @@ fn metrics(board: &Board, method: Method, pose_source: &PoseSourceConfig, began:
         latency_ms: board.latencies(),
         comm: board.communication(),
         messages: Messages::default(),
-    }
-}
-
-/// The weights of a method: `path` itself, or the one file of its name in the folder `path`.
-fn weights_of(path: &Path, method: Method) -> Result<PathBuf, EvaluationError> {
-    if !path.is_dir() {
-        return Ok(path.to_path_buf());
-    }
-    let ending = format!("-{method}.safetensors");
-    let entries = std::fs::read_dir(path).map_err(|source| ReadError::io(path, source))?;
-    let mut files: Vec<PathBuf> = entries
-        .filter_map(|entry| Some(entry.ok()?.path()))
-        .filter(|file| file.file_name().is_some_and(|name| name.to_string_lossy().ends_with(&ending)))
-        .collect();
-    match (files.pop(), files.len()) {
-        (Some(file), 0) => Ok(file),
-        (file, more) => {
-            let found = more + usize::from(file.is_some());
-            Err(EvaluationError::NoWeights { folder: path.to_path_buf(), method, found })
-        }
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn a_folder_holds_one_file_per_method() {
-        let folder = tempfile::tempdir().unwrap();
-        for name in ["lean-none.safetensors", "lean-max.safetensors", "full-max.safetensors", "lean-none.md"] {
-            std::fs::write(folder.path().join(name), b"").unwrap();
-        }
-        let of = |method| weights_of(folder.path(), method);
-        assert!(of(Method::None).unwrap().ends_with("lean-none.safetensors"));
-        assert!(of(Method::Max).unwrap_err().to_string().contains("2 files named *-max.safetensors"));
-        assert!(of(Method::Late).unwrap_err().to_string().contains("0 files"));
-        assert_eq!(weights_of(Path::new("w.safetensors"), Method::Late).unwrap(), Path::new("w.safetensors"));
     }
 }

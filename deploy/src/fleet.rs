@@ -13,6 +13,7 @@ use sim_replay::ground_truth::GroundTruthRule;
 use crate::scenario::{Launch, NoiseMode, PoseSource, Publish, Scenario};
 use crate::score::scorer_cav;
 use crate::supervise::{Life, ProcessSpec};
+use crate::weights_choice::{WeightsChoiceError, weights_of};
 
 /// Vehicles farther than this from the ego do not take part, metres (the rule of the OPV2V family).
 const COMM_RANGE_M: f64 = 70.0;
@@ -74,6 +75,9 @@ pub enum FleetError {
     /// The weights cannot be used.
     #[error("weights: {0}")]
     Weights(#[from] WeightsError),
+    /// There are no weights for the method.
+    #[error(transparent)]
+    NoWeights(#[from] WeightsChoiceError),
 }
 
 /// A scenario with everything filled in that it leaves open.
@@ -100,6 +104,7 @@ impl Fleet {
     /// [`FleetError`] says what the scene or the weights lack.
     pub fn plan(scenario: &Scenario) -> Result<Self, FleetError> {
         let mut scenario = scenario.clone();
+        scenario.models.weights = weights_of(&scenario.models.weights, scenario.method)?;
         let detector = Weights::load(&scenario.models.weights)?.config()?;
         let scene = &mut scenario.scene;
         let dataset = dataset::open(&scene.dir)?;

@@ -21,3 +21,4 @@ pub mod score;
 pub mod showcase;
 pub mod supervise;
 pub mod up;
+pub mod weights_choice;

@@ -20,6 +20,9 @@ pub(crate) struct Arguments {
     /// Folder of the run folders.
     #[arg(long, default_value = "runs")]
     runs: PathBuf,
+    /// Data set, split or scenario in place of the scenario's.
+    #[arg(long, value_name = "DIR")]
+    scene: Option<PathBuf>,
     /// Fusion method in place of the scenario's: none, late, early, max, attention.
     #[arg(long)]
     method: Option<Method>,
@@ -34,7 +37,10 @@ pub(crate) struct Arguments {
 impl Arguments {
     /// Runs the scenario and prints what came of it.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
-        let mut scenario = Scenario::load(&self.scenario)?;
+        let mut scenario = Scenario::read(&self.scenario)?;
+        if let Some(scene) = self.scene {
+            scenario.scene.dir = std::path::absolute(scene)?;
+        }
         scenario.run = self.name.or(scenario.run);
         scenario.method = self.method.unwrap_or(scenario.method);
         scenario.scene.frames = self.frames.or(scenario.scene.frames);

@@ -104,7 +104,8 @@ pub enum Clock {
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Models {
-    /// Weights of the detector (safetensors; its configuration is inside). Relative to the scenario file.
+    /// Weights of the detector (safetensors; its configuration is inside), or a folder with a file `*-METHOD.safetensors`
+    /// for each method. Relative to the scenario file.
     pub weights: PathBuf,
     /// Threads each process computes with.
     #[serde(default = "Models::default_threads")]
