@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 
 use agent::model_config::DetectorConfig;
 use agent::weights::{Weights, WeightsError};
+use ego_fuser::Exchange;
 use protocol::{CavId, Dtype, ProcessId, Role, RunId, Stream, Topic};
 use sim_replay::bus::{Route, process_id};
 use sim_replay::dataset::{self, ReadError};
@@ -273,8 +274,10 @@ impl Fleet {
         ];
         for cav in &self.agents {
             routes.push(route(cav, Stream::Pose, &scorer));
-            let publish = self.publish(cav);
-            routes.push(route(cav, publish.stream(), &ego));
+            // Alone, the ego listens to nobody but its own agent.
+            if *cav == self.ego || self.scenario.method.exchange() != Exchange::Nothing {
+                routes.push(route(cav, self.publish(cav).stream(), &ego));
+            }
         }
         routes
     }

@@ -235,6 +235,8 @@ impl Watcher {
             let how = match self.spawn() {
                 Err(error) => format!("cannot be started: {error}"),
                 Ok(mut child) => {
+                    // Taken out, as waiting for a child closes the input that it still holds.
+                    let _lifeline = child.stdin.take();
                     self.tell(Happening::Started { pid: child.id().unwrap_or(0) });
                     let stop = self.stop.clone();
                     tokio::select! {

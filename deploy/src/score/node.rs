@@ -175,7 +175,9 @@ impl ScorerNode {
         if let Err(overdue) = self.bus.leave(LEAVE_LIMIT) {
             tracing::warn!("{overdue}");
         }
-        Scored { board, books: books.into_values().chain([own]).collect(), progress }
+        // Its own books went out like everyone's and came back; those in hand are newer.
+        let others = books.into_values().filter(|books| books.process != own.process);
+        Scored { board, books: others.chain([own.clone()]).collect(), progress }
     }
 }
 
