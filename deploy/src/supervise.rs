@@ -380,6 +380,21 @@ mod tests {
     }
 
     #[test]
+    fn the_lifeline_holds_as_long_as_the_supervisor() {
+        let (supervisor, events, folder) = start(shell("car", Life::Service, "echo up; cat; echo cut off"), 3);
+        assert!(matches!(next(&events), Happening::Started { .. }));
+        let log = folder.path().join("car.log");
+        let began = Instant::now();
+        while std::fs::read_to_string(&log).unwrap().is_empty() && began.elapsed() < PATIENCE {
+            std::thread::yield_now();
+        }
+        // Its input does not end, so neither does it.
+        assert!(events.recv_timeout(Duration::from_millis(200)).is_err());
+        drop(supervisor.stop(PATIENCE));
+        assert_eq!(std::fs::read_to_string(&log).unwrap(), "up\n");
+    }
+
+    #[test]
     fn bad_input_is_not_tried_again() {
         let (_supervisor, events, _folder) = start(shell("car", Life::Service, "echo bad map; exit 2"), 5);
         assert!(matches!(next(&events), Happening::Started { .. }));
