@@ -3,14 +3,14 @@
 use bytemuck::Pod;
 use crc32fast::Hasher;
 
-use crate::{Limits, WireError};
+use crate::WireError;
 
 // Bodies are cast, not converted.
 #[cfg(target_endian = "big")]
 compile_error!("message bodies are little-endian in memory; a big-endian target would need a converting copy");
 
-/// Copied and checked at a time: small enough to be in the first-level cache for every pass over it.
-const BLOCK_BYTES: usize = 16 << 10;
+/// Copied and checked at a time: source and copy stay in the first-level cache for every pass over them.
+const BLOCK_BYTES: usize = 8 << 10;
 
 /// The body of one message, owned, in the type its values have.
 ///
@@ -50,19 +50,6 @@ impl Body {
     #[must_use]
     pub fn is_empty(&self) -> bool {
         self.len() == 0
-    }
-
-    /// Feeds the checksum and checks every value, in one pass over memory.
-    pub(crate) fn seal(&self, crc: &mut Hasher, limits: &Limits) -> Result<(), WireError> {
-        let checked = matches!(self, Self::Floats(_) | Self::Points(_));
-        let mut sound = true;
-        for block in self.as_bytes().chunks(BLOCK_BYTES) {
-            crc.update(block);
-            if checked {
-                sound &= all_bounded(bytemuck::cast_slice(block), limits.max_abs_value);
-            }
-        }
-        if sound { Ok(()) } else { check_body(self, limits.max_abs_value) }
     }
 }
 
@@ -163,34 +150,36 @@ impl<'a> PayloadReader<'a> {
             BodyShape::Empty => (Body::Empty, true),
             BodyShape::Bytes { .. } => (Body::Bytes(self.read_bytes(len)), true),
             BodyShape::Floats(_) => {
-                let (values, sound) = self.read_values::<f32>(len / 4, |new| all_bounded(new, max_abs));
+                let (values, sound) = self.read_values::<f32>(len / 4, max_abs);
                 (Body::Floats(values), sound)
             }
             BodyShape::Points(_) => {
-                let (points, sound) =
-                    self.read_values::<[f32; 4]>(len / 16, |new| all_bounded(new.as_flattened(), max_abs));
+                let (points, sound) = self.read_values::<[f32; 4]>(len / 16, max_abs);
                 (Body::Points(points), sound)
             }
         })
     }
 
-    /// The one copy from the network's pieces into aligned memory. Pieces end anywhere, inside a value too.
-    fn read_values<T: Pod>(&mut self, count: usize, is_sound: impl Fn(&[T]) -> bool) -> (Vec<T>, bool) {
+    /// The one copy from the network's pieces into aligned memory, and whether every value is sound. Pieces end
+    /// anywhere, inside a value too.
+    fn read_values<T: Pod>(&mut self, count: usize, max_abs: f32) -> (Vec<T>, bool) {
         let size = size_of::<T>();
-        let mut values = Vec::<T>::with_capacity(count);
+        let mut values = Vec::with_capacity(count);
         let mut sound = true;
         while values.len() < count {
             let known = values.len();
             let missing = (count - known).saturating_mul(size);
             let Some(run) = self.next_run(BLOCK_BYTES.min(missing)) else { break };
             self.crc.update(run);
+            // Copied and checked in two loops, both of which every build vectorises: with the check inside the copy
+            // some builds are a quarter faster, and others fall back to single values and take ten times as long.
             let whole = run.chunks_exact(size);
             let split = whole.remainder();
             values.extend(whole.map(bytemuck::pod_read_unaligned::<T>));
             if !split.is_empty() {
                 values.push(self.read_split_value(split));
             }
-            sound &= is_sound(&values[known..]);
+            sound &= all_bounded(bytemuck::cast_slice(&values[known..]), max_abs);
         }
         (values, sound)
     }
@@ -228,11 +217,25 @@ pub(crate) fn check_body(body: &Body, max_abs: f32) -> Result<(), WireError> {
     }
 }
 
-/// Whether every value is finite and at most `max_abs` in size. Compares bit patterns: those of infinity and NaN are
-/// larger than any number's, so that one integer comparison tells all three, and the loop vectorises.
+/// Whether every value is finite and at most `max_abs` in size.
 pub(crate) fn all_bounded(values: &[f32], max_abs: f32) -> bool {
-    let bound = max_abs.to_bits();
-    values.iter().fold(true, |sound, value| sound & (value.to_bits() & 0x7fff_ffff <= bound))
+    let headroom = headroom(max_abs);
+    values.iter().fold(0, |excess, value| excess | excess_over(headroom, *value)) >= 0
+}
+
+/// How far the bits of `max_abs` are from the largest integer.
+#[inline]
+fn headroom(max_abs: f32) -> i32 {
+    i32::MAX - max_abs.abs().to_bits() as i32
+}
+
+/// Negative where `number` is NaN, infinite or larger in size than the number that `headroom` was made of.
+///
+/// Without their sign, bit patterns have the order of the numbers, and those of infinity and NaN come after all: one
+/// integer addition, which overflows into the sign, tells all three.
+#[inline]
+fn excess_over(headroom: i32, number: f32) -> i32 {
+    (number.abs().to_bits() as i32).wrapping_add(headroom)
 }
 
 /// [`all_bounded`], naming the first value that is not.
@@ -240,8 +243,8 @@ pub(crate) fn check_values(what: &'static str, values: &[f32], max_abs: f32) -> 
     if all_bounded(values, max_abs) {
         return Ok(());
     }
-    let bound = max_abs.to_bits();
-    match values.iter().position(|value| value.to_bits() & 0x7fff_ffff > bound) {
+    let headroom = headroom(max_abs);
+    match values.iter().position(|value| excess_over(headroom, *value) < 0) {
         None => Ok(()),
         Some(index) => Err(WireError::Value {
             what,

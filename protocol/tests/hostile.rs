@@ -8,8 +8,8 @@ use proptest::collection::vec;
 use proptest::prelude::*;
 use proptest::sample::{Index, select};
 use protocol::{
-    BevGrid, Body, Codec, DropReason, Dtype, EncodedFeatures, HEADER_LEN, Header, Limits, Message, Packing, Selection,
-    WireError, wire,
+    Bev, BevGrid, Body, Codec, CodecConfig, DropReason, Dtype, EncodedFeatures, HEADER_LEN, Header, Lidar, Limits,
+    Message, Packing, Points, Selection, WireError, wire,
 };
 use sample::any::any_message;
 
@@ -142,6 +142,29 @@ fn smaller_limits_are_kept_too() {
         match wire::decode_any([&bytes[..]], &limits) {
             Ok(_) => assert!(!refused, "{message:?}"),
             Err(error) => assert!(refused && error.drop_reason() == DropReason::Shape, "{error}"),
+        }
+    }
+}
+
+#[test]
+fn numbers_that_are_none_never_arrive() {
+    for bad in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, 1e30] {
+        let mut features = sample::features();
+        features.values[500] = bad;
+        let features = protocol::encode_features(features, &CodecConfig::default(), None).unwrap();
+        let mut points = sample::points();
+        points.xyzi[50][2] = bad;
+        for message in [
+            Message::Bev(Bev { pose: sample::pose(), features }),
+            Message::Lidar(Lidar { points: points.clone() }),
+            Message::Points(Points { pose: sample::pose(), points }),
+        ] {
+            let bytes = wire::encode_any(&sample::stamp(), message).unwrap().to_vec();
+            for size in [7, 1 << 20] {
+                let error = wire::decode_any(bytes.chunks(size), &Limits::DEFAULT).unwrap_err();
+                assert!(matches!(error, WireError::Value { index: 500 | 202, .. }), "{error}");
+                assert_eq!(error.drop_reason(), DropReason::NotFinite);
+            }
         }
     }
 }

@@ -1,19 +1,18 @@
 //! zstd around a body.
 
-use super::Packing;
 use crate::WireError;
 
-/// Packs `bytes`, or leaves them as they are where that would not make them fewer.
+/// Packs `bytes`; `None` where that would not make them fewer.
 ///
 /// # Errors
 /// [`WireError::Compression`] when zstd refuses, for example for lack of memory.
-pub(super) fn pack(bytes: Vec<u8>, level: i32) -> Result<(Packing, Vec<u8>), WireError> {
-    let packed = zstd::bulk::compress(&bytes, level).map_err(|error| WireError::Compression {
+pub(super) fn pack(bytes: &[u8], level: i32) -> Result<Option<Vec<u8>>, WireError> {
+    let packed = zstd::bulk::compress(bytes, level).map_err(|error| WireError::Compression {
         bytes: 0,
         expected: bytes.len() as u64,
         detail: error.to_string(),
     })?;
-    Ok(if packed.len() < bytes.len() { (Packing::Zstd, packed) } else { (Packing::Raw, bytes) })
+    Ok(Some(packed).filter(|packed| packed.len() < bytes.len()))
 }
 
 /// Unpacks to exactly `expected` bytes, a size the caller has checked against its limits. The decoder writes into a
@@ -43,8 +42,7 @@ mod tests {
     #[test]
     fn round_trip_and_exact_size() {
         let bytes: Vec<u8> = (0..10_000u32).map(|n| (n / 100) as u8).collect();
-        let (packing, packed) = pack(bytes.clone(), 3).unwrap();
-        assert_eq!(packing, Packing::Zstd);
+        let packed = pack(&bytes, 3).unwrap().unwrap();
         assert_eq!(unpack(packed.clone(), bytes.len()).unwrap(), bytes);
         for wrong in [0, 1, bytes.len() - 1, bytes.len() + 1] {
             assert!(matches!(unpack(packed.clone(), wrong), Err(WireError::Compression { .. })), "{wrong}");
@@ -63,16 +61,16 @@ mod tests {
         })
         .take(4096)
         .collect();
-        assert_eq!(pack(bytes.clone(), 3).unwrap(), (Packing::Raw, bytes));
+        assert_eq!(pack(&bytes, 3).unwrap(), None);
     }
 
     #[test]
     fn a_bomb_goes_nowhere() {
-        let (_, bomb) = pack(vec![0; 64 << 20], 19).unwrap();
+        let bomb = pack(&vec![0; 64 << 20], 19).unwrap().unwrap();
         assert!(bomb.len() < 10_000);
         assert!(matches!(unpack(bomb.clone(), 1000), Err(WireError::Compression { .. })));
         // Two frames that together hold more than announced.
-        let mut twice = pack(vec![0; 1000], 3).unwrap().1;
+        let mut twice = pack(&[0; 1000], 3).unwrap().unwrap();
         twice.extend(bomb);
         assert!(matches!(unpack(twice, 1000), Err(WireError::Compression { .. })));
     }

@@ -14,14 +14,15 @@
 
 mod compression;
 mod dtype;
+mod layout;
 mod selection;
-
-use std::ops::Range;
 
 use serde::{Deserialize, Serialize};
 
 use crate::body::check_values;
 use crate::{BevFeatures, BevGrid, Body, BodyShape, Limits, WireError};
+
+use layout::Layout;
 
 pub use dtype::Dtype;
 
@@ -93,51 +94,6 @@ pub struct DecodedFeatures {
     pub sent: Option<Vec<bool>>,
 }
 
-/// Where the parts of an unpacked body lie, and how many cells it has.
-struct Layout {
-    cells: usize,
-    selected: usize,
-    scales: Range<usize>,
-    mask: Range<usize>,
-    values: Range<usize>,
-}
-
-impl Layout {
-    /// All sizes of a map, with every product checked against overflow and limits.
-    fn new(grid: &BevGrid, channels: u32, codec: &Codec, limits: &Limits) -> Result<Self, WireError> {
-        grid.check(limits)?;
-        let cells = u64::from(grid.width) * u64::from(grid.height);
-        at_most("channels", u64::from(limits.max_channels), u64::from(channels))?;
-        if channels == 0 {
-            return Err(WireError::Shape { what: "channels", expected: 1, found: 0 });
-        }
-        // What a receiver unpacks to is always the whole map, however few bytes claim it.
-        let map_bytes = cells.saturating_mul(u64::from(channels)).saturating_mul(4);
-        at_most("feature map bytes", limits.max_body_bytes.min(isize::MAX as u64), map_bytes)?;
-        let (selected, mask_bytes) = match codec.selection {
-            Selection::Dense => (cells, 0),
-            Selection::TopK { cells: selected } => (u64::from(selected), cells.div_ceil(8)),
-        };
-        at_most("selected cells", cells, selected)?;
-        let scale_bytes = if codec.dtype == Dtype::I8 { 4 * u64::from(channels) } else { 0 };
-        // Below the size of the whole map, which fits: the products cannot overflow.
-        let value_bytes = selected * u64::from(channels) * codec.dtype.size();
-        let (mask, values) = (scale_bytes + mask_bytes, scale_bytes + mask_bytes + value_bytes);
-        let [cells, selected, scales, mask, values] =
-            [cells, selected, scale_bytes, mask, values].map(|count| count as usize);
-        Ok(Self { cells, selected, scales: 0..scales, mask: scales..mask, values: mask..values })
-    }
-
-    /// Bytes of the unpacked body.
-    fn len(&self) -> usize {
-        self.values.end
-    }
-}
-
-fn at_most(what: &'static str, max: u64, found: u64) -> Result<(), WireError> {
-    if found > max { Err(WireError::Limit { what, max, found }) } else { Ok(()) }
-}
-
 /// Encodes a map.
 ///
 /// Dense `f32` without packing moves the values and copies nothing. Packing that does not make the body smaller is left
@@ -172,7 +128,7 @@ pub fn encode_features(
     encode_selected(grid, channels, codec, values, Some(&selected), config.zstd_level)
 }
 
-/// Writes the values of the selected cells, `[C, K]`.
+/// Writes the values of the selected cells, `[C, K]`. Dense `f32` that is not packed is checked by its receiver.
 fn encode_selected(
     grid: BevGrid,
     channels: u32,
@@ -181,23 +137,42 @@ fn encode_selected(
     selected: Option<&[u32]>,
     zstd_level: Option<i32>,
 ) -> Result<EncodedFeatures, WireError> {
-    if codec.dtype == Dtype::F32 && selected.is_none() && zstd_level.is_none() {
-        return Ok(EncodedFeatures { grid, channels, codec, body: Body::Floats(values) });
+    let is_sent_as_it_is = codec.dtype == Dtype::F32 && selected.is_none();
+    if !is_sent_as_it_is || zstd_level.is_some() {
+        check_values("feature", &values, Limits::SENDER.max_abs_value)?;
     }
-    check_values("feature", &values, Limits::SENDER.max_abs_value)?;
-    let layout = Layout::new(&grid, channels, &codec, &Limits::SENDER)?;
+    let body = if is_sent_as_it_is {
+        Body::Floats(values)
+    } else {
+        Body::Bytes(unpacked_body(&grid, channels, &codec, &values, selected)?)
+    };
+    let packed = zstd_level.map(|level| compression::pack(body.as_bytes(), level)).transpose()?.flatten();
+    Ok(match packed {
+        Some(packed) => {
+            let codec = Codec { packing: Packing::Zstd, ..codec };
+            EncodedFeatures { grid, channels, codec, body: Body::Bytes(packed) }
+        }
+        None => EncodedFeatures { grid, channels, codec, body },
+    })
+}
+
+/// Scales, mask and values one after the other.
+fn unpacked_body(
+    grid: &BevGrid,
+    channels: u32,
+    codec: &Codec,
+    values: &[f32],
+    selected: Option<&[u32]>,
+) -> Result<Vec<u8>, WireError> {
+    let layout = Layout::new(grid, channels, codec, &Limits::SENDER)?;
     let mut bytes = Vec::with_capacity(layout.len());
-    let scales = if codec.dtype == Dtype::I8 { dtype::scales(&values, channels as usize) } else { Vec::new() };
+    let scales = if codec.dtype == Dtype::I8 { dtype::scales(values, channels as usize) } else { Vec::new() };
     bytes.extend_from_slice(bytemuck::cast_slice(&scales));
     if let Some(selected) = selected {
         selection::append_mask(&mut bytes, layout.cells, selected);
     }
-    dtype::append(codec.dtype, &values, &scales, &mut bytes)?;
-    let (packing, bytes) = match zstd_level {
-        Some(level) => compression::pack(bytes, level)?,
-        None => (Packing::Raw, bytes),
-    };
-    Ok(EncodedFeatures { grid, channels, codec: Codec { packing, ..codec }, body: Body::Bytes(bytes) })
+    dtype::append(codec.dtype, values, &scales, &mut bytes)?;
+    Ok(bytes)
 }
 
 impl EncodedFeatures {
@@ -283,4 +258,68 @@ fn unpack(body: Body, packing: Packing, expected: usize) -> Result<Vec<u8>, Wire
         return Ok(bytes);
     }
     Err(WireError::Shape { what: "encoded map bytes", expected: expected as u64, found: bytes.len() as u64 })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const GRID: BevGrid = BevGrid { x_min_m: 0.0, y_min_m: 0.0, cell_m: 1.0, width: 4, height: 2 };
+
+    fn map(values: Vec<f32>) -> BevFeatures {
+        BevFeatures { grid: GRID, channels: values.len() as u32 / 8, values }
+    }
+
+    #[test]
+    fn packing_that_does_not_help_leaves_the_tensor_alone() {
+        let config = CodecConfig { zstd_level: Some(3), ..CodecConfig::default() };
+        let noise: Vec<f32> = (1..=8u8).map(|n| f32::from(n).sin()).collect();
+        let encoded = encode_features(map(noise.clone()), &config, None).unwrap();
+        assert_eq!((encoded.codec.packing, encoded.body), (Packing::Raw, Body::Floats(noise)));
+        let encoded = encode_features(map(vec![0.1; 800]), &config, None).unwrap();
+        assert_eq!(encoded.codec.packing, Packing::Zstd);
+        assert!(encoded.body.len() < 100);
+    }
+
+    #[test]
+    fn a_value_that_is_none_is_never_hidden_in_a_body() {
+        for dtype in [Dtype::F32, Dtype::F16, Dtype::I8] {
+            for (budget_bytes, zstd_level) in [(None, Some(1)), (Some(100), None), (Some(100), Some(1))] {
+                for bad in [f32::NAN, f32::INFINITY, 1e30] {
+                    let config = CodecConfig { dtype, budget_bytes, zstd_level };
+                    let error = encode_features(map(vec![bad; 80]), &config, Some(&[1.0; 8])).unwrap_err();
+                    assert!(matches!(error, WireError::Value { what: "feature", .. }), "{error}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_budget_that_fits_all_needs_no_confidence() {
+        let config = CodecConfig { dtype: Dtype::F16, budget_bytes: Some(16), zstd_level: None };
+        assert_eq!(encode_features(map(vec![1.0; 8]), &config, None).unwrap().codec.selection, Selection::Dense);
+        let smaller = CodecConfig { budget_bytes: Some(15), ..config };
+        let error = encode_features(map(vec![1.0; 8]), &smaller, None).unwrap_err();
+        assert_eq!(error, WireError::NoConfidence { cells: 8 });
+        let sparse = encode_features(map(vec![1.0; 8]), &smaller, Some(&[0.5; 8])).unwrap();
+        // One byte of mask, two a cell.
+        assert_eq!((sparse.codec.selection, sparse.body.len()), (Selection::TopK { cells: 7 }, 15));
+    }
+
+    #[test]
+    fn a_map_must_fill_its_lattice() {
+        let features = BevFeatures { grid: GRID, channels: 2, values: vec![0.0; 8] };
+        let error = encode_features(features, &CodecConfig::default(), None).unwrap_err();
+        assert_eq!(error, WireError::Shape { what: "features", expected: 16, found: 8 });
+    }
+
+    #[test]
+    fn a_map_of_another_shape_than_announced_is_named() {
+        let encoded = encode_features(map(vec![0.0; 16]), &CodecConfig::default(), None).unwrap();
+        assert_eq!(encoded.check_shape(&GRID, 2), Ok(()));
+        assert!(matches!(encoded.check_shape(&GRID, 3), Err(WireError::Shape { expected: 3, found: 2, .. })));
+        let other = BevGrid { cell_m: 0.5, ..GRID };
+        let message = encoded.check_shape(&other, 2).unwrap_err().to_string();
+        assert!(message.contains("4 x 2 cells of 1 m") && message.contains("4 x 2 cells of 0.5 m"), "{message}");
+    }
 }

@@ -1,7 +1,8 @@
 //! The messages: one struct of public fields per kind.
 //!
-//! What is small stands in the metadata, what is large in the body. Each message checks itself when it is decoded and,
-//! against the same rules, when it is encoded: nobody sends what others must refuse.
+//! What is small stands in the metadata, what is large in the body. Metadata are checked when they are decoded and, by the
+//! same rules, when they are encoded, so that a mistake shows where it was made; bodies are checked by those who receive
+//! them.
 
 mod bev;
 mod boxes;
