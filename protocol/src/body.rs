@@ -10,7 +10,7 @@ use crate::WireError;
 compile_error!("message bodies are little-endian in memory; a big-endian target would need a converting copy");
 
 /// Copied and checked at a time: source and copy stay in the first-level cache for every pass over them.
-const BLOCK_BYTES: usize = 8 << 10;
+const BLOCK_BYTES: usize = 4 << 10;
 
 /// The body of one message, owned, in the type its values have.
 ///

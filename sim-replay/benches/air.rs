@@ -1,8 +1,11 @@
-//! What a message costs beside the network it goes over: `air/<what>/<KiB>`, from before encoding to after decoding, over
-//! zenoh on loopback, next to raw zenoh from put to callback with a payload of the same bytes.
+//! What a message costs beside the network it goes over: `air/<what>/<pace>/<KiB>`.
 //!
-//! `cargo bench -p sim-replay --bench air`. The two take turns, so that whatever else the machine does hits both; on a busy
-//! machine the least times say more than the medians.
+//! - `raw`: zenoh on loopback from put to callback, with a payload of a map's bytes;
+//! - `raw-copied`: the same until the bytes lie together, the least that anyone needs who wants to use them;
+//! - `message`: from before encoding a dense `f32` map to after decoding it, checksums and value checks included.
+//!
+//! `cargo bench -p sim-replay --bench air`. The two take turns, so that whatever else the machine does hits both: each at
+//! 10 Hz, as a sensor does, and then back to back. On a busy machine the least times say more than the medians.
 
 use std::net::TcpListener;
 use std::sync::mpsc::{Receiver, channel};
@@ -18,7 +21,8 @@ use zenoh::pubsub::Publisher;
 use zenoh::qos::CongestionControl;
 
 const CHANNELS: usize = 64;
-const ROUNDS: usize = 60;
+const ROUNDS: usize = 40;
+const WARM_UP: usize = 5;
 const PATIENCE: Duration = Duration::from_secs(10);
 
 type Failure = Box<dyn std::error::Error>;
@@ -30,16 +34,19 @@ fn features(kib: usize) -> BevFeatures {
     BevFeatures { grid, channels: CHANNELS as u32, values }
 }
 
-/// Puts a payload of `values`' bytes and waits until the subscriber's callback has it.
-fn raw(publisher: &Publisher, arrivals: &Receiver<ZBytes>, values: Vec<f32>) -> Result<Duration, Failure> {
+/// Puts a payload of `values`' bytes; how long until the subscriber's callback has it, and until its bytes lie together,
+/// as anyone needs them who wants to use them.
+fn raw(publisher: &Publisher, arrivals: &Receiver<ZBytes>, values: Vec<f32>) -> Result<[Duration; 2], Failure> {
     let bytes = values.len() * 4;
     let payload = bytes::Bytes::from_owner(protocol::Body::Floats(values));
     let begin = Instant::now();
     publisher.put(payload).wait().map_err(|cause| cause.to_string())?;
     let arrived = arrivals.recv_timeout(PATIENCE)?;
+    let in_callback = begin.elapsed();
+    let together = arrived.to_bytes();
     let time = begin.elapsed();
-    assert_eq!(arrived.len(), bytes);
-    Ok(time)
+    assert_eq!(together.len(), bytes);
+    Ok([in_callback, time])
 }
 
 /// Encodes, sends, receives and decodes a map.
@@ -67,6 +74,12 @@ fn summary(mut times: Vec<Duration>) -> [f64; 2] {
     [times[times.len() / 2], times[0]].map(|time| time.as_secs_f64() * 1e3)
 }
 
+fn report(case: &str, times: Vec<Duration>, [raw_p50, raw_min]: [f64; 2]) {
+    let [p50, min] = summary(times);
+    let (ratio, min_ratio) = (p50 / raw_p50, min / raw_min);
+    println!("air/{case}: p50 {p50:.3} ms ({ratio:.2} x raw), min {min:.3} ms ({min_ratio:.2} x raw)");
+}
+
 fn main() -> Result<(), Failure> {
     let port = TcpListener::bind("127.0.0.1:0")?.local_addr()?.port();
     let router = open(&BusOptions::router(Endpoint::loopback(port)))?;
@@ -85,25 +98,26 @@ fn main() -> Result<(), Failure> {
         std::thread::yield_now();
     }
 
-    for kib in [64, 1024, 8192] {
-        let features = features(kib);
-        let (mut raw_times, mut message_times) = (Vec::new(), Vec::new());
-        for round in 0..ROUNDS + 5 {
-            let raw_time = raw(&publisher, &arrivals, features.values.clone())?;
-            let message_time = message(&publisher, &arrivals, features.clone())?;
-            // The first rounds warm memory and connection.
-            if round >= 5 {
-                raw_times.push(raw_time);
-                message_times.push(message_time);
+    for (pace, pause) in [("10-hz", Duration::from_millis(50)), ("back-to-back", Duration::ZERO)] {
+        for kib in [64, 1024, 8192] {
+            let features = features(kib);
+            let (mut raw_times, mut copied_times, mut message_times) = (Vec::new(), Vec::new(), Vec::new());
+            for round in 0..WARM_UP + ROUNDS {
+                std::thread::sleep(pause);
+                let [raw_time, copied_time] = raw(&publisher, &arrivals, features.values.clone())?;
+                std::thread::sleep(pause);
+                let message_time = message(&publisher, &arrivals, features.clone())?;
+                if round >= WARM_UP {
+                    raw_times.push(raw_time);
+                    copied_times.push(copied_time);
+                    message_times.push(message_time);
+                }
             }
+            let base = summary(raw_times.clone());
+            report(&format!("raw/{pace}/{kib}"), raw_times, base);
+            report(&format!("raw-copied/{pace}/{kib}"), copied_times, base);
+            report(&format!("message/{pace}/{kib}"), message_times, base);
         }
-        let ([raw_p50, raw_min], [p50, min]) = (summary(raw_times), summary(message_times));
-        println!("air/raw/{kib:<8} p50 {raw_p50:8.3} ms            min {raw_min:8.3} ms");
-        println!(
-            "air/message/{kib:<4} p50 {p50:8.3} ms {:6.3} x    min {min:8.3} ms {:6.3} x",
-            p50 / raw_p50,
-            min / raw_min
-        );
     }
     drop((subscriber, publisher));
     client.close().wait().map_err(|cause| cause.to_string())?;
