@@ -6,6 +6,7 @@
 //! # Frames and units
 //! World frame of the map: right-handed, x east, y north, z up, metres; yaw turns x towards y.
 
+mod clearance;
 mod clothoid;
 mod conflicts;
 mod convex;
@@ -25,6 +26,7 @@ mod terrain;
 
 use std::path::{Path, PathBuf};
 
+pub use clearance::LANE_HEADROOM_M;
 pub use ground::{Ground, HeightGrid, Terrain, Triangle};
 pub use lane::{JunctionId, Lane, LaneGraph, LaneId, Turn};
 pub use lane_queries::{LaneIndex, LanePosition};
@@ -34,8 +36,11 @@ use road::RoadNetwork;
 pub use solid::{Shape, Solid, SolidKind};
 use surface::Surface;
 
+/// Longest side of a town, metres.
+const MAX_EXTENT_M: f64 = 50_000.0;
+
 /// Everything that stands still.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, PartialEq)]
 pub struct Town {
     /// Kind or map the town was made from, such as `town1` or the stem of the map's file.
     pub name: String,
@@ -123,10 +128,29 @@ pub fn build(source: &TownSource, town_seed: u64) -> Result<Town, TownError> {
         TownSource::OpenDrive(path) => {
             let network = read_map(path)?;
             let name = path.file_stem().map_or_else(|| "map".into(), |stem| stem.to_string_lossy().to_lowercase());
-            let town = furnish(name, &Layout { network, islands: Vec::new() }, town_seed);
-            Ok(town)
+            let layout = Layout { network, islands: Vec::new() };
+            check_extent(path, &layout.network)?;
+            Ok(furnish(name, &layout, town_seed))
         }
     }
+}
+
+/// Refuses maps without driving lanes, and maps so large that the ground between their roads would not fit in memory.
+fn check_extent(path: &Path, network: &RoadNetwork) -> Result<(), TownError> {
+    let (graph, _) = lane_builder::lane_graph(network);
+    let points = || graph.lanes.iter().flat_map(|lane| &lane.centerline);
+    let extent = |axis: usize| {
+        let values = || points().map(|point| point[axis]);
+        values().fold(f64::NEG_INFINITY, f64::max) - values().fold(f64::INFINITY, f64::min)
+    };
+    if graph.lanes.is_empty() {
+        return Err(TownError::NoLanes { path: path.into(), roads: network.roads.len() });
+    }
+    let extent_m = extent(0).max(extent(1));
+    if extent_m > MAX_EXTENT_M {
+        return Err(TownError::TooLarge { path: path.into(), extent_m, limit_m: MAX_EXTENT_M });
+    }
+    Ok(())
 }
 
 fn read_map(path: &Path) -> Result<RoadNetwork, TownError> {
@@ -147,8 +171,42 @@ mod tests {
     use super::*;
 
     #[test]
-    fn town_has_lanes_and_solids() {
-        let town = build(&TownSource::Town1, 0).unwrap();
-        assert!(!town.lanes.lanes.is_empty());
+    fn same_seed_same_town_on_any_thread() {
+        for source in [TownSource::Town1, TownSource::Town4] {
+            let elsewhere = {
+                let source = source.clone();
+                std::thread::spawn(move || build(&source, 11).unwrap())
+            };
+            let (here, other) = (build(&source, 11).unwrap(), build(&source, 12).unwrap());
+            let elsewhere = elsewhere.join().unwrap();
+            assert!(here == elsewhere, "{source:?} differs from itself");
+            assert!(here != other, "{source:?} does not depend on its seed");
+        }
+    }
+
+    #[test]
+    fn unusable_maps_are_refused_with_their_path() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("town.xodr");
+        let error = || build(&TownSource::OpenDrive(path.clone()), 0).unwrap_err().to_string();
+        assert!(error().starts_with(&path.display().to_string()), "{}", error());
+        std::fs::write(&path, "<OpenDRIVE><road id=\"1\" length=\"x\"/></OpenDRIVE>").unwrap();
+        assert!(error().ends_with("line 1: <road> has length=\"x\"; expected a number"), "{}", error());
+        let road = |lanes: &str, length: u32| {
+            format!(
+                "<OpenDRIVE><road id=\"1\" length=\"{length}\"><planView><geometry s=\"0\" x=\"0\" y=\"0\" hdg=\"0\" \
+                 length=\"{length}\"><line/></geometry></planView><lanes><laneSection s=\"0\"><right>{lanes}</right>\
+                 </laneSection></lanes></road></OpenDRIVE>"
+            )
+        };
+        std::fs::write(&path, road("", 10)).unwrap();
+        assert!(error().ends_with("none of its 1 roads has a driving lane"), "{}", error());
+        let lane = "<lane id=\"-1\" type=\"driving\"><width sOffset=\"0\" a=\"3\" b=\"0\" c=\"0\" d=\"0\"/></lane>";
+        std::fs::write(&path, road(lane, 60_000)).unwrap();
+        assert!(error().ends_with("its lanes reach over 60000 m, more than the limit of 50000 m"), "{}", error());
+        std::fs::write(&path, road(lane, 400)).unwrap();
+        let town = build(&TownSource::OpenDrive(path.clone()), 0).unwrap();
+        assert_eq!((town.name.as_str(), town.lanes.lanes.len()), ("town", 1));
+        assert!(town.obstructions().is_empty() && town.solids.len() > 50);
     }
 }

@@ -1,11 +1,12 @@
 //! The ground plan while it fills: what is taken, and what has been placed.
 
+pub(super) use super::super::clearance::outline;
 use super::super::convex::{CellIndex, Quad, Rectangle, bounds, overlap};
 use super::super::curve::Pose2;
 use super::super::ground::Ground;
 use super::super::road::RoadNetwork;
 use super::super::surface::Surface;
-use super::super::{ParkingSpot, Shape, Solid};
+use super::super::{ParkingSpot, Solid};
 
 /// Height over a road that stays free, metres.
 pub(super) const HEADROOM_M: f64 = 4.7;
@@ -110,14 +111,6 @@ impl<'a> Site<'a> {
             self.take_outline(hull(points), [z_m[0] - 0.5, z_m[1] + HEADROOM_M]);
         }
     }
-}
-
-/// Outline of a solid seen from above.
-pub(super) fn outline(solid: &Solid) -> Rectangle {
-    let half_m = solid.shape.half_footprint_m();
-    // A round outline needs no turning, and fits its own rectangle best untilted.
-    let yaw_rad = if matches!(solid.shape, Shape::Cylinder { .. }) { 0.0 } else { solid.yaw_rad };
-    Rectangle { center_m: [solid.center_m[0], solid.center_m[1]], half_m, yaw_rad }
 }
 
 /// Convex hull, anticlockwise (Andrew's monotone chain).

@@ -1,0 +1,75 @@
+//! Whether lanes are free of what stands beside and above them.
+
+use super::convex::{CellIndex, Rectangle, bounds, overlap};
+use super::{LaneId, Shape, Solid, Town};
+
+/// Height over a lane in which nothing may stand, metres.
+pub const LANE_HEADROOM_M: f64 = 4.5;
+/// Solids whose top is this little above a lane lie under it (slabs of bridges), metres.
+const SURFACE_M: f64 = 0.02;
+/// Edge of a cell of the index, metres.
+const CELL_M: f64 = 10.0;
+
+/// Outline of a solid seen from above.
+pub(crate) fn outline(solid: &Solid) -> Rectangle {
+    let half_m = solid.shape.half_footprint_m();
+    // A round outline needs no turning.
+    let yaw_rad = if matches!(solid.shape, Shape::Cylinder { .. }) { 0.0 } else { solid.yaw_rad };
+    Rectangle { center_m: [solid.center_m[0], solid.center_m[1]], half_m, yaw_rad }
+}
+
+impl Town {
+    /// Lanes and solids (by place in [`Town::solids`]) where the solid reaches into the lane's space up to
+    /// [`LANE_HEADROOM_M`] over it. Empty for a sound town.
+    #[must_use]
+    pub fn obstructions(&self) -> Vec<(LaneId, usize)> {
+        let outlines: Vec<_> = self.solids.iter().map(|solid| outline(solid).corners()).collect();
+        let corners: Vec<[f64; 2]> = outlines.iter().flatten().copied().collect();
+        let mut found = Vec::new();
+        if corners.is_empty() {
+            return found;
+        }
+        let mut index = CellIndex::new(bounds(&corners), CELL_M);
+        for (number, outline) in outlines.iter().enumerate() {
+            index.insert(number as u32, bounds(outline));
+        }
+        for lane in &self.lanes.lanes {
+            for (pair, width) in lane.centerline.windows(2).zip(&lane.widths_m) {
+                let [from, to] = [pair[0], pair[1]];
+                let (dx, dy) = (to[0] - from[0], to[1] - from[1]);
+                let center_m = [(from[0] + to[0]) / 2.0, (from[1] + to[1]) / 2.0];
+                // Two centimetres of tolerance at the edges: lanes are sampled.
+                let half_m = [dx.hypot(dy) / 2.0, (width / 2.0 - 0.02).max(0.01)];
+                let piece = Rectangle { center_m, half_m, yaw_rad: dy.atan2(dx) }.corners();
+                index.any(bounds(&piece), |number| {
+                    let solid = &self.solids[number as usize];
+                    let clear = solid.bottom_m() > from[2] + LANE_HEADROOM_M || solid.top_m() < from[2] + SURFACE_M;
+                    if !clear && overlap(&outlines[number as usize], &piece) {
+                        found.push((lane.id, number as usize));
+                    }
+                    false
+                });
+            }
+        }
+        found.sort_unstable();
+        found.dedup();
+        found
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::{Ground, Lane, LaneGraph, SolidKind};
+    use super::*;
+
+    #[test]
+    fn a_pole_on_the_lane_is_found_and_a_sign_above_it_is_not() {
+        let line = (0..=20).map(|i| [f64::from(i), 0.0, 0.0]).collect();
+        let lanes = LaneGraph::new(vec![Lane::new(LaneId(0), line, 3.5, 10.0)]);
+        let shape = Shape::Box { half_m: [0.3, 0.3, 0.5] };
+        let solid = |y: f64, z: f64| Solid::new(SolidKind::Sign, shape, [10.0, y, z], 0.3, 0.5);
+        let solids = vec![solid(0.0, 5.6), solid(1.5, 1.0), solid(2.5, 1.0), solid(0.0, -0.6)];
+        let town = Town { name: "line".into(), lanes, ground: Ground::plane(0.0), solids, parking: Vec::new() };
+        assert_eq!(town.obstructions(), [(LaneId(0), 1)]);
+    }
+}
