@@ -67,7 +67,7 @@ pub(super) fn open(root: &Path, dir: &Path, problems: &mut Vec<ReadError>) -> Re
             }
         }
     }
-    if let Some((_, poses)) = &poses {
+    if let Some(poses) = &poses {
         for micros in poses.keys().filter(|micros| !stamps.contains_key(micros)) {
             let path = points_dir.join(format!("{micros}.bin"));
             problems.push(ReadError::malformed(&path, "does not exist, but there is a pose for it: left out"));
@@ -77,7 +77,7 @@ pub(super) fn open(root: &Path, dir: &Path, problems: &mut Vec<ReadError>) -> Re
     let tick = |(micros, stem): (u64, String)| Tick { stem, capture_nanos: micros.saturating_mul(1000) };
     let ticks = stamps.into_iter().map(tick).collect();
     let layout = if storage == Storage::Oxford { Layout::Oxford } else { Layout::Nclt };
-    let source = Sequence { points_dir, storage, world_from_lidar: poses.map(|(_, poses)| poses).unwrap_or_default() };
+    let source = Sequence { points_dir, storage, world_from_lidar: poses.unwrap_or_default() };
     Ok(single_vehicle(files::name_below(root, dir), layout, ticks, Arc::new(source)))
 }
 
@@ -93,7 +93,7 @@ fn storage(dir: &Path) -> Storage {
 }
 
 /// The poses of the best file there is, turned to z up.
-fn poses(dir: &Path) -> Result<Option<(PathBuf, BTreeMap<u64, Pose>)>, ReadError> {
+fn poses(dir: &Path) -> Result<Option<BTreeMap<u64, Pose>>, ReadError> {
     let files =
         [("velodyne_left_calibrateFalse.h5", RowOrder::RotationFirst), ("velodyne_left_False.h5", RowOrder::Matrix)];
     let found = files.into_iter().map(|(name, order)| (dir.join(name), order)).find(|(path, _)| path.is_file());
@@ -103,7 +103,7 @@ fn poses(dir: &Path) -> Result<Option<(PathBuf, BTreeMap<u64, Pose>)>, ReadError
     for pose in poses.values_mut() {
         *pose = (turn * pose.isometry() * turn.inverse()).into();
     }
-    Ok(Some((path, poses)))
+    Ok(Some(poses))
 }
 
 /// z down to z up: half a turn about x.
