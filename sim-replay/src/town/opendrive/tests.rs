@@ -137,7 +137,7 @@ proptest! {
         "0", "-0", "1e-300", "-1", "1e7", "9999999", "1e308", "-1e308", "nan", "inf", "99999999999999999999", "",
     ])) {
         let mut parts: Vec<&str> = SMALL.split('"').collect();
-        let attribute = (2 * place + 3) % (parts.len() - 1) | 1;
+        let attribute = ((2 * place + 3) % (parts.len() - 1)) | 1;
         parts[attribute] = value;
         if let Ok(network) = read(&parts.join("\"")) {
             let (graph, _) = lane_builder::lane_graph(&network);
