@@ -18,7 +18,7 @@ const FOUND_IOU: f64 = 0.5;
 /// One line of `frames.csv`.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct FrameRecord {
-    /// Which frame of the scene, counted from 0.
+    /// Which frame of the scene, counted from 0; the ego itself counts its results.
     pub frame_index: u64,
     /// Capture time on the scene's clock, nanoseconds.
     pub capture_nanos: u64,
@@ -214,7 +214,7 @@ impl Board {
         };
         let boxes = true_boxes(&truth, &self.ego, &self.rule);
         let latency_ms = (done_nanos as f64 - began_nanos as f64) / 1e6;
-        self.judge_result(capture_nanos, Some(latency_ms), result, boxes, world_from_lidar);
+        self.judge_result((truth.frame_index, capture_nanos), Some(latency_ms), result, boxes, world_from_lidar);
     }
 
     /// Judges a frame whose truth is known already, at once; `poses` are everyone's estimates. Nothing that
@@ -228,12 +228,12 @@ impl Board {
         world_from_lidar: Vec<(CavId, Pose)>,
     ) {
         self.judge_poses(poses, &world_from_lidar);
-        self.judge_result(capture_nanos, None, result, boxes, world_from_lidar);
+        self.judge_result((result.frame_index, capture_nanos), None, result, boxes, world_from_lidar);
     }
 
     fn judge_result(
         &mut self,
-        capture_nanos: u64,
+        (frame_index, capture_nanos): (u64, u64),
         latency_ms: Option<f64>,
         result: Detections,
         boxes: Vec<Box3d>,
@@ -245,7 +245,7 @@ impl Board {
         let ego_error = result.pose.world_from_cav().zip(true_pose(&world_from_lidar, &self.ego));
         let ego_error = ego_error.map(|(found, truth)| PoseError::between(found, truth));
         self.records.push(FrameRecord {
-            frame_index: result.frame_index,
+            frame_index,
             capture_nanos,
             latency_ms,
             detected: result.detections.len(),
@@ -259,7 +259,7 @@ impl Board {
             ego_error_deg: ego_error.map(|error| error.angle_deg),
         });
         self.bytes.extend(bytes);
-        self.keep_showpiece(result, boxes, world_from_lidar);
+        self.keep_showpiece(frame_index, result, boxes, world_from_lidar);
     }
 
     /// Adds a frame to the score; returns how many detections count as found.
@@ -285,13 +285,19 @@ impl Board {
         }
     }
 
-    fn keep_showpiece(&mut self, result: Detections, boxes: Vec<Box3d>, world_from_lidar: Vec<(CavId, Pose)>) {
+    fn keep_showpiece(
+        &mut self,
+        frame_index: u64,
+        result: Detections,
+        boxes: Vec<Box3d>,
+        world_from_lidar: Vec<(CavId, Pose)>,
+    ) {
         let worth = |fused: usize, boxes: usize| (fused, boxes);
         let better = self.best.as_ref().is_none_or(|best| {
             worth(result.fused.len(), boxes.len()) > worth(best.result.fused.len(), best.truth.len())
         });
         if better {
-            self.best = Some(JudgedFrame { frame_index: result.frame_index, result, truth: boxes, world_from_lidar });
+            self.best = Some(JudgedFrame { frame_index, result, truth: boxes, world_from_lidar });
         }
     }
 }

@@ -1,5 +1,6 @@
 //! The arguments that every process of a fleet shares.
 
+use std::io::IsTerminal;
 use std::time::Duration;
 
 use protocol::{CavId, Role, RunId};
@@ -80,6 +81,8 @@ impl BusArgs {
 pub fn log_to_stderr() {
     const OURS: &str = "warn,protocol=info,sim_replay=info,agent=info,ego_fuser=info,deploy=info";
     let filter = EnvFilter::try_from_default_env().unwrap_or_else(|_| EnvFilter::new(OURS));
+    // Colours are for terminals: a supervisor sends this into a file.
+    let to_stderr = tracing_subscriber::fmt().with_writer(std::io::stderr).with_ansi(std::io::stderr().is_terminal());
     // A second call, in tests, changes nothing.
-    let _ = tracing_subscriber::fmt().with_env_filter(filter).with_writer(std::io::stderr).try_init();
+    let _ = to_stderr.with_env_filter(filter).try_init();
 }
