@@ -1,0 +1,66 @@
+//! Messages on their way in: decoded, counted, laid where they wait.
+
+use std::time::{Duration, Instant};
+
+use protocol::message::{Bev, Boxes, Points};
+use protocol::{HEADER_LEN, PoseEstimate, Stamp, Stream, Topic, wire};
+use sim_replay::bus::{Arrival, unix_nanos};
+
+use super::{Node, OwnFrame, Received};
+use crate::ego::{Content, View};
+
+impl Node<'_> {
+    /// Takes a message in: the own agent's begins a frame, a neighbour's waits for one.
+    pub(super) fn admit(&mut self, arrival: &Arrival) {
+        let Topic::Stream { cav, .. } = &arrival.topic else { return };
+        let began = Instant::now();
+        let Some((pose, content)) = self.decode(arrival) else { return };
+        self.bus.books().timed("decode", began.elapsed());
+        let transport = unix_nanos().saturating_sub(arrival.header.stamp.publish_nanos);
+        self.bus.books().timed(&format!("{} transport", self.stream), Duration::from_nanos(transport));
+        let capture_nanos = arrival.header.stamp.capture_nanos;
+        let view = View { cav: cav.clone(), pose, age_nanos: 0, content };
+        if *cav == self.cav {
+            self.frames.push_back(OwnFrame { capture_nanos, begun: arrival.at, view });
+            return;
+        }
+        if let Some(neighbourhood) = &mut self.neighbourhood {
+            neighbourhood.spoke(cav);
+        }
+        let payload_bytes = u64::from(arrival.header.metadata_len) + arrival.header.body_len;
+        let wire_bytes = payload_bytes + HEADER_LEN as u64 + pose_message_bytes(&arrival.header.stamp, pose);
+        if let Some(lost) = self.pairing.insert(cav, capture_nanos, Received { view, payload_bytes, wire_bytes }) {
+            self.bus.books().dropped(&arrival.topic, lost.reason);
+        }
+    }
+
+    /// Pose and content of a message; an unsound one is counted under its sender and reason.
+    fn decode(&self, arrival: &Arrival) -> Option<(PoseEstimate, Content)> {
+        let limits = &self.options.limits;
+        match self.stream {
+            Stream::Boxes => {
+                let Boxes { pose, detections } = self.inbox.decode(arrival, limits)?;
+                Some((pose, Content::Boxes(detections)))
+            }
+            Stream::Points => {
+                let Points { pose, points } = self.inbox.decode(arrival, limits)?;
+                Some((pose, Content::Points(points)))
+            }
+            _ => {
+                let Bev { pose, features } = self.inbox.decode(arrival, limits)?;
+                match features.decode(limits) {
+                    Ok(features) => Some((pose, Content::Features(features))),
+                    Err(error) => {
+                        self.bus.books().rejected(&arrival.topic, &error);
+                        None
+                    }
+                }
+            }
+        }
+    }
+}
+
+/// What the neighbour's `pose` message for the same frame took: it says the same as the pose inside this one.
+fn pose_message_bytes(stamp: &Stamp, pose: PoseEstimate) -> u64 {
+    wire::encode(stamp, pose).map_or(0, |encoded| encoded.wire_bytes() as u64)
+}

@@ -1,0 +1,164 @@
+//! Frames on their way out: when to stop waiting, what to fuse, what to tell.
+
+use std::time::Duration;
+
+use protocol::message::{DetectionsReport, FusedNeighbour, SkippedNeighbour, StageTiming};
+use protocol::{Body, CavId, Detection, Detections, DropReason, Encoded, PoseEstimate};
+
+use super::{Node, OwnFrame};
+use crate::ego::{EgoOutput, Skipped, View};
+use crate::neighbourhood::Neighbourhood;
+use crate::pairing::Paired;
+
+/// The neighbours' messages for a frame, and who has none.
+#[derive(Default)]
+struct Choice {
+    views: Vec<View>,
+    /// One for each view.
+    books: Vec<Booking>,
+    skipped: Vec<SkippedNeighbour>,
+}
+
+/// What the books and the report need to know of a message.
+struct Booking {
+    is_first_use: bool,
+    payload_bytes: u64,
+    wire_bytes: u64,
+}
+
+impl Node<'_> {
+    /// Decides the frames that have nothing left to wait for; all of them where `must`.
+    pub(super) fn decide(&mut self, must: bool) {
+        while let Some(frame) = self.frames.front() {
+            let is_complete = self.is_complete(frame.capture_nanos);
+            // A frame with a newer one behind it has waited too long already.
+            let is_due = frame.begun.elapsed() >= self.options.deadline || self.frames.len() > 1 || must;
+            if !is_complete && !is_due {
+                return;
+            }
+            self.report.at_deadline += u64::from(!is_complete);
+            if let Some(frame) = self.frames.pop_front() {
+                self.fuse(frame);
+            }
+        }
+    }
+
+    fn is_complete(&self, capture_nanos: u64) -> bool {
+        let tolerance = self.options.pairing.max_lead_nanos;
+        self.neighbourhood.iter().flat_map(Neighbourhood::awaited).all(|cav| {
+            // Or a later one: then this frame's own is lost, and waiting is of no use.
+            self.ended.contains(cav)
+                || self.pairing.capture_times(cav).any(|time| time.saturating_add(tolerance) >= capture_nanos)
+        })
+    }
+
+    fn fuse(&mut self, frame: OwnFrame) {
+        let OwnFrame { capture_nanos, begun, view: own } = frame;
+        let waited = begun.elapsed();
+        let mut choice = self.choose(capture_nanos);
+        let own_topic = self.topic(&self.cav);
+        match self.ego.detect(&own, &choice.views) {
+            Ok(EgoOutput { detections, fused, skipped, stages }) => {
+                self.bus.books().received(&own_topic);
+                self.leave_out(&skipped, &mut choice);
+                let fused = self.take_in(&fused, &choice);
+                let stages = std::iter::once(StageTiming::new("wait", waited)).chain(stages).collect();
+                self.publish(capture_nanos, own.pose, detections, fused, choice.skipped, stages);
+            }
+            Err(error) => {
+                tracing::error!(capture_nanos, "a frame could not be fused: {error}");
+                self.report.failed += 1;
+                self.bus.books().dropped(&own_topic, DropReason::Shape);
+                // Nothing is wrong with the neighbours' messages.
+                self.take_in(&(0..choice.views.len()).collect::<Vec<_>>(), &choice);
+            }
+        }
+    }
+
+    /// The neighbours' messages for a frame, and who has none.
+    fn choose(&mut self, capture_nanos: u64) -> Choice {
+        let (paired, dropped) = self.pairing.pair(capture_nanos);
+        let mut choice = Choice::default();
+        for Paired { age_nanos, is_first_use, message, .. } in paired {
+            // A copy, as the message may serve the next frame too.
+            choice.views.push(View { age_nanos, ..message.view.clone() });
+            let (payload_bytes, wire_bytes) = (message.payload_bytes, message.wire_bytes);
+            choice.books.push(Booking { is_first_use, payload_bytes, wire_bytes });
+        }
+        for lost in &dropped {
+            self.bus.books().dropped(&self.topic(&lost.cav), lost.reason);
+        }
+        let Some(neighbourhood) = &mut self.neighbourhood else { return choice };
+        let spoke = |cav: &&CavId| choice.views.iter().any(|view| view.cav == **cav);
+        let silent: Vec<CavId> = neighbourhood.members().filter(|cav| !spoke(cav)).cloned().collect();
+        for cav in silent {
+            neighbourhood.was_silent(&cav);
+            let reason = dropped.iter().rev().find(|lost| lost.cav == cav).map(|lost| lost.reason);
+            choice.skipped.push(SkippedNeighbour { cav, reason });
+        }
+        choice
+    }
+
+    /// Books the views that are in the result, and describes them.
+    fn take_in(&mut self, fused: &[usize], choice: &Choice) -> Vec<FusedNeighbour> {
+        self.report.fused += fused.len() as u64;
+        let describe = |&index: &usize| {
+            let View { cav, pose, age_nanos, .. } = &choice.views[index];
+            let Booking { is_first_use, payload_bytes, wire_bytes } = choice.books[index];
+            self.settle(cav, is_first_use, None);
+            let (cav, age_nanos, confidence) = (cav.clone(), *age_nanos, pose.confidence());
+            FusedNeighbour { cav, age_nanos, confidence, payload_bytes, wire_bytes }
+        };
+        fused.iter().map(describe).collect()
+    }
+
+    /// Books the views that are not in the result, and names those that should have been.
+    fn leave_out(&self, left_out: &[(usize, Skipped)], choice: &mut Choice) {
+        for &(index, why) in left_out {
+            let cav = choice.views[index].cav.clone();
+            let reason = match why {
+                Skipped::Unusable(reason) => Some(reason),
+                // It was looked at, and rightly left out.
+                Skipped::NotNeeded | Skipped::OutOfRange => None,
+            };
+            self.settle(&cav, choice.books[index].is_first_use, reason);
+            if reason.is_some() {
+                choice.skipped.push(SkippedNeighbour { cav, reason });
+            }
+        }
+    }
+
+    /// Books a message that was looked at, the first time it is.
+    fn settle(&self, cav: &CavId, is_first_use: bool, reason: Option<DropReason>) {
+        let topic = self.topic(cav);
+        match reason {
+            _ if !is_first_use => {}
+            Some(reason) => self.bus.books().dropped(&topic, reason),
+            None => self.bus.books().received(&topic),
+        }
+    }
+
+    fn publish(
+        &mut self,
+        capture_nanos: u64,
+        pose: PoseEstimate,
+        detections: Vec<Detection>,
+        fused: Vec<FusedNeighbour>,
+        skipped: Vec<SkippedNeighbour>,
+        stages: Vec<StageTiming>,
+    ) {
+        for stage in &stages {
+            self.bus.books().timed(&stage.stage, Duration::from_nanos(stage.nanos));
+        }
+        let frame_index = self.report.frames;
+        self.report.frames += 1;
+        let method = self.ego.method().name().to_owned();
+        let result =
+            Detections { ego: self.cav.clone(), frame_index, method, pose, detections, fused, skipped, stages };
+        self.detections.offer(capture_nanos, result.clone());
+        self.json.offer_encoded(capture_nanos, move |stamp| {
+            let head = DetectionsReport::new(stamp, result).to_json().into_bytes();
+            Ok(Encoded { head, body: Body::Empty })
+        });
+    }
+}

@@ -1,0 +1,225 @@
+//! An ego on the bus: its own agent's message and those of its neighbours in, detections out.
+//!
+//! A frame begins with the message of the ego's own agent. It is decided when every neighbour's message of the same
+//! capture time has come, or when the deadline has passed; whatever comes later serves the next frame, if it is still
+//! young enough. One thread receives, fuses and offers; sending has threads of its own.
+
+mod admit;
+mod decide;
+
+use std::collections::{BTreeSet, VecDeque};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use protocol::{CavId, DropReason, Limits, Role, Stream, Topic};
+use sim_replay::bus::mailbox::Taken;
+use sim_replay::bus::shutdown::Stop;
+use sim_replay::bus::{Bus, BusError, Event, Inbox, Publisher, PublisherOptions, Subscription};
+
+use crate::ego::{Ego, View, own_content};
+use crate::method::{Exchange, Method};
+use crate::neighbourhood::Neighbourhood;
+use crate::pairing::{Pairing, PairingConfig};
+
+/// Messages of one sender that may wait while a frame is fused.
+const PLACES: usize = 4;
+/// Topics an ego listens to at most.
+const MAX_TOPICS: usize = 65;
+/// How often the node looks for newcomers though no message has come.
+const LOOK_ROUND: Duration = Duration::from_millis(20);
+/// How long a node whose own agent has ended waits for the last words of its neighbours.
+const LAST_WORDS: Duration = Duration::from_secs(2);
+
+/// How an ego takes part.
+#[derive(Debug, Clone)]
+pub struct NodeOptions {
+    /// How long a frame waits for its neighbours, from the arrival of the own agent's message.
+    pub deadline: Duration,
+    /// Which messages belong together.
+    pub pairing: PairingConfig,
+    /// The neighbours that may take part; `None`: all that are found.
+    pub neighbours: Option<BTreeSet<CavId>>,
+    /// Whether to go on when the own agent has ended, for the next one.
+    pub keeps_running: bool,
+    /// What it takes from the bus.
+    pub limits: Limits,
+}
+
+impl Default for NodeOptions {
+    /// 50 ms of deadline, all neighbours.
+    fn default() -> Self {
+        Self {
+            deadline: Duration::from_millis(50),
+            pairing: PairingConfig::default(),
+            neighbours: None,
+            keeps_running: false,
+            limits: Limits::DEFAULT,
+        }
+    }
+}
+
+/// What an ego did.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, serde::Serialize)]
+pub struct NodeReport {
+    /// Frames decided.
+    pub frames: u64,
+    /// Neighbours' messages that were fused, over all frames.
+    pub fused: u64,
+    /// Frames that were decided at the deadline.
+    pub at_deadline: u64,
+    /// Frames that could not be fused.
+    pub failed: u64,
+}
+
+/// Runs `ego` for the vehicle `cav` on the calling thread until its agent ends or `stop` is requested.
+///
+/// # Errors
+/// [`BusError`] when the bus refuses. What goes wrong with single messages is counted and logged.
+pub fn run(bus: &Bus, cav: &CavId, ego: Ego, options: &NodeOptions, stop: &Stop) -> Result<NodeReport, BusError> {
+    let mut node = Node::open(bus, cav, ego, options, stop)?;
+    let presence = bus.announce(Role::Ego)?;
+    node.listen(stop)?;
+    let Node { detections, json, report, .. } = node;
+    detections.finish();
+    json.finish();
+    presence.withdraw()?;
+    Ok(report)
+}
+
+/// A message as it came, decoded.
+struct Received {
+    view: View,
+    payload_bytes: u64,
+    wire_bytes: u64,
+}
+
+/// A frame that has begun.
+struct OwnFrame {
+    capture_nanos: u64,
+    begun: Instant,
+    view: View,
+}
+
+struct Node<'a> {
+    bus: &'a Bus,
+    cav: CavId,
+    ego: Ego,
+    options: &'a NodeOptions,
+    stream: Stream,
+    inbox: Arc<Inbox>,
+    neighbourhood: Option<Neighbourhood>,
+    pairing: Pairing<Received>,
+    frames: VecDeque<OwnFrame>,
+    ended: BTreeSet<CavId>,
+    detections: Publisher,
+    json: Publisher,
+    report: NodeReport,
+    _own: Subscription,
+}
+
+impl<'a> Node<'a> {
+    fn open(bus: &'a Bus, cav: &CavId, ego: Ego, options: &'a NodeOptions, stop: &Stop) -> Result<Self, BusError> {
+        let stream = stream_of(own_content(ego.method()));
+        let inbox = bus.inbox(PLACES, MAX_TOPICS);
+        stop.on_request({
+            let inbox = Arc::clone(&inbox);
+            move || inbox.close()
+        });
+        let topic = |stream| Topic::Stream { cav: cav.clone(), stream };
+        // Alone, an ego has nothing to hear from others.
+        let neighbourhood = (ego.method() != Method::None)
+            .then(|| Neighbourhood::watch(bus, cav, stream, options.neighbours.clone()))
+            .transpose()?;
+        Ok(Self {
+            bus,
+            cav: cav.clone(),
+            options,
+            stream,
+            neighbourhood,
+            pairing: Pairing::new(options.pairing),
+            frames: VecDeque::new(),
+            ended: BTreeSet::new(),
+            detections: bus.publisher(topic(Stream::Detections), PublisherOptions::DETECTIONS.lossless(PLACES))?,
+            json: bus.publisher(topic(Stream::DetectionsJson), PublisherOptions::DETECTIONS)?,
+            report: NodeReport::default(),
+            _own: bus.subscribe(topic(stream), &inbox)?,
+            ego,
+            inbox,
+        })
+    }
+
+    fn listen(&mut self, stop: &Stop) -> Result<(), BusError> {
+        while !stop.requested() {
+            self.look_round()?;
+            match self.inbox.take(Some(self.next_moment())) {
+                Taken::Item(_, Event::Message(arrival)) => self.admit(&arrival),
+                Taken::Item(Topic::Stream { cav, .. }, Event::End { .. }) if !self.options.keeps_running => {
+                    if cav == self.cav {
+                        return self.finish(stop);
+                    }
+                    self.ended.insert(cav);
+                }
+                Taken::Item(_, Event::End { .. }) | Taken::TimedOut => {}
+                Taken::Closed => return Ok(()),
+            }
+            self.decide(false);
+        }
+        Ok(())
+    }
+
+    /// The own agent has ended: the frames that wait have their usual time, the neighbours' last messages are counted.
+    fn finish(&mut self, stop: &Stop) -> Result<(), BusError> {
+        let until = Instant::now() + LAST_WORDS.max(self.options.deadline);
+        while !stop.requested() && Instant::now() < until && !(self.frames.is_empty() && self.all_have_ended()) {
+            self.look_round()?;
+            match self.inbox.take(Some(self.next_moment())) {
+                Taken::Item(_, Event::Message(arrival)) => self.admit(&arrival),
+                Taken::Item(Topic::Stream { cav, .. }, Event::End { .. }) => {
+                    self.ended.insert(cav);
+                }
+                Taken::Item(_, Event::End { .. }) | Taken::TimedOut => {}
+                Taken::Closed => break,
+            }
+            self.decide(false);
+        }
+        self.decide(true);
+        // What waits for a frame that will not come.
+        let (_, dropped) = self.pairing.pair(u64::MAX);
+        for lost in dropped {
+            self.bus.books().dropped(&self.topic(&lost.cav), lost.reason);
+        }
+        Ok(())
+    }
+
+    fn all_have_ended(&self) -> bool {
+        self.neighbourhood.iter().flat_map(Neighbourhood::members).all(|cav| self.ended.contains(cav))
+    }
+
+    fn look_round(&mut self) -> Result<(), BusError> {
+        let Some(neighbourhood) = &mut self.neighbourhood else { return Ok(()) };
+        for cav in neighbourhood.update(self.bus, &self.inbox)? {
+            let topic = Topic::Stream { cav: cav.clone(), stream: self.stream };
+            for _ in 0..self.pairing.forget(&cav) {
+                self.bus.books().dropped(&topic, DropReason::Stale);
+            }
+        }
+        Ok(())
+    }
+
+    fn topic(&self, cav: &CavId) -> Topic {
+        Topic::Stream { cav: cav.clone(), stream: self.stream }
+    }
+
+    fn next_moment(&self) -> Instant {
+        let soon = Instant::now() + LOOK_ROUND;
+        self.frames.front().map_or(soon, |frame| soon.min(frame.begun + self.options.deadline))
+    }
+}
+
+fn stream_of(exchange: Exchange) -> Stream {
+    match exchange {
+        Exchange::Boxes => Stream::Boxes,
+        Exchange::Points => Stream::Points,
+        Exchange::Features | Exchange::Nothing => Stream::Bev,
+    }
+}
