@@ -38,3 +38,4 @@ pub use error::SynthError;
 pub use generate::{Summary, generate};
 pub use options::{Subset, SynthOptions};
 pub use weather::Weather;
+pub use world::ground_surface;

@@ -33,8 +33,8 @@ impl<'t> World<'t> {
             town,
             roads: Roads::new(&town.lanes),
             lane_index: LaneIndex::new(&town.lanes),
-            ground: ground_of(town),
-            standing: town.solids.iter().map(Standing::new).chain(decks).collect(),
+            ground: ground_surface(town),
+            standing: town.solids.iter().map(Standing::from).chain(decks).collect(),
         }
     }
 
@@ -53,15 +53,17 @@ impl<'t> World<'t> {
     }
 }
 
-fn ground_of(town: &Town) -> Box<dyn Surface + Send + Sync> {
+/// The ground of a town, without its decks, as rays meet it.
+#[must_use]
+pub fn ground_surface(town: &Town) -> Box<dyn Surface + Send + Sync> {
     match &town.ground.terrain {
         Terrain::Plane { z_m } => Box::new(Plane(*z_m)),
         Terrain::Grid(grid) => Box::new(TerrainSurface::new(grid)),
     }
 }
 
-impl Standing {
-    fn new(solid: &Solid) -> Self {
+impl From<&Solid> for BodyShape {
+    fn from(solid: &Solid) -> Self {
         let part = match solid.shape {
             Shape::Box { half_m } => Part::Box(Bounds::centered([0.0; 3], half_m.map(|half| half as f32))),
             Shape::Cylinder { radius_m, half_height_m } => {
@@ -71,11 +73,14 @@ impl Standing {
                 Part::Ellipsoid { center_m: [0.0; 3], radii_m: radii_m.map(|radius| radius as f32) }
             }
         };
-        let [half_x, half_y] = solid.shape.half_footprint_m();
-        Self {
-            shape: BodyShape::new(vec![part], solid.reflectivity),
-            placement: Placement::level(solid.center_m, solid.yaw_rad),
-            radius_m: half_x.hypot(half_y),
-        }
+        Self::new(vec![part], solid.reflectivity)
+    }
+}
+
+impl From<&Solid> for Standing {
+    fn from(solid: &Solid) -> Self {
+        let shape = BodyShape::from(solid);
+        let placement = Placement::level(solid.center_m, solid.yaw_rad);
+        Self { radius_m: shape.bounds.radius_m(), shape, placement }
     }
 }

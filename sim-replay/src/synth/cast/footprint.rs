@@ -41,6 +41,9 @@ impl SensorFrames {
     /// Bounded by the corners of the body's box at both ends of the sweep: between them the motion is straight up to
     /// [`BEND_M`], so the body stays in their convex hull.
     pub(super) fn footprint(&self, pattern: &RayPattern, body: &Body<'_>) -> Option<Footprint> {
+        if self.is_surely_out_of_range(pattern.range_m, body) {
+            return None;
+        }
         let corners = self.corners(&body.shape.bounds, &body.motion);
         let flat = corners.map(|corner| corner.xy());
         let center = flat.iter().sum::<Vector2<f32>>() / 16.0;
@@ -55,6 +58,16 @@ impl SensorFrames {
         let channels = channels(pattern, &corners, nearest_m)?;
         let (first_column, columns) = columns(pattern, &flat, &center, nearest_m)?;
         Some(Footprint { first_column, columns, channels, nearest_m })
+    }
+
+    /// The cheap question first: most of what stands in a town is too far away.
+    fn is_surely_out_of_range(&self, range_m: f32, body: &Body<'_>) -> bool {
+        let [near_x, near_y] =
+            [0, 1].map(|axis: usize| body.shape.bounds.min_m[axis].abs().max(body.shape.bounds.max_m[axis].abs()));
+        // Both ends may lie a sweep's motion apart, and a little more than that is in no way wrong.
+        let reach_m = f64::from(range_m + near_x + near_y) + 10.0;
+        let offset = body.motion.end.position_m - self.ends[1].1;
+        offset.x * offset.x + offset.y * offset.y > reach_m * reach_m
     }
 
     fn corners(&self, bounds: &Bounds, motion: &Sweep) -> [Vector3<f32>; 16] {
