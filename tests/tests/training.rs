@@ -1,0 +1,186 @@
+//! Training and evaluation on a recorded scene, end to end through the library.
+
+use std::ops::ControlFlow;
+use std::path::{Path, PathBuf};
+
+use agent::model_config::DetectorConfig;
+use agent::pose_source::PoseSourceConfig;
+use ego_fuser::Method;
+use ego_fuser::evaluate::{EvaluateConfig, EvaluatedFrame, Evaluator};
+use ego_fuser::loss::LossConfig;
+use ego_fuser::model::ComputePrecision;
+use ego_fuser::samples::{SampleConfig, SampleKind};
+use ego_fuser::train::{self, Accuracy, AdamWConfig, Length, Observer, StepReport, Summary, TrainConfig, TrainError};
+use protocol::{CodecConfig, Dtype};
+use sim_replay::dataset;
+use tch::Device;
+use tests::fixtures::data;
+
+/// Hears the losses of a training.
+#[derive(Default)]
+struct Ear {
+    losses: Vec<f64>,
+    validations: Vec<u64>,
+}
+
+impl Observer for Ear {
+    fn stepped(&mut self, report: &StepReport) {
+        self.losses.push(report.score_loss + report.box_loss);
+    }
+
+    fn validated(&mut self, step: u64, _: &Accuracy) {
+        self.validations.push(step);
+    }
+}
+
+/// A network that a test has time for.
+fn small() -> DetectorConfig {
+    DetectorConfig {
+        pillar_channels: 8,
+        layer_nums: vec![1, 1],
+        layer_strides: vec![2, 2],
+        num_filters: vec![8, 16],
+        upsample_strides: vec![1, 2],
+        num_upsample_filters: vec![8; 2],
+        shrink: None,
+        lidar_range_m: [-25.6, -19.2, -3.0, 25.6, 19.2, 1.0],
+        ..DetectorConfig::lean()
+    }
+}
+
+fn config(scene: &Path, out: &Path, method: Method, steps: u64) -> TrainConfig {
+    tch::set_num_threads(1);
+    TrainConfig {
+        data: vec![scene.to_owned()],
+        validation: vec![scene.to_owned()],
+        method,
+        detector: small(),
+        init: None,
+        length: Length::Steps(steps),
+        batch: 1,
+        learning_rate: 2e-3,
+        seed: 3,
+        device: Device::Cpu,
+        loader_threads: 2,
+        precision: ComputePrecision::F32,
+        out: out.to_owned(),
+        resume: false,
+        validate_every: 5,
+        validation_frames: 1,
+        samples: SampleConfig::training(SampleKind::Single),
+        loss: LossConfig::default(),
+        optimizer: AdamWConfig::default(),
+        command: "a test".to_owned(),
+    }
+}
+
+fn run(config: &TrainConfig) -> (Summary, Ear) {
+    let mut ear = Ear::default();
+    (train::run(config, &mut ear).unwrap(), ear)
+}
+
+fn evaluate(weights: PathBuf, scene: &Path, method: Method, dtype: Dtype) -> Vec<EvaluatedFrame> {
+    let codec = CodecConfig { dtype, ..CodecConfig::default() };
+    let pose_source = PoseSourceConfig::Recorded;
+    let config = EvaluateConfig { weights, method: Some(method), pose_source, codec, rule: None };
+    let mut evaluator = Evaluator::new(config).unwrap();
+    let mut frames = Vec::new();
+    for scenario in &dataset::open(scene).unwrap().scenarios {
+        let _ = evaluator
+            .run(scenario, &mut |frame| {
+                frames.push(frame);
+                ControlFlow::Continue(())
+            })
+            .unwrap();
+    }
+    frames
+}
+
+#[test]
+fn a_training_that_was_interrupted_ends_like_one_that_was_not() {
+    let Some(scene) = data("v2xset-scene") else { return };
+    let (whole, parts) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    // The learning rate follows the share that is done, so a stop in the middle is a checkpoint of the whole length.
+    let uninterrupted = config(&scene, whole.path(), Method::Attention, 10);
+    let (summary, ear) = run(&uninterrupted);
+    assert_eq!((summary.steps, ear.validations.as_slice()), (10, [5, 10].as_slice()));
+    assert!(ear.losses.iter().all(|loss| loss.is_finite() && *loss > 0.0));
+
+    let first = TrainConfig { validation: vec![], ..config(&scene, parts.path(), Method::Attention, 10) };
+    let stopped = train_until_checkpoint(&first);
+    let resumed = TrainConfig { resume: true, loader_threads: 1, ..first };
+    let (resumed, _) = run(&resumed);
+    assert_eq!((stopped, resumed.steps), (5, 10));
+    assert_eq!(resumed.sha256, summary.sha256, "the same weights, byte for byte");
+    let card = std::fs::read_to_string(whole.path().join("model-card.md")).unwrap();
+    assert!(card.contains(&summary.sha256) && card.contains("a test") && card.contains("attention"), "{card}");
+    let curve = std::fs::read_to_string(whole.path().join("curve.csv")).unwrap();
+    let columns: Vec<usize> = curve.lines().map(|line| line.split(',').count()).collect();
+    assert_eq!(columns, [12; 4], "a header, one report, two validations:\n{curve}");
+}
+
+/// Trains and pulls the plug in the first report after the first checkpoint; the steps of that checkpoint.
+fn train_until_checkpoint(config: &TrainConfig) -> u64 {
+    struct Plug(PathBuf);
+    impl Observer for Plug {
+        fn stepped(&mut self, _: &StepReport) {
+            // The report of step 10 comes before the checkpoint of step 10: what lies there is of step 5.
+            assert!(self.0.exists(), "a checkpoint at step 5");
+            panic!("pulled");
+        }
+        fn validated(&mut self, _: u64, _: &Accuracy) {}
+    }
+    let mut plug = Plug(config.out.join("checkpoint.safetensors"));
+    let hook = std::panic::take_hook();
+    std::panic::set_hook(Box::new(|_| {}));
+    let outcome = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| train::run(config, &mut plug)));
+    std::panic::set_hook(hook);
+    assert!(outcome.is_err());
+    5
+}
+
+#[test]
+fn every_method_that_learns_trains_and_evaluates_the_same_twice() {
+    let Some(scene) = data("v2xset-scene") else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let none = config(&scene, &folder.path().join("none"), Method::None, 5);
+    let (base, _) = run(&none);
+    for method in [Method::Early, Method::Max, Method::Attention] {
+        let out = folder.path().join(method.name());
+        let (summary, _) = run(&TrainConfig { init: Some(base.weights.clone()), ..config(&scene, &out, method, 5) });
+        let frames = evaluate(summary.weights.clone(), &scene, method, Dtype::F32);
+        let again = evaluate(summary.weights, &scene, method, Dtype::F32);
+        assert_eq!(frames.len(), 1, "{method}");
+        assert_eq!(frames[0].result.detections, again[0].result.detections, "{method}");
+        assert_eq!(frames[0].result.fused.len(), 1, "{method}: the scene has one neighbour");
+        assert!(frames[0].result.fused[0].payload_bytes > 0, "{method}");
+    }
+    let late = TrainConfig { method: Method::Late, ..none };
+    assert!(matches!(train::run(&late, &mut Ear::default()), Err(TrainError::NotTrained(Method::Late))));
+}
+
+#[test]
+fn half_precision_on_the_air_takes_half_the_bytes() {
+    let Some(scene) = data("v2xset-scene") else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let (summary, _) = run(&config(&scene, folder.path(), Method::None, 5));
+    let bytes = |dtype| evaluate(summary.weights.clone(), &scene, Method::Max, dtype)[0].result.fused[0].payload_bytes;
+    let (single, half) = (bytes(Dtype::F32), bytes(Dtype::F16));
+    let values = 16 * 64 * 48;
+    assert!(single >= 4 * values && single < 4 * values + 256, "{single}");
+    assert!(half >= 2 * values && half < 2 * values + 256, "{half}");
+}
+
+#[test]
+fn a_checkpoint_of_another_training_is_refused_with_both_values() {
+    let Some(scene) = data("v2xset-scene") else { return };
+    let folder = tempfile::tempdir().unwrap();
+    let first = config(&scene, folder.path(), Method::None, 5);
+    run(&first);
+    let other = TrainConfig { resume: true, seed: 4, length: Length::Steps(9), ..first };
+    let message = train::run(&other, &mut Ear::default()).unwrap_err().to_string();
+    assert!(message.contains("seed 3") && message.contains('4'), "{message}");
+    let missing = TrainConfig { out: folder.path().join("elsewhere"), ..other };
+    let message = train::run(&missing, &mut Ear::default()).unwrap_err().to_string();
+    assert!(message.contains("checkpoint.safetensors"), "{message}");
+}
