@@ -2,6 +2,7 @@
 
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
+use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use agent::model_config::DetectorConfig;
 use agent::pose_source::PoseSourceConfig;
@@ -15,6 +16,13 @@ use protocol::{CodecConfig, Dtype};
 use sim_replay::dataset;
 use tch::Device;
 use tests::fixtures::data;
+
+/// libtorch has one generator of random numbers per process: who begins a training has it alone.
+fn alone() -> MutexGuard<'static, ()> {
+    static GENERATOR: Mutex<()> = Mutex::new(());
+    tch::set_num_threads(1);
+    GENERATOR.lock().unwrap_or_else(PoisonError::into_inner)
+}
 
 /// Hears the losses of a training.
 #[derive(Default)]
@@ -99,6 +107,7 @@ fn evaluate(weights: PathBuf, scene: &Path, method: Method, dtype: Dtype) -> Vec
 #[test]
 fn a_training_that_was_interrupted_ends_like_one_that_was_not() {
     let Some(scene) = data("v2xset-scene") else { return };
+    let _alone = alone();
     let (whole, parts) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
     // The learning rate follows the share that is done, so a stop in the middle is a checkpoint of the whole length.
     let uninterrupted = config(&scene, whole.path(), Method::Attention, 10);
@@ -142,6 +151,7 @@ fn train_until_checkpoint(config: &TrainConfig) -> u64 {
 #[test]
 fn every_method_that_learns_trains_and_evaluates_the_same_twice() {
     let Some(scene) = data("v2xset-scene") else { return };
+    let _alone = alone();
     let folder = tempfile::tempdir().unwrap();
     let none = config(&scene, &folder.path().join("none"), Method::None, 5);
     let (base, _) = run(&none);
@@ -162,6 +172,7 @@ fn every_method_that_learns_trains_and_evaluates_the_same_twice() {
 #[test]
 fn half_precision_on_the_air_takes_half_the_bytes() {
     let Some(scene) = data("v2xset-scene") else { return };
+    let _alone = alone();
     let folder = tempfile::tempdir().unwrap();
     let (summary, _) = run(&config(&scene, folder.path(), Method::None, 5));
     let bytes = |dtype| evaluate(summary.weights.clone(), &scene, Method::Max, dtype)[0].result.fused[0].payload_bytes;
@@ -174,6 +185,7 @@ fn half_precision_on_the_air_takes_half_the_bytes() {
 #[test]
 fn a_checkpoint_of_another_training_is_refused_with_both_values() {
     let Some(scene) = data("v2xset-scene") else { return };
+    let _alone = alone();
     let folder = tempfile::tempdir().unwrap();
     let first = config(&scene, folder.path(), Method::None, 5);
     run(&first);

@@ -47,11 +47,24 @@ pub fn save(
         .map(|tensor| Ok((&tensor.name, TensorView::new(tensor.dtype, tensor.shape.clone(), &tensor.bytes)?)))
         .collect();
     let header: HashMap<_, _> = metadata.clone().into_iter().collect();
-    let bytes = safetensors::serialize(views.map_err(format)?, Some(header)).map_err(format)?;
+    let bytes = with_sorted_header(safetensors::serialize(views.map_err(format)?, Some(header)).map_err(format)?);
     let io = |source| WeightsError::Io { path: path.to_owned(), source };
     let unfinished = path.with_extension("unfinished");
     fs::write(&unfinished, &bytes).and_then(|()| fs::rename(&unfinished, path)).map_err(io)?;
     Ok(hex(&Sha256::digest(&bytes)))
+}
+
+/// The same file with its header in the order of names: the library writes metadata in the order of a hash map, and equal
+/// weights should be equal files.
+fn with_sorted_header(bytes: Vec<u8>) -> Vec<u8> {
+    let Some((length, rest)) = bytes.split_first_chunk::<8>() else { return bytes };
+    let Some((header, data)) = rest.split_at_checked(u64::from_le_bytes(*length) as usize) else { return bytes };
+    let Ok(mut entries) = serde_json::from_slice::<BTreeMap<String, serde_json::Value>>(header) else { return bytes };
+    entries.values_mut().for_each(serde_json::Value::sort_all_objects);
+    let Ok(mut header) = serde_json::to_vec(&entries) else { return bytes };
+    // Tensor data begin at a multiple of eight.
+    header.resize(header.len().next_multiple_of(8), b' ');
+    [&(header.len() as u64).to_le_bytes(), header.as_slice(), data].concat()
 }
 
 struct Stored {

@@ -258,7 +258,7 @@ pub struct AgentOverrides {
 
 impl Scenario {
     fn default_method() -> Method {
-        Method::Attention
+        Method::Max
     }
 
     /// What vehicle `cav` does: `agents`, with its own entry of `vehicles` on top.
