@@ -2,6 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::fs;
+use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 
 use nalgebra::Point3;
@@ -227,7 +228,7 @@ fn bad_options_are_named() {
     let message = |options: SynthOptions| generate(&options, &|_| {}).unwrap_err().to_string();
     let period = message(SynthOptions { period_s: 0.12, ..v2vdet(1, folder.path()) });
     assert_eq!(period, "--period is 0.12; expected a multiple of 0.05 s up to 500 s");
-    let agents = message(SynthOptions { agents: 4..=2, ..v2vdet(1, folder.path()) });
+    let agents = message(SynthOptions { agents: RangeInclusive::new(4, 2), ..v2vdet(1, folder.path()) });
     assert_eq!(agents, "--agents is 4-2; expected a number or a range within 1-7");
     let town = Some(TownSource::OpenDrive("no/such/map.xodr".into()));
     let missing = message(SynthOptions { town, ..v2vdet(1, folder.path()) });
