@@ -21,7 +21,9 @@ config = zenoh.Config()
 for key, value in {"mode": "client", "connect/endpoints": [args.connect], "scouting/multicast/enabled": False}.items():
     config.insert_json5(key, json.dumps(value))
 with zenoh.open(config) as session:
-    for number, sample in enumerate(session.declare_subscriber(f"v2v/{args.run}/*/detections/json"), start=1):
+    # Kept under a name: a subscriber that nobody holds ends.
+    subscriber = session.declare_subscriber(f"v2v/{args.run}/*/detections/json")
+    for number, sample in enumerate(subscriber, start=1):
         frame = json.loads(sample.payload.to_string())
         ages = ", ".join(f"{one['cav']} ({one['age_nanos'] / 1e6:.0f} ms old)" for one in frame["fused"])
         print(f"ego {frame['ego']} at {frame['capture_nanos'] / 1e9:.1f} s, {frame['method']}, with {ages or 'nobody'}:")
