@@ -4,7 +4,7 @@ use std::fmt::Write;
 
 use super::{Summary, TrainConfig};
 use crate::model::CooperativeModel;
-use crate::samples::SceneSet;
+use crate::samples::{SampleConfig, SceneSet};
 
 /// The card as Markdown.
 pub(super) fn text(
@@ -41,12 +41,28 @@ pub(super) fn text(
     line(format!("| steps | {} of {} samples |", summary.steps, config.batch));
     line(format!("| convolutions | {:?} |", config.precision));
     line(format!("| time | {:.0} s |", summary.seconds));
-    line(format!("| loss | {:?} |", config.loss));
-    line(format!("| samples | {:?} |", config.samples));
+    line(format!(
+        "| peak learning rate | {:e}, weight decay {:e} |",
+        config.learning_rate, config.optimizer.weight_decay
+    ));
+    line(format!("| anchors between the thresholds | {:?} |", config.loss.unassigned));
+    let SampleConfig { augmentation, drop_neighbour, pose_noise, max_agents, comm_range_m, .. } = &config.samples;
+    line(format!(
+        "| augmentation | mirrored {:.0} %, turned up to {:.0} degrees, scaled up to {:.0} % |",
+        100.0 * augmentation.mirror,
+        augmentation.turn_rad.to_degrees(),
+        100.0 * augmentation.scale
+    ));
+    line(format!(
+        "| vehicles | up to {max_agents} within {comm_range_m} m, each neighbour missing in {:.0} %, poses off by {} m and {} degrees |",
+        100.0 * drop_neighbour,
+        pose_noise.position_m,
+        pose_noise.yaw_rad.to_degrees()
+    ));
     if let Some(accuracy) = &summary.accuracy {
         line(format!(
-            "\nValidation on {} frames, true poses, ground truth of all vehicles within {} m, area of the network:\n",
-            accuracy.frames, config.samples.comm_range_m
+            "\nValidation on {} frames, true poses, ground truth of all vehicles within {comm_range_m} m, area of the network:\n",
+            accuracy.frames
         ));
         line("| AP | 0.3 | 0.5 | 0.7 |\n| --- | --- | --- | --- |".into());
         for (name, [ap_30, ap_50, ap_70]) in [("global", accuracy.ap_global), ("frame order", accuracy.ap_frame_order)]

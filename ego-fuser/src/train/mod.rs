@@ -5,7 +5,10 @@
 mod adamw;
 mod card;
 mod checkpoint;
+mod config;
 mod curve;
+mod error;
+mod observer;
 mod schedule;
 mod validation;
 
@@ -14,168 +17,26 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use agent::model_config::DetectorConfig;
 use agent::weights;
-use tch::Device;
 
 pub use adamw::{AdamW, AdamWConfig, Step};
 pub use checkpoint::{CheckpointError, Progress};
+pub use config::{Length, TrainConfig};
+pub use error::TrainError;
+pub use observer::{Observer, StepReport, Summary};
 pub use schedule::OneCycle;
 pub use validation::{Accuracy, Validator};
 
 use self::curve::Curve;
-use crate::loss::{LabelTensors, LossConfig, detection_loss};
+use crate::loss::{LabelTensors, detection_loss};
 use crate::method::Method;
-use crate::model::{ComputePrecision, CooperativeModel, ModelError};
+use crate::model::{ComputePrecision, CooperativeModel};
 use crate::samples::{Batch, Loader, LoaderConfig, SampleBuilder, SampleConfig, SampleError, SampleKind, SceneSet};
 
 /// Steps between two readings of the loss: reading waits for the device.
 const READ_EVERY: u64 = 10;
 /// Losses that are not finite in a row before the training gives up.
 const MAX_SKIPPED: u32 = 20;
-
-/// What to train, on what, for how long.
-#[derive(Debug, Clone)]
-pub struct TrainConfig {
-    /// Datasets to learn from.
-    pub data: Vec<PathBuf>,
-    /// Datasets to validate on; without any, AP is not measured.
-    pub validation: Vec<PathBuf>,
-    /// The method.
-    pub method: Method,
-    /// The network, where `init` does not say.
-    pub detector: DetectorConfig,
-    /// Weights to begin with.
-    pub init: Option<PathBuf>,
-    /// How long.
-    pub length: Length,
-    /// Samples of a step.
-    pub batch: usize,
-    /// Highest learning rate.
-    pub learning_rate: f64,
-    /// Seed of parameters, order and augmentation.
-    pub seed: u64,
-    /// Where the network computes.
-    pub device: Device,
-    /// Threads that prepare samples.
-    pub loader_threads: usize,
-    /// In which numbers the convolutions compute.
-    pub precision: ComputePrecision,
-    /// Folder of checkpoint, curve, weights and model card.
-    pub out: PathBuf,
-    /// Whether to go on from the checkpoint in `out`.
-    pub resume: bool,
-    /// Steps between two validations.
-    pub validate_every: u64,
-    /// Frames of a validation.
-    pub validation_frames: usize,
-    /// How samples are made.
-    pub samples: SampleConfig,
-    /// The loss.
-    pub loss: LossConfig,
-    /// The optimizer.
-    pub optimizer: AdamWConfig,
-    /// The command as the user gave it, for the model card.
-    pub command: String,
-}
-
-/// Length of a training.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Length {
-    /// So many steps.
-    Steps(u64),
-    /// So many passes over the data.
-    Epochs(f64),
-    /// As many steps as fit into a time; the learning rate follows the clock. Not repeatable to the bit.
-    Time(Duration),
-}
-
-/// Why a training ended early.
-#[derive(Debug, thiserror::Error)]
-pub enum TrainError {
-    /// The model cannot be built or run.
-    #[error(transparent)]
-    Model(#[from] ModelError),
-    /// There is no next sample.
-    #[error(transparent)]
-    Sample(#[from] SampleError),
-    /// The checkpoint cannot be written or continued.
-    #[error(transparent)]
-    Checkpoint(#[from] CheckpointError),
-    /// The method cannot be trained.
-    #[error("method {0} exchanges boxes and is not trained; train `none` and use its weights")]
-    NotTrained(Method),
-    /// The checkpoint is of another training.
-    #[error("the checkpoint was made with {field} {found}, not {asked}")]
-    OtherTraining {
-        /// What differs.
-        field: &'static str,
-        /// In the checkpoint.
-        found: String,
-        /// On the command line.
-        asked: String,
-    },
-    /// The loss has left the numbers.
-    #[error("the loss was not finite {0} times in a row; try a lower learning rate")]
-    Diverged(u32),
-    /// A file cannot be written.
-    #[error("{}: {source}", path.display())]
-    Io {
-        /// The file.
-        path: PathBuf,
-        /// What the system said.
-        source: std::io::Error,
-    },
-    /// The tensor library refused.
-    #[error("training: {0}")]
-    Torch(#[from] tch::TchError),
-}
-
-/// What happened in some steps.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct StepReport {
-    /// Steps done.
-    pub step: u64,
-    /// Passes over the data.
-    pub epoch: f64,
-    /// Share of the training that is done, 0..1.
-    pub progress: f64,
-    /// Seconds spent so far, in all runs together.
-    pub seconds: f64,
-    /// Learning rate.
-    pub learning_rate: f64,
-    /// Classification term.
-    pub score_loss: f64,
-    /// Regression term.
-    pub box_loss: f64,
-    /// Samples per second since the last report.
-    pub samples_per_second: f64,
-    /// Share of that time spent waiting for samples, 0..1.
-    pub waiting: f64,
-}
-
-/// Hears how a training goes.
-pub trait Observer {
-    /// Some steps are done.
-    fn stepped(&mut self, report: &StepReport);
-    /// A validation is done.
-    fn validated(&mut self, step: u64, accuracy: &Accuracy);
-}
-
-/// How a training ended.
-#[derive(Debug, Clone)]
-pub struct Summary {
-    /// Steps done.
-    pub steps: u64,
-    /// Seconds spent, in all runs together.
-    pub seconds: f64,
-    /// The last validation.
-    pub accuracy: Option<Accuracy>,
-    /// The weights, in half precision.
-    pub weights: PathBuf,
-    /// Their SHA-256.
-    pub sha256: String,
-}
 
 /// Trains a method and writes checkpoint, curve, weights and model card into `config.out`.
 ///

@@ -1,0 +1,151 @@
+use agent::agent::{Agent, AgentInput};
+use agent::model_config::DetectorConfig;
+use agent::point_pillars::PointPillars;
+use agent::pose_source::RecordedPose;
+use protocol::NoPoseReason;
+use tch::Device;
+use tch::nn::VarStore;
+
+use super::*;
+
+const HERE: Pose = Pose { translation_m: [100.0, 50.0, 2.0], rotation_wxyz: [1.0, 0.0, 0.0, 0.0] };
+
+/// The same network every time, with a head that believes in vehicles, so that there is something to clean up.
+fn detector() -> Detector {
+    tch::set_num_threads(1);
+    let config = DetectorConfig { lidar_range_m: [-12.8, -6.4, -3.0, 12.8, 6.4, 1.0], ..DetectorConfig::lean() };
+    let network = VarStore::new(Device::Cpu);
+    let pillars = PointPillars::new(&network.root(), &config).unwrap();
+    for (name, mut variable) in network.variables() {
+        // No generator that tests running beside this one could disturb: values from the shape alone.
+        let count = variable.numel() as i64;
+        let wave = (Tensor::arange(count, (Kind::Float, Device::Cpu)) * 0.7).sin().view(variable.size().as_slice());
+        let new = match name.as_str() {
+            name if name.contains("running") || name.ends_with("norm.weight") => continue,
+            "cls_head.bias" => wave * 0.1 + 0.3,
+            // Small, so that scores are spread rather than all close to one.
+            "cls_head.weight" => wave * 0.01,
+            // Boxes are the anchors themselves, which the clean-up takes for vehicles.
+            "reg_head.weight" | "reg_head.bias" => wave * 0.0,
+            _ if variable.dim() > 1 => wave * (2.0 / (count as f64 / variable.size()[0] as f64).sqrt()),
+            _ => continue,
+        };
+        no_grad(|| variable.copy_(&new));
+    }
+    Detector::from_network(pillars)
+}
+
+fn cloud(phase: f32) -> PointCloud {
+    let points = (0..3000)
+        .map(|k| [(k % 83) as f32 * 0.3 - 12.0 + phase, (k % 41) as f32 * 0.3 - 6.0, -1.5 + (k % 7) as f32 * 0.1, 0.2]);
+    PointCloud { xyzi: points.collect() }
+}
+
+fn view(name: &str, world_from_cav: Pose, method: Method, phase: f32) -> View {
+    let cav = CavId::new(name).unwrap();
+    let mut agent = Agent::new(cav.clone(), Box::new(RecordedPose), detector());
+    let cloud = cloud(phase);
+    let input = AgentInput { capture_nanos: 0, cloud: &cloud, measured_pose: Some(&world_from_cav) };
+    let output = agent.process(&input).unwrap();
+    let content = match own_content(method) {
+        Exchange::Boxes => Content::Boxes(output.perception.detections),
+        Exchange::Points => Content::Points(agent.detector().crop().without_own_body(&cloud)),
+        _ => Content::Features(DecodedFeatures { features: output.perception.features, sent: None }),
+    };
+    View { cav, pose: output.pose, age_nanos: 0, content }
+}
+
+fn near() -> Pose {
+    Pose::from_xyz_yaw([104.0, 51.0, 2.0], 0.3)
+}
+
+#[test]
+fn a_neighbour_changes_what_is_seen_and_the_same_views_give_the_same_bits() {
+    for method in [Method::Early, Method::Max, Method::Attention] {
+        let (own, other) = (view("a", HERE, method, 0.0), view("b", near(), method, 0.15));
+        let mut ego = Ego::new(detector(), method);
+        let alone = ego.detect(&own, &[]).unwrap();
+        let together = ego.detect(&own, std::slice::from_ref(&other)).unwrap();
+        assert_eq!(together.fused, [0], "{method}");
+        assert!(!together.detections.is_empty(), "{method}");
+        assert!(alone.detections != together.detections, "{method}: the neighbour changed nothing");
+        let again = Ego::new(detector(), method).detect(&own, std::slice::from_ref(&other)).unwrap();
+        assert_eq!(again.detections, together.detections, "{method}");
+    }
+}
+
+#[test]
+fn late_fusion_moves_boxes_and_keeps_the_better_of_two() {
+    let found = |x: f64, score: f32| Detection {
+        box3d: protocol::Box3d { center_m: [x, 0.0, -1.0], size_m: [4.0, 1.8, 1.5], heading_rad: 0.0 },
+        score,
+        source: None,
+    };
+    let boxes = |name: &str, world_from_cav: Pose, found: Vec<Detection>| View {
+        cav: CavId::new(name).unwrap(),
+        pose: PoseEstimate::new(world_from_cav, 1.0),
+        age_nanos: 0,
+        content: Content::Boxes(found),
+    };
+    // The other stands 4 m ahead: its box at 1 m is the ego's at 5 m, the one at -10 m only it has seen.
+    let own = boxes("a", HERE, vec![found(5.2, 0.6)]);
+    let ahead = Pose { translation_m: [104.0, 50.0, 2.0], ..HERE };
+    let other = boxes("b", ahead, vec![found(1.0, 0.9), found(-10.0, 0.5), found(-6.0, 0.05)]);
+    let output = Ego::new(detector(), Method::Late).detect(&own, &[other]).unwrap();
+    let seen: Vec<_> = (output.detections.iter())
+        .map(|found| (found.box3d.center_m[0].round(), found.source.as_ref().unwrap().as_str()))
+        .collect();
+    assert_eq!(seen, [(5.0, "b"), (-6.0, "b")]);
+}
+
+#[test]
+fn with_none_left_the_maps_of_every_method_are_those_of_the_ego_alone() {
+    let own = view("a", HERE, Method::None, 0.0);
+    let alone = Ego::new(detector(), Method::None).detect(&own, &[]).unwrap().detections;
+    assert!(!alone.is_empty());
+    let far = view("b", Pose::from_xyz_yaw([200.0, 50.0, 2.0], 0.0), Method::Max, 0.0);
+    let lost = View { pose: PoseEstimate::NoPose { reason: NoPoseReason::NoSource, inlier_count: 0 }, ..far.clone() };
+    for method in [Method::Max, Method::Attention] {
+        let output = Ego::new(detector(), method).detect(&own, &[far.clone(), lost.clone()]).unwrap();
+        assert_eq!(output.detections, alone, "{method}");
+        let reasons = [(0, Skipped::OutOfRange), (1, Skipped::Unusable(DropReason::NoPose))];
+        assert_eq!((output.fused, output.skipped), (vec![], reasons.to_vec()), "{method}");
+    }
+}
+
+#[test]
+fn an_ego_without_pose_goes_on_alone() {
+    let own = view("a", HERE, Method::Max, 0.0);
+    let lost = View { pose: PoseEstimate::NoPose { reason: NoPoseReason::NoSource, inlier_count: 0 }, ..own.clone() };
+    let mut ego = Ego::new(detector(), Method::Max);
+    let output = ego.detect(&lost, &[view("b", near(), Method::Max, 0.1)]).unwrap();
+    assert_eq!(output.detections, ego.detect(&own, &[]).unwrap().detections);
+    assert_eq!(output.skipped, [(0, Skipped::Unusable(DropReason::NoPose))]);
+}
+
+#[test]
+fn cells_that_were_not_sent_have_no_part() {
+    let own = view("a", HERE, Method::Attention, 0.0);
+    let mut other = view("b", near(), Method::Attention, 0.1);
+    let mut ego = Ego::new(detector(), Method::Attention);
+    let Content::Features(map) = &mut other.content else { panic!("attention exchanges maps") };
+    map.sent = Some(vec![false; map.features.grid.cells()]);
+    let output = ego.detect(&own, &[other]).unwrap();
+    assert_eq!(output.fused, [0]);
+    assert_eq!(output.detections, ego.detect(&own, &[]).unwrap().detections);
+}
+
+#[test]
+fn maps_of_another_network_are_left_out_and_named_where_they_are_the_egos_own() {
+    let own = view("a", HERE, Method::Max, 0.0);
+    let mut other = view("b", near(), Method::Max, 0.1);
+    let Content::Features(map) = &mut other.content else { panic!("max exchanges maps") };
+    map.features.channels = 3;
+    let mut ego = Ego::new(detector(), Method::Max);
+    let output = ego.detect(&own, std::slice::from_ref(&other)).unwrap();
+    assert_eq!(output.skipped, [(0, Skipped::Unusable(DropReason::Shape))]);
+    assert!(ego.detect(&other, &[]).unwrap_err().to_string().contains("3 x"));
+    let boxes = View { content: Content::Boxes(vec![]), ..own.clone() };
+    assert!(matches!(ego.detect(&boxes, &[]), Err(EgoError::OwnContent { .. })));
+    assert_eq!(ego.detect(&own, &[boxes]).unwrap().skipped, [(0, Skipped::Unusable(DropReason::Shape))]);
+}

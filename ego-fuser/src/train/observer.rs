@@ -1,0 +1,51 @@
+//! What a training tells.
+
+use std::path::PathBuf;
+
+use super::Accuracy;
+
+/// What happened in some steps.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct StepReport {
+    /// Steps done.
+    pub step: u64,
+    /// Passes over the data.
+    pub epoch: f64,
+    /// Share of the training that is done, 0..1.
+    pub progress: f64,
+    /// Seconds spent so far, in all runs together.
+    pub seconds: f64,
+    /// Learning rate.
+    pub learning_rate: f64,
+    /// Classification term.
+    pub score_loss: f64,
+    /// Regression term.
+    pub box_loss: f64,
+    /// Samples per second since the last report.
+    pub samples_per_second: f64,
+    /// Share of that time spent waiting for samples, 0..1.
+    pub waiting: f64,
+}
+
+/// Hears how a training goes.
+pub trait Observer {
+    /// Some steps are done.
+    fn stepped(&mut self, report: &StepReport);
+    /// A validation is done.
+    fn validated(&mut self, step: u64, accuracy: &Accuracy);
+}
+
+/// How a training ended.
+#[derive(Debug, Clone)]
+pub struct Summary {
+    /// Steps done.
+    pub steps: u64,
+    /// Seconds spent, in all runs together.
+    pub seconds: f64,
+    /// The last validation.
+    pub accuracy: Option<Accuracy>,
+    /// The weights, in half precision.
+    pub weights: PathBuf,
+    /// Their SHA-256.
+    pub sha256: String,
+}
