@@ -1,26 +1,39 @@
 //! Rays against hilly ground: an exact walk over the triangles of a height grid.
+//!
+//! The rays of a column pass over the same strip of ground, the higher ones above the lower ones. So where the lower
+//! ray was still clear of everything around the strip, the higher one is too, and its walk begins farther out.
 
 use nalgebra::Vector3;
 
 use super::cast::{BodyShape, Bounds, GROUND, Part, Surface, SurfaceRays};
 use crate::town::{HeightGrid, Triangle};
 
-/// Cells along the edge of a block, whose highest point tells whether a ray passes above all of it.
-const BLOCK: i64 = 8;
+/// Length of the pieces of the strip under a column, metres.
+const PIECE_M: f64 = 4.0;
+/// The tops of the ground are known at least this far around every place, metres.
+const AROUND_M: f64 = 8.0;
+/// No ray is steeper than this (tangent of the elevation), which bounds how far a tilted sensor's rays leave the strip.
+const STEEPEST: f64 = 0.6;
 /// Thickness given to road surfaces above the terrain, metres.
 const DECK_M: f32 = 0.3;
-/// A step across the border to the next cell, in cells.
-const NUDGE: f64 = 1e-9;
 
 /// A height grid made ready for casting.
 #[derive(Debug)]
 pub(crate) struct TerrainSurface {
     grid: HeightGrid,
-    /// Highest node of each block, its borders included; `block_rows` rows of `block_columns`.
-    highest: Vec<f64>,
-    block_columns: i64,
-    block_rows: i64,
-    top_m: f64,
+    /// Highest corner of each cell, metres.
+    cell_tops: Tops,
+    /// Highest node within at least [`AROUND_M`] of each place, metres.
+    wide_tops: Tops,
+}
+
+/// One number for each square of some cells of the grid.
+#[derive(Debug)]
+struct Tops {
+    cells: f64,
+    columns: i64,
+    rows: i64,
+    values: Vec<f64>,
 }
 
 /// One ray in the coordinates of the grid: x and y in cells, z in metres, all growing evenly with the distance.
@@ -31,51 +44,79 @@ struct GridRay {
     rise: f64,
 }
 
-impl TerrainSurface {
-    pub(crate) fn new(grid: &HeightGrid) -> Self {
-        let blocks = |nodes: usize| (nodes as i64 - 1).max(1).div_euclid(BLOCK) + 1;
-        let (block_columns, block_rows) = (blocks(grid.columns), blocks(grid.rows));
-        let highest = (0..block_rows * block_columns).map(|block| {
-            let (column, row) = ((block % block_columns) * BLOCK, (block / block_columns) * BLOCK);
-            let nodes = (0..=BLOCK).flat_map(|v| (0..=BLOCK).map(move |u| (column + u, row + v)));
-            nodes.map(|(i, j)| grid.node_m(i as usize, j as usize)).fold(f64::MIN, f64::max)
-        });
-        let highest: Vec<f64> = highest.collect();
-        let top_m = highest.iter().copied().fold(f64::MIN, f64::max);
-        Self { grid: grid.clone(), highest, block_columns, block_rows, top_m }
+impl Tops {
+    /// The highest node of each square of `cells` cells, its borders included.
+    fn of_squares(grid: &HeightGrid, cells: usize) -> Self {
+        let count = |nodes: usize| (nodes - 1).div_ceil(cells).max(1);
+        let (columns, rows) = (count(grid.columns), count(grid.rows));
+        let top = |square: usize| {
+            let (column, row) = (square % columns * cells, square / columns * cells);
+            let nodes = (0..=cells).flat_map(|v| (0..=cells).map(move |u| (column + u, row + v)));
+            nodes.map(|(i, j)| grid.node_m(i, j)).fold(f64::MIN, f64::max)
+        };
+        let values = (0..columns * rows).map(top).collect();
+        Self { cells: cells as f64, columns: columns as i64, rows: rows as i64, values }
     }
 
-    /// Distance at which a ray meets the ground, if within `limit_m`.
-    fn meet(&self, ray: &GridRay, limit_m: f64) -> Option<f64> {
-        let mut at = 0.0;
-        while at < limit_m {
-            if ray.rise >= 0.0 && ray.z_m + ray.rise * at > self.top_m {
-                return None;
-            }
-            let block = ray.cell(at).map(|cell| cell.div_euclid(BLOCK));
-            let exit = ray.exit(block, BLOCK as f64, at).min(limit_m);
-            let lowest = ray.height(at).min(ray.height(exit));
-            if lowest <= self.highest_of(block)
-                && let Some(hit) = self.meet_in_block(ray, at, exit)
+    /// The highest of each square and the eight around it.
+    fn widened(&self) -> Self {
+        let around = |square: i64| {
+            let (column, row) = (square % self.columns, square / self.columns);
+            let squares = (-1..=1).flat_map(|v| (-1..=1).map(move |u| (column + u, row + v)));
+            squares.map(|(column, row)| self.at(column, row)).fold(f64::MIN, f64::max)
+        };
+        Self { values: (0..self.columns * self.rows).map(around).collect(), ..*self }
+    }
+
+    /// Beyond its edge the ground goes on at the height of the edge, which the outermost squares hold.
+    fn at(&self, column: i64, row: i64) -> f64 {
+        let (column, row) = (column.clamp(0, self.columns - 1), row.clamp(0, self.rows - 1));
+        self.values[(row * self.columns + column) as usize]
+    }
+
+    /// The square under a place given in cells.
+    fn under(&self, [x, y]: [f64; 2]) -> f64 {
+        self.at((x / self.cells).floor() as i64, (y / self.cells).floor() as i64)
+    }
+}
+
+impl TerrainSurface {
+    pub(crate) fn new(grid: &HeightGrid) -> Self {
+        let wide = (AROUND_M / grid.cell_m).ceil().max(1.0) as usize;
+        Self {
+            cell_tops: Tops::of_squares(grid, 1),
+            wide_tops: Tops::of_squares(grid, wide).widened(),
+            grid: grid.clone(),
+        }
+    }
+
+    /// Distance at which a ray meets the ground between two distances.
+    fn meet(&self, ray: &GridRay, from_m: f64, limit_m: f64) -> Option<f64> {
+        let mut cell = ray.place(from_m).map(|place| place.floor() as i64);
+        let forward = ray.slope.map(|slope| slope > 0.0);
+        let inverse = ray.slope.map(|slope| 1.0 / slope);
+        let leave = |axis: usize, cell: i64| {
+            let border = (cell + i64::from(forward[axis])) as f64;
+            // Along the other axis no border is ever reached.
+            if inverse[axis].is_finite() { (border - ray.origin[axis]) * inverse[axis] } else { f64::MAX }
+        };
+        let mut leaves = [leave(0, cell[0]), leave(1, cell[1])];
+        let mut at = from_m;
+        loop {
+            let axis = usize::from(leaves[1] < leaves[0]);
+            let exit = leaves[axis].max(at).min(limit_m);
+            if ray.height(at).min(ray.height(exit)) <= self.cell_tops.at(cell[0], cell[1])
+                && let Some(hit) = self.meet_in_cell(ray, cell, at, exit)
             {
                 return Some(hit);
             }
-            at = exit + ray.nudge();
-        }
-        None
-    }
-
-    fn meet_in_block(&self, ray: &GridRay, from: f64, to: f64) -> Option<f64> {
-        let mut at = from;
-        while at < to {
-            let cell = ray.cell(at);
-            let exit = ray.exit(cell, 1.0, at).min(to);
-            if let Some(hit) = self.meet_in_cell(ray, cell, at, exit) {
-                return Some(hit);
+            if exit >= limit_m {
+                return None;
             }
-            at = exit + ray.nudge();
+            cell[axis] += if forward[axis] { 1 } else { -1 };
+            leaves[axis] = leave(axis, cell[axis]);
+            at = exit;
         }
-        None
     }
 
     /// Between two distances inside one cell; on each of its two triangles the height above ground is linear.
@@ -109,12 +150,6 @@ impl TerrainSurface {
         meet(from, to)
     }
 
-    fn highest_of(&self, [column, row]: [i64; 2]) -> f64 {
-        // Beyond its edge the ground goes on at the height of the edge, which the outermost blocks hold.
-        let (column, row) = (column.clamp(0, self.block_columns - 1), row.clamp(0, self.block_rows - 1));
-        self.highest[(row * self.block_columns + column) as usize]
-    }
-
     fn node_m(&self, column: i64, row: i64) -> f64 {
         self.grid.node_m(column.max(0) as usize, row.max(0) as usize)
     }
@@ -125,27 +160,8 @@ impl GridRay {
         std::array::from_fn(|axis| self.origin[axis] + self.slope[axis] * at)
     }
 
-    fn cell(&self, at: f64) -> [i64; 2] {
-        self.place(at).map(|place| place.floor() as i64)
-    }
-
     fn height(&self, at: f64) -> f64 {
         self.z_m + self.rise * at
-    }
-
-    /// Where the ray leaves the square `index` of this size, at `at` or later.
-    fn exit(&self, index: [i64; 2], size: f64, at: f64) -> f64 {
-        let leave = |axis: usize| {
-            let slope = self.slope[axis];
-            let border = (index[axis] as f64 + if slope > 0.0 { 1.0 } else { 0.0 }) * size;
-            if slope.abs() < 1e-12 { f64::MAX } else { (border - self.origin[axis]) / slope }
-        };
-        leave(0).min(leave(1)).max(at)
-    }
-
-    /// A distance that carries the ray across a border.
-    fn nudge(&self) -> f64 {
-        NUDGE / self.slope[0].abs().max(self.slope[1].abs()).max(1e-6)
     }
 }
 
@@ -154,21 +170,81 @@ fn off_zero(value: f64) -> f64 {
 }
 
 impl Surface for TerrainSurface {
+    /// The elevations must grow from ray to ray, as they do in every column of a caster.
     fn cast(&self, rays: &SurfaceRays<'_>, depth: &mut [f32], hit: &mut [u32]) {
         let cell_m = self.grid.cell_m;
         let start = [rays.origin.x - self.grid.origin_m[0], rays.origin.y - self.grid.origin_m[1]];
+        let origin = start.map(|metres| metres / cell_m);
+        let range_m = depth.iter().copied().fold(0.0, f32::max);
+        let mut strip = Strip::new(self, rays, origin, f64::from(range_m));
         for (((cos, sin), depth), hit) in rays.cos.iter().zip(rays.sin).zip(depth).zip(hit) {
             let direction: Vector3<f64> = (rays.forward * *cos + rays.up * *sin).cast();
-            let ray = GridRay {
-                origin: start.map(|metres| metres / cell_m),
-                slope: [direction.x / cell_m, direction.y / cell_m],
-                z_m: rays.origin.z,
-                rise: direction.z,
-            };
-            if let Some(at) = self.meet(&ray, f64::from(*depth)) {
+            let slope = [direction.x / cell_m, direction.y / cell_m];
+            let ray = GridRay { origin, slope, z_m: rays.origin.z, rise: direction.z };
+            let Some(from_m) = strip.clear_m(&ray, direction.xy().norm()) else { return };
+            if let Some(at) = self.meet(&ray, from_m, f64::from(*depth)) {
                 (*depth, *hit) = (at as f32, GROUND);
             }
         }
+    }
+}
+
+/// The ground under a column, as far as its lower rays have been found clear of it.
+struct Strip<'a> {
+    surface: &'a TerrainSurface,
+    origin: [f64; 2],
+    /// Cells for each metre along the strip.
+    step: [f64; 2],
+    pieces: usize,
+    /// Pieces that are clear, and the top of the next one.
+    clear: usize,
+    top_m: f64,
+    /// Whether all rays stay where the tops are known.
+    is_narrow: bool,
+}
+
+impl<'a> Strip<'a> {
+    fn new(surface: &'a TerrainSurface, rays: &SurfaceRays<'_>, origin: [f64; 2], range_m: f64) -> Self {
+        let along: Vector3<f64> = rays.forward.cast();
+        let step = along.xy() / along.xy().norm().max(1e-6) / surface.grid.cell_m;
+        let tilt = f64::from(rays.up.xy().norm());
+        let aside_m = 0.5 * PIECE_M + range_m * tilt * STEEPEST;
+        let is_steep =
+            rays.sin.iter().zip(rays.cos).any(|(sin, cos)| f64::from(sin.abs()) > STEEPEST * f64::from(*cos));
+        let mut strip = Self {
+            surface,
+            origin,
+            step: step.into(),
+            pieces: (range_m / PIECE_M).ceil() as usize,
+            clear: 0,
+            top_m: f64::MAX,
+            is_narrow: aside_m < 0.95 * AROUND_M && !is_steep,
+        };
+        strip.top_m = strip.next_top_m();
+        strip
+    }
+
+    /// The distance up to which a ray is clear of the ground; nothing if it is as far as it goes, and then the rays above
+    /// it are too. `flat` is the share of the distance along the ground.
+    fn clear_m(&mut self, ray: &GridRay, flat: f64) -> Option<f64> {
+        if !self.is_narrow || flat < 1e-3 {
+            return Some(0.0);
+        }
+        let rise = ray.rise / flat;
+        while self.clear < self.pieces {
+            let near_m = self.clear as f64 * PIECE_M;
+            if (ray.z_m + rise * near_m).min(ray.z_m + rise * (near_m + PIECE_M)) <= self.top_m {
+                return Some(near_m / flat);
+            }
+            self.clear += 1;
+            self.top_m = self.next_top_m();
+        }
+        None
+    }
+
+    fn next_top_m(&self) -> f64 {
+        let middle_m = (self.clear as f64 + 0.5) * PIECE_M;
+        self.surface.wide_tops.under(std::array::from_fn(|axis| self.origin[axis] + self.step[axis] * middle_m))
     }
 }
 
@@ -252,6 +328,43 @@ mod tests {
             }
         }
         assert!(met > 200, "{met}");
+    }
+
+    #[test]
+    fn whole_columns_of_a_tilted_sensor_meet_what_single_rays_do() {
+        let mut random = SplitMix64::new(23);
+        let elevations: Vec<f32> = (0..64).map(|channel| (-25.0 + 27.0 / 63.0 * channel as f32).to_radians()).collect();
+        let cos: Vec<f32> = elevations.iter().map(|elevation| elevation.cos()).collect();
+        let sin: Vec<f32> = elevations.iter().map(|elevation| elevation.sin()).collect();
+        for seed in 0..20 {
+            let grid = hills(100 + seed);
+            let surface = TerrainSurface::new(&grid);
+            for _ in 0..40 {
+                let (x, y) = (random.between(-60.0, 60.0), random.between(-45.0, 45.0));
+                let place = Placement {
+                    position_m: Vector3::new(x, y, grid.height_m(x, y) + 1.95),
+                    yaw_rad: random.between(-3.2, 3.2),
+                    pitch_rad: random.between(-0.12, 0.12),
+                };
+                let azimuth = random.between(-3.2, 3.2);
+                let forward = (place.rotation() * Vector3::new(azimuth.cos(), azimuth.sin(), 0.0)).cast();
+                let up = (place.rotation() * Vector3::z()).cast();
+                let rays = SurfaceRays { origin: place.position_m, forward, up, cos: &cos, sin: &sin };
+                let (mut depth, mut hit) = ([120.0f32; 64], [0; 64]);
+                surface.cast(&rays, &mut depth, &mut hit);
+                for ray in 0..64 {
+                    let (mut lone_depth, mut lone_hit) = ([120.0f32], [0]);
+                    let direction: Vector3<f64> = (forward * cos[ray] + up * sin[ray]).cast();
+                    let slope = [direction.x / grid.cell_m, direction.y / grid.cell_m];
+                    let origin = [0, 1].map(|axis: usize| (place.position_m[axis] - grid.origin_m[axis]) / grid.cell_m);
+                    let whole = GridRay { origin, slope, z_m: place.position_m.z, rise: direction.z };
+                    if let Some(at) = surface.meet(&whole, 0.0, 120.0) {
+                        (lone_depth[0], lone_hit[0]) = (at as f32, GROUND);
+                    }
+                    assert!(hit[ray] == lone_hit[0] && (depth[ray] - lone_depth[0]).abs() < 1e-4);
+                }
+            }
+        }
     }
 
     #[test]
