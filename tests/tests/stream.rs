@@ -60,8 +60,12 @@ impl Listener {
 }
 
 fn play(router: &TestRouter, scenario: &Scenario, options: StreamOptions) -> StreamReport {
+    play_until(router, scenario, options, &Stop::new())
+}
+
+fn play_until(router: &TestRouter, scenario: &Scenario, options: StreamOptions, stop: &Stop) -> StreamReport {
     let bus = router.join("replay", "replay");
-    let replay = Replay::prepare(&bus, scenario, options, &Stop::new()).unwrap();
+    let replay = Replay::prepare(&bus, scenario, options, stop).unwrap();
     replay.wait_until_ready().unwrap();
     let report = replay.play();
     bus.leave(PATIENCE).unwrap();
@@ -131,50 +135,44 @@ fn pause_step_seek_and_resume_steer_the_clock() {
     scene::write(folder.path(), &AGENTS, 8);
     let (router, scenario) = (TestRouter::open(), scenario(folder.path()));
     let listener = Listener::new(&router);
-    let operator = router.join("operator", "operator");
+    let (operator, stop) = (router.join("operator", "operator"), Stop::new());
     let next_truth = || loop {
         if let (Topic::Truth, Event::Message(arrival)) = next_event(&listener.inbox) {
             let truth: Truth = listener.inbox.decode(&arrival, &Limits::DEFAULT).unwrap();
             return (truth.frame_index, arrival.header.stamp.capture_nanos);
         }
     };
+    let recorded: Vec<u64> = scenario.ticks.iter().map(|tick| tick.capture_nanos).collect();
     std::thread::scope(|scope| {
         let playing = scope.spawn(|| {
-            let bus = router.join("replay", "replay");
-            let replay = Replay::prepare(&bus, &scenario, StreamOptions::default(), &Stop::new()).unwrap();
-            // Its subscriptions stand: what is said from here on is heard.
-            operator.say(Control::Pause, 0);
-            operator.say(Control::Step { ticks: 2 }, 0);
-            replay.wait_until_ready().unwrap();
-            let report = replay.play();
-            bus.leave(PATIENCE).unwrap();
-            report
+            let options = StreamOptions { repeats: true, ..StreamOptions::default() };
+            play_until(&router, &scenario, options, &stop)
         });
-        let first = next_truth();
-        let mut seen = vec![first.0];
-        while seen.len() < 2 {
-            seen.push(next_truth().0);
-        }
-        let recorded = scenario.ticks.iter().map(|tick| tick.capture_nanos).collect::<Vec<_>>();
+        // While ticks come, the replay listens: its subscriptions have gone the same way before them.
+        while next_truth().0 < 2 {}
+        operator.say(Control::Pause, 0);
         operator.say(Control::Seek { frame_index: 6 }, 0);
         operator.say(Control::Step { ticks: 1 }, 0);
-        // Anything but tick 6 can only be one that ran before the pause arrived.
-        let (index, capture) = loop {
+        // Anything before tick 6 was out before the pause arrived.
+        let capture = loop {
             let (index, capture) = next_truth();
             if index == 6 {
-                break (index, capture);
+                break capture;
             }
-            assert!(index < 6);
+            assert!(index < 6, "{index}");
         };
-        assert_eq!((index, capture), (6, recorded[6]));
+        assert_eq!(capture, recorded[6]);
+        operator.say(Control::Step { ticks: 2 }, 0);
+        assert_eq!([next_truth().0, next_truth().0], [7, 0]);
         operator.say(Control::Seek { frame_index: 99 }, 0);
-        operator.say(Control::Seek { frame_index: 1 }, 0);
+        operator.say(Control::Seek { frame_index: 4 }, 0);
         operator.say(Control::Resume, 0);
         let (index, capture) = next_truth();
-        assert_eq!(index, 1);
-        assert!(capture > recorded[6], "time goes on over a jump back");
-        let report = playing.join().unwrap();
-        assert!(report.ticks >= 2 + 1 + 7, "{} ticks", report.ticks);
+        assert_eq!(index, 4);
+        assert!(capture > recorded[7], "time goes on over a jump back");
+        assert_eq!(next_truth().0, 5);
+        stop.request();
+        assert!(playing.join().unwrap().ticks >= 3 + 1 + 2 + 2);
     });
 }
 
