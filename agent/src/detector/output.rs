@@ -7,7 +7,7 @@ use tch::{TchError, Tensor};
 use super::error::DetectorError;
 use crate::head::HeadOutput;
 
-/// Time that each stage of [`Detector::encode`] took.
+/// Time that each stage of [`Detector::encode`](super::Detector::encode) took.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct EncodeTimes {
     /// Crop and sorting into pillars.

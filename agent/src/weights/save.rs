@@ -24,7 +24,7 @@ pub enum Precision {
 
 /// Writes all variables of a network.
 ///
-/// `metadata` holds texts for the header; the configuration belongs under [`CONFIG_KEY`]. The file appears under its
+/// `metadata` holds texts for the header; the configuration belongs under [`CONFIG_KEY`](super::CONFIG_KEY). The file appears under its
 /// name only when it is whole.
 ///
 /// Returns the SHA-256 of the file.
