@@ -208,7 +208,9 @@ fn live_in_lockstep_equals_offline_bit_by_bit_and_the_books_balance() {
         let balance = ledger.balance();
         assert!(balance.is_exact(), "{method}: {balance:?}");
         let total = ledger.total();
-        assert_eq!((total.in_flight, total.dropped_total()), (0, 0), "{method}: {ledger:?}");
+        assert_eq!(total.in_flight, 0, "{method}: {ledger:?}");
+        // The lockstep waits for the ego. Alone it waits for nobody, so the others' agents may fall behind.
+        assert!(method == Method::None || total.dropped_total() == 0, "{method}: {ledger:?}");
     }
 }
 
