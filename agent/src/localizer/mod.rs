@@ -1,0 +1,16 @@
+//! Where am I: scene-coordinate regression from one sweep (the paper's PGC, after LightLoc).
+//!
+//! A sparse encoder describes cells of the sweep; a head that belongs to one town says for each cell where in the world
+//! it lies and how far off that may be; a robust solver turns these correspondences into a pose.
+
+mod encoder_config;
+mod error;
+mod scene_encoder;
+mod sweep_voxels;
+mod voxel_batch;
+
+pub use encoder_config::{SceneEncoderConfig, VoxelInput};
+pub use error::LocalizerError;
+pub use scene_encoder::{LocalFeatures, SceneEncoder, SceneFeatures};
+pub use sweep_voxels::{Cell, SweepVoxels};
+pub use voxel_batch::VoxelBatch;

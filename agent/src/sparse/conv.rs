@@ -1,0 +1,143 @@
+//! One sparse convolution.
+
+use tch::nn::{self, Init};
+use tch::{TchError, Tensor};
+
+use super::rulebook::{GatherIndex, KERNEL_VOLUME};
+
+/// A 3x3x3 convolution over sites, with bias.
+#[derive(Debug)]
+pub struct SparseConv {
+    /// `[27 * C_in, C_out]`.
+    weight: Tensor,
+    /// `[C_out]`.
+    bias: Tensor,
+}
+
+impl SparseConv {
+    /// He-initialised for the ReLU that follows; about ten of a kernel's neighbours exist on a surface.
+    #[must_use]
+    pub fn new(path: &nn::Path<'_>, inputs: i64, outputs: i64) -> Self {
+        let stdev = (2.0 / (10.0 * inputs as f64)).sqrt();
+        let weight = path.var("weight", &[KERNEL_VOLUME as i64 * inputs, outputs], Init::Randn { mean: 0.0, stdev });
+        Self { weight, bias: path.var("bias", &[outputs], Init::Const(0.0)) }
+    }
+
+    /// `[N_in, C_in]` to `[N_out, C_out]`, in the precision of `x`.
+    ///
+    /// # Errors
+    /// The tensor library's, for example when the rows are not those of the rulebook.
+    pub fn forward(&self, x: &Tensor, index: &GatherIndex) -> Result<Tensor, TchError> {
+        let (rows, channels) = x.size2()?;
+        if rows != index.inputs {
+            return Err(TchError::Shape(format!("{rows} rows of features, the rulebook is of {}", index.inputs)));
+        }
+        // A row of zeros stands for all neighbours that do not exist.
+        let padded = Tensor::f_cat(&[x, &x.f_new_zeros([1, channels], (x.kind(), x.device()))?], 0)?;
+        // With an index that is expanded and not written out, gather and its gradient copy whole rows.
+        let gathered = padded.f_gather(0, &index.rows.f_unsqueeze(1)?.f_expand([-1, channels], false)?, false)?;
+        let columns = gathered.f_view([-1, KERNEL_VOLUME as i64 * channels])?;
+        self.bias.to_kind(x.kind()).f_addmm(&columns, &self.weight.to_kind(x.kind()))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+    use tch::nn::VarStore;
+    use tch::{Device, IndexOp, Kind};
+
+    use super::*;
+    use crate::sparse::{Rulebook, Sites};
+
+    const SIZE: i64 = 6;
+
+    /// Rows into a dense `[1, C, SIZE, SIZE, SIZE]` block.
+    fn dense(rows: &Tensor, sites: &Sites, size: i64) -> Tensor {
+        let block = Tensor::zeros([rows.size()[1], size, size, size], (Kind::Float, Device::Cpu));
+        for (row, coord) in sites.coords().iter().enumerate() {
+            let [x, y, z] = coord.map(i64::from);
+            block.i((.., x, y, z)).copy_(&rows.get(row as i64));
+        }
+        block.unsqueeze(0)
+    }
+
+    fn rows(block: &Tensor, sites: &Sites) -> Tensor {
+        let at = |coord: &[i32; 3]| {
+            let [x, y, z] = coord.map(i64::from);
+            block.i((0, .., x, y, z))
+        };
+        Tensor::stack(&sites.coords().iter().map(at).collect::<Vec<_>>(), 0)
+    }
+
+    /// Values and gradients of a sparse convolution and of a dense one over the same occupancy.
+    fn agrees(occupied: Vec<[i32; 3]>, stride: i64, seed: i64) -> bool {
+        tch::set_num_threads(1);
+        tch::manual_seed(seed);
+        let (sites, _) = Sites::collect(occupied);
+        let outputs = if stride == 1 { sites.clone() } else { sites.halved().0 };
+        let book = if stride == 1 { Rulebook::submanifold(&sites) } else { Rulebook::strided(&sites, &outputs) };
+        let index = Rulebook::stacked([&book], Device::Cpu).unwrap();
+        let network = VarStore::new(Device::Cpu);
+        let conv = SparseConv::new(&network.root(), 3, 5);
+        let x = Tensor::randn([sites.len() as i64, 3], (Kind::Float, Device::Cpu));
+        let pull = Tensor::randn([outputs.len() as i64, 5], (Kind::Float, Device::Cpu));
+
+        let sparse_x = x.detach().set_requires_grad(true);
+        let sparse = conv.forward(&sparse_x, &index).unwrap();
+        (&sparse * &pull).sum(Kind::Float).backward();
+        let weight_gradient = conv.weight.grad();
+
+        let dense_x = x.detach().set_requires_grad(true);
+        let kernel = conv.weight.detach().view([3, 3, 3, 3, 5]).permute([4, 3, 0, 1, 2]).contiguous();
+        let kernel = kernel.set_requires_grad(true);
+        let block = dense(&dense_x, &sites, SIZE);
+        let full = block.conv3d(&kernel, Some(&conv.bias.detach()), [stride; 3], [1; 3], [1; 3], 1);
+        let expected = rows(&full, &outputs);
+        (&expected * &pull).sum(Kind::Float).backward();
+        let expected_gradient = kernel.grad().permute([2, 3, 4, 1, 0]).contiguous().view([81, 5]);
+
+        sparse.allclose(&expected, 1e-4, 1e-5, false)
+            && sparse_x.grad().allclose(&dense_x.grad(), 1e-4, 1e-5, false)
+            && weight_gradient.allclose(&expected_gradient, 1e-4, 1e-4, false)
+    }
+
+    fn occupancy() -> impl Strategy<Value = Vec<[i32; 3]>> {
+        proptest::collection::vec([0..SIZE as i32, 0..SIZE as i32, 0..SIZE as i32], 1..80)
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(24))]
+
+        #[test]
+        fn equals_dense_convolution_at_stride_1(occupied in occupancy(), seed in 0..1000_i64) {
+            prop_assert!(agrees(occupied, 1, seed));
+        }
+
+        #[test]
+        fn equals_dense_convolution_at_stride_2(occupied in occupancy(), seed in 0..1000_i64) {
+            prop_assert!(agrees(occupied, 2, seed));
+        }
+    }
+
+    #[test]
+    fn rows_of_another_rulebook_are_refused() {
+        let network = VarStore::new(Device::Cpu);
+        let conv = SparseConv::new(&network.root(), 2, 2);
+        let book = Rulebook::submanifold(&Sites::collect([[0, 0, 0]]).0);
+        let index = Rulebook::stacked([&book], Device::Cpu).unwrap();
+        let message = conv.forward(&Tensor::zeros([2, 2], (Kind::Float, Device::Cpu)), &index).unwrap_err();
+        assert!(message.to_string().contains("2 rows") && message.to_string().contains("of 1"));
+    }
+
+    #[test]
+    fn stacked_sweeps_do_not_see_each_other() {
+        let book = Rulebook::submanifold(&Sites::collect([[0, 0, 0], [0, 0, 1]]).0);
+        let network = VarStore::new(Device::Cpu);
+        let conv = SparseConv::new(&network.root(), 2, 3);
+        let x = Tensor::randn([4, 2], (Kind::Float, Device::Cpu));
+        let both = conv.forward(&x, &Rulebook::stacked([&book, &book], Device::Cpu).unwrap()).unwrap();
+        let one = conv.forward(&x.i(2..), &Rulebook::stacked([&book], Device::Cpu).unwrap()).unwrap();
+        assert!(both.i(2..).allclose(&one, 1e-6, 1e-6, false));
+    }
+}

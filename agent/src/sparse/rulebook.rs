@@ -1,0 +1,144 @@
+//! Which input row feeds which output row through which weight.
+
+use tch::{Device, TchError, Tensor};
+
+use super::sites::Sites;
+
+/// Weights of a 3x3x3 kernel.
+pub const KERNEL_VOLUME: usize = 27;
+/// Mark of a neighbour that does not exist.
+const NONE: u32 = u32::MAX;
+
+/// Neighbours of every output site of a 3x3x3 convolution.
+///
+/// Offset `k` of `[-1, 1]^3` is `9 (x + 1) + 3 (y + 1) + (z + 1)`: the order of a dense `[3, 3, 3]` kernel over x, y, z.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Rulebook {
+    inputs: usize,
+    /// `[outputs, 27]` of input rows.
+    rows: Vec<u32>,
+}
+
+impl Rulebook {
+    /// Stride 1: outputs are where inputs are.
+    #[must_use]
+    pub fn submanifold(sites: &Sites) -> Self {
+        let mut rows = vec![NONE; sites.len() * KERNEL_VOLUME];
+        for (row, &[x, y, z]) in sites.coords().iter().enumerate() {
+            rows[row * KERNEL_VOLUME + KERNEL_VOLUME / 2] = row as u32;
+            // What is my neighbour at k has me at 26 - k, so half of the kernel is looked up.
+            for k in KERNEL_VOLUME / 2 + 1..KERNEL_VOLUME {
+                let [dx, dy, dz] = offset(k);
+                if let Some(other) = sites.row([x + dx, y + dy, z + dz]) {
+                    rows[row * KERNEL_VOLUME + k] = other;
+                    rows[other as usize * KERNEL_VOLUME + KERNEL_VOLUME - 1 - k] = row as u32;
+                }
+            }
+        }
+        Self { inputs: sites.len(), rows }
+    }
+
+    /// Stride 2, from the sites of a level to those of the next: output `o` sees inputs `2 o + [-1, 1]^3`.
+    #[must_use]
+    pub fn strided(sites: &Sites, halved: &Sites) -> Self {
+        let mut rows = vec![NONE; halved.len() * KERNEL_VOLUME];
+        for (row, coord) in sites.coords().iter().enumerate() {
+            // An even coordinate is the middle of one output; an odd one lies between two.
+            let choices = coord.map(|axis| match axis & 1 {
+                0 => [Some((axis >> 1, 0)), None],
+                _ => [Some((axis >> 1, 1)), Some(((axis >> 1) + 1, -1))],
+            });
+            for (x, dx) in choices[0].into_iter().flatten() {
+                for (y, dy) in choices[1].into_iter().flatten() {
+                    for (z, dz) in choices[2].into_iter().flatten() {
+                        if let Some(output) = halved.row([x, y, z]) {
+                            rows[output as usize * KERNEL_VOLUME + index([dx, dy, dz])] = row as u32;
+                        }
+                    }
+                }
+            }
+        }
+        Self { inputs: sites.len(), rows }
+    }
+
+    /// Number of input rows.
+    #[must_use]
+    pub fn inputs(&self) -> usize {
+        self.inputs
+    }
+
+    /// Number of output rows.
+    #[must_use]
+    pub fn outputs(&self) -> usize {
+        self.rows.len() / KERNEL_VOLUME
+    }
+
+    /// Pairs of input and output, of all weights together.
+    #[must_use]
+    pub fn pairs(&self) -> usize {
+        self.rows.iter().filter(|&&row| row != NONE).count()
+    }
+
+    /// The rulebooks of several sweeps as one, their rows one after another, as the tensor library wants it.
+    ///
+    /// # Errors
+    /// The tensor library's.
+    pub fn stacked<'a>(books: impl IntoIterator<Item = &'a Self>, device: Device) -> Result<GatherIndex, TchError> {
+        let books: Vec<&Self> = books.into_iter().collect();
+        let inputs: usize = books.iter().map(|book| book.inputs).sum();
+        let mut index = Vec::with_capacity(books.iter().map(|book| book.rows.len()).sum());
+        let mut first = 0;
+        for book in books {
+            index.extend(book.rows.iter().map(|&row| if row == NONE { inputs as i64 } else { first + i64::from(row) }));
+            first += book.inputs as i64;
+        }
+        Ok(GatherIndex { inputs: inputs as i64, rows: Tensor::f_from_slice(&index)?.f_to_device(device)? })
+    }
+}
+
+/// A rulebook on its device.
+#[derive(Debug)]
+pub struct GatherIndex {
+    /// Number of input rows; also the mark of a missing neighbour.
+    pub(super) inputs: i64,
+    /// `[outputs * 27]` of input rows, `i64`.
+    pub(super) rows: Tensor,
+}
+
+fn offset(k: usize) -> [i32; 3] {
+    [(k / 9) as i32 - 1, (k / 3 % 3) as i32 - 1, (k % 3) as i32 - 1]
+}
+
+fn index([dx, dy, dz]: [i32; 3]) -> usize {
+    (9 * (dx + 1) + 3 * (dy + 1) + dz + 1) as usize
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn offsets_and_indices_agree() {
+        assert!((0..KERNEL_VOLUME).all(|k| index(offset(k)) == k));
+    }
+
+    #[test]
+    fn two_neighbours_see_each_other() {
+        let book = Rulebook::submanifold(&Sites::collect([[0, 0, 0], [0, 0, 1], [5, 5, 5]]).0);
+        assert_eq!((book.inputs(), book.outputs(), book.pairs()), (3, 3, 5));
+        assert_eq!(book.rows[index([0, 0, 1])], 1);
+        assert_eq!(book.rows[KERNEL_VOLUME + index([0, 0, -1])], 0);
+    }
+
+    #[test]
+    fn an_odd_site_feeds_the_outputs_on_both_sides() {
+        let (sites, _) = Sites::collect([[1, 0, 0], [2, 0, 0]]);
+        let (halved, _) = sites.halved();
+        assert_eq!(halved.coords(), [[0, 0, 0], [1, 0, 0]]);
+        let book = Rulebook::strided(&sites, &halved);
+        assert_eq!(book.rows[index([1, 0, 0])], 0);
+        assert_eq!(book.rows[KERNEL_VOLUME + index([-1, 0, 0])], 0);
+        assert_eq!(book.rows[KERNEL_VOLUME + index([0, 0, 0])], 1);
+        assert_eq!(book.pairs(), 3);
+    }
+}
