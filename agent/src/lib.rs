@@ -24,4 +24,5 @@ pub mod rotated_iou;
 pub mod shrink;
 pub mod sparse;
 pub mod sweep_pairing;
+pub mod training;
 pub mod weights;

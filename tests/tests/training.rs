@@ -6,12 +6,13 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use agent::model_config::DetectorConfig;
 use agent::pose_source::PoseSourceConfig;
+use agent::training::AdamWConfig;
 use ego_fuser::Method;
 use ego_fuser::evaluate::{EvaluateConfig, EvaluatedFrame, Evaluator};
 use ego_fuser::loss::LossConfig;
 use ego_fuser::model::ComputePrecision;
 use ego_fuser::samples::{SampleConfig, SampleKind};
-use ego_fuser::train::{self, Accuracy, AdamWConfig, Length, Observer, StepReport, Summary, TrainConfig, TrainError};
+use ego_fuser::train::{self, Accuracy, Length, Observer, StepReport, Summary, TrainConfig, TrainError};
 use protocol::{CodecConfig, Dtype};
 use sim_replay::dataset;
 use tch::Device;

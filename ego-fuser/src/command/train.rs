@@ -5,13 +5,14 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use agent::model_config::DetectorConfig;
+use agent::training::AdamWConfig;
 use anyhow::{Context, Result};
 use clap::ValueEnum;
 use ego_fuser::Method;
 use ego_fuser::loss::{LossConfig, Unassigned};
 use ego_fuser::model::ComputePrecision;
 use ego_fuser::samples::{Augmentation, PoseNoise, SampleConfig, SampleKind};
-use ego_fuser::train::{self, Accuracy, AdamWConfig, Length, Observer, StepReport, TrainConfig};
+use ego_fuser::train::{self, Accuracy, Length, Observer, StepReport, TrainConfig};
 use indicatif::{ProgressBar, ProgressStyle};
 use tch::{Cuda, Device};
 

@@ -6,11 +6,11 @@ use std::time::Duration;
 use agent::model_config::DetectorConfig;
 use tch::Device;
 
-use super::AdamWConfig;
 use crate::loss::LossConfig;
 use crate::method::Method;
 use crate::model::ComputePrecision;
 use crate::samples::SampleConfig;
+use agent::training::AdamWConfig;
 
 /// What to train, on what, for how long.
 #[derive(Debug, Clone)]

@@ -2,7 +2,8 @@
 
 use std::path::PathBuf;
 
-use super::CheckpointError;
+use agent::training::CheckpointError;
+
 use crate::method::Method;
 use crate::model::ModelError;
 use crate::samples::SampleError;

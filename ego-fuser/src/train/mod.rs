@@ -2,14 +2,12 @@
 //!
 //! [`run`] does no output of its own but files: whoever calls it hears of every step through [`Observer`].
 
-mod adamw;
 mod card;
-mod checkpoint;
 mod config;
 mod curve;
 mod error;
 mod observer;
-mod schedule;
+mod progress;
 mod validation;
 
 use std::collections::BTreeMap;
@@ -17,14 +15,13 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use agent::training::{AdamW, OneCycle, Step, checkpoint};
 use agent::weights;
 
-pub use adamw::{AdamW, AdamWConfig, Step};
-pub use checkpoint::{CheckpointError, Progress};
 pub use config::{Length, TrainConfig};
 pub use error::TrainError;
 pub use observer::{Observer, StepReport, Summary};
-pub use schedule::OneCycle;
+pub use progress::Progress;
 pub use validation::{Accuracy, Validator};
 
 use self::curve::Curve;

@@ -96,20 +96,21 @@ impl AdamW {
                     continue;
                 }
                 let gradient = gradient * scale;
-                entry.mean = &entry.mean * beta1 + &gradient * (1.0 - beta1);
-                entry.square = &entry.square * beta2 + gradient.f_square()? * (1.0 - beta2);
-                let deviation = (&entry.square / square_correction).f_sqrt()? + eps;
+                let _ =
+                    entry.square.f_mul_scalar_(beta2)?.f_add_(&(gradient.f_square()?.f_mul_scalar_(1.0 - beta2)?))?;
+                let _ = entry.mean.f_mul_scalar_(beta1)?.f_add_(&(gradient * (1.0 - beta1)))?;
+                let deviation = (&entry.square / square_correction).f_sqrt_()?.f_add_scalar_(eps)?;
                 if entry.decays {
                     let _ = entry.variable.f_mul_scalar_(1.0 - learning_rate * weight_decay)?;
                 }
-                let change = &entry.mean * (learning_rate / mean_correction) / deviation;
+                let change = (&entry.mean * (learning_rate / mean_correction)).f_div_(&deviation)?;
                 let _ = entry.variable.f_sub_(&change)?;
             }
             Ok(Step::Taken(norm))
         })
     }
 
-    /// The moments by name, `mean.<variable>` and `square.<variable>`, and the number of steps taken.
+    /// The moments by name (the next step changes them), `mean.<variable>` and `square.<variable>`, and the number of steps taken.
     #[must_use]
     pub fn state(&self) -> (BTreeMap<String, Tensor>, i64) {
         let both = self.entries.iter().flat_map(|entry| {

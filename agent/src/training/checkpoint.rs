@@ -1,4 +1,7 @@
 //! The state of a training on disk: parameters, moments and counters in one file that appears only when it is whole.
+//!
+//! Order and augmentation of samples follow from seed and step in every training here, so no state of a random number
+//! generator has to be kept.
 
 use std::collections::{BTreeMap, HashMap};
 use std::fs;
@@ -6,30 +9,15 @@ use std::io;
 use std::path::{Path, PathBuf};
 
 use safetensors::tensor::{Dtype, SafeTensorError, SafeTensors, TensorView};
-use serde::{Deserialize, Serialize};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
 use tch::nn::VarStore;
 use tch::{Kind, TchError, Tensor, no_grad};
 
 use super::adamw::AdamW;
 
-/// Metadata key of [`Progress`].
+/// Metadata key of what the training itself remembers.
 const PROGRESS_KEY: &str = "progress";
-
-/// How far a training is. Order and augmentation of the samples follow from the seed and the step, so no state of a
-/// random number generator has to be kept.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-pub struct Progress {
-    /// Steps done.
-    pub step: u64,
-    /// Seconds spent so far.
-    pub seconds: f64,
-    /// Seed of the training.
-    pub seed: u64,
-    /// Samples of a batch.
-    pub batch: usize,
-    /// Name of the method.
-    pub method: String,
-}
 
 /// Why a checkpoint cannot be written or continued.
 #[derive(Debug, thiserror::Error)]
@@ -68,15 +56,15 @@ pub enum CheckpointError {
     },
 }
 
-/// Writes the whole state of a training.
+/// Writes the whole state of a training; `progress` is what it remembers beside parameters and moments.
 ///
 /// # Errors
 /// [`CheckpointError`] when the file cannot be written.
-pub(super) fn save(
+pub fn save<P: Serialize>(
     path: &Path,
     variables: &VarStore,
     optimizer: &AdamW,
-    progress: &Progress,
+    progress: &P,
 ) -> Result<(), CheckpointError> {
     let (moments, optimizer_steps) = optimizer.state();
     let parameters = variables.variables().into_iter().map(|(name, tensor)| (format!("parameter.{name}"), tensor));
@@ -105,7 +93,11 @@ pub(super) fn save(
 ///
 /// # Errors
 /// [`CheckpointError`] when the file is missing, cut off or of another network; nothing has been changed in that case.
-pub(super) fn restore(path: &Path, variables: &VarStore, optimizer: &mut AdamW) -> Result<Progress, CheckpointError> {
+pub fn restore<P: DeserializeOwned>(
+    path: &Path,
+    variables: &VarStore,
+    optimizer: &mut AdamW,
+) -> Result<P, CheckpointError> {
     let bytes = fs::read(path).map_err(|source| CheckpointError::Io { path: path.to_owned(), source })?;
     let format = |source| CheckpointError::Format { path: path.to_owned(), source };
     let mismatch = |reason: String| CheckpointError::Mismatch { path: path.to_owned(), reason };
@@ -170,11 +162,11 @@ mod tests {
         let path = folder.path().join("checkpoint.safetensors");
         let (variables, mut optimizer) = network(3);
         step(&variables, &mut optimizer);
-        let progress = Progress { step: 1, seconds: 2.5, seed: 7, batch: 4, method: "max".into() };
+        let progress = (1_u64, "max".to_owned());
         save(&path, &variables, &optimizer, &progress).unwrap();
         step(&variables, &mut optimizer);
         let (resumed, mut resumed_optimizer) = network(3);
-        assert_eq!(restore(&path, &resumed, &mut resumed_optimizer).unwrap(), progress);
+        assert_eq!(restore::<(u64, String)>(&path, &resumed, &mut resumed_optimizer).unwrap(), progress);
         step(&resumed, &mut resumed_optimizer);
         assert_eq!(resumed.variables()["weight"], variables.variables()["weight"]);
     }
@@ -184,13 +176,12 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("checkpoint.safetensors");
         let (variables, optimizer) = network(3);
-        let progress = Progress { step: 1, seconds: 0.0, seed: 7, batch: 4, method: "max".into() };
-        save(&path, &variables, &optimizer, &progress).unwrap();
+        save(&path, &variables, &optimizer, &1).unwrap();
         let (other, mut other_optimizer) = network(4);
-        let message = restore(&path, &other, &mut other_optimizer).unwrap_err().to_string();
+        let message = restore::<u64>(&path, &other, &mut other_optimizer).unwrap_err().to_string();
         assert!(message.contains("weight") && message.contains("[4, 2]"), "{message}");
         let bytes = fs::read(&path).unwrap();
         fs::write(&path, &bytes[..bytes.len() / 2]).unwrap();
-        assert!(matches!(restore(&path, &other, &mut other_optimizer), Err(CheckpointError::Format { .. })));
+        assert!(matches!(restore::<u64>(&path, &other, &mut other_optimizer), Err(CheckpointError::Format { .. })));
     }
 }
