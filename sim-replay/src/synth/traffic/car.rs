@@ -1,6 +1,7 @@
 //! One vehicle in traffic.
 
-use super::driver::Driver;
+use super::driver::{Driver, Obstacle};
+use super::lane_change::LaneMood;
 use super::path::Path;
 use super::rectangle::Rectangle;
 use super::roads::Roads;
@@ -19,6 +20,10 @@ pub(crate) struct Car {
     /// How far left of the lane's middle it drives, metres.
     pub(crate) aside_m: f64,
     pub(crate) speed_mps: f64,
+    /// Who was ahead in the last step.
+    pub(crate) leader: Option<Obstacle>,
+    /// Whether it would rather be on another lane.
+    pub(crate) lane_mood: LaneMood,
     /// The motion of the last step.
     pub(crate) motion: Sweep,
     /// Whether it is part of the scene.

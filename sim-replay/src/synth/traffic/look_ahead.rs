@@ -2,6 +2,7 @@
 
 use super::Traffic;
 use super::driver::Obstacle;
+use super::path::Path;
 use crate::synth::cast::wrapped;
 use crate::town::LaneId;
 
@@ -22,7 +23,9 @@ impl Traffic<'_> {
     /// How a driver accelerates now, metres per second squared.
     pub(super) fn acceleration_mps2(&mut self, index: usize, near: &mut Vec<u32>) -> f64 {
         let mut obstacles = Vec::with_capacity(4);
-        obstacles.extend(self.leader(index));
+        let leader = self.leader_on(index, &self.cars[index].path);
+        self.cars[index].leader = leader;
+        obstacles.extend(leader);
         obstacles.extend(self.stop_line(index));
         obstacles.extend(self.on_the_swept_way(index, near));
         obstacles.extend(self.end_of_the_way(index));
@@ -52,11 +55,11 @@ impl Traffic<'_> {
         wanted
     }
 
-    /// The next vehicle on the lanes of the way.
-    fn leader(&self, index: usize) -> Option<Obstacle> {
+    /// The next vehicle on the lanes of a way from its present place on.
+    pub(super) fn leader_on(&self, index: usize, path: &Path) -> Option<Obstacle> {
         let car = &self.cars[index];
         let horizon_m = 30.0 + 3.0 * car.speed_mps;
-        for (lane, start_m) in car.path.ahead(self.roads.graph) {
+        for (lane, start_m) in path.ahead(self.roads.graph) {
             if start_m > horizon_m {
                 return None;
             }

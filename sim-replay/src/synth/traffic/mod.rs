@@ -1,4 +1,4 @@
-//! Vehicles that follow lanes, keep distance, slow down for bends and give way at junctions.
+//! Vehicles that follow lanes, keep distance, slow down for bends, give way at junctions and change lanes.
 //!
 //! Traffic is simulated around one vehicle, the focus: whoever falls too far behind it leaves, and another vehicle comes
 //! in at the edge, out of sight. No two vehicles ever overlap: before all rules of the road, a vehicle moves only to
@@ -7,6 +7,7 @@
 mod car;
 mod driver;
 mod junction;
+mod lane_change;
 mod look_ahead;
 mod path;
 mod rectangle;
@@ -66,9 +67,10 @@ pub(crate) struct Traffic<'t> {
 impl<'t> Traffic<'t> {
     /// Moves everybody by one [`STEP_S`].
     pub(crate) fn step(&mut self) {
-        self.decide_ways();
-        self.list_occupants();
         let mut near = Vec::new();
+        self.list_occupants();
+        self.change_lanes(&mut near);
+        self.decide_ways();
         for index in 0..self.cars.len() {
             if !self.cars[index].is_present {
                 continue;
@@ -122,6 +124,10 @@ impl<'t> Traffic<'t> {
         self.occupants.iter_mut().for_each(Vec::clear);
         for (index, car) in self.cars.iter().enumerate().filter(|(_, car)| car.is_present) {
             self.occupants[car.path.lane().0 as usize].push((car.path.s_m(), index as u32));
+            // Those behind on the lane that it leaves must not run into it.
+            if let Some((lane, s_m)) = car.path.leaving(self.roads.graph) {
+                self.occupants[lane.0 as usize].push((s_m, index as u32));
+            }
         }
         for lane in &mut self.occupants {
             lane.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));

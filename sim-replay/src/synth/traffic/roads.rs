@@ -44,6 +44,11 @@ impl<'t> Roads<'t> {
         f64::from(speeds[(step.max(0.0) as usize).min(speeds.len() - 1)])
     }
 
+    /// Whether one can drive on from a lane for ever.
+    pub(crate) fn is_endless(&self, lane: LaneId) -> bool {
+        self.endless[lane.0 as usize]
+    }
+
     /// The lanes one may go on to: those that do not end somewhere, where there are such.
     pub(crate) fn onward(&self, lane: LaneId) -> Vec<LaneId> {
         let successors = &self.graph.lane(lane).successors;

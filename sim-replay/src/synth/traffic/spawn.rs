@@ -3,6 +3,7 @@
 use super::car::Car;
 use super::driver::Driver;
 use super::junction::RightOfWay;
+use super::lane_change::LaneMood;
 use super::path::Path;
 use super::rectangle::{NeighbourIndex, Rectangle};
 use super::roads::{Roads, Spawn};
@@ -47,6 +48,7 @@ impl<'t> Traffic<'t> {
             next_id: FOCUS_ID,
             visits: vec![0; lanes],
         };
+        traffic.visits[start.lane.0 as usize] = 1;
         let focus = Vehicle::random_connected(&mut traffic.random);
         traffic.add(focus, start);
         traffic.fill(start.point_m);
@@ -87,10 +89,11 @@ impl<'t> Traffic<'t> {
         self.is_free(index, &footprint, near)
     }
 
-    fn add(&mut self, vehicle: Vehicle, spawn: Spawn) {
+    pub(super) fn add(&mut self, vehicle: Vehicle, spawn: Spawn) {
         let driver = Driver::random(&mut self.random);
         let path = Path::new(spawn.lane, spawn.s_m);
         let aside_m = self.random.between(-0.2, 0.2);
+        let lane_mood = LaneMood::random(&mut self.random);
         let placement = path.placement(self.roads.graph, 0.0, 0.6 * vehicle.size_m[0], aside_m);
         let speed_mps = 0.6 * driver.pace * self.roads.speed_mps(spawn.lane, spawn.s_m);
         self.index.insert(self.cars.len() as u32, placement.position_m.xy().into());
@@ -101,6 +104,8 @@ impl<'t> Traffic<'t> {
             path,
             aside_m,
             speed_mps,
+            leader: None,
+            lane_mood,
             motion: Sweep::still(placement),
             is_present: true,
             standing_s: 0.0,
@@ -147,6 +152,7 @@ impl<'t> Traffic<'t> {
         car.path = Path::new(spawn.lane, spawn.s_m);
         car.motion = Sweep::still(car.placement_after(self.roads, 0.0));
         car.speed_mps = 0.6 * car.driver.pace * speed;
+        car.leader = None;
         car.is_present = true;
         car.standing_s = 0.0;
         self.index.insert(index as u32, car.point_m());

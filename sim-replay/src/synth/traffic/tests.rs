@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::synth::vehicle::Vehicle;
-use crate::town::{Lane, LaneGraph, TownSource, build};
+use crate::town::{Lane, LaneGraph, LaneId, TownSource, build};
 
 fn options(vehicles_per_km: f64) -> TrafficOptions {
     TrafficOptions { vehicles_per_km, radius_m: 210.0, focus_explores: false }
@@ -29,9 +29,10 @@ fn nobody_overlaps_and_most_get_on() {
             let start = roads.spawns[SplitMix64::new(seed).below(roads.spawns.len())];
             let mut traffic = Traffic::new(&roads, &[], options(35.0), start, seed);
             assert!(traffic.cars.len() > 20, "{}: {} vehicles", town.name, traffic.cars.len());
-            let (mut moving, mut all) = (0, 0);
+            let (mut moving, mut all, mut changing) = (0, 0, 0);
             for step in 0..1200 {
                 traffic.step();
+                changing += traffic.cars.iter().filter(|car| car.path.is_changing()).count();
                 if step % 5 == 0 {
                     assert_eq!(overlaps(&traffic), [], "{} seed {seed} step {step}", town.name);
                 }
@@ -42,6 +43,8 @@ fn nobody_overlaps_and_most_get_on() {
                 }
             }
             assert!(moving * 2 > all, "{} seed {seed}: {moving} of {all} vehicle steps are moving", town.name);
+            // The first town has one lane each way.
+            assert_eq!(changing > 0, source == TownSource::Town4, "{} seed {seed}: {changing}", town.name);
         }
     }
 }
@@ -49,7 +52,7 @@ fn nobody_overlaps_and_most_get_on() {
 #[test]
 fn vehicles_follow_with_a_gap_and_stop_for_who_stands() {
     let line = (0..400).map(|x| [f64::from(x), 0.0, 0.0]).collect();
-    let graph = LaneGraph::new(vec![Lane::new(crate::town::LaneId(0), line, 3.5, 14.0)]);
+    let graph = LaneGraph::new(vec![Lane::new(LaneId(0), line, 3.5, 14.0)]);
     let roads = Roads::new(&graph);
     let blocked = Vehicle::random_parked(&mut SplitMix64::new(1));
     let parked = [Rectangle::new(&super::super::cast::Placement::level([300.0, 0.0, 0.0], 0.0), &blocked.size_m)];
@@ -70,6 +73,85 @@ fn vehicles_follow_with_a_gap_and_stop_for_who_stands() {
         let gap = pair[1].0 - pair[0].0 - pair[0].1 - pair[1].1;
         assert!(gap > 0.8, "{gap}");
     }
+}
+
+/// Two lanes of one length that lead the same way, the second to the left of the first.
+fn two_lanes(length_m: i32) -> LaneGraph {
+    let line = |y: f64| (0..=length_m).map(|x| [f64::from(x), y, 0.0]).collect();
+    let lane = |id: u32| Lane::new(LaneId(id), line(3.5 * f64::from(id)), 3.5, 14.0);
+    let mut lanes = vec![lane(0), lane(1)];
+    (lanes[0].left, lanes[1].right) = (Some(LaneId(1)), Some(LaneId(0)));
+    LaneGraph::new(lanes)
+}
+
+fn add_slow(traffic: &mut Traffic<'_>, lane: u32, s_m: f64, pace: f64) {
+    let vehicle = Vehicle::random_driving(&mut SplitMix64::new(7));
+    let spawn = *traffic.roads.spawns.iter().find(|spawn| spawn.lane == LaneId(lane) && spawn.s_m >= s_m).unwrap();
+    traffic.add(vehicle, spawn);
+    let car = traffic.cars.last_mut().unwrap();
+    car.driver.pace = pace;
+    car.speed_mps = 14.0 * pace;
+}
+
+#[test]
+fn a_driver_changes_lanes_smoothly_to_get_past_somebody_slow() {
+    let graph = two_lanes(900);
+    let roads = Roads::new(&graph);
+    let mut traffic = Traffic::new(&roads, &[], options(0.0), roads.spawns[0], 3);
+    add_slow(&mut traffic, 0, 60.0, 0.25);
+    let mut last = traffic.cars[0].motion.end;
+    while last.position_m.x < 250.0 {
+        traffic.step();
+        assert_eq!(overlaps(&traffic), []);
+        let focus = &traffic.cars[0];
+        let (now, speed_mps) = (focus.motion.end, focus.speed_mps);
+        assert_eq!(focus.motion.start, last);
+        let moved = now.position_m - last.position_m;
+        assert!(moved.y.abs() < 2.0 * STEP_S, "{} m/s sideways", moved.y / STEP_S);
+        assert!((moved.norm() - speed_mps * STEP_S).abs() < 0.02 * speed_mps * STEP_S + 1e-9, "{moved} {speed_mps}");
+        assert!((now.yaw_rad - last.yaw_rad).abs() < 0.03, "{} {}", now.yaw_rad, last.yaw_rad);
+        last = now;
+    }
+    let slow = traffic.cars[1].motion.end.position_m;
+    assert!(slow.x < last.position_m.x && slow.y.abs() < 0.3, "{slow}");
+    assert!((last.position_m.y - 3.5).abs() < 0.3, "{last:?}");
+}
+
+#[test]
+fn nobody_changes_into_somebody() {
+    let graph = two_lanes(900);
+    let roads = Roads::new(&graph);
+    let mut traffic = Traffic::new(&roads, &[], options(0.0), roads.spawns[0], 3);
+    // Two abreast, equally slow: there is no way past.
+    add_slow(&mut traffic, 0, 60.0, 0.3);
+    add_slow(&mut traffic, 1, 56.0, 0.3);
+    for _ in 0..1200 {
+        traffic.step();
+        assert_eq!(overlaps(&traffic), []);
+        assert!(traffic.cars.iter().all(|car| car.motion.end.position_m.y > -0.3));
+    }
+    let ahead = |index: usize| traffic.cars[index].motion.end.position_m.x;
+    assert!(ahead(0) < ahead(1) && ahead(0) < ahead(2), "{} {} {}", ahead(0), ahead(1), ahead(2));
+}
+
+#[test]
+fn an_exploring_focus_drives_several_lanes_of_a_road() {
+    let town = build(&TownSource::Town4, 0).unwrap();
+    let roads = Roads::new(&town.lanes);
+    let options = TrafficOptions { focus_explores: true, ..options(12.0) };
+    let mut both = 0;
+    for seed in 0..4 {
+        let start = roads.spawns[SplitMix64::new(seed).below(roads.spawns.len())];
+        let mut traffic = Traffic::new(&roads, &[], options, start, seed);
+        let mut driven = vec![false; town.lanes.lanes.len()];
+        for _ in 0..3600 {
+            traffic.step();
+            driven[traffic.cars[0].path.lane().0 as usize] = true;
+        }
+        let is_driven = |lane: &Option<LaneId>| lane.is_some_and(|lane| driven[lane.0 as usize]);
+        both += town.lanes.lanes.iter().filter(|lane| driven[lane.id.0 as usize] && is_driven(&lane.left)).count();
+    }
+    assert!(both >= 4, "{both} lanes were driven beside another one");
 }
 
 #[test]
