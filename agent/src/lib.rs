@@ -20,6 +20,7 @@ pub mod pillars;
 pub mod point_pillars;
 pub mod pose_source;
 pub mod postprocess;
+pub mod registration;
 pub mod rotated_iou;
 pub mod shrink;
 pub mod sparse;

@@ -1,0 +1,319 @@
+//! Random sample consensus with local optimisation (Fischler and Bolles 1981; Chum, Matas and Kittler 2003).
+//!
+//! Minimal samples are drawn mostly from trusted correspondences, tested for consistent edges before anything is solved,
+//! scored by a truncated quadratic (MSAC) that gives up early, and every new best is optimised locally. Drawing ends as
+//! soon as a better motion would have been drawn with the confidence asked for. Same input and seed, same answer.
+
+use nalgebra::{Isometry3, Vector3};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
+
+use super::pairs::{Gain, Pairs};
+use super::sampling::{self, SampleTest};
+use super::{Correspondence, NoRegistration, Registration, check_enough, refine};
+
+/// Scales of the local optimisation, in thresholds: wide enough for a motion from few noisy points.
+const LOCAL_SCALES: [f64; 3] = [2.0, 1.2, 0.8];
+/// Steps of the final refinement, at most.
+const FINAL_STEPS: usize = 20;
+/// Share of all-inlier samples that are assumed to lead to the motion: half of the draws ignore the weights, and samples
+/// may be too close together or too noisy.
+const SAMPLE_YIELD: f64 = 0.25;
+
+/// How a motion is computed from a sample.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum MinimalSolver {
+    /// From two points: heading and position of a vehicle that stands upright; its tilt is found afterwards.
+    #[default]
+    UprightTwoPoint,
+    /// From three points: any rotation.
+    ThreePoint,
+}
+
+/// Settings of the search.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct RansacConfig {
+    /// Largest residual of an inlier, metres.
+    pub inlier_threshold_m: f64,
+    /// Minimal solver.
+    pub minimal: MinimalSolver,
+    /// Largest angle between both frames' upright axes, degrees; 180 allows everything.
+    pub max_tilt_deg: f64,
+    /// Shortest edge of a sample, metres.
+    pub min_edge_m: f64,
+    /// Fewest inliers of a result.
+    pub min_inliers: usize,
+    /// Probability with which the best motion is found before drawing stops.
+    pub confidence: f64,
+    /// Fewest draws.
+    pub min_draws: u32,
+    /// Most draws.
+    pub max_draws: u32,
+    /// Scale of the final refinement, metres: about the residual of good inliers.
+    pub refine_scale_m: f64,
+    /// Seed of the draws.
+    pub seed: u64,
+}
+
+impl Default for RansacConfig {
+    /// For the sweeps of vehicles and scene coordinates that are right to a metre or two.
+    fn default() -> Self {
+        Self {
+            inlier_threshold_m: 1.5,
+            minimal: MinimalSolver::UprightTwoPoint,
+            max_tilt_deg: 12.0,
+            min_edge_m: 6.0,
+            min_inliers: 12,
+            confidence: 0.999,
+            min_draws: 64,
+            max_draws: 20_000,
+            refine_scale_m: 1.0,
+            seed: 0,
+        }
+    }
+}
+
+impl RansacConfig {
+    /// For any rotation and inliers within `inlier_threshold_m`.
+    #[must_use]
+    pub fn any_rotation(inlier_threshold_m: f64) -> Self {
+        Self {
+            inlier_threshold_m,
+            minimal: MinimalSolver::ThreePoint,
+            max_tilt_deg: 180.0,
+            min_edge_m: 2.0 * inlier_threshold_m,
+            refine_scale_m: inlier_threshold_m / 1.5,
+            max_draws: 100_000,
+            ..Self::default()
+        }
+    }
+
+    fn sample_size(&self) -> i32 {
+        match self.minimal {
+            MinimalSolver::UprightTwoPoint => 2,
+            MinimalSolver::ThreePoint => 3,
+        }
+    }
+
+    fn sample_test(&self) -> SampleTest {
+        SampleTest {
+            min_edge_m: self.min_edge_m,
+            // Both ends of an edge may be off by a threshold.
+            edge_tolerance_m: 2.0 * self.inlier_threshold_m,
+            max_tilt_rad: self.max_tilt_deg.to_radians(),
+        }
+    }
+
+    fn allows_tilt_of(&self, motion: &Isometry3<f64>) -> bool {
+        let up = motion.rotation * Vector3::z();
+        up.z >= self.max_tilt_deg.to_radians().cos()
+    }
+
+    /// Draws after which a motion that `inliers` of `count` agree on would have been found.
+    fn draws_needed(&self, inliers: usize, count: usize) -> u32 {
+        let ratio = inliers as f64 / count.max(1) as f64;
+        let hit = (SAMPLE_YIELD * ratio.powi(self.sample_size())).clamp(1e-12, 1.0 - 1e-12);
+        let draws = (1.0 - self.confidence).max(1e-12).ln() / (1.0 - hit).ln();
+        (draws.ceil().min(f64::from(self.max_draws)) as u32).max(self.min_draws)
+    }
+}
+
+/// Finds the motion that most correspondences agree on.
+///
+/// # Errors
+/// [`NoRegistration`] when there are too few correspondences or too few of them agree.
+pub fn solve(correspondences: &[Correspondence], config: &RansacConfig) -> Result<Registration, NoRegistration> {
+    let required = config.min_inliers.max(3);
+    check_enough(correspondences, required)?;
+    let mut random = ChaCha8Rng::seed_from_u64(config.seed);
+    let pairs = Pairs::new(correspondences, &mut random);
+    let Some(best) = Search { pairs: &pairs, config, best: None }.run(&mut random) else {
+        return Err(NoRegistration::TooFewInliers { found: 0, required, given: correspondences.len() });
+    };
+    let near = pairs.near(&best, refine::CUTOFF_SCALES * config.refine_scale_m);
+    if near.len() < required {
+        return Err(NoRegistration::TooFewInliers { found: near.len(), required, given: correspondences.len() });
+    }
+    let refined = refine::converge(&near.iter().copied(), &best, config.refine_scale_m, FINAL_STEPS)
+        .map_err(|reason| NoRegistration::Degenerate { inliers: near.len(), reason })?;
+    let motion = if config.allows_tilt_of(&refined) { refined } else { best };
+    Registration::judge(correspondences, pairs.to_target_frame(&motion), config.inlier_threshold_m)
+        .with_at_least(required, correspondences.len())
+}
+
+/// The draws and the best motion so far.
+struct Search<'a> {
+    pairs: &'a Pairs,
+    config: &'a RansacConfig,
+    best: Option<(Gain, Isometry3<f64>)>,
+}
+
+impl Search<'_> {
+    fn run(mut self, random: &mut ChaCha8Rng) -> Option<Isometry3<f64>> {
+        let test = self.config.sample_test();
+        // The best gain of a motion as drawn, before any optimisation: what the next draw has to beat.
+        let mut best_drawn = Gain::default();
+        let mut enough = self.config.max_draws;
+        let mut draw = 0;
+        while draw < enough {
+            let drawn = match self.config.minimal {
+                MinimalSolver::UprightTwoPoint => sampling::two_points(self.pairs, draw, &test, random),
+                MinimalSolver::ThreePoint => sampling::three_points(self.pairs, draw, &test, random),
+            };
+            draw += 1;
+            let Some(motion) = drawn else { continue };
+            let Some(gain) = self.gain(&motion, &best_drawn) else { continue };
+            if gain.total > best_drawn.total {
+                best_drawn = gain;
+                if self.optimise(&motion, gain) {
+                    enough = self.config.draws_needed(self.inliers(), self.pairs.len());
+                }
+            }
+        }
+        self.best.map(|(_, motion)| motion)
+    }
+
+    fn gain(&self, motion: &Isometry3<f64>, best: &Gain) -> Option<Gain> {
+        self.pairs.gain(motion, self.config.inlier_threshold_m, best)
+    }
+
+    /// Optimises a motion on the pairs near it; whether it became the new best.
+    fn optimise(&mut self, motion: &Isometry3<f64>, gain: Gain) -> bool {
+        let scales = LOCAL_SCALES.map(|scale| scale * self.config.inlier_threshold_m);
+        let near = self.pairs.near(motion, refine::CUTOFF_SCALES * scales[0]);
+        let optimised = (refine::reweighted(&near.iter().copied(), motion, scales).ok())
+            .filter(|optimised| self.config.allows_tilt_of(optimised))
+            .and_then(|optimised| Some((self.gain(&optimised, &gain)?, optimised)))
+            .filter(|(optimised, _)| optimised.total > gain.total);
+        let candidate = optimised.unwrap_or((gain, *motion));
+        let better = self.best.is_none_or(|(best, _)| candidate.0.total > best.total);
+        if better {
+            self.best = Some(candidate);
+        }
+        better
+    }
+
+    fn inliers(&self) -> usize {
+        self.best.map_or(0, |(_, motion)| self.pairs.near(&motion, self.config.inlier_threshold_m).len())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::{Translation3, UnitQuaternion};
+    use proptest::prelude::*;
+
+    use super::*;
+    use crate::registration::synthetic::Problem;
+
+    proptest! {
+        #![proptest_config(ProptestConfig { cases: 48, ..ProptestConfig::default() })]
+        #[test]
+        fn motions_are_found_among_outliers(seed in 0_u64..1000, outliers in 0.0..0.85) {
+            let problem = Problem { count: 600, outliers, noise_m: 0.1, ..Problem::default() }.drawn(seed);
+            for config in [RansacConfig::default(), RansacConfig::any_rotation(1.5)] {
+                let found = solve(&problem.pairs, &config).unwrap();
+                let (metres, degrees) = problem.error(&found.target_from_source);
+                prop_assert!(metres < 0.15 && degrees < 0.15, "{:?}: {metres} m {degrees} degrees", config.minimal);
+                prop_assert!(found.inlier_ratio > 0.95 * (1.0 - outliers) - 0.08);
+            }
+        }
+
+        #[test]
+        fn any_numbers_give_a_motion_or_a_reason(
+            numbers in prop::collection::vec(prop::array::uniform7(prop::num::f32::ANY), 0..40), seed in any::<u64>(),
+        ) {
+            let pairs: Vec<_> = numbers.iter()
+                .map(|n| Correspondence { source_m: [n[0], n[1], n[2]], target_m: [n[3], n[4], n[5]], weight: n[6] })
+                .collect();
+            let config = RansacConfig { seed, max_draws: 200, min_inliers: 3, ..RansacConfig::default() };
+            if let Ok(found) = solve(&pairs, &config) {
+                prop_assert!(found.target_from_source.translation.vector.iter().all(|x| x.is_finite()));
+            }
+        }
+    }
+
+    #[test]
+    fn any_rotation_is_found_where_it_is_allowed() {
+        let mut problem = Problem { count: 500, outliers: 0.5, noise_m: 0.05, ..Problem::default() };
+        problem = Problem { tilt_rad: 1.5, ..problem }.drawn(11);
+        let found = solve(&problem.pairs, &RansacConfig::any_rotation(0.5)).unwrap();
+        let (metres, degrees) = problem.error(&found.target_from_source);
+        assert!(metres < 0.05 && degrees < 0.05, "{metres} m {degrees} degrees");
+        let tilted = solve(&problem.pairs, &RansacConfig::default()).map(|found| found.inlier_ratio);
+        assert!(tilted.as_ref().map_or(true, |&ratio| ratio < 0.1), "{tilted:?}");
+    }
+
+    #[test]
+    fn eight_in_a_hundred_suffice() {
+        for seed in 0..20 {
+            let problem = Problem { count: 1500, outliers: 0.92, noise_m: 0.5, ..Problem::default() }.drawn(seed);
+            let found = solve(&problem.pairs, &RansacConfig::default()).unwrap();
+            let (metres, degrees) = problem.error(&found.target_from_source);
+            assert!(metres < 0.6 && degrees < 0.6, "seed {seed}: {metres} m {degrees} degrees");
+        }
+    }
+
+    #[test]
+    fn the_same_seed_gives_the_same_bits() {
+        let problem = Problem { count: 900, outliers: 0.7, noise_m: 0.5, ..Problem::default() }.drawn(4);
+        let config = RansacConfig { seed: 9, ..RansacConfig::default() };
+        assert_eq!(solve(&problem.pairs, &config), solve(&problem.pairs, &config));
+    }
+
+    #[test]
+    fn places_far_from_the_origin_lose_nothing() {
+        let mut problem = Problem { count: 400, noise_m: 0.02, ..Problem::default() }.drawn(5);
+        let far = nalgebra::Vector3::new(16384.0, -8192.0, 128.0);
+        problem.truth.translation.vector += far;
+        for pair in &mut problem.pairs {
+            (0..3).for_each(|axis| pair.target_m[axis] += far[axis] as f32);
+        }
+        let found = solve(&problem.pairs, &RansacConfig::default()).unwrap();
+        assert!(problem.error(&found.target_from_source).0 < 0.01);
+    }
+
+    #[test]
+    fn thin_evidence_is_no_pose() {
+        let config = RansacConfig::default();
+        let none = solve(&[], &config).unwrap_err();
+        assert_eq!(none, NoRegistration::TooFewCorrespondences { usable: 0, given: 0, required: 12 });
+        let nonsense = Problem { count: 200, outliers: 1.0, ..Problem::default() }.drawn(6);
+        let few = solve(&nonsense.pairs, &config).unwrap_err();
+        assert!(matches!(few, NoRegistration::TooFewInliers { found: 0..12, required: 12, given: 200 }), "{few}");
+        // All at one place: whatever the motion, it is not fixed.
+        let pair = Correspondence { source_m: [1.0; 3], target_m: [2.0; 3], weight: 1.0 };
+        assert!(solve(&[pair; 40], &config).is_err());
+        // On a line: nothing fixes the turn about it.
+        let line: Vec<_> = (0..40).map(|k| Correspondence { source_m: [k as f32 * 2.0, 0.0, 0.0], ..pair }).collect();
+        let line: Vec<_> = line.iter().map(|p| Correspondence { target_m: p.source_m, ..*p }).collect();
+        assert!(matches!(solve(&line, &config), Err(NoRegistration::Degenerate { .. })));
+    }
+
+    #[test]
+    fn a_mirrored_sweep_is_not_registered_as_a_whole() {
+        let mut problem = Problem { count: 400, ..Problem::default() }.drawn(8);
+        problem.pairs.iter_mut().for_each(|pair| pair.source_m[1] = -pair.source_m[1]);
+        let found = solve(&problem.pairs, &RansacConfig::default());
+        assert!(found.as_ref().map_or(true, |found| found.inlier_ratio < 0.2), "{found:?}");
+    }
+
+    #[test]
+    fn upside_down_is_no_vehicle() {
+        let flip = UnitQuaternion::from_euler_angles(std::f64::consts::PI, 0.0, 0.0);
+        let motion = Isometry3::from_parts(Translation3::new(5.0, 6.0, 7.0), flip);
+        let problem = Problem { count: 200, ..Problem::default() }.drawn(9);
+        let pairs: Vec<_> = (problem.pairs.iter())
+            .map(|pair| {
+                let target = motion * nalgebra::Point3::from(pair.source_m.map(f64::from));
+                Correspondence { target_m: target.coords.map(|x| x as f32).into(), ..*pair }
+            })
+            .collect();
+        let config = RansacConfig { minimal: MinimalSolver::ThreePoint, ..RansacConfig::default() };
+        assert!(solve(&pairs, &config).map_or(true, |found| found.inlier_ratio < 0.2));
+        assert!(solve(&pairs, &RansacConfig::any_rotation(1.0)).unwrap().inlier_ratio > 0.99);
+    }
+}

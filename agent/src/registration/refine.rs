@@ -1,0 +1,111 @@
+//! Sharpening a motion: iteratively re-weighted least squares.
+//!
+//! Every pair keeps taking part, the less the farther off it is (Geman and McClure 1987): with residual `r` and scale
+//! `c` its weight is multiplied by `1 / (1 + r^2/c^2)^2`. A scale that starts wide and shrinks pulls a rough motion into
+//! place before it listens to the best pairs only.
+
+use nalgebra::{Isometry3, Vector3};
+
+use super::kabsch::{Degenerate, PairMoments};
+
+/// Pairs beyond this many scales weigh less than a hundredth and are left out.
+pub(super) const CUTOFF_SCALES: f64 = 3.0;
+/// A step smaller than this is the last: metres and radians.
+const CONVERGED: f64 = 1e-4;
+
+/// Re-fits a motion once for every scale of `scales_m`, in turn.
+///
+/// `pairs` are source point, target point and weight, all finite.
+///
+/// # Errors
+/// [`Degenerate`] when the pairs near the motion do not fix it.
+pub fn reweighted<I>(
+    pairs: &I,
+    start: &Isometry3<f64>,
+    scales_m: impl IntoIterator<Item = f64>,
+) -> Result<Isometry3<f64>, Degenerate>
+where
+    I: IntoIterator<Item = (Vector3<f64>, Vector3<f64>, f64)> + Clone,
+{
+    let mut motion = *start;
+    for scale_m in scales_m {
+        motion = step(pairs.clone(), &motion, scale_m)?;
+    }
+    Ok(motion)
+}
+
+/// Re-fits a motion at one scale until it stands still, at most `max_steps` times.
+///
+/// # Errors
+/// See [`reweighted`].
+pub fn converge<I>(
+    pairs: &I,
+    start: &Isometry3<f64>,
+    scale_m: f64,
+    max_steps: usize,
+) -> Result<Isometry3<f64>, Degenerate>
+where
+    I: IntoIterator<Item = (Vector3<f64>, Vector3<f64>, f64)> + Clone,
+{
+    let mut motion = *start;
+    for _ in 0..max_steps {
+        let next = step(pairs.clone(), &motion, scale_m)?;
+        let moved_m = (next.translation.vector - motion.translation.vector).norm();
+        let turned_rad = next.rotation.angle_to(&motion.rotation);
+        motion = next;
+        if moved_m < CONVERGED && turned_rad < CONVERGED {
+            break;
+        }
+    }
+    Ok(motion)
+}
+
+/// One weighted fit with the weights of the residuals of `motion`.
+fn step(
+    pairs: impl IntoIterator<Item = (Vector3<f64>, Vector3<f64>, f64)>,
+    motion: &Isometry3<f64>,
+    scale_m: f64,
+) -> Result<Isometry3<f64>, Degenerate> {
+    let rotation = motion.rotation.to_rotation_matrix();
+    let per_scale_squared = 1.0 / (scale_m * scale_m);
+    let mut moments = PairMoments::default();
+    for (source_m, target_m, weight) in pairs {
+        let residual = rotation * source_m + motion.translation.vector - target_m;
+        let scaled = residual.norm_squared() * per_scale_squared;
+        if scaled < CUTOFF_SCALES * CUTOFF_SCALES {
+            moments.add(&source_m, &target_m, weight / ((1.0 + scaled) * (1.0 + scaled)));
+        }
+    }
+    moments.fit()
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Vector3;
+
+    use super::*;
+    use crate::registration::synthetic::Problem;
+
+    fn pairs(problem: &Problem) -> Vec<(Vector3<f64>, Vector3<f64>, f64)> {
+        let vector = |point: [f32; 3]| Vector3::from(point.map(f64::from));
+        problem.pairs.iter().map(|pair| (vector(pair.source_m), vector(pair.target_m), 1.0)).collect()
+    }
+
+    #[test]
+    fn a_rough_motion_is_sharpened_among_outliers() {
+        let problem = Problem { count: 600, outliers: 0.5, noise_m: 0.2, ..Problem::default() }.drawn(1);
+        let off = Isometry3::new(Vector3::new(1.2, -0.8, 0.5), Vector3::new(0.01, 0.0, 0.04));
+        let rough = problem.truth * off;
+        let sharpened = reweighted(&pairs(&problem), &rough, [4.0, 2.0, 1.0]).unwrap();
+        let sharpened = converge(&pairs(&problem), &sharpened, 0.5, 20).unwrap();
+        let (metres, degrees) = problem.error(&sharpened);
+        assert!(metres < 0.06 && degrees < 0.1, "{metres} m, {degrees} degrees");
+    }
+
+    #[test]
+    fn nothing_near_is_said() {
+        let problem = Problem::default().drawn(2);
+        let elsewhere = Isometry3::translation(0.0, 0.0, 1e4);
+        assert_eq!(converge(&pairs(&problem), &elsewhere, 1.0, 5), Err(Degenerate::NoWeight(0.0)));
+    }
+}

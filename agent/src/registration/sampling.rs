@@ -1,0 +1,142 @@
+//! Minimal samples: which pairs to try a motion on, and the motion they fix.
+
+use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion, Vector3};
+use rand::Rng;
+use rand_chacha::ChaCha8Rng;
+
+use super::pairs::Pairs;
+
+/// Share of the most trusted pairs that successive draws take from. Half of the draws trust the weights, half do not, so
+/// that weights that say nothing cost a factor of two and no more.
+const POOLS: [f64; 4] = [0.1, 1.0, 0.3, 1.0];
+/// Fewest pairs in a pool.
+const MIN_POOL: usize = 12;
+
+/// What a sample must fulfil before a motion is computed from it.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct SampleTest {
+    /// Shortest distance between two points of a sample, metres.
+    pub min_edge_m: f64,
+    /// Largest difference between an edge's lengths in both frames, metres.
+    pub edge_tolerance_m: f64,
+    /// Largest slope of the source frame's upright axis, radians.
+    pub max_tilt_rad: f64,
+}
+
+/// Draws a motion from three pairs, or `None` when they do not agree with each other.
+pub(super) fn three_points(
+    pairs: &Pairs,
+    draw: u32,
+    test: &SampleTest,
+    random: &mut ChaCha8Rng,
+) -> Option<Isometry3<f64>> {
+    let [a, b, c] = draw_distinct(pairs.len(), draw, random);
+    let source = [a, b, c].map(|index| pairs.source(index));
+    let target = [a, b, c].map(|index| pairs.target(index));
+    for (from, to) in [(0, 1), (0, 2), (1, 2)] {
+        let lengths = [&source, &target].map(|points| (points[to] - points[from]).norm());
+        if lengths[0] < test.min_edge_m || (lengths[0] - lengths[1]).abs() > test.edge_tolerance_m {
+            return None;
+        }
+    }
+    let rotation = Rotation3::from_matrix_unchecked(axes(&target)? * axes(&source)?.transpose());
+    if rotation[(2, 2)] < test.max_tilt_rad.cos() {
+        return None;
+    }
+    Some(motion(rotation, &source, &target))
+}
+
+/// Draws a motion that keeps upright things upright from two pairs, or `None` when they do not agree with each other.
+pub(super) fn two_points(
+    pairs: &Pairs,
+    draw: u32,
+    test: &SampleTest,
+    random: &mut ChaCha8Rng,
+) -> Option<Isometry3<f64>> {
+    let [a, b] = draw_distinct(pairs.len(), draw, random);
+    let source = [a, b].map(|index| pairs.source(index));
+    let target = [a, b].map(|index| pairs.target(index));
+    let [from, to] = [source[1] - source[0], target[1] - target[0]];
+    let lengths = [from.xy().norm(), to.xy().norm()];
+    if lengths[0] < test.min_edge_m || (lengths[0] - lengths[1]).abs() > test.edge_tolerance_m {
+        return None;
+    }
+    // A small tilt lifts the far end.
+    if (from.z - to.z).abs() > test.edge_tolerance_m + test.max_tilt_rad.sin() * lengths[0] {
+        return None;
+    }
+    let yaw_rad = to.y.atan2(to.x) - from.y.atan2(from.x);
+    Some(motion(Rotation3::from_axis_angle(&Vector3::z_axis(), yaw_rad), &source, &target))
+}
+
+/// The motion with this rotation that takes centre to centre.
+fn motion<const N: usize>(
+    rotation: Rotation3<f64>,
+    source: &[Vector3<f64>; N],
+    target: &[Vector3<f64>; N],
+) -> Isometry3<f64> {
+    let [from, to] = [source, target].map(|points| points.iter().sum::<Vector3<f64>>() / N as f64);
+    Isometry3::from_parts(Translation3::from(to - rotation * from), UnitQuaternion::from_rotation_matrix(&rotation))
+}
+
+/// Right-handed axes tied to a triangle, as columns; `None` for a needle.
+fn axes(points: &[Vector3<f64>; 3]) -> Option<Matrix3<f64>> {
+    let first = (points[1] - points[0]).try_normalize(1e-9)?;
+    let second = points[2] - points[0];
+    let normal = first.cross(&second);
+    // Below a sine of 0.1 the direction of the normal is mostly noise.
+    if normal.norm_squared() < 0.01 * second.norm_squared() {
+        return None;
+    }
+    let normal = normal.try_normalize(1e-9)?;
+    Some(Matrix3::from_columns(&[first, normal.cross(&first), normal]))
+}
+
+/// `N` different places out of `count`; the caller sees to it that there are at least `N`.
+fn draw_distinct<const N: usize>(count: usize, draw: u32, random: &mut ChaCha8Rng) -> [usize; N] {
+    let share = POOLS[draw as usize % POOLS.len()];
+    let pool = ((count as f64 * share) as usize).clamp(MIN_POOL.min(count), count);
+    let mut chosen = [usize::MAX; N];
+    for place in 0..N {
+        chosen[place] = loop {
+            let index = random.random_range(0..pool);
+            if !chosen[..place].contains(&index) {
+                break index;
+            }
+        };
+    }
+    chosen
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::SeedableRng;
+
+    use super::*;
+    use crate::registration::synthetic::Problem;
+
+    #[test]
+    fn clean_samples_fix_the_motion() {
+        let problem = Problem { tilt_rad: 0.0, ..Problem::default() }.drawn(7);
+        let mut random = ChaCha8Rng::seed_from_u64(2);
+        let pairs = Pairs::new(&problem.pairs, &mut random);
+        let test = SampleTest { min_edge_m: 6.0, edge_tolerance_m: 0.1, max_tilt_rad: 0.2 };
+        for solver in [two_points, three_points] {
+            let found: Vec<_> = (0..40).filter_map(|draw| solver(&pairs, draw, &test, &mut random)).collect();
+            assert!(found.len() > 10);
+            for motion in found {
+                let (metres, degrees) = problem.error(&pairs.to_target_frame(&motion));
+                assert!(metres < 0.05 && degrees < 0.05, "{metres} m {degrees} degrees");
+            }
+        }
+    }
+
+    #[test]
+    fn places_differ_even_in_the_smallest_set() {
+        let mut random = ChaCha8Rng::seed_from_u64(2);
+        for draw in 0..100 {
+            let [a, b, c] = draw_distinct(3, draw, &mut random);
+            assert!(a < 3 && b < 3 && c < 3 && a != b && b != c && a != c);
+        }
+    }
+}

@@ -1,0 +1,84 @@
+//! Problems with a known answer, for tests.
+
+use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, Normal};
+
+use super::Correspondence;
+
+/// What to draw, and what was drawn.
+#[derive(Debug, Clone)]
+pub(crate) struct Problem {
+    /// Pairs.
+    pub(crate) count: usize,
+    /// Share of pairs whose target is anywhere in the town.
+    pub(crate) outliers: f64,
+    /// Standard deviation of the targets of the others per axis, metres.
+    pub(crate) noise_m: f64,
+    /// Largest tilt of the vehicle, radians.
+    pub(crate) tilt_rad: f64,
+    /// Motion of the answer.
+    pub(crate) truth: Isometry3<f64>,
+    /// Drawn.
+    pub(crate) pairs: Vec<Correspondence>,
+}
+
+impl Default for Problem {
+    fn default() -> Self {
+        Self {
+            count: 300,
+            outliers: 0.0,
+            noise_m: 0.0,
+            tilt_rad: 0.05,
+            truth: Isometry3::identity(),
+            pairs: Vec::new(),
+        }
+    }
+}
+
+impl Problem {
+    /// Draws motion and pairs: a sweep of 60 m radius in a town of 400 m.
+    pub(crate) fn drawn(mut self, seed: u64) -> Self {
+        let mut random = ChaCha8Rng::seed_from_u64(seed);
+        let tilt = self.tilt_rad.max(1e-12);
+        self.truth = Isometry3::from_parts(
+            Translation3::new(random.random_range(-200.0..200.0), random.random_range(-200.0..200.0), 2.0),
+            UnitQuaternion::from_euler_angles(
+                random.random_range(-tilt..tilt),
+                random.random_range(-tilt..tilt),
+                random.random_range(-3.1..3.1),
+            ),
+        );
+        let noise = Normal::new(0.0, self.noise_m).expect("a standard deviation");
+        for _ in 0..self.count {
+            let source = Point3::new(
+                random.random_range(-60.0..60.0),
+                random.random_range(-60.0..60.0),
+                random.random_range(-2.0..8.0),
+            );
+            let is_outlier = random.random_bool(self.outliers);
+            let target = if is_outlier {
+                let mut place = |reach: f64| random.random_range(-reach..reach);
+                Point3::new(place(260.0), place(260.0), place(5.0))
+            } else {
+                let mut shaken = self.truth * source;
+                shaken.coords.iter_mut().for_each(|coordinate| *coordinate += noise.sample(&mut random));
+                shaken
+            };
+            let weight = if is_outlier { random.random_range(0.1..0.6) } else { random.random_range(0.3..1.0) };
+            self.pairs.push(Correspondence {
+                source_m: source.coords.map(|x| x as f32).into(),
+                target_m: target.coords.map(|x| x as f32).into(),
+                weight,
+            });
+        }
+        self
+    }
+
+    /// Distance in metres and angle in degrees to the answer.
+    pub(crate) fn error(&self, found: &Isometry3<f64>) -> (f64, f64) {
+        let distance_m = (found.translation.vector - self.truth.translation.vector).norm();
+        (distance_m, found.rotation.angle_to(&self.truth.rotation).to_degrees())
+    }
+}
