@@ -17,6 +17,7 @@ pub(crate) struct Cli {
 #[derive(Debug, Subcommand)]
 enum Command {
     Run(command::run::Args),
+    Train(command::train::Args),
 }
 
 /// Usage or input at fault, and not the program: exit code 2.
@@ -28,6 +29,7 @@ pub(crate) struct BadInput(pub(crate) anyhow::Error);
 pub(crate) fn run(cli: Cli) -> ExitCode {
     let outcome = match cli.command {
         Command::Run(args) => command::run::run(&args),
+        Command::Train(args) => command::train::run(&args),
     };
     match outcome {
         Ok(()) => ExitCode::SUCCESS,

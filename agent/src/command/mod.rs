@@ -1,3 +1,4 @@
 //! One file per sub-command: its arguments and its `run`.
 
 pub(crate) mod run;
+pub(crate) mod train;

@@ -5,12 +5,19 @@
 
 mod encoder_config;
 mod error;
+mod head_config;
+mod localize;
 mod scene_encoder;
+mod scene_head;
 mod sweep_voxels;
+pub mod training;
 mod voxel_batch;
 
 pub use encoder_config::{SceneEncoderConfig, VoxelInput};
 pub use error::LocalizerError;
+pub use head_config::SceneHeadConfig;
+pub use localize::{Localization, Localizer, LocalizerTimes, SceneCoordinates, sigma};
 pub use scene_encoder::{LocalFeatures, SceneEncoder, SceneFeatures};
+pub use scene_head::{Regression, SceneHead};
 pub use sweep_voxels::{Cell, SweepVoxels};
 pub use voxel_batch::VoxelBatch;

@@ -17,6 +17,17 @@ pub struct Cell {
     pub points: u32,
 }
 
+impl Cell {
+    /// Cells lower than this look the same everywhere, metres.
+    const FLAT_M: f32 = 0.3;
+
+    /// Whether it is ground and nothing else, as far as its height tells.
+    #[must_use]
+    pub fn is_flat(&self) -> bool {
+        self.extent_m < Self::FLAT_M
+    }
+}
+
 /// One sweep, ready for the encoder.
 #[derive(Debug, Clone)]
 pub struct SweepVoxels {

@@ -1,0 +1,28 @@
+//! `agent train`: the two stages of a localizer.
+
+mod encoder;
+mod options;
+mod scene;
+
+use clap::Subcommand;
+
+/// Train a localizer: an encoder once, over many towns; then a head for each town.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    #[command(subcommand)]
+    stage: Stage,
+}
+
+#[derive(Debug, Subcommand)]
+enum Stage {
+    Encoder(encoder::Args),
+    Scene(scene::Args),
+}
+
+/// Trains what was asked for.
+pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
+    match &args.stage {
+        Stage::Encoder(args) => encoder::run(args),
+        Stage::Scene(args) => scene::run(args),
+    }
+}

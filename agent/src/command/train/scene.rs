@@ -1,0 +1,168 @@
+//! `agent train scene`.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use agent::localizer::training::{
+    RedundancyConfig, SceneReport, SceneSummary, SceneTrainConfig, SweepAugmentation, train_scene,
+};
+use agent::training::TrainingBar;
+
+use super::options::{Options, bad, check_folders, command_line, write_card};
+
+/// Train the head of one town on the features of a frozen encoder; writes checkpoint, curve.csv, weights.safetensors and
+/// model-card.md.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// Folders of scenes, all of the same town.
+    #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
+    scenes: Vec<PathBuf>,
+    /// Folders of other scenes of the town to validate on.
+    #[arg(long, num_args = 1.., value_name = "DIR")]
+    validation: Vec<PathBuf>,
+    /// Sweeps of a validation.
+    #[arg(long, default_value_t = 120)]
+    validation_sweeps: usize,
+    /// Seconds between two validations and checkpoints.
+    #[arg(long, default_value_t = 120)]
+    validate_every: u64,
+    /// Weights of the encoder.
+    #[arg(long, value_name = "FILE")]
+    encoder: PathBuf,
+    /// Name of the town, for messages and the model card.
+    #[arg(long, default_value = "town")]
+    town: String,
+    /// Clusters of sensor positions that a sweep is classified into.
+    #[arg(long, default_value_t = 50)]
+    classes: i64,
+    /// Clusters of world coordinates that a cell is placed among.
+    #[arg(long, default_value_t = 200)]
+    centres: i64,
+    /// Channels of the head.
+    #[arg(long, default_value_t = 512)]
+    width: i64,
+    /// Residual blocks of three layers.
+    #[arg(long, default_value_t = 3)]
+    blocks: usize,
+    /// Copies of every sweep, all but the first turned and thinned out at random.
+    #[arg(long, default_value_t = 1)]
+    copies: usize,
+    /// Largest turn of such copies, degrees.
+    #[arg(long, default_value_t = 10.0)]
+    turn: f64,
+    /// Leave out sweeps that are learnt evenly (RSD).
+    #[arg(long)]
+    rsd: bool,
+    /// Cells of a step.
+    #[arg(long, default_value_t = 2048)]
+    batch: usize,
+    /// Highest learning rate.
+    #[arg(long, default_value_t = 2e-3)]
+    lr: f64,
+    #[command(flatten)]
+    options: Options,
+}
+
+pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
+    let config = args.config()?;
+    let bar = TrainingBar::default();
+    let summary = train_scene(&config, &mut |report| tell(&bar, report))?;
+    bar.finish();
+    write_card(&config.out, &card(&config, &summary))?;
+    if args.options.json {
+        println!(
+            "{}",
+            serde_json::json!({"steps": summary.steps, "seconds": summary.seconds,
+                "preparing_seconds": summary.preparing_seconds, "accuracy": serde_json::to_value(summary.accuracy)?,
+                "cells_shown": summary.cells_shown, "weights": summary.weights, "sha256": summary.sha256})
+        );
+    } else {
+        println!("{} steps in {:.0} s: {}", summary.steps, summary.seconds, summary.weights.display());
+    }
+    Ok(())
+}
+
+fn tell(bar: &TrainingBar, report: &SceneReport) {
+    match report {
+        SceneReport::Encoding(done, total) => bar.report(0.0, 0.0, &format!("{done} of {total} sweeps encoded")),
+        SceneReport::Classified(share) => {
+            bar.say(&format!("{:.1} % of the training sweeps are put into their cluster", 100.0 * share));
+        }
+        SceneReport::Stepped { step, epoch, share_done, seconds, error_m, epsilon_m } => {
+            let text = format!("step {step} epoch {epoch:.2} error {error_m:.2} m, predicted {epsilon_m:.2} m");
+            bar.report(*share_done, *seconds, &text);
+        }
+        SceneReport::Validated(seconds, accuracy) => bar.say(&format!(
+            "{seconds:.0} s: cells {:.2} m, poses {:.3} m {:.3} degrees, under 3 m {:.1} %, under 1 m {:.1} %",
+            accuracy.cell_p50_m,
+            accuracy.pose_p50_m,
+            accuracy.pose_p50_deg,
+            100.0 * accuracy.success_3m,
+            100.0 * accuracy.success_1m
+        )),
+    }
+}
+
+impl Args {
+    fn config(&self) -> anyhow::Result<SceneTrainConfig> {
+        if self.batch == 0 || self.copies == 0 || self.validation_sweeps == 0 {
+            return Err(bad("--batch, --copies and --validation-sweeps are above zero"));
+        }
+        check_folders(self.scenes.iter().chain(&self.validation))?;
+        let (length, device) = self.options.start()?;
+        Ok(SceneTrainConfig {
+            scenes: self.scenes.clone(),
+            validation: self.validation.clone(),
+            validation_sweeps: self.validation_sweeps,
+            encoder: self.encoder.clone(),
+            town: self.town.clone(),
+            classes: self.classes,
+            centres: self.centres,
+            width: self.width,
+            blocks: self.blocks,
+            augmentation: SweepAugmentation { copies: self.copies, turn_rad: self.turn.to_radians(), keep: 0.7 },
+            redundancy: self.rsd.then(RedundancyConfig::default),
+            length,
+            batch: self.batch,
+            learning_rate: self.lr,
+            seed: self.options.seed,
+            device,
+            precision: self.options.precision(),
+            loader_threads: self.options.loader_threads,
+            validate_every: Duration::from_secs(self.validate_every),
+            out: self.options.out.clone(),
+            resume: self.options.resume,
+        })
+    }
+}
+
+fn card(config: &SceneTrainConfig, summary: &SceneSummary) -> String {
+    let validation = summary.accuracy.map_or_else(String::new, |accuracy| {
+        format!(
+            "| validation | poses: median {:.3} m and {:.3} degrees, under 3 m {:.1} %, under 1 m {:.1} %; cells: median {:.2} m (L1) |\n",
+            accuracy.pose_p50_m,
+            accuracy.pose_p50_deg,
+            100.0 * accuracy.success_3m,
+            100.0 * accuracy.success_1m,
+            accuracy.cell_p50_m
+        )
+    });
+    format!(
+        "# Scene head of {}\n\nWorld coordinates of cells on the features of a frozen encoder.\n\n\
+         | | |\n| --- | --- |\n| command | `{}` |\n| parameters | {} |\n| weights | SHA-256 `{}` |\n\
+         | data | {} sweeps, listing SHA-256 `{}` |\n| seed | {} |\n| steps | {} of {} cells |\n| numbers | {:?} |\n\
+         | time | {:.0} s, of which {:.0} s reading and encoding |\n{validation}",
+        config.town,
+        command_line(),
+        summary.parameters,
+        summary.sha256,
+        summary.sweeps,
+        summary.data_sha256,
+        config.seed,
+        summary.steps,
+        config.batch,
+        config.precision,
+        summary.seconds,
+        summary.preparing_seconds,
+    )
+}

@@ -1,0 +1,223 @@
+//! The live pipeline: a sweep in, a pose with its confidence out.
+
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use nalgebra::{Isometry3, Translation3};
+use protocol::{NoPoseReason, PointCloud, PoseEstimate};
+use tch::nn::VarStore;
+use tch::{Device, Kind, Tensor, no_grad};
+
+use super::error::LocalizerError;
+use super::head_config::SceneHeadConfig;
+use super::scene_encoder::SceneEncoder;
+use super::scene_head::SceneHead;
+use super::sweep_voxels::{Cell, SweepVoxels};
+use super::voxel_batch::VoxelBatch;
+use crate::registration::ransac::{RansacConfig, solve};
+use crate::registration::{Correspondence, NoRegistration, Registration};
+use crate::weights::Weights;
+
+/// Share of the regressed cells that may be flat ground, which looks the same everywhere.
+const FLAT_SHARE: f64 = 0.25;
+/// Sweeps with fewer cells are not localised.
+const MIN_CELLS: usize = 30;
+
+/// Where each cell of a sweep lies in the world, as far as the network knows.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct SceneCoordinates {
+    /// `[N]`: in the sensor frame, metres.
+    pub sensor_m: Vec<[f32; 3]>,
+    /// `[N]`: in the world relative to the head's origin, metres.
+    pub world_m: Vec<[f32; 3]>,
+    /// `[N]`: predicted L1 error, metres.
+    pub epsilon_m: Vec<f32>,
+}
+
+/// Time per stage.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct LocalizerTimes {
+    /// Points into voxels and rulebooks.
+    pub voxelise: Duration,
+    /// The encoder.
+    pub encode: Duration,
+    /// The head.
+    pub regress: Duration,
+    /// The pose solver.
+    pub solve: Duration,
+}
+
+/// What came of one sweep.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Localization {
+    /// `world_from_lidar` with its confidence, or why there is none.
+    pub estimate: PoseEstimate,
+    /// Cells that agree on the pose.
+    pub inlier_count: u32,
+    /// Their share of all regressed cells.
+    pub inlier_ratio: f64,
+    /// Where the time went.
+    pub times: LocalizerTimes,
+}
+
+/// Encoder, head of a town and solver.
+#[derive(Debug)]
+pub struct Localizer {
+    encoder: SceneEncoder,
+    head: SceneHead,
+    solver: RansacConfig,
+    device: Device,
+    sha256: [String; 2],
+}
+
+impl Localizer {
+    /// Reads encoder and head.
+    ///
+    /// # Errors
+    /// [`LocalizerError`] when a file is missing, cut off, of something else, or when the head was trained on the
+    /// features of another encoder.
+    pub fn load(encoder: &Path, head: &Path, device: Device) -> Result<Self, LocalizerError> {
+        let (network, encoder_sha256) = SceneEncoder::load(encoder, device)?;
+        let weights = Weights::load(head)?;
+        let config: SceneHeadConfig = weights.config()?;
+        if config.encoder_sha256 != encoder_sha256 {
+            return Err(LocalizerError::OtherEncoder {
+                head: head.display().to_string(),
+                expected: config.encoder_sha256,
+                encoder: encoder.display().to_string(),
+                found: encoder_sha256,
+            });
+        }
+        let mut variables = VarStore::new(device);
+        let scene_head = SceneHead::new(&variables.root(), &config)?;
+        weights.copy_into(&variables)?;
+        variables.freeze();
+        let sha256 = [encoder_sha256, weights.sha256().to_owned()];
+        Ok(Self { encoder: network, head: scene_head, solver: RansacConfig::default(), device, sha256 })
+    }
+
+    /// Hashes of encoder and head.
+    #[must_use]
+    pub fn sha256(&self) -> &[String; 2] {
+        &self.sha256
+    }
+
+    /// The head's configuration: town, origin.
+    #[must_use]
+    pub fn head_config(&self) -> &SceneHeadConfig {
+        self.head.config()
+    }
+
+    /// First steps: voxels, features, scene coordinates.
+    ///
+    /// # Errors
+    /// [`LocalizerError::Tensor`] when the tensor library refuses.
+    pub fn scene_coordinates(&self, cloud: &PointCloud) -> Result<(SceneCoordinates, LocalizerTimes), LocalizerError> {
+        let mut times = LocalizerTimes::default();
+        let start = Instant::now();
+        let points = cloud.xyzi.iter().map(|&[x, y, z, _]| [x, y, z]);
+        let sweep = SweepVoxels::new(points, self.encoder.config());
+        let chosen = choose_evenly(sweep.cells(), self.head.config().max_cells);
+        times.voxelise = start.elapsed();
+        if chosen.is_empty() {
+            return Ok((SceneCoordinates::default(), times));
+        }
+        let start = Instant::now();
+        let batch = VoxelBatch::new(&[&sweep], self.encoder.config(), self.device)?;
+        let features = self.encoder.encode(&batch, Kind::Float)?;
+        times.encode = start.elapsed();
+
+        let start = Instant::now();
+        let rows: Vec<i64> = chosen.iter().map(|&cell| cell as i64).collect();
+        let (world, epsilon_m) = no_grad(|| -> Result<(Vec<f32>, Vec<f32>), tch::TchError> {
+            let rows = Tensor::f_from_slice(&rows)?.f_to_device(self.device)?;
+            let cells = features.cells.f_index_select(0, &rows)?;
+            let logits = self.head.classify(&features.sweeps, false)?.f_expand([rows.size()[0], -1], false)?;
+            let regression = self.head.regress(&cells, &logits, Kind::Float)?;
+            let world = Vec::try_from(&regression.coordinates_m.f_reshape([-1])?.f_to_device(Device::Cpu)?)?;
+            Ok((world, Vec::try_from(&regression.epsilon_m.f_to_device(Device::Cpu)?)?))
+        })?;
+        times.regress = start.elapsed();
+        let sensor_m = chosen.iter().map(|&cell| sweep.cells()[cell].centroid_m).collect();
+        Ok((SceneCoordinates { sensor_m, world_m: world.as_chunks().0.to_vec(), epsilon_m }, times))
+    }
+
+    /// All steps.
+    ///
+    /// # Errors
+    /// [`LocalizerError::Tensor`] when the tensor library refuses. A sweep that cannot be localised is no error but an
+    /// answer: [`PoseEstimate::NoPose`].
+    pub fn localize(&self, cloud: &PointCloud) -> Result<Localization, LocalizerError> {
+        let (coordinates, mut times) = self.scene_coordinates(cloud)?;
+        let start = Instant::now();
+        let found = self.register(&coordinates);
+        times.solve = start.elapsed();
+        Ok(match found {
+            Ok(registration) => Localization {
+                estimate: self.estimate(&registration, &coordinates),
+                inlier_count: registration.inliers.len() as u32,
+                inlier_ratio: registration.inlier_ratio,
+                times,
+            },
+            Err((reason, inlier_count)) => Localization {
+                estimate: PoseEstimate::NoPose { reason, inlier_count },
+                inlier_count,
+                inlier_ratio: 0.0,
+                times,
+            },
+        })
+    }
+
+    fn register(&self, coordinates: &SceneCoordinates) -> Result<Registration, (NoPoseReason, u32)> {
+        if coordinates.sensor_m.len() < MIN_CELLS {
+            return Err((NoPoseReason::TooFewPoints, 0));
+        }
+        solve(&coordinates.correspondences(), &self.solver).map_err(|none| match none {
+            NoRegistration::TooFewInliers { found, .. } => (NoPoseReason::TooFewInliers, found as u32),
+            NoRegistration::TooFewCorrespondences { .. } | NoRegistration::Degenerate { .. } => {
+                (NoPoseReason::TooFewInliers, 0)
+            }
+        })
+    }
+
+    /// Eq. 6 over the inliers, times their share.
+    fn estimate(&self, registration: &Registration, coordinates: &SceneCoordinates) -> PoseEstimate {
+        let sigma = |&row: &u32| sigma(coordinates.epsilon_m[row as usize]);
+        let mean = registration.inliers.iter().map(sigma).sum::<f32>() / registration.inliers.len().max(1) as f32;
+        let [x, y, z] = self.head.config().origin_m;
+        let world_from_origin = Isometry3::from_parts(Translation3::new(x, y, z), nalgebra::UnitQuaternion::identity());
+        let pose = (world_from_origin * registration.target_from_source).into();
+        PoseEstimate::new(pose, (mean * registration.inlier_ratio as f32).clamp(0.0, 1.0))
+    }
+}
+
+impl SceneCoordinates {
+    /// For the solver, weighted by Eq. 6.
+    #[must_use]
+    pub fn correspondences(&self) -> Vec<Correspondence> {
+        let places = self.sensor_m.iter().zip(&self.world_m).zip(&self.epsilon_m);
+        places
+            .map(|((&source_m, &target_m), &epsilon_m)| Correspondence { source_m, target_m, weight: sigma(epsilon_m) })
+            .collect()
+    }
+}
+
+/// Confidence of a cell (Eq. 6): 0.5 at an expected error of 1 m.
+#[must_use]
+pub fn sigma(epsilon_m: f32) -> f32 {
+    1.0 / (1.0 + epsilon_m * epsilon_m)
+}
+
+/// Up to `count` cells, evenly over the sweep, flat ground no more than its share.
+fn choose_evenly(cells: &[Cell], count: usize) -> Vec<usize> {
+    let (flat, high): (Vec<usize>, Vec<usize>) = (0..cells.len()).partition(|&cell| cells[cell].is_flat());
+    let flat_count = (count as f64 * FLAT_SHARE) as usize;
+    let mut chosen = every_nth(&high, count - flat_count);
+    chosen.extend(every_nth(&flat, flat_count));
+    chosen
+}
+
+fn every_nth(rows: &[usize], count: usize) -> Vec<usize> {
+    let kept = count.min(rows.len());
+    (0..kept).map(|place| rows[place * rows.len() / kept]).collect()
+}

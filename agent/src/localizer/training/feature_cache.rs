@@ -1,0 +1,181 @@
+//! Features of a town's sweeps, computed once: the encoder is frozen, so only the head needs them again and again.
+
+use std::f64::consts::PI;
+use std::sync::Arc;
+
+use nalgebra::{Isometry3, Point3};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use tch::{Device, Kind, TchError, Tensor, no_grad};
+
+use super::error::LocalizerTrainError;
+use super::pairs::choose;
+use super::sweep_store::{SweepList, yaw};
+use crate::localizer::{Cell, SceneEncoder, SweepVoxels, VoxelBatch};
+use crate::training::{ComputePrecision, Prefetch};
+
+/// Cells kept of each sweep.
+const CELLS: usize = 400;
+/// Sweeps of one forward pass.
+const BATCH: u64 = 4;
+
+/// How sweeps are changed before they are encoded.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SweepAugmentation {
+    /// Copies of every sweep; the first is unchanged.
+    pub copies: usize,
+    /// Largest turn of the other copies, radians: a car does not always stand along its lane.
+    pub turn_rad: f64,
+    /// Least share of points that is kept in the other copies.
+    pub keep: f64,
+}
+
+/// One sweep, ready to be encoded.
+struct Prepared {
+    voxels: SweepVoxels,
+    rows: Vec<usize>,
+    world_from_sensor: Isometry3<f64>,
+}
+
+/// Cached features of cells, with what they should be regressed to.
+#[derive(Debug)]
+pub struct FeatureCache {
+    /// `[N, cell_channels]`, half precision.
+    pub cells: Tensor,
+    /// `[N]`: the sweep of each cell.
+    pub sweep_of_cell: Tensor,
+    /// `[N, 3]`: true world coordinates relative to the origin, metres.
+    pub targets_m: Tensor,
+    /// `[N, 3]`: where the cell is in the sensor frame, metres.
+    pub sensor_m: Tensor,
+    /// `[S, sweep_channels]`, single precision.
+    pub sweeps: Tensor,
+    /// `[S]`: true poses.
+    pub world_from_sensor: Vec<Isometry3<f64>>,
+    /// Middle of the sensor positions, metres.
+    pub origin_m: [f64; 3],
+}
+
+impl FeatureCache {
+    /// Encodes every sweep of `list` once per copy; `progress` hears how many of how many sweeps are done.
+    ///
+    /// # Errors
+    /// [`LocalizerTrainError`] when a sweep cannot be read or encoded, or none has a pose.
+    pub fn build(
+        list: &Arc<SweepList>,
+        encoder: &SceneEncoder,
+        augmentation: SweepAugmentation,
+        seed: u64,
+        threads: usize,
+        precision: ComputePrecision,
+        device: Device,
+        progress: &mut dyn FnMut(usize, usize),
+    ) -> Result<Self, LocalizerTrainError> {
+        let total = list.len() * augmentation.copies.max(1);
+        let config = encoder.config().clone();
+        let source = Arc::clone(list);
+        let prepare = move |batch: u64| -> Result<Vec<Prepared>, LocalizerTrainError> {
+            let numbers = (batch * BATCH..(batch + 1) * BATCH).filter(|&number| (number as usize) < total);
+            let prepared = numbers.map(|number| {
+                let (index, copy) = (number as usize % source.len(), number as usize / source.len());
+                let Some(stored) = source.read(index, config.range_m)? else { return Ok(None) };
+                let mut rng = ChaCha8Rng::seed_from_u64(seed);
+                rng.set_stream(number);
+                let (turn, keep) = match copy {
+                    0 => (Isometry3::identity(), 1.0),
+                    _ => {
+                        let angle = augmentation.turn_rad.clamp(1e-6, PI);
+                        (yaw(rng.random_range(-angle..angle)), rng.random_range(augmentation.keep..=1.0))
+                    }
+                };
+                let voxels = stored.turned_voxels(&turn, keep, &mut rng, &config);
+                let rows = choose(voxels.cells(), CELLS, &mut rng);
+                let world_from_sensor = stored.world_from_sensor * turn.inverse();
+                Ok(Some(Prepared { voxels, rows, world_from_sensor }))
+            });
+            prepared.filter_map(Result::transpose).collect()
+        };
+        let mut loader = Prefetch::start(threads, 0, prepare);
+        let mut builder = Builder::default();
+        let mut done = 0;
+        while done < total {
+            let batch = loader.next_batch().ok_or(LocalizerTrainError::LoaderGone)??;
+            if !batch.is_empty() {
+                builder.add(&batch, encoder, precision.kind(), device)?;
+            }
+            done = (done + BATCH as usize).min(total);
+            progress(done, total);
+        }
+        builder.finish(device)
+    }
+
+    /// Number of sweeps.
+    #[must_use]
+    pub fn sweep_count(&self) -> usize {
+        self.world_from_sensor.len()
+    }
+
+    /// Number of cells.
+    #[must_use]
+    pub fn cell_count(&self) -> i64 {
+        self.sweep_of_cell.size()[0]
+    }
+}
+
+#[derive(Default)]
+struct Builder {
+    cells: Vec<Tensor>,
+    sweeps: Vec<Tensor>,
+    sweep_of_cell: Vec<i64>,
+    places: Vec<Cell>,
+    poses: Vec<Isometry3<f64>>,
+}
+
+impl Builder {
+    fn add(&mut self, batch: &[Prepared], encoder: &SceneEncoder, kind: Kind, device: Device) -> Result<(), TchError> {
+        let sweeps: Vec<&SweepVoxels> = batch.iter().map(|prepared| &prepared.voxels).collect();
+        let voxels = VoxelBatch::new(&sweeps, encoder.config(), device)?;
+        let features = encoder.encode(&voxels, kind)?;
+        let mut rows = Vec::new();
+        for (number, prepared) in batch.iter().enumerate() {
+            let first = voxels.cell_rows(number).start;
+            rows.extend(prepared.rows.iter().map(|&row| first + row as i64));
+            self.sweep_of_cell.extend(prepared.rows.iter().map(|_| (self.poses.len()) as i64));
+            self.places.extend(prepared.rows.iter().map(|&row| prepared.voxels.cells()[row]));
+            self.poses.push(prepared.world_from_sensor);
+        }
+        let rows = Tensor::f_from_slice(&rows)?.f_to_device(device)?;
+        no_grad(|| {
+            self.cells.push(features.cells.f_index_select(0, &rows)?.f_to_kind(Kind::Half)?);
+            self.sweeps.push(features.sweeps);
+            Ok(())
+        })
+    }
+
+    fn finish(self, device: Device) -> Result<FeatureCache, LocalizerTrainError> {
+        if self.poses.is_empty() || self.places.is_empty() {
+            return Err(LocalizerTrainError::NoSweeps(Vec::new()));
+        }
+        let count = self.poses.len() as f64;
+        let origin_m: [f64; 3] = std::array::from_fn(|axis| {
+            self.poses.iter().map(|pose| pose.translation.vector[axis]).sum::<f64>() / count
+        });
+        let mut targets = Vec::with_capacity(3 * self.places.len());
+        for (cell, &sweep) in self.places.iter().zip(&self.sweep_of_cell) {
+            let [x, y, z] = cell.centroid_m.map(f64::from);
+            let place = self.poses[sweep as usize] * Point3::new(x, y, z);
+            targets.extend((0..3).map(|axis| (place[axis] - origin_m[axis]) as f32));
+        }
+        let sensor: Vec<f32> = self.places.iter().flat_map(|cell| cell.centroid_m).collect();
+        let columns = |values: &[f32]| Tensor::f_from_slice(values)?.f_view([-1, 3])?.f_to_device(device);
+        Ok(FeatureCache {
+            cells: Tensor::f_cat(&self.cells, 0)?,
+            sweep_of_cell: Tensor::f_from_slice(&self.sweep_of_cell)?.f_to_device(device)?,
+            targets_m: columns(&targets)?,
+            sensor_m: columns(&sensor)?,
+            sweeps: Tensor::f_cat(&self.sweeps, 0)?,
+            world_from_sensor: self.poses,
+            origin_m,
+        })
+    }
+}

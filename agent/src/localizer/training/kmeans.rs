@@ -1,0 +1,75 @@
+//! Clusters of places.
+
+use rand::SeedableRng;
+use rand::seq::IndexedRandom;
+use rand_chacha::ChaCha8Rng;
+
+/// Rounds until clusters hardly move any more.
+const ROUNDS: usize = 25;
+
+/// Middles of up to `count` clusters and the cluster of every point. Fewer points than clusters: every point is one.
+///
+/// Begins with points far from each other (k-means++, Arthur and Vassilvitskii 2007); the same for the same seed.
+#[must_use]
+pub fn kmeans(points: &[[f64; 3]], count: usize, seed: u64) -> (Vec<[f64; 3]>, Vec<usize>) {
+    let mut centres = spread(points, count.min(points.len()), seed);
+    let mut labels = vec![0; points.len()];
+    for _ in 0..ROUNDS {
+        labels.iter_mut().zip(points).for_each(|(label, point)| *label = nearest(&centres, point).0);
+        let mut sums = vec![[0.0; 4]; centres.len()];
+        for (&label, point) in labels.iter().zip(points) {
+            (0..3).for_each(|axis| sums[label][axis] += point[axis]);
+            sums[label][3] += 1.0;
+        }
+        for (centre, sum) in centres.iter_mut().zip(&sums).filter(|(_, sum)| sum[3] > 0.0) {
+            *centre = std::array::from_fn(|axis| sum[axis] / sum[3]);
+        }
+    }
+    (centres, labels)
+}
+
+fn spread(points: &[[f64; 3]], count: usize, seed: u64) -> Vec<[f64; 3]> {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let mut squares = vec![f64::MAX; points.len()];
+    let mut centres: Vec<[f64; 3]> = Vec::with_capacity(count);
+    while centres.len() < count {
+        let indices: Vec<usize> = (0..points.len()).collect();
+        let weight = |&index: &usize| if centres.is_empty() { 1.0 } else { squares[index] };
+        // All weights are zero when points repeat: any will do then.
+        let chosen = indices.choose_weighted(&mut rng, weight).copied().unwrap_or(0);
+        let centre = points[chosen];
+        squares.iter_mut().zip(points).for_each(|(least, point)| *least = least.min(square(&centre, point)));
+        centres.push(centre);
+    }
+    centres
+}
+
+fn nearest(centres: &[[f64; 3]], point: &[f64; 3]) -> (usize, f64) {
+    let distances = centres.iter().map(|centre| square(centre, point)).enumerate();
+    distances.min_by(|a, b| a.1.total_cmp(&b.1)).unwrap_or((0, f64::MAX))
+}
+
+fn square(a: &[f64; 3], b: &[f64; 3]) -> f64 {
+    (0..3).map(|axis| (a[axis] - b[axis]).powi(2)).sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn heaps_become_clusters() {
+        let heap = |x: f64| (0..20).map(move |k| [x + 0.1 * f64::from(k % 5), 0.1 * f64::from(k / 5), 0.0]);
+        let points: Vec<[f64; 3]> = heap(0.0).chain(heap(50.0)).chain(heap(100.0)).collect();
+        let (centres, labels) = kmeans(&points, 3, 1);
+        assert_eq!(centres.len(), 3);
+        assert!(labels.chunks(20).all(|heap| heap.iter().all(|label| *label == heap[0])));
+        assert_eq!(kmeans(&points, 3, 1), (centres, labels));
+    }
+
+    #[test]
+    fn few_or_equal_points_are_no_trouble() {
+        assert_eq!(kmeans(&[], 4, 0).0.len(), 0);
+        assert_eq!(kmeans(&[[1.0; 3]; 9], 4, 0).0, [[1.0; 3]; 4]);
+    }
+}

@@ -1,0 +1,24 @@
+//! Training of localizers, in two stages as LightLoc does it: an encoder once, over many towns; then, for every new town,
+//! only a head on the frozen encoder's features.
+
+mod contrast;
+mod curve;
+mod encoder_training;
+mod error;
+mod feature_cache;
+mod kmeans;
+mod pairs;
+mod redundancy;
+mod scene_training;
+mod scene_validation;
+mod sweep_store;
+
+pub use encoder_training::{EncoderAccuracy, EncoderReport, EncoderSummary, EncoderTrainConfig, train_encoder};
+pub use error::LocalizerTrainError;
+pub use feature_cache::{FeatureCache, SweepAugmentation};
+pub use kmeans::kmeans;
+pub use pairs::{Pair, PairMaker};
+pub use redundancy::{Redundancy, RedundancyConfig};
+pub use scene_training::{SceneReport, SceneSummary, SceneTrainConfig, train_scene};
+pub use scene_validation::SceneAccuracy;
+pub use sweep_store::{StoredSweep, SweepList, SweepStore};

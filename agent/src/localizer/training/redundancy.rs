@@ -1,0 +1,141 @@
+//! Redundant Sample Downsampling (LightLoc, Li et al. 2025): sweeps that the head has learnt evenly need not be shown again
+//! and again.
+
+/// When sweeps are watched, and how many are left out.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct RedundancyConfig {
+    /// Share of each cluster's sweeps that is dropped at the end of a window.
+    pub drop: f64,
+    /// The two windows, as shares of the training: from where to where losses are recorded.
+    pub windows: [[f64; 2]; 2],
+    /// From here on all sweeps are used again, a share of the training.
+    pub all_from: f64,
+}
+
+impl Default for RedundancyConfig {
+    /// A quarter after each of two windows; the last sixth of the training uses all.
+    fn default() -> Self {
+        Self { drop: 0.25, windows: [[0.1, 0.25], [0.35, 0.5]], all_from: 0.84 }
+    }
+}
+
+/// Which sweeps are used, with which weight.
+#[derive(Debug)]
+pub struct Redundancy {
+    config: RedundancyConfig,
+    class_of_sweep: Vec<usize>,
+    weights: Vec<f32>,
+    /// Median losses of each sweep in the current window, one per pass.
+    recorded: Vec<Vec<f32>>,
+    windows_done: usize,
+}
+
+impl Redundancy {
+    /// Nothing dropped yet.
+    #[must_use]
+    pub fn new(config: RedundancyConfig, class_of_sweep: Vec<usize>) -> Self {
+        let count = class_of_sweep.len();
+        Self { config, class_of_sweep, weights: vec![1.0; count], recorded: vec![Vec::new(); count], windows_done: 0 }
+    }
+
+    /// Weight of each sweep; 0: not used.
+    #[must_use]
+    pub fn weights(&self) -> &[f32] {
+        &self.weights
+    }
+
+    /// Whether losses are of interest when this share of the training is done.
+    #[must_use]
+    pub fn watches(&self, share_done: f64) -> bool {
+        self.config.windows.get(self.windows_done).is_some_and(|[from, to]| (*from..*to).contains(&share_done))
+    }
+
+    /// Takes the losses of the cells of one pass: pairs of sweep and loss.
+    pub fn record(&mut self, losses: &[(usize, f32)]) {
+        let mut by_sweep = vec![Vec::new(); self.weights.len()];
+        losses.iter().for_each(|&(sweep, loss)| by_sweep[sweep].push(loss));
+        for (recorded, mut losses) in self.recorded.iter_mut().zip(by_sweep).filter(|(_, losses)| !losses.is_empty()) {
+            let middle = losses.len() / 2;
+            recorded.push(*losses.select_nth_unstable_by(middle, f32::total_cmp).1);
+        }
+    }
+
+    /// Decides at the end of a pass. Says whether the set of used sweeps has changed.
+    pub fn advance(&mut self, share_done: f64) -> bool {
+        let is_over = |redundancy: &Self| {
+            redundancy.config.windows.get(redundancy.windows_done).is_some_and(|[_, to]| share_done >= *to)
+        };
+        if share_done >= self.config.all_from {
+            let changes = self.weights.iter().any(|&weight| weight != 1.0);
+            self.weights.fill(1.0);
+            self.windows_done = self.config.windows.len();
+            return changes;
+        }
+        if is_over(self) {
+            self.drop_most_even();
+            self.windows_done += 1;
+            self.recorded.iter_mut().for_each(Vec::clear);
+            return true;
+        }
+        false
+    }
+
+    /// In each cluster the sweeps with the lowest variance of their losses go; the others stand for them.
+    fn drop_most_even(&mut self) {
+        let classes = self.class_of_sweep.iter().max().map_or(0, |class| class + 1);
+        for class in 0..classes {
+            let used = |&sweep: &usize| self.class_of_sweep[sweep] == class && self.weights[sweep] > 0.0;
+            let mut members: Vec<(f32, usize)> =
+                (0..self.weights.len()).filter(used).map(|sweep| (variance(&self.recorded[sweep]), sweep)).collect();
+            members.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+            let dropped = (members.len() as f64 * self.config.drop) as usize;
+            let kept = (members.len() - dropped) as f32 / members.len().max(1) as f32;
+            for (place, &(_, sweep)) in members.iter().enumerate() {
+                self.weights[sweep] = if place < dropped { 0.0 } else { self.weights[sweep] / kept };
+            }
+        }
+    }
+}
+
+fn variance(values: &[f32]) -> f32 {
+    if values.len() < 2 {
+        // Nothing is known of its evenness, so it stays.
+        return f32::MAX;
+    }
+    let mean = values.iter().sum::<f32>() / values.len() as f32;
+    values.iter().map(|value| (value - mean).powi(2)).sum::<f32>() / values.len() as f32
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_most_even_quarter_goes_and_the_others_stand_for_it() {
+        let mut redundancy = Redundancy::new(RedundancyConfig::default(), vec![0; 8]);
+        assert!(redundancy.watches(0.2) && !redundancy.watches(0.3));
+        for pass in 0..3 {
+            let losses: Vec<(usize, f32)> = (0..8)
+                .flat_map(|sweep| [(sweep, (sweep * pass) as f32), (sweep, (sweep * pass) as f32 + 0.1)])
+                .collect();
+            redundancy.record(&losses);
+        }
+        assert!(!redundancy.advance(0.2));
+        assert!(redundancy.advance(0.25));
+        assert_eq!(redundancy.weights()[..2], [0.0, 0.0]);
+        assert!(redundancy.weights()[2..].iter().all(|weight| (weight - 8.0 / 6.0).abs() < 1e-6));
+        assert!(redundancy.watches(0.4) && !redundancy.watches(0.2));
+        assert!(redundancy.advance(0.9));
+        assert_eq!(redundancy.weights(), [1.0; 8]);
+    }
+
+    #[test]
+    fn sweeps_that_were_never_watched_stay() {
+        let mut redundancy = Redundancy::new(RedundancyConfig::default(), vec![0, 0, 0, 0, 1]);
+        redundancy.record(&[(0, 1.0), (1, 1.0)]);
+        redundancy.record(&[(0, 1.0), (1, 2.0)]);
+        redundancy.advance(0.25);
+        assert_eq!(redundancy.weights()[0], 0.0);
+        assert!(redundancy.weights()[1..].iter().all(|&weight| weight > 0.0));
+    }
+}

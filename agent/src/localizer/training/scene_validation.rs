@@ -1,0 +1,86 @@
+//! How good a head is, on cached features of sweeps it was not trained on.
+
+use serde::Serialize;
+use tch::{Kind, Tensor, no_grad};
+
+use super::error::LocalizerTrainError;
+use super::feature_cache::FeatureCache;
+use crate::localizer::scene_head::SceneHead;
+use crate::registration::Correspondence;
+use crate::registration::ransac::{RansacConfig, solve};
+
+/// Errors on sweeps that were not trained on.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct SceneAccuracy {
+    /// Median L1 error of a cell, metres.
+    pub cell_p50_m: f64,
+    /// Median translation error, metres.
+    pub pose_p50_m: f64,
+    /// Median rotation error, degrees.
+    pub pose_p50_deg: f64,
+    /// Share of sweeps with a translation error under 3 m; those without a pose are failures.
+    pub success_3m: f64,
+    /// Share under 1 m.
+    pub success_1m: f64,
+}
+
+/// Regresses and solves every sweep of `cache`.
+///
+/// # Errors
+/// The tensor library's.
+pub(super) fn validate(
+    head: &SceneHead,
+    cache: &FeatureCache,
+    kind: Kind,
+) -> Result<SceneAccuracy, LocalizerTrainError> {
+    let regression = no_grad(|| {
+        let logits = head.classify(&cache.sweeps, false)?.f_index_select(0, &cache.sweep_of_cell)?;
+        head.regress(&cache.cells, &logits, kind)
+    })?;
+    // Coordinates are relative to the origin of the head's town.
+    let origin = head.config().origin_m;
+    let moved: [f32; 3] = std::array::from_fn(|axis| (cache.origin_m[axis] - origin[axis]) as f32);
+    let targets = &cache.targets_m + Tensor::f_from_slice(&moved)?;
+    let error = (&regression.coordinates_m - targets).f_abs()?.f_sum_dim_intlist(1_i64, false, Kind::Float)?;
+    let mut cell_errors: Vec<f64> = Vec::try_from(&error.f_to_kind(Kind::Double)?)?;
+    let world: Vec<f32> = Vec::try_from(&regression.coordinates_m.f_reshape([-1])?)?;
+    let sensor: Vec<f32> = Vec::try_from(&cache.sensor_m.f_reshape([-1])?)?;
+    let epsilon: Vec<f32> = Vec::try_from(&regression.epsilon_m)?;
+    let sweeps: Vec<i64> = Vec::try_from(&cache.sweep_of_cell)?;
+    let mut by_sweep = vec![Vec::new(); cache.sweep_count()];
+    for (row, &sweep) in sweeps.iter().enumerate() {
+        let point = |values: &[f32]| [values[3 * row], values[3 * row + 1], values[3 * row + 2]];
+        let weight = 1.0 / (1.0 + epsilon[row] * epsilon[row]);
+        by_sweep[sweep as usize].push(Correspondence { source_m: point(&sensor), target_m: point(&world), weight });
+    }
+    let mut translations = Vec::new();
+    let mut rotations = Vec::new();
+    for (correspondences, truth) in by_sweep.iter().zip(&cache.world_from_sensor) {
+        let found = solve(correspondences, &RansacConfig::default());
+        let (metres, degrees) = found.map_or((f64::MAX, 180.0), |found| {
+            let offset = nalgebra::Vector3::from(origin);
+            let error = found.target_from_source.translation.vector + offset - truth.translation.vector;
+            (error.norm(), found.target_from_source.rotation.angle_to(&truth.rotation).to_degrees())
+        });
+        translations.push(metres);
+        rotations.push(degrees);
+    }
+    let share =
+        |limit: f64| translations.iter().filter(|&&error| error < limit).count() as f64 / translations.len() as f64;
+    let (success_3m, success_1m) = (share(3.0), share(1.0));
+    Ok(SceneAccuracy {
+        cell_p50_m: median(&mut cell_errors),
+        pose_p50_m: median(&mut translations),
+        pose_p50_deg: median(&mut rotations),
+        success_3m,
+        success_1m,
+    })
+}
+
+fn median(values: &mut [f64]) -> f64 {
+    if values.is_empty() {
+        return f64::NAN;
+    }
+    let middle = values.len() / 2;
+    *values.select_nth_unstable_by(middle, f64::total_cmp).1
+}

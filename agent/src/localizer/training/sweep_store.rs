@@ -1,0 +1,184 @@
+//! Sweeps with true poses, kept in memory: centimetres as 16-bit integers, a third of a megabyte each.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
+use rand::Rng;
+use sha2::{Digest, Sha256};
+use sim_replay::dataset::{self, LoadOptions, Scenario};
+
+use super::error::LocalizerTrainError;
+use crate::localizer::{SceneEncoderConfig, SweepVoxels};
+use crate::training::Prefetch;
+
+/// Units of stored coordinates, metres.
+const UNIT_M: f32 = 0.01;
+
+/// One sweep.
+#[derive(Debug, Clone)]
+pub struct StoredSweep {
+    /// Which world it was made in: place of its folder on the command line.
+    pub world: usize,
+    /// Which drive it belongs to.
+    pub drive: usize,
+    /// True pose.
+    pub world_from_sensor: Isometry3<f64>,
+    /// x, y, z in [`UNIT_M`].
+    points: Vec<[i16; 3]>,
+}
+
+impl StoredSweep {
+    /// A sweep from points in metres.
+    #[must_use]
+    pub fn new(world: usize, drive: usize, world_from_sensor: Isometry3<f64>, points: &[[f32; 4]]) -> Self {
+        let stored = |point: &[f32; 4]| std::array::from_fn(|axis| (point[axis] / UNIT_M).round() as i16);
+        Self { world, drive, world_from_sensor, points: points.iter().map(stored).collect() }
+    }
+
+    /// x, y, z of every point, metres in the sensor frame.
+    pub fn points(&self) -> impl Iterator<Item = [f32; 3]> + '_ {
+        self.points.iter().map(|point| point.map(|axis| f32::from(axis) * UNIT_M))
+    }
+
+    /// The sweep as another sensor would have it that stands `turned_from_sensor` differently: voxels of the turned
+    /// points, each kept with a probability.
+    pub fn turned_voxels(
+        &self,
+        turned_from_sensor: &Isometry3<f64>,
+        keep: f64,
+        rng: &mut impl Rng,
+        config: &SceneEncoderConfig,
+    ) -> SweepVoxels {
+        let turn: Isometry3<f32> = turned_from_sensor.cast();
+        // 32 decisions from one draw of the generator would be faster still; this is not what takes the time.
+        let kept = self.points().filter(|_| keep >= 1.0 || rng.random_bool(keep));
+        SweepVoxels::new(kept.map(|[x, y, z]| (turn * nalgebra::Point3::new(x, y, z)).into()), config)
+    }
+}
+
+/// A turn about the vertical, and where the sensor then stands.
+#[must_use]
+pub(super) fn yaw(angle_rad: f64) -> Isometry3<f64> {
+    Isometry3::from_parts(Translation3::identity(), UnitQuaternion::from_axis_angle(&Vector3::z_axis(), angle_rad))
+}
+
+/// Where sweeps with true poses lie on disk. Each folder is one world: poses in different folders have nothing to do with
+/// each other.
+#[derive(Debug)]
+pub struct SweepList {
+    places: Vec<Place>,
+    /// SHA-256 over names, agents and capture times: which data it is, for model cards.
+    pub listing_sha256: String,
+}
+
+#[derive(Debug)]
+struct Place {
+    scenario: Arc<Scenario>,
+    agent: usize,
+    tick: usize,
+    world: usize,
+    drive: usize,
+}
+
+impl SweepList {
+    /// Lists every sweep of every agent.
+    ///
+    /// # Errors
+    /// [`LocalizerTrainError`] when a folder cannot be read or holds no sweep.
+    pub fn open(folders: &[PathBuf]) -> Result<Self, LocalizerTrainError> {
+        let mut places = Vec::new();
+        let mut hash = Sha256::new();
+        let mut drive = 0;
+        for (world, folder) in folders.iter().enumerate() {
+            for scenario in dataset::open(folder)?.scenarios {
+                hash.update(scenario.name.as_bytes());
+                scenario.agents.iter().for_each(|agent| hash.update(format!("/{agent}")));
+                scenario.ticks.iter().for_each(|tick| hash.update(format!("\n{} {}", tick.stem, tick.capture_nanos)));
+                let scenario = Arc::new(scenario);
+                for agent in 0..scenario.agents.len() {
+                    let place = |tick| Place { scenario: Arc::clone(&scenario), agent, tick, world, drive };
+                    places.extend((0..scenario.ticks.len()).map(place));
+                    drive += 1;
+                }
+            }
+        }
+        if places.is_empty() {
+            return Err(LocalizerTrainError::NoSweeps(folders.to_vec()));
+        }
+        let listing_sha256 = hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect();
+        Ok(Self { places, listing_sha256 })
+    }
+
+    /// Keeps at most `count` sweeps, evenly spread.
+    pub fn thin_out(&mut self, count: usize) {
+        let total = self.places.len();
+        if total > count {
+            let mut index = 0;
+            // Sweep k of n stays where the running share passes a whole number.
+            self.places.retain(|_| {
+                index += 1;
+                index * count / total > (index - 1) * count / total
+            });
+        }
+    }
+
+    /// Number of sweeps.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.places.len()
+    }
+
+    /// Whether there is none.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.places.is_empty()
+    }
+
+    /// Reads one sweep, points within `range_m` of the sensor; nothing when its pose is not known.
+    ///
+    /// # Errors
+    /// [`LocalizerTrainError::Read`] names the file.
+    pub fn read(&self, index: usize, range_m: f64) -> Result<Option<StoredSweep>, LocalizerTrainError> {
+        let Place { scenario, agent, tick, world, drive } = &self.places[index];
+        let mut frame = scenario.load(*agent, *tick, &LoadOptions::default())?;
+        let Some(pose) = frame.world_from_lidar else { return Ok(None) };
+        let range = range_m as f32;
+        frame.points.xyzi.retain(|[x, y, z, _]| x * x + y * y <= range * range && z.is_finite());
+        Ok(Some(StoredSweep::new(*world, *drive, pose.isometry(), &frame.points.xyzi)))
+    }
+}
+
+/// All sweeps of some folders in memory.
+#[derive(Debug)]
+pub struct SweepStore {
+    /// The sweeps, drive after drive.
+    pub sweeps: Vec<StoredSweep>,
+    /// SHA-256 over names, agents and capture times: which data it is, for model cards.
+    pub listing_sha256: String,
+}
+
+impl SweepStore {
+    /// Reads every sweep that has a pose.
+    ///
+    /// # Errors
+    /// [`LocalizerTrainError`] when a folder cannot be read or holds no sweep with a pose.
+    pub fn read(folders: &[PathBuf], range_m: f64) -> Result<Self, LocalizerTrainError> {
+        let list = Arc::new(SweepList::open(folders)?);
+        let count = list.len();
+        let listing_sha256 = list.listing_sha256.clone();
+        let threads = std::thread::available_parallelism().map_or(1, usize::from);
+        let mut reader = Prefetch::start(threads, 0, move |number| match (number as usize) < count {
+            true => list.read(number as usize, range_m),
+            false => Ok(None),
+        });
+        let mut sweeps = Vec::with_capacity(count);
+        for _ in 0..count {
+            sweeps.extend(reader.next_batch().ok_or(LocalizerTrainError::LoaderGone)??);
+        }
+        match sweeps.is_empty() {
+            true => Err(LocalizerTrainError::NoSweeps(folders.to_vec())),
+            false => Ok(Self { sweeps, listing_sha256 }),
+        }
+    }
+}
