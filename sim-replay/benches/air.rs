@@ -1,4 +1,7 @@
-//! What a message costs beside the network it goes over: `air/<what>/<pace>/<KiB>`.
+//! What a message costs beside the network it goes over: `air/<route>/<what>/<pace>/<KiB>`.
+//!
+//! - `fleet`: from one client over the router to another, the way between an agent and an ego;
+//! - `direct`: from a client into the router's own process, where only the scorer sits.
 //!
 //! - `raw`: zenoh on loopback from put to callback, with a payload of a map's bytes;
 //! - `raw-copied`: the same until the bytes lie together, the least that anyone needs who wants to use them;
@@ -15,6 +18,7 @@ use protocol::{
     Bev, BevFeatures, BevGrid, CavId, CodecConfig, Limits, Pose, PoseEstimate, Stamp, encode_features, wire,
 };
 use sim_replay::bus::{BusOptions, Endpoint, open};
+use zenoh::Session;
 use zenoh::Wait;
 use zenoh::bytes::ZBytes;
 use zenoh::pubsub::Publisher;
@@ -83,14 +87,24 @@ fn report(case: &str, times: Vec<Duration>, [raw_p50, raw_min]: [f64; 2]) {
 fn main() -> Result<(), Failure> {
     let port = TcpListener::bind("127.0.0.1:0")?.local_addr()?.port();
     let router = open(&BusOptions::router(Endpoint::loopback(port)))?;
-    let client = open(&BusOptions::client(Endpoint::loopback(port)))?;
+    let sender = open(&BusOptions::client(Endpoint::loopback(port)))?;
+    let receiver = open(&BusOptions::client(Endpoint::loopback(port)))?;
+    measure("fleet", &sender, &receiver)?;
+    measure("direct", &sender, &router)?;
+    for session in [receiver, sender, router] {
+        session.close().wait().map_err(|cause| cause.to_string())?;
+    }
+    Ok(())
+}
+
+fn measure(route: &str, sender: &Session, receiver: &Session) -> Result<(), Failure> {
     let (arrive, arrivals) = channel();
-    let subscriber = router.declare_subscriber("v2v/bench/4279/bev").callback(move |sample| {
+    let subscriber = receiver.declare_subscriber("v2v/bench/4279/bev").callback(move |sample| {
         // The receiver has gone only when the benchmark is over.
         let _ = arrive.send(sample.payload().clone());
     });
     let subscriber = subscriber.wait().map_err(|cause| cause.to_string())?;
-    let publisher = client.declare_publisher("v2v/bench/4279/bev").congestion_control(CongestionControl::Block);
+    let publisher = sender.declare_publisher("v2v/bench/4279/bev").congestion_control(CongestionControl::Block);
     let publisher = publisher.wait().map_err(|cause| cause.to_string())?;
     let deadline = Instant::now() + PATIENCE;
     while !publisher.matching_status().wait().map_err(|cause| cause.to_string())?.matching() {
@@ -114,13 +128,11 @@ fn main() -> Result<(), Failure> {
                 }
             }
             let base = summary(raw_times.clone());
-            report(&format!("raw/{pace}/{kib}"), raw_times, base);
-            report(&format!("raw-copied/{pace}/{kib}"), copied_times, base);
-            report(&format!("message/{pace}/{kib}"), message_times, base);
+            report(&format!("{route}/raw/{pace}/{kib}"), raw_times, base);
+            report(&format!("{route}/raw-copied/{pace}/{kib}"), copied_times, base);
+            report(&format!("{route}/message/{pace}/{kib}"), message_times, base);
         }
     }
-    drop((subscriber, publisher));
-    client.close().wait().map_err(|cause| cause.to_string())?;
-    router.close().wait().map_err(|cause| cause.to_string())?;
-    Ok(())
+    publisher.undeclare().wait().map_err(|cause| cause.to_string())?;
+    Ok(subscriber.undeclare().wait().map_err(|cause| cause.to_string())?)
 }
