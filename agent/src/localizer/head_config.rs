@@ -26,6 +26,54 @@ pub struct SceneHeadConfig {
     pub origin_m: [f64; 3],
     /// Cells of a sweep that are regressed at most.
     pub max_cells: usize,
+    /// The second look; nothing: there is none.
+    pub refiner: Option<RefinerConfig>,
+}
+
+/// The refiner of a head.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RefinerConfig {
+    /// Channels of a cell that it looks at: those before the surroundings.
+    pub local_channels: i64,
+    /// South-west corner of the town, metres relative to the head's origin.
+    pub low_m: [f64; 2],
+    /// North-east corner.
+    pub high_m: [f64; 2],
+    /// Edges of the patches of each plane, metres.
+    pub patch_m: Vec<f64>,
+    /// Channels of a patch.
+    pub embedding: i64,
+    /// Channels inside.
+    pub width: i64,
+}
+
+impl RefinerConfig {
+    /// Corners of patches along x and y.
+    #[must_use]
+    pub fn corners(&self, patch_m: f64) -> [i64; 2] {
+        std::array::from_fn(|axis| ((self.high_m[axis] - self.low_m[axis]) / patch_m).ceil() as i64 + 2)
+    }
+
+    /// Checks that a network can be built.
+    ///
+    /// # Errors
+    /// Says which field is wrong and what stood there.
+    pub fn validate(&self) -> Result<(), String> {
+        let sizes = [("local_channels", self.local_channels), ("embedding", self.embedding), ("width", self.width)];
+        if let Some((name, size)) = sizes.into_iter().find(|(_, size)| !(1..=4096).contains(size)) {
+            return Err(format!("refiner: {name} is {size}, must be 1 to 4096"));
+        }
+        let edges = (0..2).map(|axis| self.high_m[axis] - self.low_m[axis]);
+        if edges.clone().any(|edge| !(edge > 0.0 && edge < 1e5)) {
+            return Err(format!("refiner: from {:?} to {:?} is no area", self.low_m, self.high_m));
+        }
+        match self.patch_m.iter().find(|&&patch_m| !(patch_m >= 0.5 && patch_m < 1e4)) {
+            Some(patch_m) => Err(format!("refiner: patch_m has {patch_m}, must be 0.5 or more")),
+            None if self.patch_m.len() > 8 => Err(format!("refiner: {} planes, must be 8 at most", self.patch_m.len())),
+            None => Ok(()),
+        }
+    }
 }
 
 impl SceneHeadConfig {

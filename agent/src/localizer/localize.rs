@@ -12,6 +12,7 @@ use super::error::LocalizerError;
 use super::head_config::SceneHeadConfig;
 use super::scene_encoder::SceneEncoder;
 use super::scene_head::SceneHead;
+use super::second_look::look_again;
 use super::sweep_voxels::{Cell, SweepVoxels};
 use super::voxel_batch::VoxelBatch;
 use crate::registration::ransac::{RansacConfig, solve};
@@ -34,6 +35,13 @@ pub struct SceneCoordinates {
     pub epsilon_m: Vec<f32>,
 }
 
+/// Scene coordinates, and the features they were regressed from, which the second look asks for.
+struct Regressed {
+    coordinates: SceneCoordinates,
+    /// `[N, cell_channels]`.
+    cells: Tensor,
+}
+
 /// Time per stage.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
 pub struct LocalizerTimes {
@@ -45,6 +53,8 @@ pub struct LocalizerTimes {
     pub regress: Duration,
     /// The pose solver.
     pub solve: Duration,
+    /// The second look, its fits included.
+    pub refine: Duration,
 }
 
 /// What came of one sweep.
@@ -114,13 +124,19 @@ impl Localizer {
     /// [`LocalizerError::Tensor`] when the tensor library refuses.
     pub fn scene_coordinates(&self, cloud: &PointCloud) -> Result<(SceneCoordinates, LocalizerTimes), LocalizerError> {
         let mut times = LocalizerTimes::default();
+        let regressed = self.regress(cloud, &mut times)?;
+        Ok((regressed.map(|regressed| regressed.coordinates).unwrap_or_default(), times))
+    }
+
+    /// Nothing for a sweep without cells.
+    fn regress(&self, cloud: &PointCloud, times: &mut LocalizerTimes) -> Result<Option<Regressed>, LocalizerError> {
         let start = Instant::now();
         let points = cloud.xyzi.iter().map(|&[x, y, z, _]| [x, y, z]);
         let sweep = SweepVoxels::new(points, self.encoder.config());
         let chosen = choose_evenly(sweep.cells(), self.head.config().max_cells);
         times.voxelise = start.elapsed();
         if chosen.is_empty() {
-            return Ok((SceneCoordinates::default(), times));
+            return Ok(None);
         }
         let start = Instant::now();
         let batch = VoxelBatch::new(&[&sweep], self.encoder.config(), self.device)?;
@@ -129,17 +145,18 @@ impl Localizer {
 
         let start = Instant::now();
         let rows: Vec<i64> = chosen.iter().map(|&cell| cell as i64).collect();
+        let rows = Tensor::f_from_slice(&rows)?.f_to_device(self.device)?;
+        let cells = no_grad(|| features.cells.f_index_select(0, &rows))?;
         let (world, epsilon_m) = no_grad(|| -> Result<(Vec<f32>, Vec<f32>), tch::TchError> {
-            let rows = Tensor::f_from_slice(&rows)?.f_to_device(self.device)?;
-            let cells = features.cells.f_index_select(0, &rows)?;
             let logits = self.head.classify(&features.sweeps, false)?.f_expand([rows.size()[0], -1], false)?;
-            let regression = self.head.regress(&cells, &logits, Kind::Float)?;
+            let regression = self.head.regress(&self.head.normalise(&cells)?, &logits, Kind::Float)?;
             let world = Vec::try_from(&regression.coordinates_m.f_reshape([-1])?.f_to_device(Device::Cpu)?)?;
             Ok((world, Vec::try_from(&regression.epsilon_m.f_to_device(Device::Cpu)?)?))
         })?;
         times.regress = start.elapsed();
         let sensor_m = chosen.iter().map(|&cell| sweep.cells()[cell].centroid_m).collect();
-        Ok((SceneCoordinates { sensor_m, world_m: world.as_chunks().0.to_vec(), epsilon_m }, times))
+        let coordinates = SceneCoordinates { sensor_m, world_m: world.as_chunks().0.to_vec(), epsilon_m };
+        Ok(Some(Regressed { coordinates, cells }))
     }
 
     /// All steps.
@@ -148,23 +165,29 @@ impl Localizer {
     /// [`LocalizerError::Tensor`] when the tensor library refuses. A sweep that cannot be localised is no error but an
     /// answer: [`PoseEstimate::NoPose`].
     pub fn localize(&self, cloud: &PointCloud) -> Result<Localization, LocalizerError> {
-        let (coordinates, mut times) = self.scene_coordinates(cloud)?;
+        let mut times = LocalizerTimes::default();
+        let Some(Regressed { mut coordinates, cells }) = self.regress(cloud, &mut times)? else {
+            return Ok(Localization::none(NoPoseReason::TooFewPoints, 0, times));
+        };
         let start = Instant::now();
         let found = self.register(&coordinates);
         times.solve = start.elapsed();
-        Ok(match found {
-            Ok(registration) => Localization {
-                estimate: self.estimate(&registration, &coordinates),
-                inlier_count: registration.inliers.len() as u32,
-                inlier_ratio: registration.inlier_ratio,
-                times,
-            },
-            Err((reason, inlier_count)) => Localization {
-                estimate: PoseEstimate::NoPose { reason, inlier_count },
-                inlier_count,
-                inlier_ratio: 0.0,
-                times,
-            },
+        let mut registration = match found {
+            Ok(registration) => registration,
+            Err((reason, inlier_count)) => return Ok(Localization::none(reason, inlier_count, times)),
+        };
+        let start = Instant::now();
+        let rough = registration.target_from_source;
+        if let Some(second) = look_again(&self.head, &cells, &coordinates.sensor_m, &rough, Kind::Float)? {
+            registration = second.registration;
+            coordinates.epsilon_m = second.epsilon_m;
+        }
+        times.refine = start.elapsed();
+        Ok(Localization {
+            estimate: self.estimate(&registration, &coordinates),
+            inlier_count: registration.inliers.len() as u32,
+            inlier_ratio: registration.inlier_ratio,
+            times,
         })
     }
 
@@ -188,6 +211,12 @@ impl Localizer {
         let world_from_origin = Isometry3::from_parts(Translation3::new(x, y, z), nalgebra::UnitQuaternion::identity());
         let pose = (world_from_origin * registration.target_from_source).into();
         PoseEstimate::new(pose, (mean * registration.inlier_ratio as f32).clamp(0.0, 1.0))
+    }
+}
+
+impl Localization {
+    fn none(reason: NoPoseReason, inlier_count: u32, times: LocalizerTimes) -> Self {
+        Self { estimate: PoseEstimate::NoPose { reason, inlier_count }, inlier_count, inlier_ratio: 0.0, times }
     }
 }
 

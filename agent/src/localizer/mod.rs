@@ -3,20 +3,24 @@
 //! A sparse encoder describes cells of the sweep; a head that belongs to one town says for each cell where in the world
 //! it lies and how far off that may be; a robust solver turns these correspondences into a pose.
 
+mod dense;
 mod encoder_config;
 mod error;
 mod head_config;
 mod localize;
+mod refiner;
 mod scene_encoder;
 mod scene_head;
+mod second_look;
 mod sweep_voxels;
 pub mod training;
 mod voxel_batch;
 
 pub use encoder_config::{SceneEncoderConfig, VoxelInput};
 pub use error::LocalizerError;
-pub use head_config::SceneHeadConfig;
+pub use head_config::{RefinerConfig, SceneHeadConfig};
 pub use localize::{Localization, Localizer, LocalizerTimes, SceneCoordinates, sigma};
+pub use refiner::Refiner;
 pub use scene_encoder::{LocalFeatures, SceneEncoder, SceneFeatures};
 pub use scene_head::{Regression, SceneHead};
 pub use sweep_voxels::{Cell, SweepVoxels};

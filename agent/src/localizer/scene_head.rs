@@ -1,10 +1,12 @@
 //! The head that belongs to one town: which part of it a sweep was made in, and where in the world each cell lies.
 
-use tch::nn::{self, Init, LinearConfig, Module};
+use tch::nn::{self, LinearConfig, Module};
 use tch::{Kind, TchError, Tensor};
 
+use super::dense::Dense;
 use super::error::LocalizerError;
 use super::head_config::SceneHeadConfig;
+use super::refiner::Refiner;
 use crate::convolution::Norm;
 
 /// Hidden layers of the classifier of sweeps, as in LightLoc.
@@ -36,6 +38,7 @@ pub struct SceneHead {
     inward: Dense,
     blocks: Vec<[Dense; 3]>,
     outward: Dense,
+    refiner: Option<Refiner>,
 }
 
 impl SceneHead {
@@ -59,6 +62,7 @@ impl SceneHead {
             inward: Dense::new(&(path / "inward"), cell_channels + classes, width, 1.0),
             blocks: (0..blocks).map(block).collect(),
             outward: Dense::new(&(path / "outward"), width, centres + 4, 0.1),
+            refiner: config.refiner.as_ref().map(|config| Refiner::new(&(path / "refiner"), config)).transpose()?,
         })
     }
 
@@ -66,6 +70,20 @@ impl SceneHead {
     #[must_use]
     pub fn config(&self) -> &SceneHeadConfig {
         &self.config
+    }
+
+    /// The second look, where there is one.
+    #[must_use]
+    pub fn refiner(&self) -> Option<&Refiner> {
+        self.refiner.as_ref()
+    }
+
+    /// Features of cells with mean 0 and deviation 1 over the training sweeps.
+    ///
+    /// # Errors
+    /// The tensor library's.
+    pub fn normalise(&self, cells: &Tensor) -> Result<Tensor, TchError> {
+        self.cell_norm.forward(cells)
     }
 
     /// Which part of town, `[sweeps, classes]` logits of `[sweeps, sweep_channels]`; with `train` channels drop out.
@@ -76,13 +94,13 @@ impl SceneHead {
         self.classifier.forward(&self.sweep_norm.forward(sweeps)?, train)
     }
 
-    /// World coordinates of `[N, cell_channels]`, given the logits `[N, classes]` of the sweep that each is part of.
+    /// World coordinates of `[N, cell_channels]` normalised features, given the logits `[N, classes]` of the sweep that each is part of.
     ///
     /// # Errors
     /// The tensor library's.
     pub fn regress(&self, cells: &Tensor, logits: &Tensor, kind: Kind) -> Result<Regression, TchError> {
         let norm = logits.f_square()?.f_sum_dim_intlist(1_i64, true, Kind::Float)?.f_add_scalar(1e-12)?.f_sqrt()?;
-        let input = Tensor::f_cat(&[self.cell_norm.forward(cells)?, logits / norm], 1)?.f_to_kind(kind)?;
+        let input = Tensor::f_cat(&[cells, &(logits / norm)], 1)?.f_to_kind(kind)?;
         let mut x = self.inward.forward(&input)?.f_relu()?;
         for [first, second, third] in &self.blocks {
             let inner = second.forward(&first.forward(&x)?.f_relu()?)?.f_relu()?;
@@ -163,26 +181,5 @@ impl Classifier {
             x = norm.forward(&layer.forward(&x), train).f_relu()?.f_dropout(DROPOUT, train)?;
         }
         Ok(self.last.forward(&x))
-    }
-}
-
-/// `x W + b` in the precision of `x`.
-#[derive(Debug)]
-struct Dense {
-    weight: Tensor,
-    bias: Tensor,
-}
-
-impl Dense {
-    fn new(path: &nn::Path<'_>, inputs: i64, outputs: i64, gain: f64) -> Self {
-        let stdev = gain * (2.0 / inputs as f64).sqrt();
-        Self {
-            weight: path.var("weight", &[inputs, outputs], Init::Randn { mean: 0.0, stdev }),
-            bias: path.var("bias", &[outputs], Init::Const(0.0)),
-        }
-    }
-
-    fn forward(&self, x: &Tensor) -> Result<Tensor, TchError> {
-        self.bias.to_kind(x.kind()).f_addmm(x, &self.weight.to_kind(x.kind()))
     }
 }

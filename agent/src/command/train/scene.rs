@@ -44,6 +44,9 @@ pub(crate) struct Args {
     /// Residual blocks of three layers.
     #[arg(long, default_value_t = 3)]
     blocks: usize,
+    /// Leave the second look out.
+    #[arg(long)]
+    no_refiner: bool,
     /// Copies of every sweep, all but the first turned and thinned out at random.
     #[arg(long, default_value_t = 1)]
     copies: usize,
@@ -88,8 +91,10 @@ fn tell(bar: &TrainingBar, report: &SceneReport) {
         SceneReport::Classified(share) => {
             bar.say(&format!("{:.1} % of the training sweeps are put into their cluster", 100.0 * share));
         }
-        SceneReport::Stepped { step, epoch, share_done, seconds, error_m, epsilon_m } => {
-            let text = format!("step {step} epoch {epoch:.2} error {error_m:.2} m, predicted {epsilon_m:.2} m");
+        SceneReport::Stepped { step, epoch, share_done, seconds, error_m, epsilon_m, refined_m } => {
+            let text = format!(
+                "step {step} epoch {epoch:.2} error {error_m:.2} m, predicted {epsilon_m:.2} m, refined {refined_m:.2} m"
+            );
             bar.report(*share_done, *seconds, &text);
         }
         SceneReport::Validated(seconds, accuracy) => bar.say(&format!(
@@ -120,6 +125,7 @@ impl Args {
             centres: self.centres,
             width: self.width,
             blocks: self.blocks,
+            refiner: !self.no_refiner,
             augmentation: SweepAugmentation { copies: self.copies, turn_rad: self.turn.to_radians(), keep: 0.7 },
             redundancy: self.rsd.then(RedundancyConfig::default),
             length,

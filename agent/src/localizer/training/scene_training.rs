@@ -20,8 +20,8 @@ use super::redundancy::{Redundancy, RedundancyConfig};
 use super::scene_validation::{SceneAccuracy, validate};
 use super::sweep_store::SweepList;
 use crate::localizer::SceneEncoder;
-use crate::localizer::head_config::SceneHeadConfig;
-use crate::localizer::scene_head::SceneHead;
+use crate::localizer::head_config::{RefinerConfig, SceneHeadConfig};
+use crate::localizer::scene_head::{Regression, SceneHead};
 use crate::training::{AdamW, AdamWConfig, ComputePrecision, Length, OneCycle, Step, checkpoint};
 use crate::weights::{self, CONFIG_KEY};
 
@@ -34,6 +34,15 @@ const LABEL_SMOOTHING: f64 = 0.1;
 const SAMPLE: usize = 20_000;
 /// Steps between two reports.
 const REPORT_EVERY: u64 = 20;
+/// Deviation of the largest errors that the refiner starts from, metres.
+const MAX_ASSUMED_ERROR_M: f64 = 2.5;
+/// Deviation of the heading that it starts from, radians.
+const ASSUMED_TURN_RAD: f64 = 0.015;
+/// Sides of its patches, metres, and channels of each.
+const PATCHES_M: [f64; 2] = [3.0, 12.0];
+const EMBEDDING: i64 = 24;
+/// What lies this far beyond the outermost cell is still town, metres.
+const MARGIN_M: f64 = 8.0;
 /// Gradients that are not finite in a row before the training gives up.
 const MAX_SKIPPED: u32 = 20;
 
@@ -58,6 +67,8 @@ pub struct SceneTrainConfig {
     pub width: i64,
     /// Residual blocks of the head.
     pub blocks: usize,
+    /// Whether there is a second look.
+    pub refiner: bool,
     /// How sweeps are changed before they are encoded.
     pub augmentation: SweepAugmentation,
     /// Which sweeps may be left out; nothing: none.
@@ -105,6 +116,8 @@ pub enum SceneReport {
         error_m: f64,
         /// Mean predicted error, metres.
         epsilon_m: f64,
+        /// Mean L1 error of the refiner's answers, metres.
+        refined_m: f64,
     },
     /// A validation is done, after so many seconds.
     Validated(f64, SceneAccuracy),
@@ -184,6 +197,8 @@ struct Training<'a> {
     redundancy: Option<Redundancy>,
     /// Weight of each sweep.
     sweep_weights: Tensor,
+    /// Heading of each sweep's sensor, radians.
+    headings: Tensor,
     order: Vec<i64>,
     place: usize,
     /// Cells of all sweeps, of which a pass shows those that are used.
@@ -191,7 +206,7 @@ struct Training<'a> {
     watched: Vec<(usize, f32)>,
     progress: Progress,
     cells_shown: u64,
-    window: [f64; 3],
+    window: [f64; 4],
     accuracy: Option<SceneAccuracy>,
     curve: Curve,
     data_sha256: String,
@@ -247,6 +262,7 @@ impl<'a> Training<'a> {
             blocks: config.blocks,
             origin_m: cache.origin_m,
             max_cells: 1024,
+            refiner: config.refiner.then(|| refiner_config(&cache, encoder.config().local_channels())).transpose()?,
         };
         let variables = VarStore::new(config.device);
         let mut head = SceneHead::new(&variables.root(), &head_config)?;
@@ -268,6 +284,12 @@ impl<'a> Training<'a> {
         let redundancy = config.redundancy.map(|redundancy| Redundancy::new(redundancy, class_of_sweep));
         let header = "step,seconds,error_m,epsilon_m,cell_p50_m,pose_p50_m,pose_p50_deg,success_3m,success_1m";
         let curve = Curve::open(&config.out.join("curve.csv"), header, config.resume)?;
+        let heading = |pose: &nalgebra::Isometry3<f64>| {
+            let ahead = pose.rotation * nalgebra::Vector3::x();
+            ahead.y.atan2(ahead.x) as f32
+        };
+        let headings: Vec<f32> = cache.world_from_sensor.iter().map(heading).collect();
+        let headings = Tensor::f_from_slice(&headings)?.f_to_device(config.device)?;
         let sweep_weights = Tensor::ones([cache.sweep_count() as i64], (Kind::Float, config.device));
         Ok(Self {
             config,
@@ -278,13 +300,14 @@ impl<'a> Training<'a> {
             optimizer,
             redundancy,
             sweep_weights,
+            headings,
             order: Vec::new(),
             place: 0,
             passes: progress.step as f64 * config.batch as f64 / cache.cell_count() as f64,
             cache,
             watched: Vec::new(),
             cells_shown: 0,
-            window: [0.0; 3],
+            window: [0.0; 4],
             accuracy: None,
             curve,
             data_sha256,
@@ -353,23 +376,29 @@ impl<'a> Training<'a> {
     /// Eq. 4 and 5. Whether the step was taken.
     fn step(&mut self, rows: &Tensor) -> Result<bool, LocalizerTrainError> {
         let sweeps = self.cache.sweep_of_cell.f_index_select(0, rows)?;
-        let cells = self.cache.cells.f_index_select(0, rows)?;
+        let cells = self.head.normalise(&self.cache.cells.f_index_select(0, rows)?)?;
         // Channels drop out here too: at a place that was never driven the classifier is less sure than on what it has seen.
         let logits = no_grad(|| self.head.classify(&self.cache.sweeps.f_index_select(0, &sweeps)?, true))?;
         let regression = self.head.regress(&cells, &logits, self.config.precision.kind())?;
         let targets = self.cache.targets_m.f_index_select(0, rows)?;
-        let error = (&regression.coordinates_m - targets).f_abs()?.f_sum_dim_intlist(1_i64, false, Kind::Float)?;
-        // The error is learnt from, not bent towards its prediction: the second term moves epsilon alone.
-        let surprise = (error.f_detach()? - &regression.epsilon_m).f_abs()?;
         let weights = self.sweep_weights.f_index_select(0, &sweeps)?;
-        let loss = ((&error + surprise) * weights).f_mean(Kind::Float)?;
+        let (mut loss, error) = weighted_loss(&regression, &targets, &weights)?;
+        let mut refined_m = 0.0;
+        if let Some(refiner) = self.head.refiner() {
+            let (assumed, heading) = self.assume(&targets, &sweeps)?;
+            let answer = refiner.compare(&cells, &assumed, &heading, self.config.precision.kind())?;
+            let (refiner_loss, refined) = weighted_loss(&answer, &targets, &weights)?;
+            loss += refiner_loss;
+            refined_m = refined.f_mean(Kind::Float)?.f_double_value(&[])?;
+        }
         self.optimizer.zero_grad();
         loss.f_backward()?;
         let learning_rate = OneCycle { peak: self.config.learning_rate }.at(self.share_done());
         let taken = matches!(self.optimizer.step(learning_rate)?, Step::Taken(_));
         self.window[0] += error.f_mean(Kind::Float)?.f_double_value(&[])?;
         self.window[1] += regression.epsilon_m.f_mean(Kind::Float)?.f_double_value(&[])?;
-        self.window[2] += 1.0;
+        self.window[2] += refined_m;
+        self.window[3] += 1.0;
         self.progress.step += 1;
         self.cells_shown += self.config.batch as u64;
         let share_done = self.share_done();
@@ -381,8 +410,22 @@ impl<'a> Training<'a> {
         Ok(taken)
     }
 
+    /// Where a rough pose would put cells: their places moved, the heading turned.
+    fn assume(&self, targets_m: &Tensor, sweeps: &Tensor) -> Result<(Tensor, Tensor), tch::TchError> {
+        let like = (Kind::Float, targets_m.device());
+        let count = targets_m.size()[0];
+        // Small and large errors both occur: the second round starts from a better pose than the first.
+        let scale = Tensor::f_rand([count, 1], like)?.f_square()? * MAX_ASSUMED_ERROR_M;
+        let shift = Tensor::f_randn([count, 3], like)?
+            * scale
+            * Tensor::f_from_slice(&[1.0f32, 1.0, 0.3])?.f_to_device(like.1)?;
+        let turn = Tensor::f_randn([count], like)? * ASSUMED_TURN_RAD;
+        let yaw = self.headings.f_index_select(0, sweeps)? + turn;
+        Ok((targets_m + shift, Tensor::f_stack(&[yaw.f_cos()?, yaw.f_sin()?], 1)?))
+    }
+
     fn report(&mut self) -> SceneReport {
-        let [error, epsilon, steps] = std::mem::take(&mut self.window);
+        let [error, epsilon, refined, steps] = std::mem::take(&mut self.window);
         SceneReport::Stepped {
             step: self.progress.step,
             epoch: self.passes,
@@ -390,6 +433,7 @@ impl<'a> Training<'a> {
             seconds: self.seconds(),
             error_m: error / steps.max(1.0),
             epsilon_m: epsilon / steps.max(1.0),
+            refined_m: refined / steps.max(1.0),
         }
     }
 
@@ -442,6 +486,14 @@ impl<'a> Training<'a> {
     }
 }
 
+/// Eq. 4 and 5, each cell by its weight; also the L1 errors `[N]`.
+fn weighted_loss(answer: &Regression, targets_m: &Tensor, weights: &Tensor) -> Result<(Tensor, Tensor), tch::TchError> {
+    let error = (&answer.coordinates_m - targets_m).f_abs()?.f_sum_dim_intlist(1_i64, false, Kind::Float)?;
+    // The error is learnt from, not bent towards its prediction: the second term moves epsilon alone.
+    let surprise = (error.f_detach()? - &answer.epsilon_m).f_abs()?;
+    Ok((((&error + surprise) * weights).f_mean(Kind::Float)?, error))
+}
+
 fn checkpoint_path(config: &SceneTrainConfig) -> PathBuf {
     config.out.join("checkpoint.safetensors")
 }
@@ -455,6 +507,22 @@ fn same_training(asked: &Progress, stored: Progress) -> Result<Progress, Localiz
         Some((field, found, asked)) => Err(LocalizerTrainError::OtherTraining { field, found, asked }),
         None => Ok(stored),
     }
+}
+
+/// Planes that cover all cells.
+fn refiner_config(cache: &FeatureCache, local_channels: i64) -> Result<RefinerConfig, tch::TchError> {
+    let bound = |extreme: Tensor, margin_m: f64| -> Result<[f64; 2], tch::TchError> {
+        let values: Vec<f32> = Vec::try_from(&extreme)?;
+        Ok([f64::from(values[0]) + margin_m, f64::from(values[1]) + margin_m])
+    };
+    Ok(RefinerConfig {
+        local_channels,
+        low_m: bound(cache.targets_m.f_amin([0_i64], false)?, -MARGIN_M)?,
+        high_m: bound(cache.targets_m.f_amax([0_i64], false)?, MARGIN_M)?,
+        patch_m: PATCHES_M.into(),
+        embedding: EMBEDDING,
+        width: 256,
+    })
 }
 
 /// Statistics of the features, and centres among the world coordinates of cells.

@@ -6,6 +6,7 @@ use tch::{Kind, Tensor, no_grad};
 use super::error::LocalizerTrainError;
 use super::feature_cache::FeatureCache;
 use crate::localizer::scene_head::SceneHead;
+use crate::localizer::second_look::look_again;
 use crate::registration::Correspondence;
 use crate::registration::ransac::{RansacConfig, solve};
 
@@ -35,7 +36,7 @@ pub(super) fn validate(
 ) -> Result<SceneAccuracy, LocalizerTrainError> {
     let regression = no_grad(|| {
         let logits = head.classify(&cache.sweeps, false)?.f_index_select(0, &cache.sweep_of_cell)?;
-        head.regress(&cache.cells, &logits, kind)
+        head.regress(&head.normalise(&cache.cells)?, &logits, kind)
     })?;
     // Coordinates are relative to the origin of the head's town.
     let origin = head.config().origin_m;
@@ -55,9 +56,19 @@ pub(super) fn validate(
     }
     let mut translations = Vec::new();
     let mut rotations = Vec::new();
+    let mut first_row = 0;
     for (correspondences, truth) in by_sweep.iter().zip(&cache.world_from_sensor) {
-        let found = solve(correspondences, &RansacConfig::default());
-        let (metres, degrees) = found.map_or((f64::MAX, 180.0), |found| {
+        let rows = correspondences.len() as i64;
+        let cells = cache.cells.f_narrow(0, first_row, rows)?;
+        first_row += rows;
+        let mut found = solve(correspondences, &RansacConfig::default());
+        if let Ok(first) = &found {
+            let sensor_m: Vec<[f32; 3]> = correspondences.iter().map(|pair| pair.source_m).collect();
+            if let Some(second) = look_again(head, &cells, &sensor_m, &first.target_from_source, kind)? {
+                found = Ok(second.registration);
+            }
+        }
+        let (metres, degrees) = found.map_or((f64::INFINITY, 180.0), |found| {
             let offset = nalgebra::Vector3::from(origin);
             let error = found.target_from_source.translation.vector + offset - truth.translation.vector;
             (error.norm(), found.target_from_source.rotation.angle_to(&truth.rotation).to_degrees())

@@ -1,0 +1,82 @@
+//! From a rough pose to a sharp one: the refiner's answers, fitted anew, twice.
+
+use nalgebra::{Isometry3, Point3, Vector3};
+use tch::{Device, Kind, TchError, Tensor, no_grad};
+
+use super::scene_head::SceneHead;
+use crate::registration::refine::reweighted;
+use crate::registration::{Correspondence, Registration};
+
+/// Scales of the fits of each round, metres: the first pose may be off by two metres, the second hardly is.
+const ROUNDS_M: [&[f64]; 2] = [&[2.0, 1.2, 0.8], &[0.6, 0.4, 0.3, 0.3]];
+/// A cell agrees with the sharp pose when its answer is this near, metres.
+const AGREES_M: f64 = 1.0;
+/// What even the best cell does not know, metres.
+const FLOOR_M: f32 = 0.1;
+
+/// A sharpened pose and the answers that it rests on.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct SecondLook {
+    /// `origin_from_sensor` and who agrees with it.
+    pub(super) registration: Registration,
+    /// `[N]`: predicted L1 error of each cell's last answer, metres.
+    pub(super) epsilon_m: Vec<f32>,
+}
+
+/// Asks the refiner where cells are that `start` puts somewhere.
+///
+/// `cells` are features `[N, cell_channels]`, `sensor_m` `[N]` places in the sensor frame; poses are relative to the head's
+/// origin. Nothing comes back where the head has no refiner or its answers fix no pose.
+///
+/// # Errors
+/// The tensor library's.
+pub(super) fn look_again(
+    head: &SceneHead,
+    cells: &Tensor,
+    sensor_m: &[[f32; 3]],
+    start: &Isometry3<f64>,
+    kind: Kind,
+) -> Result<Option<SecondLook>, TchError> {
+    let Some(refiner) = head.refiner() else { return Ok(None) };
+    let cells = head.normalise(cells)?;
+    let device = cells.device();
+    let mut pose = *start;
+    let mut answer = None;
+    for scales_m in ROUNDS_M {
+        let assumed: Vec<f32> = sensor_m
+            .iter()
+            .flat_map(|point| (pose * Point3::from(point.map(f64::from))).coords.map(|axis| axis as f32).data.0[0])
+            .collect();
+        let ahead = pose.rotation * Vector3::x();
+        let norm = ahead.xy().norm().max(1e-6);
+        let heading = Tensor::f_from_slice(&[(ahead.x / norm) as f32, (ahead.y / norm) as f32])?;
+        let heading = heading.f_to_device(device)?.f_view([1, 2])?.f_expand([sensor_m.len() as i64, -1], false)?;
+        let assumed = Tensor::f_from_slice(&assumed)?.f_view([-1, 3])?.f_to_device(device)?;
+        let seen = no_grad(|| refiner.compare(&cells, &assumed, &heading, kind))?;
+        let world: Vec<f32> = Vec::try_from(&seen.coordinates_m.f_reshape([-1])?.f_to_device(Device::Cpu)?)?;
+        let epsilon_m: Vec<f32> = Vec::try_from(&seen.epsilon_m.f_to_device(Device::Cpu)?)?;
+        let pairs: Vec<Correspondence> = (sensor_m.iter().zip(world.as_chunks().0).zip(&epsilon_m))
+            .map(|((&source_m, &target_m), &epsilon_m)| Correspondence {
+                source_m,
+                target_m,
+                weight: precision(epsilon_m),
+            })
+            .collect();
+        let usable = pairs.iter().filter(|pair| pair.usable());
+        let fits = usable.map(|pair| {
+            let point = |point: [f32; 3]| Vector3::from(point.map(f64::from));
+            (point(pair.source_m), point(pair.target_m), f64::from(pair.weight))
+        });
+        match reweighted(&fits.collect::<Vec<_>>(), &pose, scales_m.iter().copied()) {
+            Ok(fitted) => pose = fitted,
+            Err(_) => return Ok(None),
+        }
+        answer = Some(SecondLook { registration: Registration::judge(&pairs, pose, AGREES_M), epsilon_m });
+    }
+    Ok(answer)
+}
+
+/// Weight of an answer: the inverse of its expected squared error.
+fn precision(epsilon_m: f32) -> f32 {
+    1.0 / (FLOOR_M * FLOOR_M + epsilon_m * epsilon_m)
+}

@@ -1,0 +1,187 @@
+//! A localizer from nothing: generated drives, an encoder, a head, and poses from sweeps alone.
+
+use std::path::{Path, PathBuf};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+use std::time::Duration;
+
+use agent::localizer::training::{
+    EncoderTrainConfig, LocalizerTrainError, RedundancyConfig, SceneReport, SceneTrainConfig, SweepAugmentation,
+    train_encoder, train_scene,
+};
+use agent::localizer::{Localizer, LocalizerError, SceneEncoderConfig};
+use agent::training::{ComputePrecision, Length};
+use protocol::{NoPoseReason, PointCloud, PoseEstimate};
+use sim_replay::dataset::{self, LoadOptions};
+use sim_replay::synth::{Subset, SynthOptions, generate};
+use tch::Device;
+
+/// libtorch has one generator of random numbers per process: who begins a training has it alone.
+fn alone() -> MutexGuard<'static, ()> {
+    static GENERATOR: Mutex<()> = Mutex::new(());
+    tch::set_num_threads(1);
+    GENERATOR.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Two short drives through one town, at whose crossings they meet themselves and each other.
+fn drives(out: &Path) -> PathBuf {
+    let folder = out.join("drives");
+    let options = SynthOptions {
+        traversals: 2,
+        frames: 24,
+        period_s: 0.5,
+        ..SynthOptions::new(Subset::Town1loc, 11, folder.clone())
+    };
+    generate(&options, &|_| {}).unwrap();
+    folder
+}
+
+/// An encoder that a test has time for.
+fn small() -> SceneEncoderConfig {
+    SceneEncoderConfig {
+        voxel_m: 1.0,
+        range_m: 40.0,
+        widths: vec![8, 12, 16],
+        residual_widths: vec![16],
+        ..SceneEncoderConfig::lean()
+    }
+}
+
+fn encoder_config(scenes: &Path, out: &Path, steps: u64) -> EncoderTrainConfig {
+    EncoderTrainConfig {
+        scenes: vec![scenes.to_owned()],
+        validation: vec![scenes.to_owned()],
+        encoder: small(),
+        length: Length::Steps(steps),
+        batch: 2,
+        learning_rate: 3e-3,
+        seed: 5,
+        device: Device::Cpu,
+        precision: ComputePrecision::F32,
+        loader_threads: 2,
+        validate_every: 10,
+        out: out.to_owned(),
+        resume: false,
+    }
+}
+
+fn scene_config(scenes: &Path, encoder: &Path, out: &Path, steps: u64) -> SceneTrainConfig {
+    SceneTrainConfig {
+        scenes: vec![scenes.to_owned()],
+        validation: vec![scenes.to_owned()],
+        validation_sweeps: 12,
+        encoder: encoder.to_owned(),
+        town: "small".into(),
+        classes: 4,
+        centres: 12,
+        width: 64,
+        blocks: 1,
+        refiner: true,
+        augmentation: SweepAugmentation { copies: 1, turn_rad: 0.1, keep: 0.8 },
+        redundancy: Some(RedundancyConfig::default()),
+        length: Length::Steps(steps),
+        batch: 512,
+        learning_rate: 4e-3,
+        seed: 5,
+        device: Device::Cpu,
+        precision: ComputePrecision::F32,
+        loader_threads: 2,
+        validate_every: Duration::from_secs(3600),
+        out: out.to_owned(),
+        resume: false,
+    }
+}
+
+fn trained_encoder(scenes: &Path, out: &Path) -> PathBuf {
+    let mut losses = Vec::new();
+    let mut validations = 0;
+    let config = encoder_config(scenes, out, 40);
+    let summary = train_encoder(&config, &mut |report| losses.push(report.loss), &mut |_, _| validations += 1).unwrap();
+    assert_eq!((summary.steps, validations), (40, 4));
+    assert!(losses.last().unwrap() < &(0.9 * losses[0]), "{losses:?}");
+    assert!(summary.accuracy.unwrap().top1 > 0.005, "chance is below one in five hundred: {:?}", summary.accuracy);
+    summary.weights
+}
+
+#[test]
+fn a_localizer_learns_two_drives_and_finds_itself_on_them() {
+    let _alone = alone();
+    let dir = tempfile::tempdir().unwrap();
+    let scenes = drives(dir.path());
+    let encoder = trained_encoder(&scenes, &dir.path().join("encoder"));
+
+    let mut errors = Vec::new();
+    let config = scene_config(&scenes, &encoder, &dir.path().join("head"), 400);
+    let summary = train_scene(&config, &mut |report| {
+        if let SceneReport::Stepped { error_m, .. } = report {
+            errors.push(*error_m);
+        }
+    })
+    .unwrap();
+    assert!(errors.last().unwrap() < &(0.3 * errors[0]), "{errors:?}");
+    assert!(summary.accuracy.unwrap().success_3m > 0.5, "{:?}", summary.accuracy);
+
+    let localizer = Localizer::load(&encoder, &summary.weights, Device::Cpu).unwrap();
+    let dataset = dataset::open(&scenes).unwrap();
+    let mut found = 0;
+    for tick in 0..12 {
+        let frame = dataset.scenarios[0].load(0, 2 * tick, &LoadOptions::default()).unwrap();
+        let answer = localizer.localize(&frame.points).unwrap();
+        let Some(pose) = answer.estimate.world_from_cav() else { continue };
+        let off = pose.isometry().translation.vector - frame.world_from_lidar.unwrap().isometry().translation.vector;
+        found += usize::from(off.norm() < 3.0);
+        assert!((0.0..=1.0).contains(&answer.estimate.confidence()));
+        assert_eq!(localizer.localize(&frame.points).unwrap().estimate, answer.estimate, "same sweep, same answer");
+    }
+    assert!(found >= 7, "{found} of 12");
+
+    // What cannot be localised is said, not made up.
+    let nan = PointCloud { xyzi: vec![[f32::NAN; 4]; 5000] };
+    let few = PointCloud { xyzi: (0..10).map(|k| [k as f32, 3.0, 0.5, 0.1]).collect() };
+    for cloud in [PointCloud::default(), nan, few] {
+        let estimate = localizer.localize(&cloud).unwrap().estimate;
+        assert_eq!(estimate, PoseEstimate::NoPose { reason: NoPoseReason::TooFewPoints, inlier_count: 0 });
+    }
+
+    // A head belongs to one encoder.
+    let other = dir.path().join("other");
+    train_encoder(&EncoderTrainConfig { seed: 6, ..encoder_config(&scenes, &other, 1) }, &mut |_| (), &mut |_, _| ())
+        .unwrap();
+    let error = Localizer::load(&other.join("weights.safetensors"), &summary.weights, Device::Cpu).unwrap_err();
+    assert!(matches!(error, LocalizerError::OtherEncoder { .. }), "{error}");
+    // And an encoder is no head.
+    let message = Localizer::load(&encoder, &encoder, Device::Cpu).unwrap_err().to_string();
+    assert!(message.contains("weights.safetensors") && message.contains("config"), "{message}");
+}
+
+#[test]
+fn trainings_go_on_where_they_stopped_and_refuse_what_is_not_theirs() {
+    let _alone = alone();
+    let dir = tempfile::tempdir().unwrap();
+    let scenes = drives(dir.path());
+    let whole =
+        train_encoder(&encoder_config(&scenes, &dir.path().join("a"), 20), &mut |_| (), &mut |_, _| ()).unwrap();
+    let b = dir.path().join("b");
+    // Stopped at the second validation, whose checkpoint is then not yet written.
+    let mut validations = 0;
+    let stopped = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| {
+        let mut stop = |_: u64, _: &_| {
+            validations += 1;
+            assert!(validations < 2, "stopped by the test");
+        };
+        train_encoder(&encoder_config(&scenes, &b, 20), &mut |_| (), &mut stop)
+    }));
+    assert!(stopped.is_err());
+    let resumed = EncoderTrainConfig { resume: true, ..encoder_config(&scenes, &b, 20) };
+    let resumed = train_encoder(&resumed, &mut |_| (), &mut |_, _| ()).unwrap();
+    assert_eq!(resumed.sha256, whole.sha256, "bit for bit");
+
+    let other = EncoderTrainConfig { resume: true, seed: 9, ..encoder_config(&scenes, &b, 30) };
+    let error = train_encoder(&other, &mut |_| (), &mut |_, _| ()).unwrap_err();
+    assert!(matches!(error, LocalizerTrainError::OtherTraining { field: "seed", .. }), "{error}");
+    let checkpoint = b.join("checkpoint.safetensors");
+    let bytes = std::fs::read(&checkpoint).unwrap();
+    std::fs::write(&checkpoint, &bytes[..bytes.len() / 2]).unwrap();
+    let cut = EncoderTrainConfig { resume: true, ..encoder_config(&scenes, &b, 30) };
+    let message = train_encoder(&cut, &mut |_| (), &mut |_, _| ()).unwrap_err().to_string();
+    assert!(message.contains("checkpoint.safetensors") && message.contains("not a whole"), "{message}");
+}
