@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 
 use nalgebra::Isometry3;
-use protocol::Pose;
+use protocol::{DropReason, Pose};
 use serde::{Deserialize, Serialize};
 
 /// A pose nearer to the truth than this is a success, metres.
@@ -108,7 +108,7 @@ pub struct Messages {
     /// Still under way at the end.
     pub in_flight: u64,
     /// Not used, by reason.
-    pub dropped: BTreeMap<String, u64>,
+    pub dropped: BTreeMap<DropReason, u64>,
 }
 
 impl Percentiles {

@@ -60,8 +60,7 @@ impl RunResult {
     /// Whether data were lost beyond what the link dropped.
     #[must_use]
     pub fn lost_data(&self) -> bool {
-        let by_link = |reason: &str| reason.starts_with("link_");
-        let dropped = self.metrics.messages.dropped.iter().any(|(reason, count)| !by_link(reason) && *count > 0);
+        let dropped = self.metrics.messages.dropped.iter().any(|(reason, count)| reason.is_loss() && *count > 0);
         dropped || self.missed > 0 || !self.balance.is_exact()
     }
 }
@@ -310,7 +309,7 @@ fn metrics(fleet: &Fleet, board: &Board, progress: &Progress, sum: &Ledger) -> M
             sent: total.sent,
             received: total.received,
             in_flight: total.in_flight,
-            dropped: total.dropped.iter().map(|(reason, count)| (reason.to_string(), *count)).collect(),
+            dropped: total.dropped,
         },
     }
 }

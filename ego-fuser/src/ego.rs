@@ -61,9 +61,7 @@ impl Content {
 pub enum Skipped {
     /// The method exchanges nothing.
     NotNeeded,
-    /// It is farther away than vehicles talk to each other.
-    OutOfRange,
-    /// Its message cannot be used.
+    /// Its message cannot be used, or is of somebody too far away.
     Unusable(DropReason),
 }
 
@@ -226,7 +224,7 @@ impl Ego {
         let world_from_cav = view.pose.world_from_cav().ok_or(no_pose)?;
         let [dx, dy] = [0, 1].map(|axis| world_from_cav.translation_m[axis] - world_from_ego.translation_m[axis]);
         if dx.hypot(dy) > self.comm_range_m {
-            return Err(Skipped::OutOfRange);
+            return Err(Skipped::Unusable(DropReason::OutOfRange));
         }
         let fits = match &view.content {
             Content::Features(map) => self.is_own_shape(map),

@@ -168,7 +168,7 @@ impl Evaluator {
             cav: neighbours[index].cav.clone(),
             reason: match reason {
                 Skipped::Unusable(reason) => Some(reason),
-                Skipped::NotNeeded | Skipped::OutOfRange => None,
+                Skipped::NotNeeded => None,
             },
         });
         let result = Detections {

@@ -32,11 +32,13 @@ pub enum DropReason {
     Version,
     /// Sender or receiver does not know where it is.
     NoPose,
+    /// From a vehicle farther away than vehicles talk to each other.
+    OutOfRange,
 }
 
 impl DropReason {
     /// Every reason.
-    pub const ALL: [Self; 12] = [
+    pub const ALL: [Self; 13] = [
         Self::LinkLoss,
         Self::LinkQueue,
         Self::Superseded,
@@ -49,7 +51,15 @@ impl DropReason {
         Self::Identity,
         Self::Version,
         Self::NoPose,
+        Self::OutOfRange,
     ];
+
+    /// Whether data were lost that should have been used: not by what the air does to them, and not for being rightly
+    /// left out.
+    #[must_use]
+    pub fn is_loss(self) -> bool {
+        !matches!(self, Self::LinkLoss | Self::LinkQueue | Self::OutOfRange)
+    }
 
     /// Its name, as in reports: `link_loss`.
     #[must_use]
@@ -67,6 +77,7 @@ impl DropReason {
             Self::Identity => "identity",
             Self::Version => "version",
             Self::NoPose => "no_pose",
+            Self::OutOfRange => "out_of_range",
         }
     }
 }

@@ -108,7 +108,7 @@ fn with_none_left_the_maps_of_every_method_are_those_of_the_ego_alone() {
     for method in [Method::Max, Method::Attention] {
         let output = Ego::new(detector(), method).detect(&own, &[far.clone(), lost.clone()]).unwrap();
         assert_eq!(output.detections, alone, "{method}");
-        let reasons = [(0, Skipped::OutOfRange), (1, Skipped::Unusable(DropReason::NoPose))];
+        let reasons = [(0, Skipped::Unusable(DropReason::OutOfRange)), (1, Skipped::Unusable(DropReason::NoPose))];
         assert_eq!((output.fused, output.skipped), (vec![], reasons.to_vec()), "{method}");
     }
 }

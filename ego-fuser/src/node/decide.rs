@@ -119,7 +119,7 @@ impl Node<'_> {
             let reason = match why {
                 Skipped::Unusable(reason) => Some(reason),
                 // It was looked at, and rightly left out.
-                Skipped::NotNeeded | Skipped::OutOfRange => None,
+                Skipped::NotNeeded => None,
             };
             self.settle(&cav, choice.books[index].is_first_use, reason);
             if reason.is_some() {
