@@ -18,7 +18,7 @@ const FOUND_IOU: f64 = 0.5;
 /// One line of `frames.csv`.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct FrameRecord {
-    /// Which frame of the scene, counted from 0; the ego itself counts its results.
+    /// Which frame of the scene, counted from 0.
     pub frame_index: u64,
     /// Capture time on the scene's clock, nanoseconds.
     pub capture_nanos: u64,

@@ -21,7 +21,8 @@ impl Node<'_> {
         let capture_nanos = arrival.header.stamp.capture_nanos;
         let view = View { cav: cav.clone(), pose, age_nanos: 0, content };
         if *cav == self.cav {
-            self.frames.push_back(OwnFrame { capture_nanos, begun: arrival.at, view });
+            let frame_index = arrival.header.stamp.sequence;
+            self.frames.push_back(OwnFrame { frame_index, capture_nanos, begun: arrival.at, view });
             return;
         }
         if let Some(neighbourhood) = &mut self.neighbourhood {

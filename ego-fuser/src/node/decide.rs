@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use protocol::message::{DetectionsReport, FusedNeighbour, SkippedNeighbour, StageTiming};
-use protocol::{Body, CavId, Detection, Detections, DropReason, Encoded, PoseEstimate};
+use protocol::{Body, CavId, Detections, DropReason, Encoded};
 
 use super::{Node, OwnFrame};
 use crate::ego::{EgoOutput, Skipped, View};
@@ -53,7 +53,7 @@ impl Node<'_> {
     }
 
     fn fuse(&mut self, frame: OwnFrame) {
-        let OwnFrame { capture_nanos, begun, view: own } = frame;
+        let OwnFrame { frame_index, capture_nanos, begun, view: own } = frame;
         let waited = begun.elapsed();
         let mut choice = self.choose(capture_nanos);
         let own_topic = self.topic(&self.cav);
@@ -63,7 +63,17 @@ impl Node<'_> {
                 self.leave_out(&skipped, &mut choice);
                 let fused = self.take_in(&fused, &choice);
                 let stages = std::iter::once(StageTiming::new("wait", waited)).chain(stages).collect();
-                self.publish(capture_nanos, own.pose, detections, fused, choice.skipped, stages);
+                let result = Detections {
+                    ego: self.cav.clone(),
+                    frame_index,
+                    method: self.ego.method().name().to_owned(),
+                    pose: own.pose,
+                    detections,
+                    fused,
+                    skipped: choice.skipped,
+                    stages,
+                };
+                self.publish(capture_nanos, result);
             }
             Err(error) => {
                 tracing::error!(capture_nanos, "a frame could not be fused: {error}");
@@ -138,23 +148,11 @@ impl Node<'_> {
         }
     }
 
-    fn publish(
-        &mut self,
-        capture_nanos: u64,
-        pose: PoseEstimate,
-        detections: Vec<Detection>,
-        fused: Vec<FusedNeighbour>,
-        skipped: Vec<SkippedNeighbour>,
-        stages: Vec<StageTiming>,
-    ) {
-        for stage in &stages {
+    fn publish(&mut self, capture_nanos: u64, result: Detections) {
+        for stage in &result.stages {
             self.bus.books().timed(&stage.stage, Duration::from_nanos(stage.nanos));
         }
-        let frame_index = self.report.frames;
         self.report.frames += 1;
-        let method = self.ego.method().name().to_owned();
-        let result =
-            Detections { ego: self.cav.clone(), frame_index, method, pose, detections, fused, skipped, stages };
         self.detections.offer(capture_nanos, result.clone());
         self.json.offer_encoded(capture_nanos, move |stamp| {
             let head = DetectionsReport::new(stamp, result).to_json().into_bytes();

@@ -95,6 +95,8 @@ struct Received {
 
 /// A frame that has begun.
 struct OwnFrame {
+    /// Sequence of the own agent's message.
+    frame_index: u64,
     capture_nanos: u64,
     begun: Instant,
     view: View,

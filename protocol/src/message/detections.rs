@@ -10,7 +10,9 @@ use crate::{CavId, Detection, DropReason, Limits, Stamp, WireError};
 pub struct Detections {
     /// The vehicle that fused, whose LiDAR frame the boxes are in.
     pub ego: CavId,
-    /// Which frame of the scene, counted from 0.
+    /// Which frame of the ego's own agent, counted from 0: the sequence of the agent's message that the frame began
+    /// with, or the tick of the scene where nothing was sent. A number left out is a frame that was never decided. The
+    /// same moment has the same capture time everywhere, but no vehicle knows the scene's own count of it.
     pub frame_index: u64,
     /// Fusion method, as in the configuration.
     pub method: String,
