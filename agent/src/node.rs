@@ -7,7 +7,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use protocol::codec::CodecConfig;
-use protocol::message::{Bev, Boxes, Descriptor, ModelHash, Points};
+use protocol::message::{Bev, Boxes, Descriptor, Points};
 use protocol::{DropReason, Dtype, Gnss, Lidar, Limits, PoseEstimate, Role, Stream, Topic, encode_features, wire};
 use sim_replay::bus::mailbox::Taken;
 use sim_replay::bus::shutdown::Stop;
@@ -200,8 +200,7 @@ impl Outlet {
         };
         let detector = agent.detector();
         let description = Descriptor {
-            // A network that was not read from a file has no hash; nobody can share its features anyway.
-            model_hash: detector.sha256().parse().unwrap_or(ModelHash([0; 32])),
+            model_hash: detector.model_hash(),
             grid: detector.grid(),
             channels: u32::try_from(detector.map_shape()[0]).unwrap_or(u32::MAX),
             dtype: options.codec.dtype,

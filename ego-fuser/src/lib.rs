@@ -17,6 +17,7 @@ pub mod model;
 mod neighbourhood;
 pub mod node;
 pub mod pairing;
+mod peer_models;
 pub mod samples;
 pub mod targets;
 pub mod train;

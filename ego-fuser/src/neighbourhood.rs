@@ -16,7 +16,7 @@ const SILENT_AFTER: u32 = 3;
 /// The other agents of the run.
 pub(crate) struct Neighbourhood {
     ego: CavId,
-    stream: Stream,
+    streams: Vec<Stream>,
     allowed: Option<BTreeSet<CavId>>,
     sightings: Arc<Mailbox<CavId, bool>>,
     members: BTreeMap<CavId, Member>,
@@ -25,15 +25,15 @@ pub(crate) struct Neighbourhood {
 
 struct Member {
     silent_frames: u32,
-    _subscription: Subscription,
+    _subscriptions: Vec<Subscription>,
 }
 
 impl Neighbourhood {
-    /// Watches for agents other than `ego`'s own; `allowed` restricts them.
+    /// Watches for agents other than `ego`'s own, to listen to these streams of theirs; `allowed` restricts them.
     pub(crate) fn watch(
         bus: &Bus,
         ego: &CavId,
-        stream: Stream,
+        streams: Vec<Stream>,
         allowed: Option<BTreeSet<CavId>>,
     ) -> Result<Self, BusError> {
         let sightings = Arc::new(Mailbox::new(1, 2 * MAX_NEIGHBOURS));
@@ -49,7 +49,7 @@ impl Neighbourhood {
                 }
             }
         })?;
-        Ok(Self { ego: ego.clone(), stream, allowed, sightings, members: BTreeMap::new(), _watch: watch })
+        Ok(Self { ego: ego.clone(), streams, allowed, sightings, members: BTreeMap::new(), _watch: watch })
     }
 
     /// Follows up on who came and went; those who went are returned.
@@ -63,9 +63,9 @@ impl Neighbourhood {
                 }
             } else if self.is_wanted(&cav) {
                 tracing::info!(%cav, "a neighbour has come");
-                let topic = Topic::Stream { cav: cav.clone(), stream: self.stream };
-                let subscription = bus.subscribe(topic, inbox)?;
-                self.members.insert(cav, Member { silent_frames: 0, _subscription: subscription });
+                let topics = self.streams.iter().map(|&stream| Topic::Stream { cav: cav.clone(), stream });
+                let subscriptions = topics.map(|topic| bus.subscribe(topic, inbox)).collect::<Result<_, _>>()?;
+                self.members.insert(cav, Member { silent_frames: 0, _subscriptions: subscriptions });
             }
         }
         Ok(gone)

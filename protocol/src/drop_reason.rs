@@ -22,7 +22,7 @@ pub enum DropReason {
     Decode,
     /// Changed on the way.
     Checksum,
-    /// Sizes that do not agree with each other, with what was announced, or with the limits.
+    /// Sizes that do not agree with each other, with what was announced, or with the limits; maps of another network.
     Shape,
     /// A value that is NaN, infinite or out of bounds.
     NotFinite,

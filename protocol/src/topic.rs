@@ -134,6 +134,17 @@ impl Topic {
         Key { run: run.clone(), topic: self }
     }
 
+    /// Whether the ledger covers it: data, but neither the talk about the run itself nor what is said again and again
+    /// for those who come later, of whom nobody knows how much of it they should have heard.
+    #[must_use]
+    pub fn is_booked(&self) -> bool {
+        match self {
+            Self::Stream { stream, .. } | Self::Received { stream, .. } => *stream != Stream::Descriptor,
+            Self::Truth => true,
+            Self::Control(_) | Self::Stats(_) | Self::Alive { .. } => false,
+        }
+    }
+
     fn from_chunks(chunks: &[&str]) -> Result<Option<Self>, IdError> {
         Ok(match chunks {
             ["truth"] => Some(Self::Truth),

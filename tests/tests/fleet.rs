@@ -16,6 +16,7 @@ use ego_fuser::Method;
 use ego_fuser::ego::{Content, Ego, View, own_content};
 use ego_fuser::node as ego_node;
 use ego_fuser::{Exchange, pairing::PairingConfig};
+use protocol::message::{Descriptor, ModelHash};
 use protocol::{Account, CavId, DecodedFeatures, Detection, Detections, DropReason, Ledger, Limits, Stream, Topic};
 use sim_replay::bus::mailbox::Taken;
 use sim_replay::bus::shutdown::Stop;
@@ -332,6 +333,74 @@ fn late_killed_and_lying_neighbours_are_named_and_the_ego_goes_on() {
     assert_eq!(from_20.received, 3);
     let own = ledger.get(&Account::towards(topic("10", Stream::Bev), &process_id(protocol::Role::Ego, &cav("10"))));
     assert_eq!(own.unwrap().received, 6);
+}
+
+#[test]
+fn maps_of_a_network_that_a_neighbour_names_as_another_are_left_out() {
+    let folder = tempfile::tempdir().unwrap();
+    scene::write(folder.path(), &AGENTS, TICKS);
+    let scenario = dataset::open(folder.path()).unwrap().scenarios.remove(0);
+    let (router, stop) = (TestRouter::open(), Stop::new());
+    let mut fleet: Vec<Puppet> = (0..3).map(|index| Puppet::new(&router, index)).collect();
+    let scorer = router.join("scorer", "scorer");
+    let inbox = scorer.inbox(100, 1);
+    let _subscription = scorer.subscribe(topic("10", Stream::Detections), &inbox).unwrap();
+    let next = || match inbox.take(Some(Instant::now() + PATIENCE)) {
+        Taken::Item(_, Event::Message(arrival)) => inbox.decode::<Detections>(&arrival, &Limits::DEFAULT).unwrap(),
+        other => panic!("{other:?}"),
+    };
+    let names = |result: &Detections| result.fused.iter().map(|fused| fused.cav.to_string()).collect::<Vec<_>>();
+    let own = Descriptor {
+        model_hash: detector().model_hash(),
+        grid: detector().grid(),
+        channels: u32::try_from(detector().map_shape()[0]).unwrap(),
+        dtype: protocol::Dtype::F32,
+        streams: vec![Stream::Bev],
+    };
+    let ledger = std::thread::scope(|scope| {
+        let ego = scope.spawn(|| {
+            let bus = router.join("ego-10", "10");
+            // A frame that waited for what is left out would take for ever.
+            let options = ego_node::NodeOptions { deadline: PATIENCE, keeps_running: true, ..Default::default() };
+            let report = ego_node::run(&bus, &cav("10"), Ego::new(detector(), Method::Max), &options, &stop).unwrap();
+            assert_eq!((report.frames, report.at_deadline), (4, 0));
+            leave(bus)
+        });
+        fleet.iter().for_each(|puppet| puppet.wait_until_heard("ego-10"));
+        let say = |puppet: &Puppet, descriptor: Descriptor| {
+            let publisher = puppet.bus.publisher(topic("20", Stream::Descriptor), PublisherOptions::POSE).unwrap();
+            publisher.offer(0, descriptor);
+            // It is on its way before the next map is.
+            publisher.finish();
+        };
+        let send_all = |fleet: &mut [Puppet], tick| [1, 2, 0].map(|index| fleet[index].send(&scenario, tick));
+
+        send_all(&mut fleet, 0);
+        assert_eq!(names(&next()), ["20", "30"], "nothing is known of anybody");
+
+        say(&fleet[1], Descriptor { model_hash: ModelHash([9; 32]), ..own.clone() });
+        for tick in 1..3 {
+            send_all(&mut fleet, tick);
+            let result = next();
+            assert_eq!(names(&result), ["30"]);
+            assert_eq!((result.skipped[0].cav.as_str(), result.skipped[0].reason), ("20", Some(DropReason::Shape)));
+        }
+
+        // It was started again, with the right weights.
+        let restarted = fleet.remove(1);
+        restarted.bus.session().close().wait().unwrap();
+        fleet.insert(1, Puppet::new(&router, 1));
+        fleet[1].wait_until_heard("ego-10");
+        say(&fleet[1], own);
+        send_all(&mut fleet, 3);
+        assert_eq!(names(&next()), ["20", "30"]);
+        stop.request();
+        ego.join().unwrap()
+    });
+    let from_20 = ledger.get(&Account::towards(topic("20", Stream::Bev), &process_id(protocol::Role::Ego, &cav("10"))));
+    let from_20 = from_20.unwrap();
+    assert_eq!((from_20.received, from_20.dropped.get(&DropReason::Shape)), (2, Some(&2)), "{from_20:?}");
+    assert!(ledger.iter().all(|(account, _)| account.topic != topic("20", Stream::Descriptor)), "not booked");
 }
 
 #[test]

@@ -6,6 +6,7 @@ mod output;
 use std::path::Path;
 use std::time::{Duration, Instant};
 
+use protocol::message::ModelHash;
 use protocol::{BevFeatures, BevGrid, PointCloud};
 use tch::nn::VarStore;
 use tch::{Device, Tensor};
@@ -103,6 +104,12 @@ impl Detector {
     #[must_use]
     pub fn sha256(&self) -> &str {
         &self.sha256
+    }
+
+    /// The same for the wire, where it tells whose maps belong together; all zeros when it was not read from a file.
+    #[must_use]
+    pub fn model_hash(&self) -> ModelHash {
+        self.sha256.parse().unwrap_or(ModelHash([0; 32]))
     }
 
     /// The lattice of its maps.

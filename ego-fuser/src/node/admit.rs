@@ -2,8 +2,8 @@
 
 use std::time::{Duration, Instant};
 
-use protocol::message::{Bev, Boxes, Points};
-use protocol::{HEADER_LEN, PoseEstimate, Stamp, Stream, Topic, wire};
+use protocol::message::{Bev, Boxes, Descriptor, Points};
+use protocol::{CavId, DropReason, HEADER_LEN, PoseEstimate, Stamp, Stream, Topic, wire};
 use sim_replay::bus::{Arrival, unix_nanos};
 
 use super::{Node, OwnFrame, Received};
@@ -12,7 +12,13 @@ use crate::ego::{Content, View};
 impl Node<'_> {
     /// Takes a message in: the own agent's begins a frame, a neighbour's waits for one.
     pub(super) fn admit(&mut self, arrival: &Arrival) {
-        let Topic::Stream { cav, .. } = &arrival.topic else { return };
+        let Topic::Stream { cav, stream } = &arrival.topic else { return };
+        if *stream == Stream::Descriptor {
+            return self.hear_of(cav, arrival);
+        }
+        if *cav != self.cav && self.models.is_other(cav) {
+            return self.bus.books().dropped(&arrival.topic, DropReason::Shape);
+        }
         let began = Instant::now();
         let Some((pose, content)) = self.decode(arrival) else { return };
         self.bus.books().timed("decode", began.elapsed());
@@ -32,6 +38,20 @@ impl Node<'_> {
         let wire_bytes = payload_bytes + HEADER_LEN as u64 + pose_message_bytes(&arrival.header.stamp, pose);
         if let Some(lost) = self.pairing.insert(cav, capture_nanos, Received { view, payload_bytes, wire_bytes }) {
             self.bus.books().dropped(&arrival.topic, lost.reason);
+        }
+    }
+
+    /// Takes in what an agent says of itself. The maps of another network are left out from then on.
+    fn hear_of(&mut self, cav: &CavId, arrival: &Arrival) {
+        let Some(descriptor) = self.inbox.decode::<Descriptor>(arrival, &self.options.limits) else { return };
+        let Some(other) = self.models.hear(cav, &descriptor) else { return };
+        if *cav == self.cav {
+            tracing::error!(%cav, "the ego's own agent runs another network than the ego: {other}");
+            return;
+        }
+        tracing::warn!(%cav, "its maps are of another network and are left out: {other}");
+        for _ in 0..self.pairing.forget(cav) {
+            self.bus.books().dropped(&self.topic(cav), DropReason::Shape);
         }
     }
 

@@ -48,6 +48,7 @@ impl Node<'_> {
         self.neighbourhood.iter().flat_map(Neighbourhood::awaited).all(|cav| {
             // Or a later one: then this frame's own is lost, and waiting is of no use.
             self.ended.contains(cav)
+                || self.models.is_other(cav)
                 || self.pairing.capture_times(cav).any(|time| time.saturating_add(tolerance) >= capture_nanos)
         })
     }
@@ -103,7 +104,8 @@ impl Node<'_> {
         let silent: Vec<CavId> = neighbourhood.members().filter(|cav| !spoke(cav)).cloned().collect();
         for cav in silent {
             neighbourhood.was_silent(&cav);
-            let reason = dropped.iter().rev().find(|lost| lost.cav == cav).map(|lost| lost.reason);
+            let lost = dropped.iter().rev().find(|lost| lost.cav == cav).map(|lost| lost.reason);
+            let reason = if self.models.is_other(&cav) { Some(DropReason::Shape) } else { lost };
             choice.skipped.push(SkippedNeighbour { cav, reason });
         }
         choice

@@ -20,11 +20,12 @@ use crate::ego::{Ego, View, own_content};
 use crate::method::{Exchange, Method};
 use crate::neighbourhood::Neighbourhood;
 use crate::pairing::{Pairing, PairingConfig};
+use crate::peer_models::PeerModels;
 
 /// Messages of one sender that may wait while a frame is fused.
 const PLACES: usize = 4;
-/// Topics an ego listens to at most.
-const MAX_TOPICS: usize = 65;
+/// Topics an ego listens to at most: of 65 vehicles, what they see and what they say of themselves.
+const MAX_TOPICS: usize = 130;
 /// How often the node looks for newcomers though no message has come.
 const LOOK_ROUND: Duration = Duration::from_millis(20);
 /// How long a node whose own agent has ended waits for the last words of its neighbours.
@@ -110,13 +111,14 @@ struct Node<'a> {
     stream: Stream,
     inbox: Arc<Inbox>,
     neighbourhood: Option<Neighbourhood>,
+    models: PeerModels,
     pairing: Pairing<Received>,
     frames: VecDeque<OwnFrame>,
     ended: BTreeSet<CavId>,
     detections: Publisher,
     json: Publisher,
     report: NodeReport,
-    _own: Subscription,
+    _own: Vec<Subscription>,
 }
 
 impl<'a> Node<'a> {
@@ -128,9 +130,12 @@ impl<'a> Node<'a> {
             move || inbox.close()
         });
         let topic = |stream| Topic::Stream { cav: cav.clone(), stream };
+        // Boxes and points are of no network.
+        let streams = if stream == Stream::Bev { vec![Stream::Descriptor, stream] } else { vec![stream] };
+        let own = streams.iter().map(|&stream| bus.subscribe(topic(stream), &inbox)).collect::<Result<_, _>>()?;
         // Alone, an ego has nothing to hear from others.
         let neighbourhood = (ego.method() != Method::None)
-            .then(|| Neighbourhood::watch(bus, cav, stream, options.neighbours.clone()))
+            .then(|| Neighbourhood::watch(bus, cav, streams, options.neighbours.clone()))
             .transpose()?;
         Ok(Self {
             bus,
@@ -138,13 +143,14 @@ impl<'a> Node<'a> {
             options,
             stream,
             neighbourhood,
+            models: PeerModels::new(ego.detector()),
             pairing: Pairing::new(options.pairing),
             frames: VecDeque::new(),
             ended: BTreeSet::new(),
             detections: bus.publisher(topic(Stream::Detections), PublisherOptions::DETECTIONS.lossless(PLACES))?,
             json: bus.publisher(topic(Stream::DetectionsJson), PublisherOptions::DETECTIONS)?,
             report: NodeReport::default(),
-            _own: bus.subscribe(topic(stream), &inbox)?,
+            _own: own,
             ego,
             inbox,
         })
@@ -155,11 +161,11 @@ impl<'a> Node<'a> {
             self.look_round()?;
             match self.inbox.take(Some(self.next_moment())) {
                 Taken::Item(_, Event::Message(arrival)) => self.admit(&arrival),
-                Taken::Item(Topic::Stream { cav, .. }, Event::End { .. }) if !self.options.keeps_running => {
-                    if cav == self.cav {
+                Taken::Item(topic, Event::End { .. }) if !self.options.keeps_running => {
+                    if topic == self.topic(&self.cav) {
                         return self.finish(stop);
                     }
-                    self.ended.insert(cav);
+                    self.end(topic);
                 }
                 Taken::Item(_, Event::End { .. }) | Taken::TimedOut => {}
                 Taken::Closed => return Ok(()),
@@ -176,10 +182,8 @@ impl<'a> Node<'a> {
             self.look_round()?;
             match self.inbox.take(Some(self.next_moment())) {
                 Taken::Item(_, Event::Message(arrival)) => self.admit(&arrival),
-                Taken::Item(Topic::Stream { cav, .. }, Event::End { .. }) => {
-                    self.ended.insert(cav);
-                }
-                Taken::Item(_, Event::End { .. }) | Taken::TimedOut => {}
+                Taken::Item(topic, Event::End { .. }) => self.end(topic),
+                Taken::TimedOut => {}
                 Taken::Closed => break,
             }
             self.decide(false);
@@ -193,6 +197,15 @@ impl<'a> Node<'a> {
         Ok(())
     }
 
+    /// A neighbour sends nothing to fuse any more.
+    fn end(&mut self, topic: Topic) {
+        if let Topic::Stream { cav, stream } = topic
+            && stream == self.stream
+        {
+            self.ended.insert(cav);
+        }
+    }
+
     fn all_have_ended(&self) -> bool {
         self.neighbourhood.iter().flat_map(Neighbourhood::members).all(|cav| self.ended.contains(cav))
     }
@@ -201,6 +214,7 @@ impl<'a> Node<'a> {
         let Some(neighbourhood) = &mut self.neighbourhood else { return Ok(()) };
         for cav in neighbourhood.update(self.bus, &self.inbox)? {
             let topic = Topic::Stream { cav: cav.clone(), stream: self.stream };
+            self.models.forget(&cav);
             for _ in 0..self.pairing.forget(&cav) {
                 self.bus.books().dropped(&topic, DropReason::Stale);
             }

@@ -9,7 +9,7 @@ use protocol::{Account, DropReason, Ledger, ProcessId, StageSummary, Topic, Wire
 /// Timings kept per stage: at 10 Hz the last three minutes.
 const KEPT_TIMINGS: usize = 2048;
 
-/// The books of one process. Cloning shares them.
+/// The books of one process. Cloning shares them. What is not booked ([`Topic::is_booked`]) leaves no trace in them.
 #[derive(Clone)]
 pub struct Books {
     process: ProcessId,
@@ -22,6 +22,8 @@ struct State {
     // How many messages of an account have come as far as this process takes them: out of a sender's queue onto the
     // network, or from the network into a receiver's. What lies between is in flight.
     passed: BTreeMap<Account, u64>,
+    // Unsound messages, of whatever kind of topic.
+    refused: BTreeMap<Topic, u64>,
     stages: BTreeMap<String, Timings>,
 }
 
@@ -47,47 +49,49 @@ impl Books {
 
     /// This process offers one more message on `topic`.
     pub fn offered(&self, topic: &Topic) {
-        self.lock().ledger.sent(&Account::published(topic.clone()));
+        self.note(topic, |state| state.ledger.sent(&Account::published(topic.clone())));
     }
 
     /// The network has taken a message that was offered.
     pub fn handed_over(&self, topic: &Topic) {
-        self.lock().pass(Account::published(topic.clone()));
+        self.note(topic, |state| state.pass(Account::published(topic.clone())));
     }
 
     /// A message that was offered will not be sent.
     pub fn withheld(&self, topic: &Topic, reason: DropReason) {
-        self.lock().ledger.dropped(&Account::published(topic.clone()), reason);
+        self.note(topic, |state| state.ledger.dropped(&Account::published(topic.clone()), reason));
     }
 
     /// This process listens to `topic` from now on.
     pub fn subscribed(&self, topic: &Topic) {
-        self.lock().ledger.open(&self.here(topic));
+        self.note(topic, |state| state.ledger.open(&self.here(topic)));
     }
 
     /// The network has delivered a message, sound or not.
     pub fn arrived(&self, topic: &Topic) {
-        self.lock().pass(self.here(topic));
+        self.note(topic, |state| state.pass(self.here(topic)));
     }
 
     /// A message that arrived was used.
     pub fn received(&self, topic: &Topic) {
-        self.lock().ledger.received(&self.here(topic));
+        self.note(topic, |state| state.ledger.received(&self.here(topic)));
     }
 
     /// A message that arrived was not used.
     pub fn dropped(&self, topic: &Topic, reason: DropReason) {
-        self.lock().ledger.dropped(&self.here(topic), reason);
+        self.note(topic, |state| state.ledger.dropped(&self.here(topic), reason));
     }
 
     /// A message that arrived is unsound: counted always, logged ever more rarely, as a hostile peer must not fill the
     /// log.
     pub fn rejected(&self, topic: &Topic, error: &WireError) {
-        let (account, reason) = (self.here(topic), error.drop_reason());
+        let reason = error.drop_reason();
+        self.dropped(topic, reason);
         let times = {
             let mut state = self.lock();
-            state.ledger.dropped(&account, reason);
-            state.ledger.get(&account).and_then(|counts| counts.dropped.get(&reason)).copied().unwrap_or(1)
+            let times = state.refused.entry(topic.clone()).or_default();
+            *times += 1;
+            *times
         };
         if times.is_power_of_two() {
             tracing::warn!(%topic, %reason, times, "message refused: {error}");
@@ -131,6 +135,12 @@ impl Books {
     pub fn stages(&self) -> Vec<StageSummary> {
         let state = self.lock();
         state.stages.iter().map(|(stage, timings)| timings.summary(stage)).collect()
+    }
+
+    fn note(&self, topic: &Topic, change: impl FnOnce(&mut State)) {
+        if topic.is_booked() {
+            change(&mut self.lock());
+        }
     }
 
     fn here(&self, topic: &Topic) -> Account {
@@ -200,6 +210,16 @@ mod tests {
         assert!(ledger.balance().is_exact(), "{:?}", ledger.balance());
         ego.dropped(&topic(), DropReason::Stale);
         assert_eq!(ego.ledger().get(&Account::towards(topic(), ego.process())).unwrap().in_flight, 0);
+    }
+
+    #[test]
+    fn what_is_said_again_and_again_is_not_booked() {
+        let agent = books("agent-4279");
+        let topic: Topic = "4279/descriptor".parse().unwrap();
+        agent.offered(&topic);
+        agent.handed_over(&topic);
+        agent.rejected(&topic, &WireError::Kind { expected: protocol::Kind::Descriptor, found: protocol::Kind::Bev });
+        assert!(agent.ledger().is_empty());
     }
 
     #[test]

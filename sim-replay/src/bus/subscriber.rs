@@ -99,9 +99,7 @@ impl Inbox {
             Pushed::Queued => return,
             Pushed::Displaced(event) | Pushed::NoLane(event) | Pushed::Closed(event) => event,
         };
-        if let Event::Message(arrival) = lost
-            && is_booked(topic)
-        {
+        if let Event::Message(arrival) = lost {
             self.books.dropped(&arrival.topic, DropReason::Superseded);
         }
     }
@@ -118,9 +116,7 @@ impl Subscription {
         (inbox, places): (&Arc<Inbox>, Option<usize>),
         notices: &Notices,
     ) -> Result<Self, BusError> {
-        if is_booked(&key.topic) {
-            inbox.books.subscribed(&key.topic);
-        }
+        inbox.books.subscribed(&key.topic);
         let topic = key.topic.clone();
         Self::declare(session, &key.to_string(), Door::new(inbox, places, notices), move |_| Some(topic.clone()))
     }
@@ -151,8 +147,8 @@ impl Subscription {
     }
 }
 
-/// Whether the ledger covers a topic: data, but not the talk about the run itself, which goes to whoever is there.
-fn is_booked(topic: &Topic) -> bool {
+/// Whether notices about a topic's publisher travel on it too: not where notices are all there is.
+fn has_notices(topic: &Topic) -> bool {
     match topic {
         Topic::Stream { .. } | Topic::Received { .. } | Topic::Truth => true,
         Topic::Control(_) | Topic::Stats(_) | Topic::Alive { .. } => false,
@@ -182,10 +178,10 @@ impl Door {
             Ok(header) => header,
             Err(error) => return self.refuse(&topic, &error),
         };
-        if header.kind == Kind::Control && is_booked(&topic) {
+        if header.kind == Kind::Control && has_notices(&topic) {
             return self.note(topic, &header, sample);
         }
-        if is_booked(&topic) {
+        if has_notices(&topic) {
             self.inbox.books.arrived(&topic);
             self.notices.heard(&topic);
             if !self.is_new(&topic, &header) {
@@ -198,12 +194,8 @@ impl Door {
     }
 
     fn refuse(&self, topic: &Topic, error: &WireError) {
-        if is_booked(topic) {
-            self.inbox.books.arrived(topic);
-            self.inbox.books.rejected(topic, error);
-        } else {
-            tracing::warn!(%topic, "message refused: {error}");
-        }
+        self.inbox.books.arrived(topic);
+        self.inbox.books.rejected(topic, error);
     }
 
     fn note(&self, topic: Topic, header: &Header, sample: &Sample) {

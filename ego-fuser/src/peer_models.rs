@@ -1,0 +1,114 @@
+//! Whose maps are of another network than the ego's, by what their agents say of themselves.
+//!
+//! Maps of another lattice are found out one by one in any case. Those of the same lattice from other weights are not:
+//! they look sound and mean something else.
+
+use std::collections::BTreeMap;
+
+use agent::detector::Detector;
+use protocol::message::{Descriptor, ModelHash};
+use protocol::{BevGrid, CavId};
+
+/// A network that is not the ego's: the field that tells, and both values.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub(crate) enum OtherModel {
+    /// Another lattice.
+    #[error("grid is {found}, the ego's is {own}")]
+    Grid { found: BevGrid, own: BevGrid },
+    /// Another number of channels.
+    #[error("channels are {found}, the ego's are {own}")]
+    Channels { found: u32, own: u32 },
+    /// Other weights.
+    #[error("model_hash is {found}, the ego's is {own}")]
+    Hash { found: ModelHash, own: ModelHash },
+}
+
+/// The ego's network, and the agents known to run another one. An agent of which nothing was heard is not among them.
+pub(crate) struct PeerModels {
+    grid: BevGrid,
+    channels: u32,
+    model_hash: ModelHash,
+    others: BTreeMap<CavId, OtherModel>,
+}
+
+impl PeerModels {
+    /// Nobody is known yet.
+    pub(crate) fn new(own: &Detector) -> Self {
+        Self {
+            grid: own.grid(),
+            channels: u32::try_from(own.map_shape()[0]).unwrap_or(u32::MAX),
+            model_hash: own.model_hash(),
+            others: BTreeMap::new(),
+        }
+    }
+
+    /// Takes in what an agent says of itself; how its network differs, when that is news.
+    pub(crate) fn hear(&mut self, cav: &CavId, descriptor: &Descriptor) -> Option<OtherModel> {
+        let Some(other) = self.difference(descriptor) else {
+            if self.others.remove(cav).is_some() {
+                tracing::info!(%cav, "its maps are of the ego's network now");
+            }
+            return None;
+        };
+        let before = self.others.insert(cav.clone(), other.clone());
+        (before.as_ref() != Some(&other)).then_some(other)
+    }
+
+    /// Whether an agent said that its network is another one.
+    pub(crate) fn is_other(&self, cav: &CavId) -> bool {
+        self.others.contains_key(cav)
+    }
+
+    /// Forgets an agent that has left.
+    pub(crate) fn forget(&mut self, cav: &CavId) {
+        self.others.remove(cav);
+    }
+
+    fn difference(&self, descriptor: &Descriptor) -> Option<OtherModel> {
+        // What it publishes and how exactly it writes is its own affair.
+        let Descriptor { model_hash, grid, channels, dtype: _, streams: _ } = descriptor;
+        if *grid != self.grid {
+            Some(OtherModel::Grid { found: *grid, own: self.grid })
+        } else if *channels != self.channels {
+            Some(OtherModel::Channels { found: *channels, own: self.channels })
+        } else if *model_hash != self.model_hash {
+            Some(OtherModel::Hash { found: *model_hash, own: self.model_hash })
+        } else {
+            None
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use protocol::{Dtype, Stream};
+
+    use super::*;
+
+    #[test]
+    fn another_network_is_news_once_and_until_it_is_the_egos() {
+        let grid = BevGrid { x_min_m: -51.2, y_min_m: -38.4, cell_m: 0.8, width: 128, height: 96 };
+        let own = ModelHash([7; 32]);
+        let mut models = PeerModels { grid, channels: 64, model_hash: own, others: BTreeMap::new() };
+        let cav = CavId::new("20").unwrap();
+        let same = Descriptor { model_hash: own, grid, channels: 64, dtype: Dtype::I8, streams: vec![Stream::Bev] };
+        assert_eq!(models.hear(&cav, &same), None);
+        assert!(!models.is_other(&cav));
+
+        let hash = Descriptor { model_hash: ModelHash([8; 32]), ..same.clone() };
+        let told = models.hear(&cav, &hash).unwrap().to_string();
+        assert!(told.contains("model_hash") && told.contains(&"07".repeat(32)) && told.contains(&"08".repeat(32)));
+        assert_eq!(models.hear(&cav, &hash), None, "said once");
+        assert!(models.is_other(&cav));
+        let narrow = Descriptor { channels: 32, ..hash };
+        assert_eq!(models.hear(&cav, &narrow), Some(OtherModel::Channels { found: 32, own: 64 }));
+        let wide = Descriptor { grid: BevGrid { width: 256, ..grid }, ..narrow };
+        assert!(models.hear(&cav, &wide).unwrap().to_string().starts_with("grid is "));
+
+        assert_eq!(models.hear(&cav, &same), None);
+        assert!(!models.is_other(&cav));
+        models.hear(&cav, &wide);
+        models.forget(&cav);
+        assert!(!models.is_other(&cav));
+    }
+}
