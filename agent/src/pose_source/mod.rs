@@ -4,6 +4,7 @@
 //! the sweep alone. A source that has no pose says so; nothing is made up.
 
 mod error_table;
+mod icp_map;
 mod noise;
 mod noisy;
 
@@ -13,6 +14,7 @@ use protocol::{CavId, NoPoseReason, PointCloud, Pose, PoseEstimate};
 use serde::{Deserialize, Serialize};
 
 pub use error_table::{ErrorTable, ErrorTableError, TableRow};
+pub use icp_map::{IcpMapPose, MapError, read_map};
 pub use noise::{PlanarError, PoseNoise};
 pub use noisy::NoisyPose;
 

@@ -1,5 +1,7 @@
 //! Rigid registration of correspondences: where is the sensor, given points it measured and where they are in the world.
 //!
+//! Clouds against clouds without correspondences: [`icp`].
+//!
 //! Pure geometry: [`ransac`] and [`sc2pcr`] find the motion among outliers, [`kabsch`] fits it to pairs that are right and
 //! [`refine`] sharpens it. All of them answer with a [`Registration`] or say why there is none.
 //!
@@ -14,6 +16,7 @@
 //! assert_eq!(found.inliers.len(), 60);
 //! ```
 
+pub mod icp;
 pub mod kabsch;
 pub mod ransac;
 pub mod refine;

@@ -26,7 +26,7 @@ impl Sites {
         (sites, rows)
     }
 
-    fn add(&mut self, coord: [i32; 3]) -> u32 {
+    pub(crate) fn add(&mut self, coord: [i32; 3]) -> u32 {
         match self.rows.entry(key(coord)) {
             Entry::Occupied(found) => *found.get(),
             Entry::Vacant(place) => {

@@ -1,0 +1,430 @@
+//! Iterative closest point, point to plane (Chen and Medioni 1992), on voxels and from coarse to fine.
+//!
+//! The target becomes small planes, one per voxel; every step pairs the source's points with the nearest of them, weighs
+//! the pairs by how well they fit already (Geman and McClure 1987), and solves one Gauss-Newton step. There is no global
+//! search: what starts some metres off ends in a wrong place, and nothing tells. That is the method, not this code.
+//!
+//! Two uses: a neighbour's sweep against the ego's, and a sweep against a map of many sweeps ([`IcpTarget::add`]).
+
+mod surfels;
+
+use nalgebra::{Isometry3, Matrix6, SymmetricEigen, Translation3, UnitQuaternion, Vector3, Vector6};
+use serde::{Deserialize, Serialize};
+
+use surfels::{Surfels, thinned};
+
+/// Turns and shifts are made comparable by the way a turn of one radian moves a typical point, metres.
+const LEVER_M: f64 = 10.0;
+/// A step smaller than this ends a level: metres and, times [`LEVER_M`], radians.
+const CONVERGED_M: f64 = 1e-3;
+
+/// One level of resolution.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct IcpLevel {
+    /// Side of the target's voxels, metres. Points farther than one and a half of it from any plane find none.
+    pub voxel_m: f64,
+    /// Distance to the plane at which a pair counts a quarter, metres.
+    pub scale_m: f64,
+    /// Most steps.
+    pub max_steps: u32,
+}
+
+/// Settings of a registration.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct IcpConfig {
+    /// From coarse to fine.
+    pub levels: Vec<IcpLevel>,
+    /// Nearest and farthest points that take part, metres: nearer ones are hits on the vehicle itself.
+    pub range_m: [f64; 2],
+    /// The source is thinned to one point per voxel of this side, metres.
+    pub source_voxel_m: f64,
+    /// And at each level to about this many points.
+    pub max_points: usize,
+    /// Share of the source's points that must have a partner in the end.
+    pub min_overlap: f64,
+    /// How well the worst direction must be fixed: 1 where every pair fixes it, 0 where none does.
+    pub min_constraint: f64,
+}
+
+impl Default for IcpConfig {
+    /// For 64-channel sweeps of streets.
+    fn default() -> Self {
+        let level = |voxel_m, scale_m, max_steps| IcpLevel { voxel_m, scale_m, max_steps };
+        Self {
+            levels: vec![level(2.0, 1.0, 40), level(1.0, 0.4, 20), level(0.5, 0.15, 20)],
+            range_m: [2.5, 80.0],
+            source_voxel_m: 0.5,
+            max_points: 5000,
+            min_overlap: 0.2,
+            min_constraint: 2e-3,
+        }
+    }
+}
+
+/// What is registered against: one sweep, or a map of many.
+#[derive(Debug, Clone)]
+pub struct IcpTarget {
+    /// Relative to `origin_m`.
+    levels: Vec<Surfels>,
+    /// Where the first sweep was taken: keeps numbers small far out in the world.
+    origin_m: Option<Vector3<f64>>,
+    range_m: [f64; 2],
+}
+
+impl IcpTarget {
+    /// A target without a point.
+    #[must_use]
+    pub fn new(config: &IcpConfig) -> Self {
+        let levels = config.levels.iter().map(|level| Surfels::new(level.voxel_m)).collect();
+        Self { levels, origin_m: None, range_m: config.range_m }
+    }
+
+    /// A target of one sweep, in the frame of its sensor.
+    #[must_use]
+    pub fn of_sweep(xyzi: &[[f32; 4]], config: &IcpConfig) -> Self {
+        let mut target = Self::new(config);
+        target.add(xyzi, &Isometry3::identity());
+        target.fit();
+        target
+    }
+
+    /// Adds a sweep taken at `target_from_sensor`. [`Self::fit`] before registering.
+    pub fn add(&mut self, xyzi: &[[f32; 4]], target_from_sensor: &Isometry3<f64>) {
+        let rotation = target_from_sensor.rotation.to_rotation_matrix();
+        let sensor = target_from_sensor.translation.vector;
+        let shift = sensor - *self.origin_m.get_or_insert(sensor);
+        for point in within(xyzi, self.range_m) {
+            let moved = rotation * point + shift;
+            self.levels.iter_mut().for_each(|level| level.add(&moved));
+        }
+    }
+
+    /// Fits the planes to all that has been added.
+    pub fn fit(&mut self) {
+        self.levels.iter_mut().for_each(Surfels::fit);
+    }
+
+    /// Planes at the finest level.
+    #[must_use]
+    pub fn planes(&self) -> usize {
+        self.levels.last().map_or(0, Surfels::len)
+    }
+}
+
+/// A sweep laid out for registering it, and what a vehicle would have to send of it.
+#[derive(Debug, Clone, PartialEq)]
+pub struct IcpSource {
+    points_m: Vec<Vector3<f64>>,
+}
+
+impl IcpSource {
+    /// Thins a sweep.
+    #[must_use]
+    pub fn of_sweep(xyzi: &[[f32; 4]], config: &IcpConfig) -> Self {
+        Self { points_m: thinned(within(xyzi, config.range_m), config.source_voxel_m) }
+    }
+
+    /// The points that are left, in the frame of the sensor, metres.
+    #[must_use]
+    pub fn points_m(&self) -> &[Vector3<f64>] {
+        &self.points_m
+    }
+}
+
+/// Points that take part.
+fn within(xyzi: &[[f32; 4]], [nearest_m, farthest_m]: [f64; 2]) -> impl Iterator<Item = Vector3<f64>> {
+    let points = xyzi.iter().map(|[x, y, z, _]| Vector3::new(*x, *y, *z).cast());
+    points.filter(move |point: &Vector3<f64>| (nearest_m..=farthest_m).contains(&point.norm()))
+}
+
+/// Where a sweep came to lie.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct IcpFit {
+    /// Takes points of the source's sensor to the target frame.
+    pub target_from_source: Isometry3<f64>,
+    /// Share of the source's points with a partner near its plane.
+    pub overlap: f64,
+    /// Root mean square of their distances to the planes, metres.
+    pub rms_m: f64,
+    /// Steps taken.
+    pub steps: u32,
+}
+
+/// Why a sweep came to lie nowhere.
+#[derive(Debug, Clone, Copy, PartialEq, thiserror::Error)]
+pub enum NoIcpFit {
+    /// Source or target are (nearly) empty.
+    #[error("{found} {what}, at least {required} are needed")]
+    TooFew {
+        /// Source points or target planes.
+        what: &'static str,
+        /// How many there are.
+        found: usize,
+        /// What it takes.
+        required: usize,
+    },
+    /// The clouds do not overlap where they came to lie.
+    #[error("{overlap:.2} of the points have a partner, at least {required:.2} must")]
+    TooLittleOverlap {
+        /// Share of points with a partner.
+        overlap: f64,
+        /// What it takes.
+        required: f64,
+    },
+    /// Some direction is free: nothing but ground, or a street between two walls.
+    #[error("the planes fix the worst direction to {constraint:.1e} only, at least {required:.1e} is needed")]
+    Unconstrained {
+        /// How well the worst direction is fixed, 0..1.
+        constraint: f64,
+        /// What it takes.
+        required: f64,
+    },
+}
+
+/// Fewest source points and target planes.
+const MIN_POINTS: usize = 50;
+
+/// Registers a sweep, beginning at `start`.
+///
+/// # Errors
+/// [`NoIcpFit`] where there is too little to register, or the result is not fixed by it. A result is no proof: a wrong
+/// start gives a wrong one.
+pub fn register(
+    source: &IcpSource,
+    target: &IcpTarget,
+    start: &Isometry3<f64>,
+    config: &IcpConfig,
+) -> Result<IcpFit, NoIcpFit> {
+    for (what, found) in [("source points", source.points_m.len()), ("target planes", target.planes())] {
+        if found < MIN_POINTS {
+            return Err(NoIcpFit::TooFew { what, found, required: MIN_POINTS });
+        }
+    }
+    let stride = source.points_m.len().div_ceil(config.max_points.max(1));
+    let points: Vec<&Vector3<f64>> = source.points_m.iter().step_by(stride).collect();
+    let origin = Translation3::from(target.origin_m.unwrap_or_default());
+    let (mut motion, mut steps) = (origin.inverse() * start, 0);
+    let mut last = NormalEquations::default();
+    for (planes, level) in target.levels.iter().zip(&config.levels) {
+        for _ in 0..level.max_steps {
+            last = NormalEquations::gather(&points, planes, &motion, level);
+            let Some(step) = last.step() else { break };
+            motion = moved(&motion, &step);
+            steps += 1;
+            if step.norm() < CONVERGED_M {
+                break;
+            }
+        }
+    }
+    last.judge(points.len(), config)?;
+    let overlap = last.pairs / points.len() as f64;
+    Ok(IcpFit { target_from_source: origin * motion, overlap, rms_m: (last.squares / last.pairs).sqrt(), steps })
+}
+
+/// `motion`, turned about the sensor and shifted: the step's turn is in units of 1 / [`LEVER_M`] radians.
+fn moved(motion: &Isometry3<f64>, step: &Vector6<f64>) -> Isometry3<f64> {
+    let turn = Vector3::new(step[0], step[1], step[2]) / LEVER_M;
+    let shift = Vector3::new(step[3], step[4], step[5]);
+    Isometry3::from_parts(
+        Translation3::from(motion.translation.vector + shift),
+        UnitQuaternion::from_scaled_axis(turn) * motion.rotation,
+    )
+}
+
+/// Sums of one Gauss-Newton step: turn about the sensor times [`LEVER_M`], then shift, all in metres.
+#[derive(Debug, Clone, Copy, Default)]
+struct NormalEquations {
+    hessian: Matrix6<f64>,
+    gradient: Vector6<f64>,
+    /// Sum of the weights.
+    weight: f64,
+    /// Pairs within three scales of their planes.
+    pairs: f64,
+    /// Sum of their squared distances.
+    squares: f64,
+}
+
+impl NormalEquations {
+    fn gather(points: &[&Vector3<f64>], planes: &Surfels, motion: &Isometry3<f64>, level: &IcpLevel) -> Self {
+        let rotation = motion.rotation.to_rotation_matrix();
+        let sensor = motion.translation.vector;
+        let mut sums = Self::default();
+        for point in points {
+            let arm = rotation * *point;
+            let moved = arm + sensor;
+            let Some(plane) = planes.near(&moved) else { continue };
+            let distance = plane.normal.dot(&(moved - plane.centre_m));
+            let scaled = (distance / level.scale_m).powi(2);
+            if scaled < 9.0 {
+                sums.pairs += 1.0;
+                sums.squares += distance * distance;
+            }
+            let weight = 1.0 / ((1.0 + scaled) * (1.0 + scaled));
+            let turn = arm.cross(&plane.normal) / LEVER_M;
+            let row = Vector6::new(turn.x, turn.y, turn.z, plane.normal.x, plane.normal.y, plane.normal.z);
+            sums.weight += weight;
+            sums.hessian += row * row.transpose() * weight;
+            sums.gradient += row * (distance * weight);
+        }
+        sums
+    }
+
+    /// The step, `None` without any pair. Directions that nothing fixes are left alone.
+    fn step(&self) -> Option<Vector6<f64>> {
+        let damped = self.hessian + Matrix6::identity() * (1e-6 * self.weight);
+        let step = damped.cholesky()?.solve(&-self.gradient);
+        step.iter().all(|value| value.is_finite()).then_some(step)
+    }
+
+    fn judge(&self, points: usize, config: &IcpConfig) -> Result<(), NoIcpFit> {
+        let overlap = self.pairs / points as f64;
+        if overlap < config.min_overlap.max(f64::EPSILON) {
+            return Err(NoIcpFit::TooLittleOverlap { overlap, required: config.min_overlap });
+        }
+        let constraint = SymmetricEigen::new(self.hessian / self.weight).eigenvalues.min();
+        if constraint < config.min_constraint {
+            return Err(NoIcpFit::Unconstrained { constraint, required: config.min_constraint });
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A crossing of two streets as a LiDAR at 2 m sees it from `world_from_sensor`: ground, eight walls, posts.
+    fn crossing(world_from_sensor: &Isometry3<f64>, shift: f64) -> Vec<[f32; 4]> {
+        let mut world = Vec::new();
+        let mut add = |x: f64, y: f64, z: f64| world.push(Vector3::new(x, y, z));
+        let span = |from: f64, to: f64, step: f64| {
+            (0..((to - from) / step) as usize).map(move |k| from + step * (k as f64 + 0.37))
+        };
+        for x in span(-40.0, 40.0, 0.6) {
+            for y in span(-40.0, 40.0, 0.6) {
+                add(x + shift, y - shift, 0.0);
+            }
+        }
+        for along in span(10.0, 40.0, 0.3) {
+            for z in span(0.0, 6.0, 0.3) {
+                for (sx, sy) in [(1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0)] {
+                    // Corners of different depth, so that no two views are alike.
+                    let depth = 8.0 + sx + 0.5 * sy;
+                    add(sx * (along + shift), sy * depth, z);
+                    add(sx * depth, sy * (along - shift), z + 0.1 * shift);
+                }
+            }
+        }
+        let sensor_from_world = world_from_sensor.inverse();
+        let single = |point: Vector3<f64>| {
+            let seen = sensor_from_world * nalgebra::Point3::from(point);
+            [seen.x as f32, seen.y as f32, seen.z as f32, 0.5]
+        };
+        world.into_iter().map(single).collect()
+    }
+
+    fn pose(x: f64, y: f64, yaw: f64) -> Isometry3<f64> {
+        Isometry3::new(Vector3::new(x, y, 2.0), Vector3::z() * yaw)
+    }
+
+    fn error(truth: &Isometry3<f64>, found: &Isometry3<f64>) -> (f64, f64) {
+        let off = truth.inv_mul(found);
+        (off.translation.vector.norm(), off.rotation.angle().to_degrees())
+    }
+
+    #[test]
+    fn a_sweep_is_put_in_place_from_near() {
+        let config = IcpConfig::default();
+        let (here, there) = (pose(0.0, 0.0, 0.2), pose(3.0, -1.5, 0.6));
+        let target = IcpTarget::of_sweep(&crossing(&here, 0.0), &config);
+        let source = IcpSource::of_sweep(&crossing(&there, 0.11), &config);
+        let truth = here.inv_mul(&there);
+        let start = truth * Isometry3::new(Vector3::new(0.8, -0.6, 0.2), Vector3::new(0.01, -0.02, 0.05));
+        let fit = register(&source, &target, &start, &config).unwrap();
+        let (metres, degrees) = error(&truth, &fit.target_from_source);
+        assert!(metres < 0.03 && degrees < 0.05, "{metres} m, {degrees} degrees");
+        assert!(fit.overlap > 0.6 && fit.rms_m < 0.05 && fit.steps > 2, "{fit:?}");
+    }
+
+    #[test]
+    fn a_map_of_several_sweeps_places_one_more_far_out_in_the_world() {
+        let config = IcpConfig::default();
+        let far = Isometry3::translation(4.2e5, -5.1e6, 300.0);
+        let mut map = IcpTarget::new(&config);
+        for (step, shift) in [(-4.0, 0.0), (0.0, 0.1), (4.0, 0.2)] {
+            let at = pose(step, 0.0, 0.1 * step);
+            map.add(&crossing(&at, shift), &(far * at));
+        }
+        map.fit();
+        let there = pose(1.0, 1.0, 0.3);
+        let source = IcpSource::of_sweep(&crossing(&there, 0.15), &config);
+        let start = far * there * Isometry3::new(Vector3::new(-0.7, 0.7, 0.0), Vector3::z() * -0.04);
+        let fit = register(&source, &map, &start, &config).unwrap();
+        let (metres, degrees) = error(&(far * there), &fit.target_from_source);
+        assert!(metres < 0.05 && degrees < 0.1, "{metres} m, {degrees} degrees");
+    }
+
+    #[test]
+    fn traffic_that_has_moved_is_not_believed() {
+        let config = IcpConfig::default();
+        let (here, there) = (pose(0.0, 0.0, 0.0), pose(1.0, 0.3, 0.02));
+        let mut moved = crossing(&there, 0.1);
+        let static_points = moved.len();
+        // A side of a lorry, two metres farther than in the target.
+        let lorry = |x: f64| (0..800).map(move |k| [x + f64::from(k % 40) * 0.2, 4.0, f64::from(k / 40) * 0.15]);
+        let mut target = crossing(&here, 0.0);
+        target.extend(lorry(3.0).map(|p| [p[0] as f32, p[1] as f32, p[2] as f32 - 2.0, 0.1]));
+        moved.extend(lorry(5.0).map(|p| [p[0] as f32 - 1.0, p[1] as f32 - 0.3, p[2] as f32 - 2.0, 0.1]));
+        assert!(moved.len() > static_points);
+        let source = IcpSource::of_sweep(&moved, &config);
+        let fit = register(&source, &IcpTarget::of_sweep(&target, &config), &Isometry3::identity(), &config).unwrap();
+        let (metres, degrees) = error(&here.inv_mul(&there), &fit.target_from_source);
+        assert!(metres < 0.04 && degrees < 0.1, "{metres} m, {degrees} degrees");
+    }
+
+    #[test]
+    fn bare_ground_and_a_tunnel_leave_directions_free() {
+        let config = IcpConfig::default();
+        let ground = |shift: f32| -> Vec<[f32; 4]> {
+            (0..10_000)
+                .map(|k| [(k % 100) as f32 * 0.5 - 25.0 + shift, (k / 100) as f32 * 0.5 - 25.0, -2.0, 0.1])
+                .collect()
+        };
+        let walls = |shift: f32| {
+            let wall = move |y: f32| {
+                (0..2_000).map(move |k| [(k % 200) as f32 * 0.25 - 25.0 + shift, y, (k / 200) as f32 * 0.4 - 2.0, 0.1])
+            };
+            wall(6.0).chain(wall(-6.0))
+        };
+        for (source, target) in [
+            (ground(0.1), ground(0.0)),
+            (ground(0.1).into_iter().chain(walls(0.2)).collect(), ground(0.0).into_iter().chain(walls(0.0)).collect()),
+        ] {
+            let target = IcpTarget::of_sweep(&target, &config);
+            let found = register(&IcpSource::of_sweep(&source, &config), &target, &Isometry3::identity(), &config);
+            assert!(matches!(found, Err(NoIcpFit::Unconstrained { .. })), "{found:?}");
+        }
+    }
+
+    #[test]
+    fn thin_evidence_is_said() {
+        let config = IcpConfig::default();
+        let sweep = crossing(&pose(0.0, 0.0, 0.0), 0.0);
+        let (source, target) = (IcpSource::of_sweep(&sweep, &config), IcpTarget::of_sweep(&sweep, &config));
+        let none = IcpSource::of_sweep(&[[f32::NAN; 4]; 1000], &config);
+        let start = Isometry3::identity();
+        assert!(matches!(
+            register(&none, &target, &start, &config),
+            Err(NoIcpFit::TooFew { what: "source points", found: 0, .. })
+        ));
+        let empty = IcpTarget::of_sweep(&[], &config);
+        assert!(matches!(
+            register(&source, &empty, &start, &config),
+            Err(NoIcpFit::TooFew { what: "target planes", .. })
+        ));
+        let elsewhere = Isometry3::translation(500.0, 0.0, 0.0);
+        assert!(matches!(register(&source, &target, &elsewhere, &config), Err(NoIcpFit::TooLittleOverlap { .. })));
+    }
+}
