@@ -5,6 +5,7 @@
 
 mod dense;
 mod encoder_config;
+mod end_to_end;
 mod error;
 mod head_config;
 mod localize;
@@ -17,6 +18,7 @@ pub mod training;
 mod voxel_batch;
 
 pub use encoder_config::{SceneEncoderConfig, VoxelInput};
+pub use end_to_end::{EndToEnd, EndToEndConfig, EndToEndKind};
 pub use error::LocalizerError;
 pub use head_config::{RefinerConfig, SceneHeadConfig};
 pub use localize::{Localization, Localizer, LocalizerTimes, SceneCoordinates, sigma};

@@ -1,6 +1,7 @@
 //! `agent train`: the two stages of a localizer.
 
 mod encoder;
+mod end_to_end;
 mod options;
 mod scene;
 
@@ -17,6 +18,7 @@ pub(crate) struct Args {
 enum Stage {
     Encoder(encoder::Args),
     Scene(scene::Args),
+    EndToEnd(end_to_end::Args),
 }
 
 /// Trains what was asked for.
@@ -24,5 +26,6 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     match &args.stage {
         Stage::Encoder(args) => encoder::run(args),
         Stage::Scene(args) => scene::run(args),
+        Stage::EndToEnd(args) => end_to_end::run(args),
     }
 }

@@ -4,6 +4,7 @@
 mod contrast;
 mod curve;
 mod encoder_training;
+mod end_to_end_training;
 mod error;
 mod feature_cache;
 mod kmeans;
@@ -14,6 +15,7 @@ mod scene_validation;
 mod sweep_store;
 
 pub use encoder_training::{EncoderAccuracy, EncoderReport, EncoderSummary, EncoderTrainConfig, train_encoder};
+pub use end_to_end_training::{EndToEndReport, EndToEndSummary, EndToEndTrainConfig, train_end_to_end};
 pub use error::LocalizerTrainError;
 pub use feature_cache::{FeatureCache, SweepAugmentation};
 pub use kmeans::kmeans;
