@@ -57,7 +57,7 @@ pub(crate) struct Args {
     #[arg(long)]
     rsd: bool,
     /// Cells of a step.
-    #[arg(long, default_value_t = 2048)]
+    #[arg(long, default_value_t = 4096)]
     batch: usize,
     /// Highest learning rate.
     #[arg(long, default_value_t = 2e-3)]

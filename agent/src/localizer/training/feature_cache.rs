@@ -96,7 +96,8 @@ impl FeatureCache {
             prepared.filter_map(Result::transpose).collect()
         };
         let mut loader = Prefetch::start(threads, 0, prepare);
-        let mut builder = Builder::default();
+        let rows = (total * CELLS) as i64;
+        let mut builder = Builder::new(rows, encoder.config().cell_channels(), device)?;
         let mut done = 0;
         while done < total {
             let batch = loader.next_batch().ok_or(LocalizerTrainError::LoaderGone)??;
@@ -122,9 +123,9 @@ impl FeatureCache {
     }
 }
 
-#[derive(Default)]
 struct Builder {
-    cells: Vec<Tensor>,
+    /// One block from the start: thousands of pieces would stay in the allocator's lists for the whole training.
+    cells: Tensor,
     sweeps: Vec<Tensor>,
     sweep_of_cell: Vec<i64>,
     places: Vec<Cell>,
@@ -132,11 +133,17 @@ struct Builder {
 }
 
 impl Builder {
+    fn new(rows: i64, channels: i64, device: Device) -> Result<Self, TchError> {
+        let cells = Tensor::f_empty([rows, channels], (Kind::Half, device))?;
+        Ok(Self { cells, sweeps: Vec::new(), sweep_of_cell: Vec::new(), places: Vec::new(), poses: Vec::new() })
+    }
+
     fn add(&mut self, batch: &[Prepared], encoder: &SceneEncoder, kind: Kind, device: Device) -> Result<(), TchError> {
         let sweeps: Vec<&SweepVoxels> = batch.iter().map(|prepared| &prepared.voxels).collect();
         let voxels = VoxelBatch::new(&sweeps, encoder.config(), device)?;
         let features = encoder.encode(&voxels, kind)?;
         let mut rows = Vec::new();
+        let filled = self.places.len() as i64;
         for (number, prepared) in batch.iter().enumerate() {
             let first = voxels.cell_rows(number).start;
             rows.extend(prepared.rows.iter().map(|&row| first + row as i64));
@@ -146,7 +153,8 @@ impl Builder {
         }
         let rows = Tensor::f_from_slice(&rows)?.f_to_device(device)?;
         no_grad(|| {
-            self.cells.push(features.cells.f_index_select(0, &rows)?.f_to_kind(Kind::Half)?);
+            let mut place = self.cells.f_narrow(0, filled, rows.size()[0])?;
+            place.f_copy_(&features.cells.f_index_select(0, &rows)?)?;
             self.sweeps.push(features.sweeps);
             Ok(())
         })
@@ -169,7 +177,7 @@ impl Builder {
         let sensor: Vec<f32> = self.places.iter().flat_map(|cell| cell.centroid_m).collect();
         let columns = |values: &[f32]| Tensor::f_from_slice(values)?.f_view([-1, 3])?.f_to_device(device);
         Ok(FeatureCache {
-            cells: Tensor::f_cat(&self.cells, 0)?,
+            cells: self.cells.f_narrow(0, 0, self.places.len() as i64)?,
             sweep_of_cell: Tensor::f_from_slice(&self.sweep_of_cell)?.f_to_device(device)?,
             targets_m: columns(&targets)?,
             sensor_m: columns(&sensor)?,

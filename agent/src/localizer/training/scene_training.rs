@@ -32,6 +32,8 @@ const CLASSIFIER_BATCH: usize = 256;
 const LABEL_SMOOTHING: f64 = 0.1;
 /// Cells that centres and statistics are computed from.
 const SAMPLE: usize = 20_000;
+/// Steps between two draws of what drops out of the classifier.
+const LOGITS_EVERY: u64 = 50;
 /// Steps between two reports.
 const REPORT_EVERY: u64 = 20;
 /// Deviation of the largest errors that the refiner starts from, metres.
@@ -199,6 +201,8 @@ struct Training<'a> {
     sweep_weights: Tensor,
     /// Heading of each sweep's sensor, radians.
     headings: Tensor,
+    /// What the classifier says of each sweep at the moment.
+    logits: Option<Tensor>,
     order: Vec<i64>,
     place: usize,
     /// Cells of all sweeps, of which a pass shows those that are used.
@@ -301,6 +305,7 @@ impl<'a> Training<'a> {
             redundancy,
             sweep_weights,
             headings,
+            logits: None,
             order: Vec::new(),
             place: 0,
             passes: progress.step as f64 * config.batch as f64 / cache.cell_count() as f64,
@@ -377,8 +382,12 @@ impl<'a> Training<'a> {
     fn step(&mut self, rows: &Tensor) -> Result<bool, LocalizerTrainError> {
         let sweeps = self.cache.sweep_of_cell.f_index_select(0, rows)?;
         let cells = self.head.normalise(&self.cache.cells.f_index_select(0, rows)?)?;
-        // Channels drop out here too: at a place that was never driven the classifier is less sure than on what it has seen.
-        let logits = no_grad(|| self.head.classify(&self.cache.sweeps.f_index_select(0, &sweeps)?, true))?;
+        if self.progress.step.is_multiple_of(LOGITS_EVERY) || self.logits.is_none() {
+            // Channels drop out here too: where nobody has driven the classifier is less sure than on what it has seen.
+            self.logits = Some(no_grad(|| self.head.classify(&self.cache.sweeps, true))?);
+        }
+        let Some(logits) = &self.logits else { unreachable!("set above") };
+        let logits = logits.f_index_select(0, &sweeps)?;
         let regression = self.head.regress(&cells, &logits, self.config.precision.kind())?;
         let targets = self.cache.targets_m.f_index_select(0, rows)?;
         let weights = self.sweep_weights.f_index_select(0, &sweeps)?;
