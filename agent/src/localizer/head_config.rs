@@ -2,6 +2,9 @@
 
 use serde::{Deserialize, Serialize};
 
+/// Corners of a lattice.
+const MAX_CORNERS: i64 = 1_000_000;
+
 /// The head of one town.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -40,19 +43,24 @@ pub struct RefinerConfig {
     pub low_m: [f64; 2],
     /// North-east corner.
     pub high_m: [f64; 2],
-    /// Edges of the patches of each plane, metres.
-    pub patch_m: Vec<f64>,
-    /// Channels of a patch.
-    pub embedding: i64,
+    /// Distance between corners of the lattice, metres.
+    pub spacing_m: f64,
+    /// Corners to each side that are candidates.
+    pub reach: i64,
+    /// Channels of a key.
+    pub keys: i64,
     /// Channels inside.
     pub width: i64,
 }
 
 impl RefinerConfig {
-    /// Corners of patches along x and y.
+    /// Corners along x and y.
     #[must_use]
-    pub fn corners(&self, patch_m: f64) -> [i64; 2] {
-        std::array::from_fn(|axis| ((self.high_m[axis] - self.low_m[axis]) / patch_m).ceil() as i64 + 2)
+    pub fn corners(&self) -> [i64; 2] {
+        std::array::from_fn(|axis| {
+            let steps = ((self.high_m[axis] - self.low_m[axis]) / self.spacing_m).ceil() as i64;
+            (steps + 1).max(2 * self.reach + 1)
+        })
     }
 
     /// Checks that a network can be built.
@@ -60,18 +68,28 @@ impl RefinerConfig {
     /// # Errors
     /// Says which field is wrong and what stood there.
     pub fn validate(&self) -> Result<(), String> {
-        let sizes = [("local_channels", self.local_channels), ("embedding", self.embedding), ("width", self.width)];
+        let sizes = [
+            ("local_channels", self.local_channels),
+            ("keys", self.keys),
+            ("width", self.width),
+            ("reach", self.reach),
+        ];
         if let Some((name, size)) = sizes.into_iter().find(|(_, size)| !(1..=4096).contains(size)) {
             return Err(format!("refiner: {name} is {size}, must be 1 to 4096"));
         }
-        let edges = (0..2).map(|axis| self.high_m[axis] - self.low_m[axis]);
-        if edges.clone().any(|edge| !(edge > 0.0 && edge < 1e5)) {
+        let mut edges = (0..2).map(|axis| self.high_m[axis] - self.low_m[axis]);
+        if edges.any(|edge| !(edge > 0.0 && edge < 1e5)) {
             return Err(format!("refiner: from {:?} to {:?} is no area", self.low_m, self.high_m));
         }
-        match self.patch_m.iter().find(|&&patch_m| !(patch_m >= 0.5 && patch_m < 1e4)) {
-            Some(patch_m) => Err(format!("refiner: patch_m has {patch_m}, must be 0.5 or more")),
-            None if self.patch_m.len() > 8 => Err(format!("refiner: {} planes, must be 8 at most", self.patch_m.len())),
-            None => Ok(()),
+        if !(0.1..=100.0).contains(&self.spacing_m) {
+            return Err(format!("refiner: spacing_m is {}, must be 0.1 to 100", self.spacing_m));
+        }
+        let [columns, rows] = self.corners();
+        match columns.saturating_mul(rows) {
+            corners if corners > MAX_CORNERS => {
+                Err(format!("refiner: {corners} corners, must be {MAX_CORNERS} at most"))
+            }
+            _ => Ok(()),
         }
     }
 }

@@ -1,8 +1,9 @@
-//! The second look: once a sweep's pose is known to a metre or two, how far is each cell from where that pose puts it.
+//! The second look: once a sweep's pose is known to a metre or two, where exactly is each cell.
 //!
-//! The head answers from the whole town; the refiner only compares. It keeps a learnt description of every patch of the
-//! town (a plane of embeddings at two resolutions) and sets what the cell looks like against what the town looks like
-//! there. Neither the paper nor LightLoc has this stage; the solver's 'final refinement' is run on its answers.
+//! The head answers from the whole town; the refiner only looks around. A lattice over the town holds a learnt key for
+//! every corner. What the cell looks like is the query, the corners around the place where the pose puts the cell are
+//! the candidates, and the answer is their mean by attention. Neither the paper nor LightLoc has this stage; the
+//! solver's 'final refinement' is run on its answers.
 
 use tch::nn::{self, Init};
 use tch::{Kind, TchError, Tensor};
@@ -12,16 +13,22 @@ use super::error::LocalizerError;
 use super::head_config::RefinerConfig;
 use super::scene_head::Regression;
 
-/// Wavelengths by which a place within a patch is told, metres.
-const WAVELENGTHS_M: [f64; 2] = [4.0, 1.5];
+/// Similarities are multiplied by this at first; learnt from there on.
+const FIRST_SHARPNESS: f64 = 2.0;
 
-/// Compares cells with the town.
+/// Finds cells on a learnt lattice over the town.
 #[derive(Debug)]
 pub struct Refiner {
     config: RefinerConfig,
-    planes: Vec<EmbeddingPlane>,
-    layers: [Dense; 2],
-    outward: Dense,
+    /// `[corners, keys]`.
+    keys: Tensor,
+    /// `[corners, 1]`: height of what stands there, metres.
+    heights: Tensor,
+    sharpness: Tensor,
+    inward: Dense,
+    query: Dense,
+    height: Dense,
+    epsilon: [Dense; 2],
 }
 
 impl Refiner {
@@ -31,17 +38,21 @@ impl Refiner {
     /// [`LocalizerError::Config`] names the field that is wrong.
     pub fn new(path: &nn::Path<'_>, config: &RefinerConfig) -> Result<Self, LocalizerError> {
         config.validate().map_err(LocalizerError::Config)?;
-        let plane = |(level, &patch_m): (usize, &f64)| EmbeddingPlane::new(&(path / "planes" / level), patch_m, config);
-        let planes: Vec<EmbeddingPlane> = config.patch_m.iter().enumerate().map(plane).collect();
-        // Features, embeddings, heading, height, and sine and cosine of x and y at each wavelength.
-        let inputs =
-            config.local_channels + config.embedding * planes.len() as i64 + 3 + 4 * WAVELENGTHS_M.len() as i64;
-        let width = config.width;
+        let [columns, rows] = config.corners();
+        let corners = columns * rows;
+        let RefinerConfig { local_channels, keys, width, .. } = *config;
         Ok(Self {
             config: config.clone(),
-            planes,
-            layers: [Dense::new(&(path / 0), inputs, width, 1.0), Dense::new(&(path / 1), width, width, 1.0)],
-            outward: Dense::new(&(path / 2), width, 4, 0.05),
+            keys: path.var("keys", &[corners, keys], Init::Randn { mean: 0.0, stdev: 0.2 }),
+            heights: path.var("heights", &[corners, 1], Init::Const(0.0)),
+            sharpness: path.var("sharpness", &[1], Init::Const(FIRST_SHARPNESS)),
+            inward: Dense::new(&(path / "inward"), local_channels + 3, width, 1.0),
+            query: Dense::new(&(path / "query"), width, keys, 0.5),
+            height: Dense::new(&(path / "height"), width, 1, 0.1),
+            epsilon: [
+                Dense::new(&(path / "epsilon" / 0), width + 2, 32, 1.0),
+                Dense::new(&(path / "epsilon" / 1), 32, 1, 0.1),
+            ],
         })
     }
 
@@ -60,75 +71,79 @@ impl Refiner {
     ///
     /// # Errors
     /// The tensor library's.
-    pub fn compare(
+    pub fn look(
         &self,
         cells: &Tensor,
         assumed_m: &Tensor,
         heading: &Tensor,
         kind: Kind,
     ) -> Result<Regression, TchError> {
-        let plane_m = assumed_m.f_narrow(1, 0, 2)?;
-        let mut input = vec![cells.f_narrow(1, 0, self.config.local_channels)?];
-        for plane in &self.planes {
-            input.push(plane.at(&plane_m)?);
-        }
-        input.push(heading.shallow_clone());
-        input.push(assumed_m.f_narrow(1, 2, 1)? / 10.0);
-        for wavelength_m in WAVELENGTHS_M {
-            let phase = &plane_m * (std::f64::consts::TAU / wavelength_m);
-            input.extend([phase.f_sin()?, phase.f_cos()?]);
-        }
-        let mut x = Tensor::f_cat(&input, 1)?.f_to_kind(kind)?;
-        for layer in &self.layers {
-            x = layer.forward(&x)?.f_relu()?;
-        }
-        let output = self.outward.forward(&x)?.f_to_kind(Kind::Float)?;
+        let local = cells.f_narrow(1, 0, self.config.local_channels)?;
+        let height = assumed_m.f_narrow(1, 2, 1)? / 10.0;
+        let input = Tensor::f_cat(&[&local, heading, &height], 1)?.f_to_kind(kind)?;
+        let hidden = self.inward.forward(&input)?.f_relu()?;
+        let query = self.query.forward(&hidden)?.f_to_kind(Kind::Float)?.f_unsqueeze(2)?;
+
+        let window = self.window(assumed_m)?;
+        let similarity = gather(&self.keys, &window.corners)?.f_bmm(&query)?.f_squeeze_dim(2)? * &self.sharpness;
+        let shares = similarity.f_softmax(1, Kind::Float)?.f_unsqueeze(1)?;
+        let plane_m = shares.f_bmm(&window.places_m)?.f_squeeze_dim(1)?;
+        let floor_m = shares.f_bmm(&gather(&self.heights, &window.corners)?)?.f_squeeze_dim(1)?;
+        let above_m = self.height.forward(&hidden)?.f_to_kind(Kind::Float)?;
+        // How far the shares are spread, and how large the largest is, tell how sure the answer is.
+        let square = shares.f_bmm(&window.places_m.f_square()?)?.f_squeeze_dim(1)?;
+        let spread =
+            (square - plane_m.f_square()?).f_sum_dim_intlist(1_i64, true, Kind::Float)?.f_clamp_min(1e-6)?.f_sqrt()?;
+        let largest = shares.f_amax([2_i64], false)?;
+        let evidence = Tensor::f_cat(&[hidden.f_to_kind(Kind::Float)?, spread, largest], 1)?;
+        let epsilon = self.epsilon[1].forward(&self.epsilon[0].forward(&evidence)?.f_relu()?)?;
         Ok(Regression {
-            coordinates_m: assumed_m + output.f_narrow(1, 0, 3)?,
-            epsilon_m: output.f_narrow(1, 3, 1)?.f_squeeze_dim(1)?.f_softplus()?,
+            coordinates_m: Tensor::f_cat(&[plane_m + window.middle_m, floor_m + above_m], 1)?,
+            epsilon_m: epsilon.f_squeeze_dim(1)?.f_softplus()?,
+        })
+    }
+
+    /// The corners around each place.
+    fn window(&self, assumed_m: &Tensor) -> Result<Window, TchError> {
+        let RefinerConfig { spacing_m, reach, low_m, .. } = &self.config;
+        let [columns, rows] = self.config.corners();
+        let device = assumed_m.device();
+        let axis = |axis: usize, size: i64| {
+            let steps = ((assumed_m.f_select(1, axis as i64)? - low_m[axis]) / *spacing_m).f_round()?;
+            steps.f_clamp(*reach as f64, (size - 1 - reach) as f64)
+        };
+        let (column, row) = (axis(0, columns)?, axis(1, rows)?);
+        let middle = [&column * *spacing_m + low_m[0], &row * *spacing_m + low_m[1]];
+        let first = (row * columns as f64 + column).f_to_kind(Kind::Int64)?.f_unsqueeze(1)?;
+        let around = || (-reach..=*reach).flat_map(move |y| (-reach..=*reach).map(move |x| (x, y)));
+        let shifts: Vec<i64> = around().map(|(x, y)| y * columns + x).collect();
+        let places: Vec<f32> =
+            around().flat_map(|(x, y)| [(x as f64 * spacing_m) as f32, (y as f64 * spacing_m) as f32]).collect();
+        let count = assumed_m.size()[0];
+        let places_m = Tensor::f_from_slice(&places)?.f_view([1, -1, 2])?.f_to_device(device)?;
+        Ok(Window {
+            corners: first + Tensor::f_from_slice(&shifts)?.f_to_device(device)?,
+            places_m: places_m.f_expand([count, -1, -1], false)?,
+            middle_m: Tensor::f_stack(&middle, 1)?,
         })
     }
 }
 
-/// Learnt descriptions of square patches, bilinear between their corners.
-#[derive(Debug)]
-struct EmbeddingPlane {
-    /// `[rows * columns, channels]`.
+/// Candidates of some cells.
+struct Window {
+    /// `[N, K]` rows of keys.
     corners: Tensor,
-    low_m: [f64; 2],
-    patch_m: f64,
-    size: [i64; 2],
+    /// `[N, K, 2]`: where they are relative to the middle, metres.
+    places_m: Tensor,
+    /// `[N, 2]`: the corner in the middle, metres relative to the head's origin.
+    middle_m: Tensor,
 }
 
-impl EmbeddingPlane {
-    fn new(path: &nn::Path<'_>, patch_m: f64, config: &RefinerConfig) -> Self {
-        let size = config.corners(patch_m);
-        let corners =
-            path.var("corners", &[size[0] * size[1], config.embedding], Init::Randn { mean: 0.0, stdev: 0.1 });
-        Self { corners, low_m: config.low_m, patch_m, size }
-    }
-
-    /// `[N, channels]` at `[N, 2]` of x and y; places outside have the description of the edge.
-    fn at(&self, plane_m: &Tensor) -> Result<Tensor, TchError> {
-        let axis = |axis: i64| {
-            let steps = (plane_m.f_select(1, axis)? - self.low_m[axis as usize]) / self.patch_m;
-            let steps = steps.f_clamp(0.0, self.size[axis as usize] as f64 - 1.001)?;
-            let low = steps.f_floor()?;
-            Ok::<_, TchError>((low.f_to_kind(Kind::Int64)?, (steps - low).f_unsqueeze(1)?))
-        };
-        let ((column, share_x), (row, share_y)) = (axis(0)?, axis(1)?);
-        let first = row * self.size[0] + column;
-        let corner = |shift: i64| {
-            let index = (&first + shift).f_unsqueeze(1)?.f_expand([-1, self.corners.size()[1]], false)?;
-            self.corners.f_gather(0, &index, false)
-        };
-        let along_x = |shift: i64| {
-            let (left, right) = (corner(shift)?, corner(shift + 1)?);
-            Ok::<_, TchError>(&left + (right - &left) * &share_x)
-        };
-        let (low, high) = (along_x(0)?, along_x(self.size[0])?);
-        Ok(&low + (high - &low) * share_y)
-    }
+/// `[N, K, C]` rows of `[R, C]` by `[N, K]`; its gradient is fast because the index is expanded, not written out.
+fn gather(rows: &Tensor, index: &Tensor) -> Result<Tensor, TchError> {
+    let channels = rows.size()[1];
+    let flat = index.f_reshape([-1, 1])?.f_expand([-1, channels], false)?;
+    rows.f_gather(0, &flat, false)?.f_view([index.size()[0], index.size()[1], channels])
 }
 
 #[cfg(test)]
@@ -143,36 +158,51 @@ mod tests {
             local_channels: 4,
             low_m: [-20.0, -10.0],
             high_m: [20.0, 30.0],
-            patch_m: vec![4.0],
-            embedding: 2,
+            spacing_m: 2.0,
+            reach: 2,
+            keys: 4,
             width: 8,
         }
     }
 
-    #[test]
-    fn descriptions_are_bilinear() {
-        let network = VarStore::new(Device::Cpu);
-        let plane = EmbeddingPlane::new(&network.root(), 4.0, &config());
-        let [columns, rows] = plane.size;
-        // A slope is its own bilinear interpolation.
-        let slope: Vec<f32> =
-            (0..rows).flat_map(|y| (0..columns).flat_map(move |x| [x as f32, (10 * y) as f32])).collect();
-        let _ = tch::no_grad(|| plane.corners.shallow_clone().copy_(&Tensor::from_slice(&slope).view([-1, 2])));
-        let at = plane.at(&Tensor::from_slice(&[-19.0f32, -9.0, 3.0, 12.0, -500.0, 5.0]).view([3, 2])).unwrap();
-        let expected = Tensor::from_slice(&[0.25f32, 2.5, 5.75, 55.0, 0.0, 37.5]).view([3, 2]);
-        assert!(at.allclose(&expected, 1e-4, 1e-4, false), "{at:?}");
-    }
-
-    #[test]
-    fn answers_are_near_the_assumption_before_training() {
+    fn refiner() -> (VarStore, Refiner) {
+        tch::set_num_threads(1);
         tch::manual_seed(1);
         let network = VarStore::new(Device::Cpu);
         let refiner = Refiner::new(&network.root(), &config()).unwrap();
-        let assumed = Tensor::from_slice(&[1.0f32, 2.0, 3.0, 900.0, -900.0, 0.0]).view([2, 3]);
-        let cells = Tensor::randn([2, 6], (Kind::Float, Device::Cpu));
+        (network, refiner)
+    }
+
+    #[test]
+    fn answers_lie_within_the_window_around_the_assumption() {
+        let (_network, refiner) = refiner();
+        let assumed = Tensor::from_slice(&[1.3f32, 2.2, 3.0, -7.9, 11.0, 0.0]).view([2, 3]);
+        let cells = Tensor::randn([2, 6], (Kind::Float, Device::Cpu)) * 5.0;
         let heading = Tensor::from_slice(&[1.0f32, 0.0, 0.0, 1.0]).view([2, 2]);
-        let answer = refiner.compare(&cells, &assumed, &heading, Kind::Float).unwrap();
-        assert!((answer.coordinates_m - assumed).abs().max().double_value(&[]) < 2.0);
+        let answer = refiner.look(&cells, &assumed, &heading, Kind::Float).unwrap();
+        let off = (answer.coordinates_m - assumed).narrow(1, 0, 2).abs().max().double_value(&[]);
+        assert!(off <= 5.0, "{off}");
         assert!(answer.epsilon_m.min().double_value(&[]) > 0.0);
+    }
+
+    #[test]
+    fn the_corner_whose_key_is_like_the_query_wins() {
+        let (_network, refiner) = refiner();
+        let assumed = Tensor::from_slice(&[0.2f32, 0.1, 0.0]).view([1, 3]);
+        let window = refiner.window(&assumed).unwrap();
+        assert_eq!(Vec::<f32>::try_from(window.middle_m.view([-1])).unwrap(), [0.0, 0.0]);
+        let corner: i64 = window.corners.int64_value(&[0, 2 * 5 + 3]);
+        assert_eq!(window.corners.int64_value(&[0, 12]) + 1, corner, "one step along x");
+        let places: Vec<f32> = Vec::try_from(window.places_m.get(0).get(13)).unwrap();
+        assert_eq!(places, [2.0, 0.0]);
+    }
+
+    #[test]
+    fn places_outside_are_sought_at_the_edge() {
+        let (_network, refiner) = refiner();
+        let assumed = Tensor::from_slice(&[1e4f32, -1e4, 0.0, f32::MAX, f32::MIN, 0.0]).view([2, 3]);
+        let window = refiner.window(&assumed).unwrap();
+        let [columns, rows] = config().corners();
+        assert!(window.corners.min().int64_value(&[]) >= 0 && window.corners.max().int64_value(&[]) < columns * rows);
     }
 }

@@ -99,6 +99,19 @@ impl SceneHead {
     /// # Errors
     /// The tensor library's.
     pub fn regress(&self, cells: &Tensor, logits: &Tensor, kind: Kind) -> Result<Regression, TchError> {
+        Ok(self.regress_among_centres(cells, logits, kind)?.0)
+    }
+
+    /// The same, and the logarithms `[N, centres]` of the shares that the centres have in each answer.
+    ///
+    /// # Errors
+    /// The tensor library's.
+    pub fn regress_among_centres(
+        &self,
+        cells: &Tensor,
+        logits: &Tensor,
+        kind: Kind,
+    ) -> Result<(Regression, Tensor), TchError> {
         let norm = logits.f_square()?.f_sum_dim_intlist(1_i64, true, Kind::Float)?.f_add_scalar(1e-12)?.f_sqrt()?;
         let input = Tensor::f_cat(&[cells, &(logits / norm)], 1)?.f_to_kind(kind)?;
         let mut x = self.inward.forward(&input)?.f_relu()?;
@@ -108,11 +121,17 @@ impl SceneHead {
         }
         let output = self.outward.forward(&x)?.f_to_kind(Kind::Float)?;
         let centres = self.config.centres;
-        let shares = output.f_narrow(1, 0, centres)?.f_softmax(1, Kind::Float)?;
+        let log_shares = output.f_narrow(1, 0, centres)?.f_log_softmax(1, Kind::Float)?;
         let offset = output.f_narrow(1, centres, 3)? * OFFSET_SCALE_M;
-        let coordinates_m = shares.f_matmul(&self.centres)? + offset;
+        let coordinates_m = log_shares.f_exp()?.f_matmul(&self.centres)? + offset;
         let epsilon_m = output.f_narrow(1, centres + 3, 1)?.f_squeeze_dim(1)?.f_softplus()?;
-        Ok(Regression { coordinates_m, epsilon_m })
+        Ok((Regression { coordinates_m, epsilon_m }, log_shares))
+    }
+
+    /// `[centres, 3]`: what cells are placed among, metres relative to the origin.
+    #[must_use]
+    pub fn centres_m(&self) -> &Tensor {
+        &self.centres
     }
 
     /// Sets what is computed from the training data, not learnt: statistics of the features, and the centres.

@@ -52,7 +52,7 @@ pub(super) fn look_again(
         let heading = Tensor::f_from_slice(&[(ahead.x / norm) as f32, (ahead.y / norm) as f32])?;
         let heading = heading.f_to_device(device)?.f_view([1, 2])?.f_expand([sensor_m.len() as i64, -1], false)?;
         let assumed = Tensor::f_from_slice(&assumed)?.f_view([-1, 3])?.f_to_device(device)?;
-        let seen = no_grad(|| refiner.compare(&cells, &assumed, &heading, kind))?;
+        let seen = no_grad(|| refiner.look(&cells, &assumed, &heading, kind))?;
         let world: Vec<f32> = Vec::try_from(&seen.coordinates_m.f_reshape([-1])?.f_to_device(Device::Cpu)?)?;
         let epsilon_m: Vec<f32> = Vec::try_from(&seen.epsilon_m.f_to_device(Device::Cpu)?)?;
         let pairs: Vec<Correspondence> = (sensor_m.iter().zip(world.as_chunks().0).zip(&epsilon_m))

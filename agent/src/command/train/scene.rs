@@ -36,7 +36,7 @@ pub(crate) struct Args {
     #[arg(long, default_value_t = 50)]
     classes: i64,
     /// Clusters of world coordinates that a cell is placed among.
-    #[arg(long, default_value_t = 200)]
+    #[arg(long, default_value_t = 500)]
     centres: i64,
     /// Channels of the head.
     #[arg(long, default_value_t = 512)]

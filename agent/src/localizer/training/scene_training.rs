@@ -32,6 +32,10 @@ const CLASSIFIER_BATCH: usize = 256;
 const LABEL_SMOOTHING: f64 = 0.1;
 /// Cells that centres and statistics are computed from.
 const SAMPLE: usize = 20_000;
+/// What a unit of cross entropy over the centres weighs, metres.
+const CENTRE_WEIGHT_M: f64 = 5.0;
+/// Centres share a cell by their distance over this, metres.
+const CENTRE_BLUR_M: f64 = 4.0;
 /// Steps between two draws of what drops out of the classifier.
 const LOGITS_EVERY: u64 = 50;
 /// Steps between two reports.
@@ -40,9 +44,13 @@ const REPORT_EVERY: u64 = 20;
 const MAX_ASSUMED_ERROR_M: f64 = 2.5;
 /// Deviation of the heading that it starts from, radians.
 const ASSUMED_TURN_RAD: f64 = 0.015;
-/// Sides of its patches, metres, and channels of each.
-const PATCHES_M: [f64; 2] = [3.0, 12.0];
-const EMBEDDING: i64 = 24;
+/// Distance between the corners of its lattice, metres, and how many corners that may be: larger towns have a wider lattice.
+const SPACING_M: f64 = 1.5;
+const CORNERS: f64 = 110_000.0;
+/// How far it looks to each side, metres.
+const REACH_M: f64 = 3.0;
+/// Channels of a key.
+const KEYS: i64 = 16;
 /// What lies this far beyond the outermost cell is still town, metres.
 const MARGIN_M: f64 = 8.0;
 /// Gradients that are not finite in a row before the training gives up.
@@ -388,14 +396,16 @@ impl<'a> Training<'a> {
         }
         let Some(logits) = &self.logits else { unreachable!("set above") };
         let logits = logits.f_index_select(0, &sweeps)?;
-        let regression = self.head.regress(&cells, &logits, self.config.precision.kind())?;
+        let kind = self.config.precision.kind();
+        let (regression, log_shares) = self.head.regress_among_centres(&cells, &logits, kind)?;
         let targets = self.cache.targets_m.f_index_select(0, rows)?;
         let weights = self.sweep_weights.f_index_select(0, &sweeps)?;
         let (mut loss, error) = weighted_loss(&regression, &targets, &weights)?;
+        loss += centre_loss(&log_shares, &targets, self.head.centres_m(), &weights)? * CENTRE_WEIGHT_M;
         let mut refined_m = 0.0;
         if let Some(refiner) = self.head.refiner() {
             let (assumed, heading) = self.assume(&targets, &sweeps)?;
-            let answer = refiner.compare(&cells, &assumed, &heading, self.config.precision.kind())?;
+            let answer = refiner.look(&cells, &assumed, &heading, kind)?;
             let (refiner_loss, refined) = weighted_loss(&answer, &targets, &weights)?;
             loss += refiner_loss;
             refined_m = refined.f_mean(Kind::Float)?.f_double_value(&[])?;
@@ -503,6 +513,21 @@ fn weighted_loss(answer: &Regression, targets_m: &Tensor, weights: &Tensor) -> R
     Ok((((&error + surprise) * weights).f_mean(Kind::Float)?, error))
 }
 
+/// Cross entropy between the shares of the centres and how near they really are.
+///
+/// Coordinates alone teach which centre is right only through their mean, which several wrong ones can make up together.
+fn centre_loss(
+    log_shares: &Tensor,
+    targets_m: &Tensor,
+    centres_m: &Tensor,
+    weights: &Tensor,
+) -> Result<Tensor, tch::TchError> {
+    let distance = Tensor::f_cdist(targets_m, centres_m, 2.0, 1_i64)? / CENTRE_BLUR_M;
+    let wanted = (distance.f_square()? * -0.5).f_softmax(1, Kind::Float)?;
+    let each = (wanted * log_shares).f_sum_dim_intlist(1_i64, false, Kind::Float)?.f_neg()?;
+    (each * weights).f_mean(Kind::Float)
+}
+
 fn checkpoint_path(config: &SceneTrainConfig) -> PathBuf {
     config.out.join("checkpoint.safetensors")
 }
@@ -518,20 +543,18 @@ fn same_training(asked: &Progress, stored: Progress) -> Result<Progress, Localiz
     }
 }
 
-/// Planes that cover all cells.
+/// A lattice that covers all cells.
 fn refiner_config(cache: &FeatureCache, local_channels: i64) -> Result<RefinerConfig, tch::TchError> {
     let bound = |extreme: Tensor, margin_m: f64| -> Result<[f64; 2], tch::TchError> {
         let values: Vec<f32> = Vec::try_from(&extreme)?;
         Ok([f64::from(values[0]) + margin_m, f64::from(values[1]) + margin_m])
     };
-    Ok(RefinerConfig {
-        local_channels,
-        low_m: bound(cache.targets_m.f_amin([0_i64], false)?, -MARGIN_M)?,
-        high_m: bound(cache.targets_m.f_amax([0_i64], false)?, MARGIN_M)?,
-        patch_m: PATCHES_M.into(),
-        embedding: EMBEDDING,
-        width: 256,
-    })
+    let low_m = bound(cache.targets_m.f_amin([0_i64], false)?, -MARGIN_M)?;
+    let high_m = bound(cache.targets_m.f_amax([0_i64], false)?, MARGIN_M)?;
+    let area_m2 = (high_m[0] - low_m[0]) * (high_m[1] - low_m[1]);
+    let spacing_m = (area_m2 / CORNERS).sqrt().max(SPACING_M);
+    let reach = (REACH_M / spacing_m).ceil() as i64;
+    Ok(RefinerConfig { local_channels, low_m, high_m, spacing_m, reach, keys: KEYS, width: 256 })
 }
 
 /// Statistics of the features, and centres among the world coordinates of cells.
