@@ -2,11 +2,13 @@
 //!
 //! - [`ego`]: the pipeline, the same live and offline; [`pairing`] says which messages belong to a frame.
 //! - [`model`], [`samples`], [`train`]: how a method learns; [`evaluate`]: what it has learnt.
+//! - [`alignment`]: ways to do without GNSS, compared.
 //! - [`targets`] and [`loss`]: what a detector is trained towards.
 //! - [`warp`] and [`fusion`]: maps of neighbours on the ego's lattice, and many maps made one.
 //!
 //! Conventions of axes, units and boxes are those of [`protocol`].
 
+pub mod alignment;
 pub mod average_precision;
 pub mod ego;
 pub mod evaluate;

@@ -1,5 +1,6 @@
 //! One file per subcommand: its arguments, and the call into the library.
 
+mod align;
 mod eval;
 mod methods;
 mod run;
@@ -10,6 +11,8 @@ use std::process::ExitCode;
 /// What `ego-fuser` can be asked to do.
 #[derive(Debug, clap::Subcommand)]
 pub(crate) enum Command {
+    /// Compare ways to align two vehicles without GNSS.
+    Align(Box<align::Arguments>),
     /// List the collaboration methods and what each sends.
     Methods(methods::Arguments),
     /// Measure AP on recorded scenes.
@@ -24,6 +27,7 @@ impl Command {
     /// Does what was asked.
     pub(crate) fn run(self) -> anyhow::Result<()> {
         match self {
+            Self::Align(arguments) => arguments.run(),
             Self::Methods(arguments) => arguments.run(),
             Self::Eval(arguments) => arguments.run(),
             Self::Run(arguments) => arguments.run(),

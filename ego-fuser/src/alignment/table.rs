@@ -1,0 +1,152 @@
+//! What the outcomes of an approach add up to: the columns of the paper's alignment table, and a few more.
+
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+
+use serde::Serialize;
+
+use super::compare::{AlignmentError, PairOutcome};
+
+/// One approach over all pairs.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Row {
+    /// The approach.
+    pub method: String,
+    /// Pairs of ego and neighbour, every moment anew.
+    pub pairs: usize,
+    /// Mean time per pair, seconds.
+    pub time_s: f64,
+    /// Mean bytes that a neighbour sends for it.
+    pub bytes_mean: f64,
+    /// Their logarithm to base 2.
+    pub log2_bytes: f64,
+    /// Share of all pairs that are right to 3 m, 0..1; a pair without alignment is not.
+    pub success_3m: f64,
+    /// The same within 1 m.
+    pub success_1m: f64,
+    /// Mean error of the pairs that were aligned, metres; `None` where none was.
+    pub mean_m: Option<f64>,
+    /// Median of the same.
+    pub p50_m: Option<f64>,
+    /// Mean error of the pairs that were aligned, degrees.
+    pub mean_deg: Option<f64>,
+    /// Median of the same.
+    pub p50_deg: Option<f64>,
+    /// Share of all pairs that were not aligned, 0..1.
+    pub not_aligned: f64,
+    /// Pairs that were not aligned, by reason.
+    pub reasons: BTreeMap<&'static str, usize>,
+}
+
+/// Collects outcomes of one approach.
+#[derive(Debug, Clone, Default)]
+pub struct Tally {
+    seconds: f64,
+    bytes: f64,
+    errors: Vec<AlignmentError>,
+    reasons: BTreeMap<&'static str, usize>,
+}
+
+impl Tally {
+    /// Counts one pair.
+    pub fn add(&mut self, outcome: &PairOutcome) {
+        self.seconds += outcome.time.as_secs_f64();
+        self.bytes += outcome.bytes as f64;
+        match &outcome.result {
+            Ok(error) => self.errors.push(*error),
+            Err(why) => *self.reasons.entry(why.reason()).or_default() += 1,
+        }
+    }
+
+    /// The row; shares of nothing are zero.
+    #[must_use]
+    pub fn row(&self, method: &str) -> Row {
+        let failed: usize = self.reasons.values().sum();
+        let pairs = failed + self.errors.len();
+        let share = |count: usize| count as f64 / pairs.max(1) as f64;
+        let within = |metres: f64| share(self.errors.iter().filter(|error| error.metres < metres).count());
+        let bytes_mean = self.bytes / pairs.max(1) as f64;
+        let of = |value: fn(&AlignmentError) -> f64| {
+            let mut values: Vec<f64> = self.errors.iter().map(value).collect();
+            values.sort_by(f64::total_cmp);
+            let mean = values.iter().sum::<f64>() / values.len().max(1) as f64;
+            (!values.is_empty()).then(|| (mean, values[values.len() / 2]))
+        };
+        let (metres, degrees) = (of(|error| error.metres), of(|error| error.degrees));
+        Row {
+            method: method.to_owned(),
+            pairs,
+            time_s: self.seconds / pairs.max(1) as f64,
+            bytes_mean,
+            log2_bytes: bytes_mean.max(1.0).log2(),
+            success_3m: within(3.0),
+            success_1m: within(1.0),
+            mean_m: metres.map(|(mean, _)| mean),
+            p50_m: metres.map(|(_, median)| median),
+            mean_deg: degrees.map(|(mean, _)| mean),
+            p50_deg: degrees.map(|(_, median)| median),
+            not_aligned: share(failed),
+            reasons: self.reasons.clone(),
+        }
+    }
+}
+
+/// The rows as a markdown table.
+#[must_use]
+pub fn markdown(rows: &[Row]) -> String {
+    let mut text = String::from(
+        "| method | time, s | bytes, log2 | under 3 m, % | under 1 m, % | mean / median, m | mean / median, deg | no alignment, % | pairs |\n\
+         | --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |\n",
+    );
+    let both = |mean: Option<f64>, median: Option<f64>| match (mean, median) {
+        (Some(mean), Some(median)) => format!("{mean:.2} / {median:.2}"),
+        _ => "-".to_owned(),
+    };
+    for row in rows {
+        // Writing to a string does not fail.
+        let _ = writeln!(
+            text,
+            "| {} | {:.4} | {:.2} | {:.2} | {:.2} | {} | {} | {:.2} | {} |",
+            row.method,
+            row.time_s,
+            row.log2_bytes,
+            100.0 * row.success_3m,
+            100.0 * row.success_1m,
+            both(row.mean_m, row.p50_m),
+            both(row.mean_deg, row.p50_deg),
+            100.0 * row.not_aligned,
+            row.pairs
+        );
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use super::super::NotAligned;
+    use super::*;
+
+    fn outcome(result: Result<(f64, f64), NotAligned>) -> PairOutcome {
+        let result = result.map(|(metres, degrees)| AlignmentError { metres, degrees });
+        PairOutcome { approach: 0, bytes: 64, time: Duration::from_millis(20), result }
+    }
+
+    #[test]
+    fn a_pair_without_alignment_is_no_success() {
+        let mut tally = Tally::default();
+        for result in [Ok((0.5, 1.0)), Ok((2.0, 0.2)), Ok((30.0, 90.0)), Err(NotAligned::NoPose)] {
+            tally.add(&outcome(result));
+        }
+        let row = tally.row("poses");
+        assert_eq!((row.pairs, row.success_3m, row.success_1m, row.not_aligned), (4, 0.5, 0.25, 0.25));
+        assert_eq!((row.p50_m, row.p50_deg, row.log2_bytes), (Some(2.0), Some(1.0), 6.0));
+        assert!((row.mean_m.unwrap() - 32.5 / 3.0).abs() < 1e-12 && (row.time_s - 0.02).abs() < 1e-12);
+        assert_eq!(row.reasons, BTreeMap::from([("no_pose", 1)]));
+        let text = markdown(&[row, Tally::default().row("nothing")]);
+        assert_eq!(text.lines().count(), 4);
+        assert!(text.contains("| poses | 0.0200 | 6.00 | 50.00 | 25.00 | 10.83 / 2.00 |"), "{text}");
+        assert!(text.contains("| nothing | 0.0000 | 0.00 | 0.00 | 0.00 | - | - |"), "{text}");
+    }
+}
