@@ -121,6 +121,18 @@ impl Agent {
         })
     }
 
+    /// Where the time of the last pose went, for pose sources that compute.
+    #[must_use]
+    pub fn pose_stages(&self) -> &[StageTiming] {
+        self.pose_source.stages()
+    }
+
+    /// Poses so far that the vehicle cannot have driven to from those before.
+    #[must_use]
+    pub fn pose_jumps(&self) -> u64 {
+        self.pose_source.jumps()
+    }
+
     /// Second step: map, confidence and own detections.
     ///
     /// # Errors

@@ -17,6 +17,7 @@ pub(crate) struct Cli {
 #[derive(Debug, Subcommand)]
 enum Command {
     Run(command::run::Args),
+    Eval(command::eval::Args),
     Train(command::train::Args),
 }
 
@@ -29,6 +30,7 @@ pub(crate) struct BadInput(pub(crate) anyhow::Error);
 pub(crate) fn run(cli: Cli) -> ExitCode {
     let outcome = match cli.command {
         Command::Run(args) => command::run::run(&args),
+        Command::Eval(args) => command::eval::run(&args),
         Command::Train(args) => command::train::run(&args),
     };
     match outcome {

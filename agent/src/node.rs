@@ -58,6 +58,8 @@ pub struct NodeReport {
     pub no_pose: u64,
     /// Sweeps that could not be computed.
     pub failed: u64,
+    /// Poses that the vehicle cannot have driven to from those before; they go out with little confidence.
+    pub pose_jumps: u64,
 }
 
 /// Runs `agent` on the calling thread until the replay ends or `stop` is requested.
@@ -161,7 +163,11 @@ impl<'a> Node<'a> {
         let pose = self.agent.estimate_pose(input);
         books.timed("pose", began.elapsed());
         self.outlet.pose.offer(input.capture_nanos, pose);
+        for stage in self.agent.pose_stages() {
+            books.timed(&stage.stage, Duration::from_nanos(stage.nanos));
+        }
         self.report.no_pose += u64::from(pose.world_from_cav().is_none());
+        self.report.pose_jumps = self.agent.pose_jumps();
         match self.agent.perceive(input.cloud) {
             Ok(perception) => {
                 for stage in perception.times.stages() {

@@ -106,16 +106,12 @@ fn judge(board: &mut Board, frame: EvaluatedFrame) {
 
 fn metrics(board: &Board, method: Method, pose_source: &PoseSourceConfig, began: Instant) -> Metrics {
     let (ap_global, ap_frame_order) = board.average_precision();
-    let pose_source = match pose_source {
-        PoseSourceConfig::Recorded => "recorded",
-        PoseSourceConfig::Noisy(_) => "noisy",
-    };
     Metrics {
         frames: board.records().len() as u64,
         seconds: began.elapsed().as_secs_f64(),
         clock: "offline".into(),
         method: method.name().into(),
-        pose_source: pose_source.into(),
+        pose_source: pose_source.name().into(),
         ap_global,
         ap_frame_order,
         pose: board.pose_errors(),

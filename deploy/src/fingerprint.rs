@@ -7,6 +7,8 @@ use std::path::{Path, PathBuf};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
+use crate::scenario::LocalizerModels;
+
 /// What a run was made of. Stands in the `scenario.yaml` of a run folder.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -17,6 +19,9 @@ pub struct Provenance {
     pub program_sha256: String,
     /// SHA-256 of the weights file.
     pub weights_sha256: String,
+    /// SHA-256 of the localizer's encoder and of its head, where a vehicle finds its pose itself.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub localizer_sha256: Option<[String; 2]>,
     /// SHA-256 over names and contents of the scenario's point clouds and annotations; images do not count.
     pub scene_sha256: String,
     /// Files that `scene_sha256` covers.
@@ -28,12 +33,22 @@ impl Provenance {
     ///
     /// # Errors
     /// The first file that cannot be read, by name.
-    pub fn collect(programs: &[PathBuf], weights: &Path, scene: &Path) -> io::Result<Self> {
+    pub fn collect(
+        programs: &[PathBuf],
+        weights: &Path,
+        localizer: Option<&LocalizerModels>,
+        scene: &Path,
+    ) -> io::Result<Self> {
         let scene_files = scene_files(scene)?;
+        let localizer_sha256 = match localizer {
+            Some(LocalizerModels { encoder, head }) => Some([hash_file(encoder)?.1, hash_file(head)?.1]),
+            None => None,
+        };
         Ok(Self {
             version: env!("CARGO_PKG_VERSION").into(),
             program_sha256: hash_all(programs.first().and_then(|path| path.parent()).unwrap_or(scene), programs)?,
             weights_sha256: hash_file(weights)?.1,
+            localizer_sha256,
             scene_sha256: hash_all(scene, &scene_files)?,
             scene_files: scene_files.len(),
         })
@@ -112,18 +127,22 @@ mod tests {
         let [one, two, three] = [(); 3].map(|()| tempfile::tempdir().unwrap());
         let weights = one.path().join("w.safetensors");
         std::fs::write(&weights, b"weights").unwrap();
-        let collect = |scene: &Path| Provenance::collect(std::slice::from_ref(&weights), &weights, scene).unwrap();
+        let networks = LocalizerModels { encoder: weights.clone(), head: weights.clone() };
+        let collect = |scene: &Path| {
+            Provenance::collect(std::slice::from_ref(&weights), &weights, Some(&networks), scene).unwrap()
+        };
         let first = collect(&scene(one.path(), "0 0 0"));
         assert_eq!(first.scene_files, 2, "images do not count");
         // From `printf weights | sha256sum`.
         assert!(first.weights_sha256.starts_with("9a129038d9a00aed"), "{}", first.weights_sha256);
+        assert_eq!(first.localizer_sha256.as_ref().unwrap()[1], first.weights_sha256);
         assert_eq!(first, collect(&scene(two.path(), "0 0 0")));
         assert_ne!(first.scene_sha256, collect(&scene(three.path(), "0 0 1")).scene_sha256);
     }
 
     #[test]
     fn a_missing_file_is_named() {
-        let error = Provenance::collect(&[], Path::new("/nowhere/w"), Path::new("/nowhere")).unwrap_err();
+        let error = Provenance::collect(&[], Path::new("/nowhere/w"), None, Path::new("/nowhere")).unwrap_err();
         assert!(error.to_string().starts_with("/nowhere"), "{error}");
     }
 }

@@ -210,6 +210,10 @@ impl Fleet {
             args.option("--noise-heading-std", &noise.std_deg.to_string());
             args.option("--noise-seed", &noise.seed.to_string());
         }
+        if let (PoseSource::Pgc, Some(models)) = (&settings.pose, &self.scenario.models.localizer) {
+            args.option("--encoder", &models.encoder);
+            args.option("--head", &models.head);
+        }
         args.option("--dtype", dtype(settings.codec.dtype));
         if let Some(bytes) = settings.codec.budget_bytes {
             args.option("--budget", &bytes.to_string());

@@ -2,8 +2,9 @@
 
 use std::collections::BTreeMap;
 
-use nalgebra::Isometry3;
-use protocol::{DropReason, Pose};
+pub use agent::pose_error::PoseError;
+use agent::statistics::{quantile, sorted};
+use protocol::DropReason;
 use serde::{Deserialize, Serialize};
 
 /// A pose nearer to the truth than this is a success, metres.
@@ -120,24 +121,6 @@ impl Percentiles {
     }
 }
 
-/// The error of one pose.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct PoseError {
-    /// Distance to the true position, metres.
-    pub distance_m: f64,
-    /// Angle to the true orientation, degrees.
-    pub angle_deg: f64,
-}
-
-impl PoseError {
-    /// How far `found` is from `truth`; both are poses in the same world.
-    #[must_use]
-    pub fn between(found: &Pose, truth: &Pose) -> Self {
-        let difference: Isometry3<f64> = truth.isometry().inv_mul(&found.isometry());
-        Self { distance_m: difference.translation.vector.norm(), angle_deg: difference.rotation.angle().to_degrees() }
-    }
-}
-
 impl PoseErrors {
     /// Sums up the errors of all poses; `no_pose` vehicles had none.
     #[must_use]
@@ -175,25 +158,8 @@ fn mean(values: impl ExactSizeIterator<Item = f64>) -> Option<f64> {
     (count > 0).then(|| values.sum::<f64>() / count as f64)
 }
 
-fn sorted(sample: &[f64]) -> Vec<f64> {
-    let mut sorted = sample.to_vec();
-    sorted.sort_by(f64::total_cmp);
-    sorted
-}
-
-/// The quantile `q` of a sorted sample, interpolated between neighbours.
-fn quantile(sorted: &[f64], q: f64) -> Option<f64> {
-    let last = sorted.len().checked_sub(1)?;
-    let rank = q * last as f64;
-    let below = rank.floor() as usize;
-    let above = (below + 1).min(last);
-    Some(sorted[below] + (sorted[above] - sorted[below]) * (rank - below as f64))
-}
-
 #[cfg(test)]
 mod tests {
-    use std::f64::consts::FRAC_PI_2;
-
     use super::*;
 
     #[test]
@@ -203,14 +169,6 @@ mod tests {
         assert!((percentiles.p95.unwrap() - 4.8).abs() < 1e-12);
         assert_eq!(Percentiles::of(&[7.0]).p99, Some(7.0));
         assert_eq!(Percentiles::of(&[]), Percentiles::default());
-    }
-
-    #[test]
-    fn a_pose_error_is_distance_and_angle() {
-        let truth = Pose::from_xyz_yaw([1.0, 2.0, 0.0], 0.0);
-        let found = Pose::from_xyz_yaw([4.0, 6.0, 0.0], FRAC_PI_2);
-        let error = PoseError::between(&found, &truth);
-        assert!((error.distance_m - 5.0).abs() < 1e-12 && (error.angle_deg - 90.0).abs() < 1e-9);
     }
 
     #[test]

@@ -1,15 +1,13 @@
 //! One fused frame as a PNG, seen from above: points in the colour of the CAV that measured them, truth, detections.
 
-use std::fs::File;
-use std::io::BufWriter;
 use std::path::{Path, PathBuf};
 
+use agent::canvas::{Canvas, CanvasError};
 use embedded_graphics::mono_font::MonoTextStyle;
 use embedded_graphics::mono_font::ascii::{FONT_8X13, FONT_10X20};
 use embedded_graphics::pixelcolor::Rgb888;
-use embedded_graphics::prelude::{DrawTarget, Drawable, OriginDimensions, Pixel, Point, Primitive, RgbColor, Size};
-use embedded_graphics::primitives::{Circle, Line, PrimitiveStyle, Rectangle};
-use embedded_graphics::text::Text;
+use embedded_graphics::prelude::{OriginDimensions, Point, Primitive, Size};
+use embedded_graphics::primitives::{Circle, PrimitiveStyle, Rectangle};
 use protocol::{Box3d, Pose};
 
 /// Pixels a metre takes in the finished picture.
@@ -92,14 +90,8 @@ impl Picture<'_> {
     /// # Errors
     /// [`PictureError`] when the range makes no picture or the file cannot be written.
     pub fn save(&self, path: &Path) -> Result<(), PictureError> {
-        let canvas = self.draw()?;
-        let failed = |reason: String| PictureError::Write { path: path.into(), reason };
-        let file = BufWriter::new(File::create(path).map_err(|error| failed(error.to_string()))?);
-        let mut encoder = png::Encoder::new(file, canvas.size.width, canvas.size.height);
-        encoder.set_color(png::ColorType::Rgb);
-        let mut writer = encoder.write_header().map_err(|error| failed(error.to_string()))?;
-        writer.write_image_data(&canvas.bytes()).map_err(|error| failed(error.to_string()))?;
-        writer.finish().map_err(|error| failed(error.to_string()))
+        let failed = |error: CanvasError| PictureError::Write { path: path.into(), reason: error.to_string() };
+        self.draw()?.save(path).map_err(failed)
     }
 
     fn draw(&self) -> Result<Canvas, PictureError> {
@@ -108,7 +100,7 @@ impl Picture<'_> {
             return Err(PictureError::Range { x_m: self.x_m, y_m: self.y_m });
         }
         let map = Size::new(width as u32, height as u32);
-        let mut large = Canvas::new(map * OVERSAMPLING);
+        let mut large = Canvas::new(map * OVERSAMPLING, BACKGROUND);
         self.draw_grid(&mut large);
         // The ego last, so that its points lie on top.
         for (index, view) in self.views.iter().enumerate().rev() {
@@ -123,8 +115,8 @@ impl Picture<'_> {
         for (index, view) in self.views.iter().enumerate() {
             self.draw_position(view, CAV_COLOURS[index % CAV_COLOURS.len()], &mut large);
         }
-        let mut canvas = Canvas::new(Size::new(map.width.max(760), map.height + LEGEND_HEIGHT));
-        canvas.paste_shrunk(&large);
+        let mut canvas = Canvas::new(Size::new(map.width.max(760), map.height + LEGEND_HEIGHT), BACKGROUND);
+        canvas.paste_shrunk(&large, OVERSAMPLING);
         for (found, score) in &self.detections {
             let at = self.pixel(found.center_m[0], found.center_m[1], 1) + Point::new(10, -8);
             canvas.text(&format!("{score:.2}"), at, MonoTextStyle::new(&FONT_8X13, DETECTION));
@@ -197,7 +189,7 @@ impl Picture<'_> {
         let (large, small) = (MonoTextStyle::new(&FONT_10X20, INK), MonoTextStyle::new(&FONT_8X13, FAINT));
         canvas.line(
             Point::new(0, top),
-            Point::new(canvas.size.width as i32, top),
+            Point::new(canvas.size().width as i32, top),
             PrimitiveStyle::with_stroke(GRID, 2),
         );
         canvas.text(&self.title, Point::new(14, top + 24), large);
@@ -232,91 +224,12 @@ impl Picture<'_> {
     }
 }
 
-/// Pixels to draw on.
-struct Canvas {
-    size: Size,
-    pixels: Vec<Rgb888>,
-}
-
-impl Canvas {
-    fn new(size: Size) -> Self {
-        Self { size, pixels: vec![BACKGROUND; size.width as usize * size.height as usize] }
-    }
-
-    fn line(&mut self, from: Point, to: Point, style: PrimitiveStyle<Rgb888>) {
-        self.show(Line::new(from, to).into_styled(style));
-    }
-
-    fn text(&mut self, text: &str, at: Point, style: MonoTextStyle<'_, Rgb888>) {
-        self.show(Text::new(text, at, style));
-    }
-
-    fn show(&mut self, shape: impl Drawable<Color = Rgb888>) {
-        let Ok(_) = shape.draw(self);
-    }
-
-    fn index(&self, at: Point) -> Option<usize> {
-        let (x, y) = (u32::try_from(at.x).ok()?, u32::try_from(at.y).ok()?);
-        (x < self.size.width && y < self.size.height).then(|| y as usize * self.size.width as usize + x as usize)
-    }
-
-    /// Moves a pixel towards `colour`, never away from it: points that overlap must not darken each other.
-    fn blend(&mut self, at: Point, colour: Rgb888, strength: f32) {
-        let Some(index) = self.index(at) else { return };
-        let mix = |under: u8, over: u8| (f32::from(under) + (f32::from(over) - f32::from(under)) * strength) as u8;
-        let under = self.pixels[index];
-        self.pixels[index] =
-            Rgb888::new(mix(under.r(), colour.r()), mix(under.g(), colour.g()), mix(under.b(), colour.b()));
-    }
-
-    /// Puts a canvas of [`OVERSAMPLING`] times the size into the upper left corner, averaged down.
-    fn paste_shrunk(&mut self, large: &Self) {
-        let shrunk = large.size / OVERSAMPLING;
-        let count = OVERSAMPLING * OVERSAMPLING;
-        for y in 0..shrunk.height.min(self.size.height) {
-            for x in 0..shrunk.width.min(self.size.width) {
-                let mut sum = [0_u32; 3];
-                for (dx, dy) in (0..OVERSAMPLING).flat_map(|dy| (0..OVERSAMPLING).map(move |dx| (dx, dy))) {
-                    let row = (y * OVERSAMPLING + dy) as usize * large.size.width as usize;
-                    let pixel = large.pixels[row + (x * OVERSAMPLING + dx) as usize];
-                    for (sum, part) in sum.iter_mut().zip([pixel.r(), pixel.g(), pixel.b()]) {
-                        *sum += u32::from(part);
-                    }
-                }
-                let [r, g, b] = sum.map(|sum| (sum / count) as u8);
-                self.pixels[y as usize * self.size.width as usize + x as usize] = Rgb888::new(r, g, b);
-            }
-        }
-    }
-
-    /// RGB, row by row.
-    fn bytes(&self) -> Vec<u8> {
-        self.pixels.iter().flat_map(|pixel| [pixel.r(), pixel.g(), pixel.b()]).collect()
-    }
-}
-
-impl OriginDimensions for Canvas {
-    fn size(&self) -> Size {
-        self.size
-    }
-}
-
-impl DrawTarget for Canvas {
-    type Color = Rgb888;
-    type Error = std::convert::Infallible;
-
-    fn draw_iter<I: IntoIterator<Item = Pixel<Rgb888>>>(&mut self, pixels: I) -> Result<(), Self::Error> {
-        for Pixel(at, colour) in pixels {
-            if let Some(index) = self.index(at) {
-                self.pixels[index] = colour;
-            }
-        }
-        Ok(())
-    }
-}
-
 #[cfg(test)]
 mod tests {
+    use std::fs::File;
+
+    use embedded_graphics::prelude::RgbColor;
+
     use super::*;
 
     fn car(x: f64, y: f64) -> Box3d {
@@ -335,7 +248,7 @@ mod tests {
     }
 
     fn colour_at(canvas: &Canvas, picture: &Picture<'_>, x: f64, y: f64) -> Rgb888 {
-        canvas.pixels[canvas.index(picture.pixel(x, y, 1)).unwrap()]
+        canvas.pixel(picture.pixel(x, y, 1)).unwrap()
     }
 
     #[test]
@@ -370,7 +283,7 @@ mod tests {
     #[test]
     fn points_that_are_nowhere_are_left_out() {
         let points = [[f32::NAN, 0.0, 0.0, 0.0], [f32::INFINITY, 3e9, 0.0, 0.0], [1e30, -1e30, 0.0, 0.0]];
-        assert_eq!(picture(&points).draw().unwrap().pixels, picture(&[]).draw().unwrap().pixels);
+        assert!(picture(&points).draw().unwrap() == picture(&[]).draw().unwrap());
     }
 
     #[test]

@@ -253,7 +253,8 @@ fn drain(supervisor: &Supervisor, scorer: &ScorerNode, until: Instant, display: 
 fn fingerprint(fleet: &Fleet, programs: &Path) -> JoinHandle<std::io::Result<Provenance>> {
     let (programs, weights) = (Fleet::programs(programs), fleet.scenario.models.weights.clone());
     let scene = fleet.scene_dir.clone();
-    std::thread::spawn(move || Provenance::collect(&programs, &weights, &scene))
+    let localizer = fleet.scenario.models.localizer.clone().filter(|_| fleet.scenario.uses_localizer());
+    std::thread::spawn(move || Provenance::collect(&programs, &weights, localizer.as_ref(), &scene))
 }
 
 /// Writes the run folder.

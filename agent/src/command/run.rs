@@ -5,7 +5,8 @@ use std::path::PathBuf;
 use agent::agent::Agent;
 use agent::detector::Detector;
 use agent::node::{self, NodeOptions};
-use agent::pose_source::{NoiseMode, NoisyPoseConfig, PoseSource, PoseSourceConfig};
+use agent::pose_source::sanity::SanityConfig;
+use agent::pose_source::{NoiseMode, NoisyPoseConfig, PgcConfig, PoseSource, PoseSourceConfig};
 use anyhow::Context;
 use clap::ValueEnum;
 use protocol::{CavId, CodecConfig, Dtype, Role, Stream};
@@ -31,6 +32,8 @@ pub(crate) struct Args {
     pose_source: PoseFrom,
     #[command(flatten)]
     noise: NoiseArgs,
+    #[command(flatten)]
+    localizer: LocalizerArgs,
     /// What to send beside the pose.
     #[arg(long, value_enum, value_delimiter = ',', default_value = "bev")]
     publish: Vec<Published>,
@@ -63,11 +66,11 @@ struct NoiseArgs {
     #[arg(long, value_enum, default_value_t = Mode::Fixed)]
     noise_mode: Mode,
     /// Standard deviation of x, y and z, metres.
-    #[arg(long, default_value_t = NoisyPoseConfig::default().position_std_m)]
-    noise_std_m: f64,
+    #[arg(long, visible_alias = "noise-std-m", default_value_t = NoisyPoseConfig::default().position_std_m)]
+    noise_position_std: f64,
     /// Standard deviation of yaw, degrees.
-    #[arg(long, default_value_t = NoisyPoseConfig::default().heading_std_deg)]
-    noise_std_deg: f64,
+    #[arg(long, visible_alias = "noise-std-deg", default_value_t = NoisyPoseConfig::default().heading_std_deg)]
+    noise_heading_std: f64,
     /// Same seed, same errors.
     #[arg(long, default_value_t = NoisyPoseConfig::default().seed)]
     noise_seed: u64,
@@ -82,12 +85,26 @@ struct NoiseArgs {
     noise_table: Option<PathBuf>,
 }
 
+/// Networks that find the pose, with --pose-source pgc.
+#[derive(Debug, clap::Args)]
+#[command(next_help_heading = "Pose from the sweep alone (--pose-source pgc)")]
+struct LocalizerArgs {
+    /// Weights of the localizer's encoder.
+    #[arg(long, required_if_eq("pose_source", "pgc"))]
+    encoder: Option<PathBuf>,
+    /// Weights of the town's head.
+    #[arg(long, required_if_eq("pose_source", "pgc"))]
+    head: Option<PathBuf>,
+}
+
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum PoseFrom {
     /// The recording's own pose.
     Recorded,
     /// That pose with an error.
     Noisy,
+    /// From the LiDAR sweep alone.
+    Pgc,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -152,6 +169,7 @@ impl Args {
         let config = match self.pose_source {
             PoseFrom::Recorded => PoseSourceConfig::Recorded,
             PoseFrom::Noisy => PoseSourceConfig::Noisy(self.noise.config()),
+            PoseFrom::Pgc => PoseSourceConfig::Pgc(self.localizer.config()?),
         };
         Ok(config.build()?)
     }
@@ -176,6 +194,18 @@ impl Args {
     }
 }
 
+impl LocalizerArgs {
+    fn config(&self) -> anyhow::Result<PgcConfig> {
+        let needed =
+            |path: &Option<PathBuf>, name| path.clone().with_context(|| format!("--pose-source pgc needs {name}"));
+        Ok(PgcConfig {
+            encoder: needed(&self.encoder, "--encoder")?,
+            head: needed(&self.head, "--head")?,
+            sanity: SanityConfig::default(),
+        })
+    }
+}
+
 impl NoiseArgs {
     fn config(&self) -> NoisyPoseConfig {
         NoisyPoseConfig {
@@ -185,8 +215,8 @@ impl NoiseArgs {
                 Mode::Autoregressive => NoiseMode::Autoregressive,
                 Mode::Replayed => NoiseMode::Replayed,
             },
-            position_std_m: self.noise_std_m,
-            heading_std_deg: self.noise_std_deg,
+            position_std_m: self.noise_position_std,
+            heading_std_deg: self.noise_heading_std,
             seed: self.noise_seed,
             step_s: self.noise_step,
             decay_s: self.noise_decay,

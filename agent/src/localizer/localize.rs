@@ -3,26 +3,24 @@
 use std::path::Path;
 use std::time::{Duration, Instant};
 
-use nalgebra::{Isometry3, Translation3};
-use protocol::{NoPoseReason, PointCloud, PoseEstimate};
+use protocol::{PointCloud, PoseEstimate, StageTiming};
 use tch::nn::VarStore;
 use tch::{Device, Kind, Tensor, no_grad};
 
+use super::confidence::{CONFIDENCE_KEY, Confidence};
 use super::error::LocalizerError;
 use super::head_config::SceneHeadConfig;
+use super::pose_solver::{self, FoundPose, PoseSolver, Solved};
 use super::scene_encoder::SceneEncoder;
 use super::scene_head::SceneHead;
 use super::second_look::look_again;
 use super::sweep_voxels::{Cell, SweepVoxels};
 use super::voxel_batch::VoxelBatch;
-use crate::registration::ransac::{RansacConfig, solve};
-use crate::registration::{Correspondence, NoRegistration, Registration};
+use crate::registration::Correspondence;
 use crate::weights::Weights;
 
 /// Share of the regressed cells that may be flat ground, which looks the same everywhere.
 const FLAT_SHARE: f64 = 0.25;
-/// Sweeps with fewer cells are not localised.
-const MIN_CELLS: usize = 30;
 
 /// Where each cell of a sweep lies in the world, as far as the network knows.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -33,6 +31,8 @@ pub struct SceneCoordinates {
     pub world_m: Vec<[f32; 3]>,
     /// `[N]`: predicted L1 error, metres.
     pub epsilon_m: Vec<f32>,
+    /// The head's origin in the world, metres.
+    pub origin_m: [f64; 3],
 }
 
 /// Scene coordinates, and the features they were regressed from, which the second look asks for.
@@ -62,6 +62,8 @@ pub struct LocalizerTimes {
 pub struct Localization {
     /// `world_from_lidar` with its confidence, or why there is none.
     pub estimate: PoseEstimate,
+    /// The pose with what speaks for it, also where `estimate` withholds it.
+    pub found: Option<FoundPose>,
     /// Cells that agree on the pose.
     pub inlier_count: u32,
     /// Their share of all regressed cells.
@@ -70,12 +72,22 @@ pub struct Localization {
     pub times: LocalizerTimes,
 }
 
+/// Says where a sweep was made.
+pub trait Localize: std::fmt::Debug + Send {
+    /// Localises one sweep.
+    ///
+    /// # Errors
+    /// [`LocalizerError::Tensor`] when the tensor library refuses. A sweep that cannot be localised is no error but an
+    /// answer: [`PoseEstimate::NoPose`].
+    fn localize(&mut self, cloud: &PointCloud) -> Result<Localization, LocalizerError>;
+}
+
 /// Encoder, head of a town and solver.
 #[derive(Debug)]
 pub struct Localizer {
     encoder: SceneEncoder,
     head: SceneHead,
-    solver: RansacConfig,
+    solver: PoseSolver,
     device: Device,
     sha256: [String; 2],
 }
@@ -102,8 +114,13 @@ impl Localizer {
         let scene_head = SceneHead::new(&variables.root(), &config)?;
         weights.copy_into(&variables)?;
         variables.freeze();
+        let confidence = match weights.metadata(CONFIDENCE_KEY) {
+            Some(_) => Confidence::Calibrated(weights.metadata_json(CONFIDENCE_KEY)?),
+            None => Confidence::Plain,
+        };
+        let solver = PoseSolver { confidence, ..PoseSolver::default() };
         let sha256 = [encoder_sha256, weights.sha256().to_owned()];
-        Ok(Self { encoder: network, head: scene_head, solver: RansacConfig::default(), device, sha256 })
+        Ok(Self { encoder: network, head: scene_head, solver, device, sha256 })
     }
 
     /// Hashes of encoder and head.
@@ -155,8 +172,20 @@ impl Localizer {
         })?;
         times.regress = start.elapsed();
         let sensor_m = chosen.iter().map(|&cell| sweep.cells()[cell].centroid_m).collect();
-        let coordinates = SceneCoordinates { sensor_m, world_m: world.as_chunks().0.to_vec(), epsilon_m };
+        let origin_m = self.head.config().origin_m;
+        let coordinates = SceneCoordinates { sensor_m, world_m: world.as_chunks().0.to_vec(), epsilon_m, origin_m };
         Ok(Some(Regressed { coordinates, cells }))
+    }
+
+    /// Search and confidence.
+    #[must_use]
+    pub fn solver(&self) -> &PoseSolver {
+        &self.solver
+    }
+
+    /// Uses another search or confidence.
+    pub fn set_solver(&mut self, solver: PoseSolver) {
+        self.solver = solver;
     }
 
     /// All steps.
@@ -166,57 +195,71 @@ impl Localizer {
     /// answer: [`PoseEstimate::NoPose`].
     pub fn localize(&self, cloud: &PointCloud) -> Result<Localization, LocalizerError> {
         let mut times = LocalizerTimes::default();
-        let Some(Regressed { mut coordinates, cells }) = self.regress(cloud, &mut times)? else {
-            return Ok(Localization::none(NoPoseReason::TooFewPoints, 0, times));
+        let Regressed { coordinates, cells } = match self.regress(cloud, &mut times)? {
+            Some(regressed) => regressed,
+            None => return Ok(Localization::new(&self.solver.solve(&SceneCoordinates::default()), times)),
         };
         let start = Instant::now();
-        let found = self.register(&coordinates);
+        let rough = self.solver.search(&coordinates);
         times.solve = start.elapsed();
-        let mut registration = match found {
-            Ok(registration) => registration,
-            Err((reason, inlier_count)) => return Ok(Localization::none(reason, inlier_count, times)),
+        let rough = match rough {
+            Ok(rough) => rough,
+            Err(none) => return Ok(Localization::new(&Err(none), times)),
         };
         let start = Instant::now();
-        let rough = registration.target_from_source;
-        if let Some(second) = look_again(&self.head, &cells, &coordinates.sensor_m, &rough, Kind::Float)? {
-            registration = second.registration;
-            coordinates.epsilon_m = second.epsilon_m;
-        }
+        let pose = rough.target_from_source;
+        let second = look_again(&self.head, &cells, &coordinates.sensor_m, &pose, Kind::Float)?;
+        let found = self.solver.judge(&coordinates, &rough, second.as_ref());
         times.refine = start.elapsed();
-        Ok(Localization {
-            estimate: self.estimate(&registration, &coordinates),
-            inlier_count: registration.inliers.len() as u32,
-            inlier_ratio: registration.inlier_ratio,
-            times,
-        })
+        Ok(Localization::new(&Ok(found), times))
     }
+}
 
-    fn register(&self, coordinates: &SceneCoordinates) -> Result<Registration, (NoPoseReason, u32)> {
-        if coordinates.sensor_m.len() < MIN_CELLS {
-            return Err((NoPoseReason::TooFewPoints, 0));
-        }
-        solve(&coordinates.correspondences(), &self.solver).map_err(|none| match none {
-            NoRegistration::TooFewInliers { found, .. } => (NoPoseReason::TooFewInliers, found as u32),
-            NoRegistration::TooFewCorrespondences { .. } | NoRegistration::Degenerate { .. } => {
-                (NoPoseReason::TooFewInliers, 0)
-            }
-        })
-    }
-
-    /// Eq. 6 over the inliers, times their share.
-    fn estimate(&self, registration: &Registration, coordinates: &SceneCoordinates) -> PoseEstimate {
-        let sigma = |&row: &u32| sigma(coordinates.epsilon_m[row as usize]);
-        let mean = registration.inliers.iter().map(sigma).sum::<f32>() / registration.inliers.len().max(1) as f32;
-        let [x, y, z] = self.head.config().origin_m;
-        let world_from_origin = Isometry3::from_parts(Translation3::new(x, y, z), nalgebra::UnitQuaternion::identity());
-        let pose = (world_from_origin * registration.target_from_source).into();
-        PoseEstimate::new(pose, (mean * registration.inlier_ratio as f32).clamp(0.0, 1.0))
+impl Localize for Localizer {
+    fn localize(&mut self, cloud: &PointCloud) -> Result<Localization, LocalizerError> {
+        Self::localize(self, cloud)
     }
 }
 
 impl Localization {
-    fn none(reason: NoPoseReason, inlier_count: u32, times: LocalizerTimes) -> Self {
-        Self { estimate: PoseEstimate::NoPose { reason, inlier_count }, inlier_count, inlier_ratio: 0.0, times }
+    /// The answer that a solver found.
+    #[must_use]
+    pub fn new(solved: &Solved, times: LocalizerTimes) -> Self {
+        let found = solved.as_ref().ok().copied();
+        let inliers = match solved {
+            Ok(found) => found.evidence.inliers,
+            Err(none) => none.inlier_count(),
+        };
+        Self {
+            estimate: pose_solver::estimate(solved),
+            found,
+            inlier_count: u32::try_from(inliers).unwrap_or(u32::MAX),
+            inlier_ratio: found.map_or(0.0, |found| found.evidence.inlier_ratio),
+            times,
+        }
+    }
+}
+
+impl LocalizerTimes {
+    /// The stages by name, in the order they run.
+    #[must_use]
+    pub fn stages(&self) -> Vec<StageTiming> {
+        let Self { voxelise, encode, regress, solve, refine } = *self;
+        [
+            ("pose voxelise", voxelise),
+            ("pose encode", encode),
+            ("pose regress", regress),
+            ("pose solve", solve),
+            ("pose refine", refine),
+        ]
+        .map(|(stage, time)| StageTiming::new(stage, time))
+        .into()
+    }
+
+    /// All stages together.
+    #[must_use]
+    pub fn total(&self) -> Duration {
+        self.voxelise + self.encode + self.regress + self.solve + self.refine
     }
 }
 

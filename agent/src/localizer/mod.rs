@@ -3,17 +3,23 @@
 //! A sparse encoder describes cells of the sweep; a head that belongs to one town says for each cell where in the world
 //! it lies and how far off that may be; a robust solver turns these correspondences into a pose.
 
+pub mod confidence;
 mod dense;
 mod encoder_config;
 mod end_to_end;
 mod error;
+pub mod evaluation;
 mod head_config;
 mod localize;
+mod pose_evidence;
+pub mod pose_solver;
 mod refiner;
 mod scene_encoder;
 mod scene_head;
 mod second_look;
 mod sweep_voxels;
+#[cfg(test)]
+pub(crate) mod synthetic;
 pub mod training;
 mod voxel_batch;
 
@@ -21,7 +27,8 @@ pub use encoder_config::{SceneEncoderConfig, VoxelInput};
 pub use end_to_end::{EndToEnd, EndToEndConfig, EndToEndKind};
 pub use error::LocalizerError;
 pub use head_config::{RefinerConfig, SceneHeadConfig};
-pub use localize::{Localization, Localizer, LocalizerTimes, SceneCoordinates, sigma};
+pub use localize::{Localization, Localize, Localizer, LocalizerTimes, SceneCoordinates, sigma};
+pub use pose_evidence::{PoseEvidence, SecondEvidence};
 pub use refiner::Refiner;
 pub use scene_encoder::{LocalFeatures, SceneEncoder, SceneFeatures};
 pub use scene_head::{Regression, SceneHead};

@@ -7,16 +7,21 @@ mod error_table;
 mod icp_map;
 mod noise;
 mod noisy;
+mod pgc;
+pub mod sanity;
 
 use std::path::PathBuf;
 
-use protocol::{CavId, NoPoseReason, PointCloud, Pose, PoseEstimate};
+use protocol::{CavId, NoPoseReason, PointCloud, Pose, PoseEstimate, StageTiming};
 use serde::{Deserialize, Serialize};
 
 pub use error_table::{ErrorTable, ErrorTableError, TableRow};
 pub use icp_map::{IcpMapPose, MapError, read_map};
 pub use noise::{PlanarError, PoseNoise};
 pub use noisy::NoisyPose;
+pub use pgc::{PgcConfig, PgcPose};
+
+use crate::localizer::LocalizerError;
 
 /// What a source may look at for one sweep.
 #[derive(Debug, Clone, Copy)]
@@ -35,6 +40,16 @@ pub struct PoseInput<'a> {
 pub trait PoseSource: std::fmt::Debug + Send {
     /// The pose of one sweep with its confidence, or why there is none.
     fn estimate(&mut self, input: &PoseInput<'_>) -> PoseEstimate;
+
+    /// Where the time of the last estimate went, for sources that compute.
+    fn stages(&self) -> &[StageTiming] {
+        &[]
+    }
+
+    /// Poses so far that the vehicle cannot have driven to from those before.
+    fn jumps(&self) -> u64 {
+        0
+    }
 }
 
 /// Takes the measured pose as it is, fully trusted.
@@ -62,6 +77,8 @@ pub enum PoseSourceConfig {
     Recorded,
     /// The measured pose with an error.
     Noisy(NoisyPoseConfig),
+    /// From the sweep alone, by networks.
+    Pgc(PgcConfig),
 }
 
 /// An error on the measured pose.
@@ -134,9 +151,22 @@ pub enum PoseSourceError {
     /// The table is not readable.
     #[error(transparent)]
     Table(#[from] ErrorTableError),
+    /// The networks cannot be used.
+    #[error(transparent)]
+    Localizer(#[from] LocalizerError),
 }
 
 impl PoseSourceConfig {
+    /// The name in files and on command lines.
+    #[must_use]
+    pub fn name(&self) -> &'static str {
+        match self {
+            Self::Recorded => "recorded",
+            Self::Noisy(_) => "noisy",
+            Self::Pgc(_) => "pgc",
+        }
+    }
+
     /// Sets the source up, files read.
     ///
     /// # Errors
@@ -145,6 +175,7 @@ impl PoseSourceConfig {
         Ok(match self {
             Self::Recorded => Box::new(RecordedPose),
             Self::Noisy(config) => Box::new(NoisyPose::new(config)?),
+            Self::Pgc(config) => Box::new(PgcPose::load(config)?),
         })
     }
 }
@@ -173,5 +204,10 @@ mod tests {
         assert_eq!((noisy.mode, noisy.position_std_m, noisy.seed), (NoiseMode::Autoregressive, 0.5, 25));
         assert_eq!(serde_saphyr::from_str::<PoseSourceConfig>("recorded").unwrap(), PoseSourceConfig::Recorded);
         assert!(serde_saphyr::from_str::<PoseSourceConfig>("noisy:\n  posision_std_m: 0.5\n").is_err());
+        let config: PoseSourceConfig =
+            serde_saphyr::from_str("pgc:\n  encoder: e.safetensors\n  head: h.safetensors\n").unwrap();
+        assert_eq!(config.name(), "pgc");
+        let message = config.build().unwrap_err().to_string();
+        assert!(message.starts_with("e.safetensors"), "{message}");
     }
 }

@@ -3,6 +3,7 @@
 //! A file is complete alone: the key `config` of its metadata holds the JSON of the configuration that the network is
 //! built from. Names of the tensors are those of the reference's state dictionary.
 
+mod annotate;
 mod error;
 mod save;
 
@@ -17,6 +18,7 @@ use sha2::{Digest, Sha256};
 use tch::Tensor;
 use tch::nn::VarStore;
 
+pub use annotate::annotate;
 pub use error::WeightsError;
 pub use save::{Precision, save};
 

@@ -2,7 +2,8 @@
 
 use std::path::PathBuf;
 
-use agent::pose_source::{NoiseMode, NoisyPoseConfig, PoseSourceConfig};
+use agent::pose_source::sanity::SanityConfig;
+use agent::pose_source::{NoiseMode, NoisyPoseConfig, PgcConfig, PoseSourceConfig};
 use clap::ValueEnum;
 use deploy::evaluation::{EvaluationOptions, evaluate, frame_count};
 use deploy::report;
@@ -38,6 +39,12 @@ pub(crate) struct Arguments {
     /// Same seed, same errors (--pose-source noisy).
     #[arg(long, default_value_t = NoisyPoseConfig::default().seed)]
     noise_seed: u64,
+    /// Weights of the localizer's encoder (--pose-source pgc).
+    #[arg(long, value_name = "FILE", required_if_eq("pose_source", "pgc"))]
+    encoder: Option<PathBuf>,
+    /// Weights of the town's head (--pose-source pgc).
+    #[arg(long, value_name = "FILE", required_if_eq("pose_source", "pgc"))]
+    head: Option<PathBuf>,
     /// How exactly feature values cross the air.
     #[arg(long, value_enum, default_value_t = Exactness::F32)]
     dtype: Exactness,
@@ -64,7 +71,7 @@ enum PoseFrom {
     Recorded,
     /// That pose with an error.
     Noisy,
-    /// From the LiDAR sweep by the pose generator.
+    /// From the LiDAR sweep alone.
     Pgc,
 }
 
@@ -141,7 +148,14 @@ impl Arguments {
                 seed: self.noise_seed,
                 ..NoisyPoseConfig::default()
             })),
-            PoseFrom::Pgc => Err(BadInput("--pose-source pgc: this version has no pose generator".into())),
+            PoseFrom::Pgc => match (&self.encoder, &self.head) {
+                (Some(encoder), Some(head)) => Ok(PoseSourceConfig::Pgc(PgcConfig {
+                    encoder: encoder.clone(),
+                    head: head.clone(),
+                    sanity: SanityConfig::default(),
+                })),
+                _ => Err(BadInput("--pose-source pgc needs --encoder and --head".into())),
+            },
         }
     }
 }

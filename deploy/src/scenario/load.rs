@@ -86,7 +86,9 @@ impl Scenario {
         let mut scenario = Self::parse(&text, path)?;
         let folder = std::path::absolute(path).map_err(unreadable)?;
         let folder = folder.parent().unwrap_or(Path::new("/"));
-        for place in [&mut scenario.scene.dir, &mut scenario.models.weights] {
+        let Scenario { scene, models, .. } = &mut scenario;
+        let localizer = models.localizer.iter_mut().flat_map(|models| [&mut models.encoder, &mut models.head]);
+        for place in [&mut scene.dir, &mut models.weights].into_iter().chain(localizer) {
             *place = without_dots(&folder.join(&place));
         }
         Ok(scenario)
@@ -136,7 +138,19 @@ impl Scenario {
                 return Err(value("network", endpoint.clone(), "must read tcp/ADDRESS:PORT"));
             }
         }
-        for (field, place) in [("scene.dir", &self.scene.dir), ("models.weights", &self.models.weights)] {
+        let localizer = self.models.localizer.iter();
+        if self.uses_localizer() && localizer.len() == 0 {
+            return Err(value(
+                "models.localizer",
+                "left out".into(),
+                "must name encoder and head: a vehicle's pose is pgc",
+            ));
+        }
+        let networks = localizer.flat_map(|models| {
+            [("models.localizer.encoder", &models.encoder), ("models.localizer.head", &models.head)]
+        });
+        let places = [("scene.dir", &self.scene.dir), ("models.weights", &self.models.weights)];
+        for (field, place) in places.into_iter().chain(networks) {
             if !place.exists() {
                 return Err(ScenarioError::Missing { path: path.into(), field, missing: place.clone() });
             }
@@ -198,6 +212,27 @@ mod tests {
         let PoseSource::Noisy(noise) = own.pose else { panic!("{:?}", own.pose) };
         assert_eq!((noise.mode, noise.std_m, noise.std_deg), (NoiseMode::Fixed, 1.5, 0.2));
         assert_eq!(scenario.settings_of(&CavId::new("4279").unwrap()), scenario.agents);
+    }
+
+    #[test]
+    fn one_vehicle_may_find_its_pose_itself() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("s.yaml");
+        let text = |models: &str| {
+            format!("scene: {{dir: .}}\nmodels: {{weights: s.yaml{models}}}\nvehicles:\n  4288: {{pose: pgc}}\n")
+        };
+        std::fs::write(&file, text("")).unwrap();
+        let message = Scenario::load(&file).unwrap_err().to_string();
+        assert!(message.contains("models.localizer is left out"), "{message}");
+        std::fs::write(&file, text(", localizer: {encoder: e.safetensors, head: s.yaml}")).unwrap();
+        let message = Scenario::load(&file).unwrap_err().to_string();
+        assert!(message.contains("models.localizer.encoder: ") && message.contains("e.safetensors"), "{message}");
+        std::fs::write(folder.path().join("e.safetensors"), b"").unwrap();
+        let scenario = Scenario::load(&file).unwrap();
+        assert!(scenario.models.localizer.as_ref().unwrap().encoder.is_absolute());
+        assert_eq!(scenario.settings_of(&CavId::new("4288").unwrap()).pose, PoseSource::Pgc);
+        assert_eq!(scenario.settings_of(&CavId::new("4279").unwrap()).pose, PoseSource::Recorded);
+        assert_eq!(parse(&scenario.to_yaml()).unwrap(), scenario);
     }
 
     #[test]

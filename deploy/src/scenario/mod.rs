@@ -107,9 +107,22 @@ pub struct Models {
     /// Weights of the detector (safetensors; its configuration is inside), or a folder with a file `*-METHOD.safetensors`
     /// for each method. Relative to the scenario file.
     pub weights: PathBuf,
+    /// The networks that find poses; needed by vehicles whose pose is `pgc`.
+    #[serde(default)]
+    pub localizer: Option<LocalizerModels>,
     /// Threads each process computes with.
     #[serde(default = "Models::default_threads")]
     pub threads: usize,
+}
+
+/// Weights that find a vehicle's pose in its sweep.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct LocalizerModels {
+    /// The encoder, the same for all towns. Relative to the scenario file.
+    pub encoder: PathBuf,
+    /// The head of the scene's town. Relative to the scenario file.
+    pub head: PathBuf,
 }
 
 impl Models {
@@ -171,6 +184,8 @@ pub enum PoseSource {
     Recorded,
     /// The pose of the recording plus noise.
     Noisy(PoseNoise),
+    /// From the vehicle's own LiDAR sweep, by the networks of `models.localizer`.
+    Pgc,
 }
 
 impl PoseSource {
@@ -180,6 +195,7 @@ impl PoseSource {
         match self {
             Self::Recorded => "recorded",
             Self::Noisy(_) => "noisy",
+            Self::Pgc => "pgc",
         }
     }
 }
@@ -259,6 +275,13 @@ pub struct AgentOverrides {
 impl Scenario {
     fn default_method() -> Method {
         Method::Max
+    }
+
+    /// Whether some vehicle finds its pose itself.
+    #[must_use]
+    pub fn uses_localizer(&self) -> bool {
+        let own = self.vehicles.values().filter_map(|vehicle| vehicle.pose.as_ref());
+        own.chain([&self.agents.pose]).any(|pose| *pose == PoseSource::Pgc)
     }
 
     /// What vehicle `cav` does: `agents`, with its own entry of `vehicles` on top.

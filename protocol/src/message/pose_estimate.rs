@@ -36,6 +36,10 @@ pub enum NoPoseReason {
     TooFewInliers,
     /// The recording or receiver that poses are taken from has none for this sweep.
     NoSource,
+    /// A pose was found, but too little speaks for it.
+    LowConfidence,
+    /// The localizer could not compute.
+    Failed,
 }
 
 impl PoseEstimate {

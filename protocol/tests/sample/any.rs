@@ -53,7 +53,13 @@ fn any_pose() -> impl Strategy<Value = Pose> {
 }
 
 fn any_estimate() -> impl Strategy<Value = PoseEstimate> {
-    let reasons = vec![NoPoseReason::TooFewPoints, NoPoseReason::TooFewInliers, NoPoseReason::NoSource];
+    let reasons = vec![
+        NoPoseReason::TooFewPoints,
+        NoPoseReason::TooFewInliers,
+        NoPoseReason::NoSource,
+        NoPoseReason::LowConfidence,
+        NoPoseReason::Failed,
+    ];
     prop_oneof![
         (any_pose(), 0f32..=1.0).prop_map(|(pose, confidence)| PoseEstimate::new(pose, confidence)),
         (select(reasons), any::<u32>())

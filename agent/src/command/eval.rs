@@ -1,0 +1,224 @@
+//! `agent eval`: how well a localizer finds poses on recorded sweeps.
+
+use std::path::{Path, PathBuf};
+
+use agent::chart;
+use agent::localizer::confidence::{CONFIDENCE_KEY, Confidence, ConfidenceModel, FitReport};
+use agent::localizer::evaluation::{
+    EvaluatedSweep, EvaluationError, EvaluationOptions, LocalizationSummary, evaluate, reliability_charts, write_csv,
+    write_error_table,
+};
+use agent::localizer::pose_solver::{PoseSolver, Solver};
+use agent::localizer::{Localizer, LocalizerError};
+use agent::registration::ransac::RansacConfig;
+use agent::registration::sc2pcr::Sc2PcrConfig;
+use agent::weights::annotate;
+use anyhow::Context;
+use clap::ValueEnum;
+use indicatif::{ProgressBar, ProgressStyle};
+use tch::Device;
+
+use crate::cli::BadInput;
+
+/// Localise recorded sweeps and compare with their true poses.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// Data sets, splits or scenarios of the head's town; the layout is found out.
+    #[arg(long, value_name = "DIR", num_args = 1.., required = true)]
+    scene: Vec<PathBuf>,
+    /// Weights of the encoder.
+    #[arg(long, value_name = "FILE")]
+    encoder: PathBuf,
+    /// Weights of the town's head.
+    #[arg(long, visible_alias = "weights", value_name = "FILE")]
+    head: PathBuf,
+    /// Sweeps of another weather, where the data set has them, for example fog_0.060.
+    #[arg(long, value_name = "NAME")]
+    variant: Option<String>,
+    /// Take every N-th sweep of each vehicle.
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
+    every: u32,
+    /// Most sweeps, evenly over all there are [default: all].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    sweeps: Option<u32>,
+    /// Which search finds the pose.
+    #[arg(long, value_enum, default_value_t = Search::Ransac)]
+    solver: Search,
+    /// Seed of the search.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Fit the confidence and the threshold below which poses are withheld to these sweeps, and write them into the head.
+    /// Not on sweeps that results are reported on.
+    #[arg(long)]
+    fit_confidence: bool,
+    /// Largest share of poses less than 3 m off that --fit-confidence may withhold.
+    #[arg(long, value_name = "SHARE", default_value_t = 0.01, requires = "fit_confidence")]
+    good_loss: f64,
+    /// Write a row per sweep.
+    #[arg(long, value_name = "FILE")]
+    csv: Option<PathBuf>,
+    /// Write the reliability curve as PNG.
+    #[arg(long, value_name = "FILE")]
+    plot: Option<PathBuf>,
+    /// Write the errors as a table that --pose-source noisy replays.
+    #[arg(long, value_name = "FILE")]
+    error_table: Option<PathBuf>,
+    /// Where to compute.
+    #[arg(long, value_enum, default_value_t = ComputeOn::Cpu)]
+    device: ComputeOn,
+    /// Threads to compute with.
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
+    threads: u16,
+    /// Print JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Search {
+    /// Random samples with local optimisation.
+    Ransac,
+    /// Second-order spatial compatibility.
+    Sc2pcr,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum ComputeOn {
+    /// The processor.
+    Cpu,
+    /// The first CUDA device.
+    Cuda,
+}
+
+/// Localises, fits, writes and prints.
+pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
+    tch::set_num_threads(i32::from(args.threads));
+    let mut localizer = args.localizer().map_err(|error| BadInput(error.into()))?;
+    let mut sweeps = args.evaluate(&mut localizer)?;
+    if args.fit_confidence {
+        let report = args.fit(&mut sweeps)?;
+        eprintln!("{}", report_line(&report));
+    }
+    args.write(&sweeps)?;
+    let summary = LocalizationSummary::of(&sweeps);
+    if args.json {
+        println!("{}", serde_json::to_string_pretty(&summary)?);
+    } else {
+        print!("{}", table(&summary));
+    }
+    Ok(())
+}
+
+impl Args {
+    fn localizer(&self) -> Result<Localizer, LocalizerError> {
+        let device = match self.device {
+            ComputeOn::Cpu => Device::Cpu,
+            ComputeOn::Cuda => Device::Cuda(0),
+        };
+        let mut localizer = Localizer::load(&self.encoder, &self.head, device)?;
+        let solver = match self.solver {
+            Search::Ransac => Solver::Ransac(RansacConfig { seed: self.seed, ..RansacConfig::default() }),
+            Search::Sc2pcr => Solver::Sc2Pcr(Sc2PcrConfig::default()),
+        };
+        let confidence = localizer.solver().confidence.clone();
+        localizer.set_solver(PoseSolver { solver, confidence });
+        Ok(localizer)
+    }
+
+    fn evaluate(&self, localizer: &mut Localizer) -> anyhow::Result<Vec<EvaluatedSweep>> {
+        let count = |number: u32| usize::try_from(number).unwrap_or(usize::MAX);
+        let options = EvaluationOptions {
+            scenes: self.scene.clone(),
+            variant: self.variant.clone(),
+            every: count(self.every),
+            sweeps: self.sweeps.map(count),
+        };
+        let bar =
+            ProgressBar::new(0).with_style(ProgressStyle::with_template("{bar:30} {pos}/{len} sweeps  {eta} left")?);
+        let evaluated = evaluate(localizer, &options, &mut |done, all| {
+            bar.set_length(all as u64);
+            bar.set_position(done as u64);
+        });
+        bar.finish_and_clear();
+        match evaluated {
+            Ok(sweeps) => Ok(sweeps),
+            Err(error @ EvaluationError::Localizer(_)) => Err(error.into()),
+            Err(error) => Err(BadInput(error.into()).into()),
+        }
+    }
+
+    fn fit(&self, sweeps: &mut [EvaluatedSweep]) -> anyhow::Result<FitReport> {
+        let labelled: Vec<_> = sweeps.iter().filter_map(EvaluatedSweep::labelled).collect();
+        let (model, report) =
+            ConfidenceModel::fit(&labelled, self.good_loss).map_err(|error| BadInput(error.into()))?;
+        let sha256 = annotate(&self.head, CONFIDENCE_KEY, &serde_json::to_string(&model)?)?;
+        eprintln!("{}: confidence written, SHA-256 is now {sha256}", self.head.display());
+        let confidence = Confidence::Calibrated(model);
+        sweeps.iter_mut().for_each(|sweep| sweep.judge_again(&confidence));
+        Ok(report)
+    }
+
+    fn write(&self, sweeps: &[EvaluatedSweep]) -> anyhow::Result<()> {
+        let writing = |path: &Path| format!("writing {}", path.display());
+        if let Some(path) = &self.csv {
+            write_csv(path, sweeps).with_context(|| writing(path))?;
+        }
+        if let Some(path) = &self.error_table {
+            write_error_table(path, sweeps).with_context(|| writing(path))?;
+        }
+        if let Some(path) = &self.plot {
+            chart::save(&reliability_charts(sweeps), path).with_context(|| writing(path))?;
+        }
+        Ok(())
+    }
+}
+
+fn report_line(report: &FitReport) -> String {
+    let FitReport { sweeps, bad, bad_withheld, good_withheld } = report;
+    let good = sweeps - bad;
+    format!("fitted to {sweeps} poses: withholds {bad_withheld} of {bad} bad ones, {good_withheld} of {good} good ones")
+}
+
+/// The numbers for a person.
+fn table(summary: &LocalizationSummary) -> String {
+    let number = |value: Option<f64>, digits: usize| value.map_or("-".into(), |value| format!("{value:.digits$}"));
+    let percent = |share: f64| format!("{:.1} %", 100.0 * share);
+    let share = |value: Option<f64>| value.map_or("-".into(), percent);
+    let LocalizationSummary { sweeps, no_pose, withheld, ms, .. } = summary;
+    let total = ms.get("total").copied();
+    let stages: Vec<String> =
+        ms.iter().filter(|(stage, _)| *stage != "total").map(|(s, ms)| format!("{s} {ms:.1}")).collect();
+    let lines = [
+        format!("sweeps     {sweeps}, {no_pose} without a pose {:?}", summary.outcomes),
+        format!("success    {} under 3 m, {} under 1 m", percent(summary.success_3m), percent(summary.success_1m)),
+        format!(
+            "position   mean {} m, median {}, 95 % {}, largest {}",
+            number(summary.mean_m, 2),
+            number(summary.p50_m, 3),
+            number(summary.p95_m, 2),
+            number(summary.max_m, 1)
+        ),
+        format!(
+            "rotation   mean {} degrees, median {}, 95 % {}, largest {}",
+            number(summary.mean_deg, 2),
+            number(summary.p50_deg, 3),
+            number(summary.p95_deg, 2),
+            number(summary.max_deg, 1)
+        ),
+        format!(
+            "sigma      rank correlation {} (share of inliers {}), calibration error {}",
+            number(summary.sigma_spearman, 2),
+            number(summary.inlier_ratio_spearman, 2),
+            number(summary.calibration_error, 3)
+        ),
+        format!(
+            "withheld   {} poses: {} of {} errors above 3 m, {} of the others",
+            withheld.poses,
+            share(withheld.bad_share),
+            withheld.bad,
+            share(withheld.good_share)
+        ),
+        format!("time       {} ms median: {}", number(total, 1), stages.join(", ")),
+    ];
+    lines.join("\n") + "\n"
+}

@@ -1,0 +1,138 @@
+//! How far to trust a pose: from what speaks for it to one number, sigma.
+//!
+//! Sigma is calibrated when poses with sigma `s` have errors `e` with a mean of `1 / (1 + e^2)` of `s`, `e` in metres: what
+//! Eq. 6 of the paper says of a cell, said of a pose. Without calibration it is the mean of the inliers' confidences times
+//! their share.
+
+mod fit;
+mod isotonic;
+
+use serde::{Deserialize, Serialize};
+
+pub use fit::{BAD_M, FitError, FitReport, Labelled, observed};
+pub use isotonic::MonotoneMap;
+
+use super::pose_evidence::{PoseEvidence, SecondEvidence};
+
+/// Number of features of [`PoseEvidence`].
+const FEATURES: usize = 11;
+
+/// Metadata key of a head's file that the [`ConfidenceModel`] of its town lies under, as JSON.
+pub const CONFIDENCE_KEY: &str = "confidence";
+
+/// How sigma is computed.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub enum Confidence {
+    /// Mean confidence of the inliers times their share; nothing is withheld.
+    #[default]
+    Plain,
+    /// Fitted on sweeps whose poses are known.
+    Calibrated(ConfidenceModel),
+}
+
+impl Confidence {
+    /// Sigma of a pose, 0..=1.
+    #[must_use]
+    pub fn sigma(&self, evidence: &PoseEvidence) -> f64 {
+        match self {
+            Self::Plain => evidence.plain_sigma(),
+            Self::Calibrated(model) => model.sigma(evidence),
+        }
+    }
+
+    /// Whether a pose of this sigma is kept back.
+    #[must_use]
+    pub fn withholds(&self, sigma: f64) -> bool {
+        match self {
+            Self::Plain => false,
+            Self::Calibrated(model) => sigma < model.withhold_below,
+        }
+    }
+}
+
+/// Sigma as a monotone map of a weighted sum of what speaks against a pose.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ConfidenceModel {
+    /// Expected logarithm of the error in metres where all features are 0.
+    pub bias: f64,
+    /// Weight of each feature, none below 0: what speaks against a pose never helps it, however far a sweep lies from those
+    /// that were fitted on.
+    pub weights: [f64; FEATURES],
+    /// From the expected logarithm of the error to sigma, falling.
+    pub sigma: MonotoneMap,
+    /// Poses of a lower sigma are kept back.
+    pub withhold_below: f64,
+}
+
+impl ConfidenceModel {
+    /// Sigma of a pose, 0..=1.
+    #[must_use]
+    pub fn sigma(&self, evidence: &PoseEvidence) -> f64 {
+        self.sigma.at(self.log_error(evidence)).clamp(0.0, 1.0)
+    }
+
+    /// Expected natural logarithm of the error in metres.
+    fn log_error(&self, evidence: &PoseEvidence) -> f64 {
+        self.bias + features(evidence).iter().zip(&self.weights).map(|(feature, weight)| feature * weight).sum::<f64>()
+    }
+
+    /// A model with round numbers.
+    #[cfg(test)]
+    pub(crate) fn example() -> Self {
+        let sigma = MonotoneMap::falling(vec![(-3.0, 0.95), (0.0, 0.5), (2.0, 0.05)]);
+        Self { bias: -1.0, weights: [0.3; FEATURES], sigma, withhold_below: 0.1 }
+    }
+}
+
+/// What speaks against a pose, each the larger the worse: logarithms, because errors span orders of magnitude.
+fn features(evidence: &PoseEvidence) -> [f64; FEATURES] {
+    let log = |value: f64| value.max(1e-3).ln();
+    // A head has a refiner or has none: features that are always 0 get no weight.
+    let again = |value: fn(&SecondEvidence) -> f64| evidence.second.as_ref().map_or(0.0, |second| log(value(second)));
+    [
+        -log(evidence.inlier_ratio),
+        -log(evidence.inliers as f64 / 100.0),
+        log(evidence.rms_m),
+        log(evidence.inlier_epsilon_m),
+        log(evidence.median_epsilon_m),
+        log(evidence.position_std_m),
+        log(evidence.rotation_std_rad),
+        -again(|second| second.inlier_ratio),
+        again(|second| second.rms_m),
+        again(|second| second.median_epsilon_m),
+        again(|second| second.moved_m),
+    ]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::localizer::pose_solver::PoseSolver;
+    use crate::localizer::synthetic::SyntheticTown;
+
+    #[test]
+    fn sigma_falls_with_what_speaks_against_a_pose() {
+        let sigma = |outliers, noise_m| {
+            let town = SyntheticTown { outliers, noise_m, ..SyntheticTown::default() };
+            let found = PoseSolver::default().solve(&town.coordinates(1)).unwrap();
+            ConfidenceModel::example().sigma(&found.evidence)
+        };
+        let falling = [sigma(0.1, 0.1), sigma(0.3, 0.2), sigma(0.6, 0.4), sigma(0.8, 0.6)];
+        assert!(falling.windows(2).all(|pair| pair[0] > pair[1]), "{falling:?}");
+    }
+
+    #[test]
+    fn a_model_survives_its_file() {
+        let model = ConfidenceModel::example();
+        let text = serde_json::to_string(&model).unwrap();
+        assert_eq!(serde_json::from_str::<ConfidenceModel>(&text).unwrap(), model);
+        assert!(serde_json::from_str::<ConfidenceModel>(&text.replace("bias", "bais")).is_err());
+    }
+
+    #[test]
+    fn the_plain_confidence_withholds_nothing() {
+        assert!(!Confidence::Plain.withholds(0.0));
+        assert!(Confidence::Calibrated(ConfidenceModel::example()).withholds(0.09));
+    }
+}

@@ -1,0 +1,208 @@
+//! A localizer on recorded sweeps whose poses are known.
+
+mod summary;
+mod table;
+
+use std::path::PathBuf;
+
+use protocol::{CavId, Pose, PoseEstimate};
+use sim_replay::dataset::{self, LoadOptions, ReadError, Scenario};
+
+pub use summary::{CalibrationBin, LocalizationSummary, WithheldSummary, reliability_charts};
+pub use table::{write_csv, write_error_table};
+
+use super::confidence::{Confidence, Labelled};
+use super::error::LocalizerError;
+use super::localize::{Localization, Localize};
+use crate::pose_error::PoseError;
+
+/// Which sweeps.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct EvaluationOptions {
+    /// Datasets, splits or scenarios, all of one world.
+    pub scenes: Vec<PathBuf>,
+    /// A variant of the sweeps, for example `fog_0.060`.
+    pub variant: Option<String>,
+    /// Every how many ticks a sweep is taken.
+    pub every: usize,
+    /// Most sweeps, evenly over all there are.
+    pub sweeps: Option<usize>,
+}
+
+/// Why an evaluation ended early.
+#[derive(Debug, thiserror::Error)]
+pub enum EvaluationError {
+    /// A dataset or a frame cannot be read.
+    #[error(transparent)]
+    Read(#[from] ReadError),
+    /// There is nothing to evaluate on.
+    #[error("there is no sweep in {0:?}")]
+    Empty(Vec<PathBuf>),
+    /// A sweep has no pose to compare with.
+    #[error("{scenario}: {cav} at {stem}: there is no true pose to compare with")]
+    NoTruth {
+        /// The scenario.
+        scenario: String,
+        /// The vehicle.
+        cav: CavId,
+        /// The frame's name.
+        stem: String,
+    },
+    /// The localizer refused.
+    #[error(transparent)]
+    Localizer(#[from] LocalizerError),
+}
+
+/// What came of one sweep.
+#[derive(Debug, Clone, PartialEq)]
+pub struct EvaluatedSweep {
+    /// The scenario.
+    pub scenario: String,
+    /// The vehicle.
+    pub cav: CavId,
+    /// The frame's name.
+    pub stem: String,
+    /// True `world_from_lidar`.
+    pub truth: Pose,
+    /// What the localizer said.
+    pub localization: Localization,
+}
+
+impl EvaluatedSweep {
+    /// Error of the pose that was found, withheld or not.
+    #[must_use]
+    pub fn error(&self) -> Option<PoseError> {
+        self.localization.found.map(|found| PoseError::between(&found.world_from_sensor.into(), &self.truth))
+    }
+
+    /// Error of the pose that was told, if one was.
+    #[must_use]
+    pub fn told_error(&self) -> Option<PoseError> {
+        self.localization.estimate.world_from_cav().map(|pose| PoseError::between(pose, &self.truth))
+    }
+
+    /// What a confidence is fitted on.
+    #[must_use]
+    pub fn labelled(&self) -> Option<Labelled> {
+        let found = self.localization.found?;
+        Some(Labelled { evidence: found.evidence, error_m: self.error()?.distance_m })
+    }
+
+    /// Applies another confidence to what was found.
+    pub fn judge_again(&mut self, confidence: &Confidence) {
+        let Some(found) = &mut self.localization.found else { return };
+        found.sigma = confidence.sigma(&found.evidence);
+        found.is_withheld = confidence.withholds(found.sigma);
+        self.localization.estimate = super::pose_solver::estimate(&Ok(*found));
+    }
+}
+
+/// A sweep that is there.
+struct Sweep<'a> {
+    scenario: &'a Scenario,
+    agent: usize,
+    tick: usize,
+}
+
+/// Localises every sweep of the scenes in turn; `on_sweep` is told how many there are and how many are done.
+///
+/// # Errors
+/// [`EvaluationError`] at the first sweep that cannot be read or has no true pose.
+pub fn evaluate(
+    localizer: &mut dyn Localize,
+    options: &EvaluationOptions,
+    on_sweep: &mut dyn FnMut(usize, usize),
+) -> Result<Vec<EvaluatedSweep>, EvaluationError> {
+    let datasets = options.scenes.iter().map(|dir| dataset::open(dir)).collect::<Result<Vec<_>, _>>()?;
+    let scenarios = datasets.iter().flat_map(|dataset| &dataset.scenarios);
+    let all: Vec<Sweep<'_>> = scenarios.flat_map(|scenario| sweeps_of(scenario, options.every)).collect();
+    let count = options.sweeps.map_or(all.len(), |most| most.min(all.len()));
+    if count == 0 {
+        return Err(EvaluationError::Empty(options.scenes.clone()));
+    }
+    let load = LoadOptions { lidar_variant: options.variant.clone(), ..LoadOptions::default() };
+    let mut evaluated = Vec::with_capacity(count);
+    for place in 0..count {
+        let Sweep { scenario, agent, tick } = all[place * all.len() / count];
+        let frame = scenario.load(agent, tick, &load)?;
+        let stem = scenario.ticks[tick].stem.clone();
+        let Some(truth) = frame.world_from_lidar else {
+            return Err(EvaluationError::NoTruth { scenario: scenario.name.clone(), cav: frame.cav, stem });
+        };
+        let localization = localizer.localize(&frame.points)?;
+        evaluated.push(EvaluatedSweep { scenario: scenario.name.clone(), cav: frame.cav, stem, truth, localization });
+        on_sweep(place + 1, count);
+    }
+    Ok(evaluated)
+}
+
+/// Vehicle by vehicle, in the order of time.
+fn sweeps_of(scenario: &Scenario, every: usize) -> impl Iterator<Item = Sweep<'_>> {
+    let ticks = move || (0..scenario.ticks.len()).step_by(every.max(1));
+    (0..scenario.agents.len()).flat_map(move |agent| ticks().map(move |tick| Sweep { scenario, agent, tick }))
+}
+
+/// A word for what became of a sweep.
+fn outcome(estimate: &PoseEstimate) -> &'static str {
+    use protocol::NoPoseReason::{Failed, LowConfidence, NoSource, TooFewInliers, TooFewPoints};
+    match estimate {
+        PoseEstimate::Pose { .. } => "pose",
+        PoseEstimate::NoPose { reason, .. } => match reason {
+            TooFewPoints => "too_few_points",
+            TooFewInliers => "too_few_inliers",
+            NoSource => "no_source",
+            LowConfidence => "low_confidence",
+            Failed => "failed",
+        },
+    }
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use super::*;
+    use crate::localizer::synthetic::SyntheticTown;
+    use protocol::PointCloud;
+
+    /// Sweeps of a town that gets harder and harder; every tenth is empty.
+    pub(crate) fn evaluated(count: u64) -> Vec<EvaluatedSweep> {
+        (0..count)
+            .map(|seed| {
+                let hardness = seed as f64 / count as f64;
+                let outliers = 0.1 + 0.85 * hardness;
+                let twins = 0.6 * hardness;
+                let cells = if seed % 10 == 9 { 0 } else { 300 };
+                let mut town = SyntheticTown { cells, outliers, twins, next_seed: seed, ..SyntheticTown::default() };
+                EvaluatedSweep {
+                    scenario: "town".into(),
+                    cav: CavId::new("7").unwrap(),
+                    stem: format!("{seed:06}"),
+                    truth: town.world_from_sensor(seed).into(),
+                    localization: town.localize(&PointCloud::default()).unwrap(),
+                }
+            })
+            .collect()
+    }
+
+    #[test]
+    fn another_confidence_changes_what_is_told_and_not_what_was_found() {
+        let mut sweep = evaluated(10).swap_remove(0);
+        let found = sweep.error().unwrap();
+        assert_eq!(sweep.told_error(), Some(found));
+        let strict = crate::localizer::confidence::ConfidenceModel {
+            withhold_below: 1.0,
+            ..crate::localizer::confidence::ConfidenceModel::example()
+        };
+        sweep.judge_again(&Confidence::Calibrated(strict));
+        assert_eq!((sweep.error(), sweep.told_error()), (Some(found), None));
+        assert_eq!(outcome(&sweep.localization.estimate), "low_confidence");
+    }
+
+    #[test]
+    fn folders_without_sweeps_are_named() {
+        let empty = tempfile::tempdir().unwrap();
+        let options =
+            EvaluationOptions { scenes: vec![empty.path().to_owned()], variant: None, every: 1, sweeps: None };
+        let error = evaluate(&mut SyntheticTown::default(), &options, &mut |_, _| {}).unwrap_err().to_string();
+        assert!(error.contains(&empty.path().display().to_string()), "{error}");
+    }
+}

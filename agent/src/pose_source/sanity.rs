@@ -1,0 +1,262 @@
+//! Temporal sanity: whether a vehicle can have driven from where it was to where it believes to be.
+//!
+//! A pose that cannot be reached from the last accepted one is a jump: it is told with a lowered confidence and counted.
+//! When several poses in a row can be reached from each other, they are right and the accepted one was wrong (or the
+//! vehicle was carried): they become the accepted place.
+
+use std::collections::VecDeque;
+
+use nalgebra::Isometry3;
+use serde::{Deserialize, Serialize};
+
+/// Accepted poses further back say nothing about the speed now, seconds.
+const SPEED_WINDOW_S: f64 = 1.5;
+/// Shortest time between two poses that a speed is computed from, seconds: below, their errors weigh too much.
+const SPEED_BASE_S: f64 = 0.3;
+
+/// What a vehicle can do.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct SanityConfig {
+    /// Largest speed, metres per second.
+    pub max_speed_mps: f64,
+    /// Largest acceleration or deceleration, metres per second squared.
+    pub max_acceleration_mps2: f64,
+    /// Largest rate of turn, degrees per second.
+    pub max_turn_deg_per_s: f64,
+    /// How far apart two good poses of the same place may lie, metres.
+    pub position_slack_m: f64,
+    /// The same of their orientation, degrees.
+    pub rotation_slack_deg: f64,
+    /// After this long without an accepted pose anything is possible, seconds.
+    pub memory_s: f64,
+    /// Poses in a row that have to agree on a new place.
+    pub agreeing: usize,
+    /// What the confidence of a jump is multiplied by.
+    pub penalty: f64,
+}
+
+impl Default for SanityConfig {
+    /// A car, and poses that are right to a metre or so.
+    fn default() -> Self {
+        Self {
+            max_speed_mps: 50.0,
+            max_acceleration_mps2: 12.0,
+            max_turn_deg_per_s: 60.0,
+            position_slack_m: 2.5,
+            rotation_slack_deg: 8.0,
+            memory_s: 5.0,
+            agreeing: 3,
+            penalty: 0.2,
+        }
+    }
+}
+
+/// What a pose is, given those before it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Verdict {
+    /// It can be reached from the last accepted pose, or there is none.
+    Reachable,
+    /// It cannot.
+    Jump,
+    /// It cannot, but it is the last of several that agree with each other: they are accepted now.
+    NewPlace,
+}
+
+#[derive(Debug, Clone, Copy)]
+struct TimedPose {
+    capture_nanos: u64,
+    world_from_lidar: Isometry3<f64>,
+}
+
+/// Remembers where a vehicle was.
+#[derive(Debug, Clone)]
+pub struct MotionSanity {
+    config: SanityConfig,
+    /// Accepted poses of the last moments, oldest first.
+    accepted: VecDeque<TimedPose>,
+    /// Jumps in a row that can be reached from each other.
+    elsewhere: Vec<TimedPose>,
+    jumps: u64,
+}
+
+impl MotionSanity {
+    /// Remembers nothing yet.
+    #[must_use]
+    pub fn new(config: SanityConfig) -> Self {
+        Self { config, accepted: VecDeque::new(), elsewhere: Vec::new(), jumps: 0 }
+    }
+
+    /// Jumps so far.
+    #[must_use]
+    pub fn jumps(&self) -> u64 {
+        self.jumps
+    }
+
+    /// What the confidence of a pose with this verdict is multiplied by.
+    #[must_use]
+    pub fn factor(&self, verdict: Verdict) -> f64 {
+        match verdict {
+            Verdict::Jump => self.config.penalty,
+            Verdict::Reachable | Verdict::NewPlace => 1.0,
+        }
+    }
+
+    /// Judges a pose and remembers it.
+    pub fn judge(&mut self, capture_nanos: u64, world_from_lidar: &Isometry3<f64>) -> Verdict {
+        let pose = TimedPose { capture_nanos, world_from_lidar: *world_from_lidar };
+        let last = self.accepted.back().copied().filter(|last| self.remembers(last, &pose));
+        let Some(last) = last else {
+            // Nothing is known, or the scene began anew.
+            self.accepted.clear();
+            self.accept(pose);
+            return Verdict::Reachable;
+        };
+        if self.can_reach(&last, &pose, self.speed_mps()) {
+            self.accept(pose);
+            return Verdict::Reachable;
+        }
+        self.jumps += 1;
+        let follows = self
+            .elsewhere
+            .last()
+            .is_some_and(|before| self.remembers(before, &pose) && self.can_reach(before, &pose, None));
+        if !follows {
+            self.elsewhere.clear();
+        }
+        self.elsewhere.push(pose);
+        if self.elsewhere.len() < self.config.agreeing {
+            return Verdict::Jump;
+        }
+        self.accepted = std::mem::take(&mut self.elsewhere).into();
+        Verdict::NewPlace
+    }
+
+    fn accept(&mut self, pose: TimedPose) {
+        self.elsewhere.clear();
+        self.accepted.push_back(pose);
+        while self.accepted.front().is_some_and(|first| seconds(first, &pose) > SPEED_WINDOW_S) {
+            self.accepted.pop_front();
+        }
+    }
+
+    /// Whether a pose is recent enough to judge a later one by.
+    fn remembers(&self, earlier: &TimedPose, later: &TimedPose) -> bool {
+        (0.0..=self.config.memory_s).contains(&seconds(earlier, later))
+    }
+
+    /// Speed over the last accepted poses, where they tell.
+    fn speed_mps(&self) -> Option<f64> {
+        let (first, last) = (self.accepted.front()?, self.accepted.back()?);
+        let time_s = seconds(first, last);
+        (time_s >= SPEED_BASE_S).then(|| distance_m(first, last) / time_s)
+    }
+
+    /// Whether a vehicle with this speed, or any, can be at `to` after `from`.
+    fn can_reach(&self, from: &TimedPose, to: &TimedPose, speed_mps: Option<f64>) -> bool {
+        let config = &self.config;
+        let time_s = seconds(from, to);
+        // The speed comes from poses that may be off by the slack, over a second or so.
+        let fastest = speed_mps.map_or(config.max_speed_mps, |speed| {
+            speed + config.position_slack_m / SPEED_WINDOW_S + config.max_acceleration_mps2 * time_s
+        });
+        let reach_m = config.position_slack_m + fastest.min(config.max_speed_mps) * time_s;
+        let turn_deg = from.world_from_lidar.rotation.angle_to(&to.world_from_lidar.rotation).to_degrees();
+        let may_turn_deg = config.rotation_slack_deg + config.max_turn_deg_per_s * time_s;
+        distance_m(from, to) <= reach_m && turn_deg <= may_turn_deg
+    }
+}
+
+/// From one pose to another; negative when the other is earlier.
+fn seconds(from: &TimedPose, to: &TimedPose) -> f64 {
+    (to.capture_nanos as f64 - from.capture_nanos as f64) * 1e-9
+}
+
+fn distance_m(a: &TimedPose, b: &TimedPose) -> f64 {
+    (a.world_from_lidar.translation.vector - b.world_from_lidar.translation.vector).norm()
+}
+
+#[cfg(test)]
+mod tests {
+    use nalgebra::Vector3;
+
+    use super::*;
+
+    const TENTH_NANOS: u64 = 100_000_000;
+
+    fn at(x: f64, y: f64, yaw_deg: f64) -> Isometry3<f64> {
+        Isometry3::new(Vector3::new(x, y, 2.0), Vector3::z() * yaw_deg.to_radians())
+    }
+
+    /// The verdicts on poses a tenth of a second apart.
+    fn verdicts(sanity: &mut MotionSanity, poses: &[Isometry3<f64>]) -> Vec<Verdict> {
+        let capture = |step: usize| step as u64 * TENTH_NANOS;
+        poses.iter().enumerate().map(|(step, pose)| sanity.judge(capture(step), pose)).collect()
+    }
+
+    #[test]
+    fn a_drive_through_a_bend_is_no_jump() {
+        let mut sanity = MotionSanity::new(SanityConfig::default());
+        // 15 m/s, 30 degrees a second, with poses that shake by half a metre.
+        let drive: Vec<_> = (0..80)
+            .map(|step| {
+                let (time_s, shake) = (f64::from(step) * 0.1, if step % 2 == 0 { 0.5 } else { -0.5 });
+                let angle = 30.0_f64.to_radians() * time_s;
+                let radius = 15.0 / 30.0_f64.to_radians();
+                at(radius * angle.sin() + shake, radius * (1.0 - angle.cos()), angle.to_degrees())
+            })
+            .collect();
+        assert!(verdicts(&mut sanity, &drive).iter().all(|&verdict| verdict == Verdict::Reachable));
+        assert_eq!(sanity.jumps(), 0);
+    }
+
+    #[test]
+    fn a_jump_is_counted_and_forgotten() {
+        let mut sanity = MotionSanity::new(SanityConfig::default());
+        let mut drive: Vec<_> = (0..12).map(|step| at(f64::from(step), 0.0, 0.0)).collect();
+        drive[6] = at(6.0, 40.0, 0.0);
+        drive[9] = at(9.0, 0.0, 180.0);
+        let verdicts = verdicts(&mut sanity, &drive);
+        for (step, verdict) in verdicts.into_iter().enumerate() {
+            let expected = if step == 6 || step == 9 { Verdict::Jump } else { Verdict::Reachable };
+            assert_eq!(verdict, expected, "step {step}");
+        }
+        assert_eq!(sanity.jumps(), 2);
+        assert!(sanity.factor(Verdict::Jump) < 0.5 && sanity.factor(Verdict::Reachable) == 1.0);
+    }
+
+    #[test]
+    fn poses_that_agree_on_a_new_place_are_believed() {
+        let mut sanity = MotionSanity::new(SanityConfig::default());
+        let mut drive = vec![at(500.0, 0.0, 0.0)];
+        drive.extend((0..5).map(|step| at(f64::from(step), 0.0, 0.0)));
+        use Verdict::{Jump, NewPlace, Reachable};
+        assert_eq!(verdicts(&mut sanity, &drive), [Reachable, Jump, Jump, NewPlace, Reachable, Reachable]);
+    }
+
+    #[test]
+    fn jumps_that_do_not_agree_are_never_believed() {
+        let mut sanity = MotionSanity::new(SanityConfig::default());
+        let anywhere = (0..20).map(|step| at(f64::from((step * 7919) % 400), 100.0 + f64::from(step * 60), 0.0));
+        let drive: Vec<_> = std::iter::once(at(0.0, 0.0, 0.0)).chain(anywhere).collect();
+        assert!(verdicts(&mut sanity, &drive)[1..].iter().all(|&verdict| verdict == Verdict::Jump));
+        assert_eq!(sanity.judge(21 * TENTH_NANOS, &at(20.0, 0.0, 0.0)), Verdict::Reachable);
+    }
+
+    #[test]
+    fn a_step_is_judged_by_the_speed_before_it() {
+        let standing: Vec<_> = (0..10).map(|_| at(0.0, 0.0, 0.0)).collect();
+        let mut sanity = MotionSanity::new(SanityConfig::default());
+        verdicts(&mut sanity, &standing);
+        // A car at 50 m/s could be there, one that stood a moment ago cannot.
+        assert_eq!(sanity.judge(10 * TENTH_NANOS, &at(5.0, 0.0, 0.0)), Verdict::Jump);
+    }
+
+    #[test]
+    fn a_scene_that_begins_anew_or_a_long_gap_forgets() {
+        let mut sanity = MotionSanity::new(SanityConfig::default());
+        assert_eq!(sanity.judge(90_000_000_000, &at(0.0, 0.0, 0.0)), Verdict::Reachable);
+        assert_eq!(sanity.judge(0, &at(900.0, 0.0, 0.0)), Verdict::Reachable);
+        assert_eq!(sanity.judge(60_000_000_000, &at(0.0, 0.0, 90.0)), Verdict::Reachable);
+    }
+}
