@@ -42,7 +42,8 @@ pub struct IcpConfig {
     pub source_voxel_m: f64,
     /// And at each level to about this many points.
     pub max_points: usize,
-    /// Share of the source's points that must have a partner in the end.
+    /// Share of the source's points that must have a partner in the end. Vehicles 50 m apart share a tenth of what
+    /// they see.
     pub min_overlap: f64,
     /// How well the worst direction must be fixed: 1 where every pair fixes it, 0 where none does.
     pub min_constraint: f64,
@@ -57,7 +58,7 @@ impl Default for IcpConfig {
             range_m: [2.5, 80.0],
             source_voxel_m: 0.5,
             max_points: 5000,
-            min_overlap: 0.2,
+            min_overlap: 0.05,
             min_constraint: 2e-3,
         }
     }
