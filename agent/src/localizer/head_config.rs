@@ -63,6 +63,29 @@ impl RefinerConfig {
         })
     }
 
+    /// The part of the lattice between two corners (metres relative to the origin), and the rows of the whole lattice that
+    /// its rows are.
+    #[must_use]
+    pub fn cropped(&self, low_m: [f64; 2], high_m: [f64; 2]) -> (Self, Vec<i64>) {
+        let whole = self.corners();
+        let step = |axis: usize, place_m: f64| (place_m - self.low_m[axis]) / self.spacing_m;
+        let first: [i64; 2] =
+            std::array::from_fn(|axis| (step(axis, low_m[axis]).floor() as i64).clamp(0, whole[axis] - 1));
+        let last: [i64; 2] =
+            std::array::from_fn(|axis| (step(axis, high_m[axis]).ceil() as i64).clamp(first[axis], whole[axis] - 1));
+        let at = |axis: usize, step: i64| self.low_m[axis] + step as f64 * self.spacing_m;
+        let cropped = Self {
+            low_m: [at(0, first[0]), at(1, first[1])],
+            // A little less than the last corner, so that rounding does not ask for one more.
+            high_m: std::array::from_fn(|axis| at(axis, last[axis]) - 0.01 * self.spacing_m),
+            ..self.clone()
+        };
+        let [columns, rows] = cropped.corners();
+        let row = |x: i64, y: i64| (first[1] + y).min(whole[1] - 1) * whole[0] + (first[0] + x).min(whole[0] - 1);
+        let kept = (0..rows).flat_map(|y| (0..columns).map(move |x| row(x, y))).collect();
+        (cropped, kept)
+    }
+
     /// Checks that a network can be built.
     ///
     /// # Errors
@@ -115,6 +138,37 @@ impl SceneHeadConfig {
                 Err(format!("origin_m is {:?}, must be finite", self.origin_m))
             }
             None => Ok(()),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_cropped_lattice_has_its_corners_where_they_were() {
+        let whole = RefinerConfig {
+            local_channels: 4,
+            low_m: [-50.0, -40.0],
+            high_m: [50.0, 40.0],
+            spacing_m: 1.5,
+            reach: 2,
+            keys: 4,
+            width: 8,
+        };
+        let [columns, _] = whole.corners();
+        let (cropped, rows) = whole.cropped([-20.2, -11.0], [30.1, 25.0]);
+        let [cropped_columns, cropped_rows] = cropped.corners();
+        assert_eq!(rows.len() as i64, cropped_columns * cropped_rows);
+        assert!(cropped.low_m[0] <= -20.2 && cropped.high_m[0] >= 30.0 && rows.len() < 1000);
+        for (place, &row) in rows.iter().enumerate() {
+            let (x, y) = (place as i64 % cropped_columns, place as i64 / cropped_columns);
+            for (axis, step, of_whole) in [(0, x, row % columns), (1, y, row / columns)] {
+                let here = cropped.low_m[axis] + step as f64 * cropped.spacing_m;
+                let there = whole.low_m[axis] + of_whole as f64 * whole.spacing_m;
+                assert!((here - there).abs() < 1e-9, "{here} {there}");
+            }
         }
     }
 }

@@ -51,6 +51,8 @@ const CORNERS: f64 = 110_000.0;
 const REACH_M: f64 = 3.0;
 /// Channels of a key.
 const KEYS: i64 = 16;
+/// Share of the cells that may lie beyond each edge of the lattice that is kept in the end.
+const EDGE_SHARE: f64 = 0.003;
 /// What lies this far beyond the outermost cell is still town, metres.
 const MARGIN_M: f64 = 8.0;
 /// Gradients that are not finite in a row before the training gives up.
@@ -443,6 +445,32 @@ impl<'a> Training<'a> {
         Ok((targets_m + shift, Tensor::f_stack(&[yaw.f_cos()?, yaw.f_sin()?], 1)?))
     }
 
+    /// Cuts the edges of the refiner's lattice off that hardly any cell comes near, so that they need not be shipped.
+    fn crop_lattice(&mut self) -> Result<(), LocalizerTrainError> {
+        let Some(full) = self.head_config.refiner.clone() else { return Ok(()) };
+        let bound = |share: f64, axis: i64| -> Result<f64, tch::TchError> {
+            let values = self.cache.targets_m.f_select(1, axis)?;
+            let rank = ((values.size()[0] - 1) as f64 * share).round() as i64 + 1;
+            values.f_kthvalue(rank, 0, false)?.0.f_double_value(&[])
+        };
+        let low = [bound(EDGE_SHARE, 0)?, bound(EDGE_SHARE, 1)?];
+        let high = [bound(1.0 - EDGE_SHARE, 0)?, bound(1.0 - EDGE_SHARE, 1)?];
+        let (cropped, rows) = full.cropped(low, high);
+        let rows = Tensor::f_from_slice(&rows)?.f_to_device(self.config.device)?;
+        self.head_config.refiner = Some(cropped);
+        let variables = VarStore::new(self.config.device);
+        SceneHead::new(&variables.root(), &self.head_config)?;
+        let trained = self.variables.variables();
+        for (name, mut variable) in variables.variables() {
+            let source = &trained[&name];
+            let is_lattice = matches!(name.as_str(), "refiner.keys" | "refiner.heights");
+            let source = if is_lattice { source.f_index_select(0, &rows)? } else { source.shallow_clone() };
+            no_grad(|| variable.f_copy_(&source))?;
+        }
+        self.variables = variables;
+        Ok(())
+    }
+
     fn report(&mut self) -> SceneReport {
         let [error, epsilon, refined, steps] = std::mem::take(&mut self.window);
         SceneReport::Stepped {
@@ -480,7 +508,8 @@ impl<'a> Training<'a> {
         Ok(())
     }
 
-    fn finish(self) -> Result<SceneSummary, LocalizerTrainError> {
+    fn finish(mut self) -> Result<SceneSummary, LocalizerTrainError> {
+        self.crop_lattice()?;
         let about = BTreeMap::from([
             (CONFIG_KEY.to_owned(), serde_json::to_string(&self.head_config).expect("a configuration is JSON")),
             ("kind".to_owned(), "scene head".to_owned()),
