@@ -22,8 +22,7 @@ where
         cross += a.perp(&b);
         spread += a.norm_squared();
     }
-    // Not greater: NaN where there is no pair.
-    if !(spread >= MIN_SPREAD_M * MIN_SPREAD_M) {
+    if spread.is_nan() || spread < MIN_SPREAD_M * MIN_SPREAD_M {
         return None;
     }
     let rotation = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), cross.atan2(dot));

@@ -146,7 +146,7 @@ impl Arguments {
     }
 
     fn icp_map(&self) -> Result<Box<dyn Approach>> {
-        if self.map.is_empty() || !(self.map_spacing >= 0.0) {
+        if self.map.is_empty() || self.map_spacing.is_nan() || self.map_spacing < 0.0 {
             return Err(BadInput("icp-map needs --map DIR, and a spacing that is not negative".into()).into());
         }
         let config = IcpConfig::default();
