@@ -3,6 +3,7 @@
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
+use agent::localizer::{Localizer, LocalizerError};
 use agent::model_config::DetectorConfig;
 use agent::weights::{Weights, WeightsError};
 use ego_fuser::Exchange;
@@ -10,6 +11,7 @@ use protocol::{CavId, Dtype, ProcessId, Role, RunId, Stream, Topic};
 use sim_replay::bus::{Route, process_id};
 use sim_replay::dataset::{self, ReadError};
 use sim_replay::ground_truth::GroundTruthRule;
+use tch::Device;
 
 use crate::scenario::{Launch, NoiseMode, PoseSource, Publish, Scenario};
 use crate::score::scorer_cav;
@@ -79,6 +81,9 @@ pub enum FleetError {
     /// There are no weights for the method.
     #[error(transparent)]
     NoWeights(#[from] WeightsChoiceError),
+    /// The networks that find poses cannot be used, or not together.
+    #[error("localizer: {0}")]
+    Localizer(#[from] LocalizerError),
 }
 
 /// A scenario with everything filled in that it leaves open.
@@ -107,6 +112,10 @@ impl Fleet {
         let mut scenario = scenario.clone();
         scenario.models.weights = weights_of(&scenario.models.weights, scenario.method)?;
         let detector = Weights::load(&scenario.models.weights)?.config()?;
+        if let Some(models) = scenario.models.localizer.as_ref().filter(|_| scenario.uses_localizer()) {
+            // Every vehicle loads them for itself; what is wrong with them is better said once.
+            Localizer::load(&models.encoder, &models.head, Device::Cpu)?;
+        }
         let scene = &mut scenario.scene;
         let dataset = dataset::open(&scene.dir)?;
         let recorded = match &scene.scenario {

@@ -3,4 +3,5 @@
 pub mod bus;
 pub mod fixtures;
 pub mod fleet;
+pub mod localizer;
 pub mod scene;

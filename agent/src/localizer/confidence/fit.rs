@@ -13,7 +13,7 @@ pub const BAD_M: f64 = 3.0;
 /// Fewest sweeps to fit on.
 const MIN_SWEEPS: usize = 40;
 /// Errors below this are all the same to those who use a pose, metres.
-const SMALLEST_ERROR_M: f64 = 0.05;
+const SMALLEST_ERROR_M: f64 = 0.01;
 /// Strength of the pull of weights towards 0, per sweep.
 const RIDGE: f64 = 1e-3;
 /// Rounds of coordinate descent; it converges in some hundred.
