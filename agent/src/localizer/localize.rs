@@ -19,6 +19,8 @@ use super::voxel_batch::VoxelBatch;
 use crate::registration::Correspondence;
 use crate::weights::Weights;
 
+/// Cells that are regressed at most, where the head allows for more: poses hardly gain from more, and they take time.
+const CELLS: usize = 512;
 /// Share of the regressed cells that may be flat ground, which looks the same everywhere.
 const FLAT_SHARE: f64 = 0.25;
 
@@ -150,7 +152,7 @@ impl Localizer {
         let start = Instant::now();
         let points = cloud.xyzi.iter().map(|&[x, y, z, _]| [x, y, z]);
         let sweep = SweepVoxels::new(points, self.encoder.config());
-        let chosen = choose_evenly(sweep.cells(), self.head.config().max_cells);
+        let chosen = choose_evenly(sweep.cells(), self.head.config().max_cells.min(CELLS));
         times.voxelise = start.elapsed();
         if chosen.is_empty() {
             return Ok(None);
