@@ -26,11 +26,11 @@ pub(crate) struct Args {
     /// Data sets, splits or scenarios of the head's town; the layout is found out.
     #[arg(long, value_name = "DIR", num_args = 1.., required = true)]
     scene: Vec<PathBuf>,
-    /// Weights of the encoder.
+    /// Weights of the encoder [default: pgc-encoder.safetensors beside the head].
     #[arg(long, value_name = "FILE")]
-    encoder: PathBuf,
+    encoder: Option<PathBuf>,
     /// Weights of the town's head.
-    #[arg(long, visible_alias = "weights", value_name = "FILE")]
+    #[arg(long, visible_alias = "weights", value_name = "FILE", default_value = "deploy/weights/pgc-town1.safetensors")]
     head: PathBuf,
     /// Sweeps of another weather, where the data set has them, for example fog_0.060.
     #[arg(long, value_name = "NAME")]
@@ -115,7 +115,7 @@ impl Args {
             ComputeOn::Cpu => Device::Cpu,
             ComputeOn::Cuda => Device::Cuda(0),
         };
-        let mut localizer = Localizer::load(&self.encoder, &self.head, device)?;
+        let mut localizer = Localizer::load(&self.encoder(), &self.head, device)?;
         let solver = match self.solver {
             Search::Ransac => Solver::Ransac(RansacConfig { seed: self.seed, ..RansacConfig::default() }),
             Search::Sc2pcr => Solver::Sc2Pcr(Sc2PcrConfig::default()),
@@ -123,6 +123,10 @@ impl Args {
         let confidence = localizer.solver().confidence.clone();
         localizer.set_solver(PoseSolver { solver, confidence });
         Ok(localizer)
+    }
+
+    fn encoder(&self) -> PathBuf {
+        self.encoder.clone().unwrap_or_else(|| self.head.with_file_name("pgc-encoder.safetensors"))
     }
 
     fn evaluate(&self, localizer: &mut Localizer) -> anyhow::Result<Vec<EvaluatedSweep>> {
