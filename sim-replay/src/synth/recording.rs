@@ -16,6 +16,8 @@ const COMPANION_RANGE_M: f64 = 62.0;
 const TOGETHER: f64 = 0.9;
 /// Scenes that are tried until one has enough companions.
 const ATTEMPTS: u64 = 24;
+/// A drive during which the ego stands for longer is driven anew, seconds.
+const LONGEST_STAND_S: f64 = 60.0;
 /// Traffic around the focus, metres: what a companion at the edge of the communication range can see, and a bit.
 const TRAFFIC_RADIUS_M: f64 = 210.0;
 /// Tick of the first stored frame, after the habit of OpenCDA's recordings.
@@ -76,7 +78,10 @@ pub(crate) fn record(world: &World<'_>, spec: &SceneSpec) -> Result<Recording, S
     for attempt in 0..ATTEMPTS {
         let (vehicles, frames) = simulate(world, spec, &parked, derive_seed(spec.seed, &[2, attempt]))?;
         let mut random = SplitMix64::derived(spec.seed, &[3, attempt]);
-        let (quality, agents) = choose_agents(&vehicles, &frames, spec.agents, &mut random);
+        let (together, agents) = choose_agents(&vehicles, &frames, spec.agents, &mut random);
+        // A drive that ends in a jam for good shows one place again and again.
+        let standing_s = longest_stand_s(&frames);
+        let quality = if standing_s > LONGEST_STAND_S { together.min(0.0) - standing_s } else { together };
         if best.as_ref().is_none_or(|(least, _)| quality > *least) {
             best = Some((quality, Recording { vehicles, parked: Vec::new(), frames, agents }));
         }
@@ -176,6 +181,38 @@ fn share_together(frames: &[RecordedFrame], vehicle: usize) -> f64 {
     near as f64 / frames.len() as f64
 }
 
+/// How long the ego stands at one place, at most, seconds.
+fn longest_stand_s(frames: &[RecordedFrame]) -> f64 {
+    let mut since: Option<(&Moving, u64)> = None;
+    let mut longest = 0;
+    for (frame, own) in frames.iter().filter_map(|frame| Some((frame, frame.of(0)?))) {
+        match since {
+            Some((before, tick)) if distance_m(&before.motion.end, &own.motion.end) < 0.1 => {
+                longest = longest.max(frame.tick - tick);
+            }
+            _ => since = Some((own, frame.tick)),
+        }
+    }
+    longest as f64 * STEP_S
+}
+
 fn distance_m(a: &Placement, b: &Placement) -> f64 {
     (a.position_m - b.position_m).xy().norm()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_stand_is_as_long_as_the_place_is_the_same() {
+        let frame = |tick: u64, x_m: f64| {
+            let motion = Sweep::still(Placement::level([x_m, 0.0, 0.0], 0.0));
+            RecordedFrame { tick, moving: vec![Moving { vehicle: 0, id: 1000, motion, speed_mps: 0.0 }] }
+        };
+        let places = [0.0, 5.0, 5.0, 5.05, 5.0, 9.0, 9.0];
+        let frames: Vec<_> = places.iter().zip(0..).map(|(&x_m, k)| frame(60 + 20 * k, x_m)).collect();
+        assert!((longest_stand_s(&frames) - 3.0).abs() < 1e-9);
+        assert_eq!(longest_stand_s(&[]), 0.0);
+    }
 }
