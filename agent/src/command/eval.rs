@@ -30,7 +30,12 @@ pub(crate) struct Args {
     #[arg(long, value_name = "FILE")]
     encoder: Option<PathBuf>,
     /// Weights of the town's head.
-    #[arg(long, visible_alias = "weights", value_name = "FILE", default_value = "deploy/weights/pgc-town1.safetensors")]
+    #[arg(
+        long,
+        visible_alias = "weights",
+        value_name = "FILE",
+        default_value = "deploy/weights/pgc-town1.safetensors"
+    )]
     head: PathBuf,
     /// Sweeps of another weather, where the data set has them, for example fog_0.060.
     #[arg(long, value_name = "NAME")]

@@ -149,7 +149,7 @@ impl SceneEncoderConfig {
         positive("voxel_m", self.voxel_m)?;
         positive("range_m", self.range_m)?;
         self.context_m.iter().try_for_each(|&edge| positive("context_m", edge))?;
-        if !(self.height_m[0] < self.height_m[1]) {
+        if self.height_m.iter().any(|height| !height.is_finite()) || self.height_m[0] >= self.height_m[1] {
             return Err(format!("height_m is {:?}, must rise", self.height_m));
         }
         if !(2..=6).contains(&self.levels()) {

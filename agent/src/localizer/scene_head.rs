@@ -129,7 +129,6 @@ impl SceneHead {
     }
 
     /// `[centres, 3]`: what cells are placed among, metres relative to the origin.
-    #[must_use]
     pub fn centres_m(&self) -> &Tensor {
         &self.centres
     }

@@ -30,6 +30,21 @@ pub struct SweepAugmentation {
     pub keep: f64,
 }
 
+/// How a cache is built.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct CacheOptions {
+    /// How sweeps are changed.
+    pub augmentation: SweepAugmentation,
+    /// Seed of changes and of the choice of cells.
+    pub seed: u64,
+    /// Threads that read and sort sweeps.
+    pub threads: usize,
+    /// In which numbers the encoder computes.
+    pub precision: ComputePrecision,
+    /// Where the encoder computes and the features lie.
+    pub device: Device,
+}
+
 /// One sweep, ready to be encoded.
 struct Prepared {
     voxels: SweepVoxels,
@@ -64,13 +79,10 @@ impl FeatureCache {
     pub fn build(
         list: &Arc<SweepList>,
         encoder: &SceneEncoder,
-        augmentation: SweepAugmentation,
-        seed: u64,
-        threads: usize,
-        precision: ComputePrecision,
-        device: Device,
+        options: CacheOptions,
         progress: &mut dyn FnMut(usize, usize),
     ) -> Result<Self, LocalizerTrainError> {
+        let CacheOptions { augmentation, seed, threads, precision, device } = options;
         let total = list.len() * augmentation.copies.max(1);
         let config = encoder.config().clone();
         let source = Arc::clone(list);

@@ -17,7 +17,7 @@ mod sweep_store;
 pub use encoder_training::{EncoderAccuracy, EncoderReport, EncoderSummary, EncoderTrainConfig, train_encoder};
 pub use end_to_end_training::{EndToEndReport, EndToEndSummary, EndToEndTrainConfig, train_end_to_end};
 pub use error::LocalizerTrainError;
-pub use feature_cache::{FeatureCache, SweepAugmentation};
+pub use feature_cache::{CacheOptions, FeatureCache, SweepAugmentation};
 pub use kmeans::kmeans;
 pub use pairs::{Pair, PairMaker};
 pub use redundancy::{Redundancy, RedundancyConfig};

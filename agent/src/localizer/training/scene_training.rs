@@ -14,7 +14,7 @@ use tch::{Device, Kind, Tensor, no_grad};
 
 use super::curve::Curve;
 use super::error::LocalizerTrainError;
-use super::feature_cache::{FeatureCache, SweepAugmentation};
+use super::feature_cache::{CacheOptions, FeatureCache, SweepAugmentation};
 use super::kmeans::kmeans;
 use super::redundancy::{Redundancy, RedundancyConfig};
 use super::scene_validation::{SceneAccuracy, validate};
@@ -244,16 +244,14 @@ impl<'a> Training<'a> {
         let data_sha256 = list.listing_sha256.clone();
         let mut encode = |list: &Arc<SweepList>, augmentation| {
             let mut progress = |done, total| observe(&SceneReport::Encoding(done, total));
-            FeatureCache::build(
-                list,
-                &encoder,
+            let options = CacheOptions {
                 augmentation,
-                config.seed,
-                config.loader_threads,
-                config.precision,
-                config.device,
-                &mut progress,
-            )
+                seed: config.seed,
+                threads: config.loader_threads,
+                precision: config.precision,
+                device: config.device,
+            };
+            FeatureCache::build(list, &encoder, options, &mut progress)
         };
         let cache = encode(&list, config.augmentation)?;
         let validation = match config.validation.as_slice() {
