@@ -39,14 +39,16 @@ pub struct FreeAlignConfig {
 }
 
 impl Default for FreeAlignConfig {
+    /// Chosen on detections of 160 pairs of validation scenes: 61 % are right to 3 m and 3 % wrong. With edges to 0.5 m,
+    /// as in the published code, 42 % and 1 %; with three matches and a lead of one 66 % and 6 %.
     fn default() -> Self {
         Self {
             max_boxes: 40,
             min_edge_m: 2.0,
-            edge_tolerance_m: 0.5,
+            edge_tolerance_m: 1.2,
             fit_tolerance_m: 1.0,
             min_matches: 4,
-            min_lead: 1,
+            min_lead: 2,
         }
     }
 }
