@@ -1,7 +1,14 @@
 //! Localization sequences: NCLT as recorded and as LightLoc converts it, Oxford and QEOxford.
 //!
 //! `<root>/<sequence>/velodyne_left/<microseconds>.bin` (or NCLT's original `velodyne_sync`), with poses in
-//! `velodyne_left_False.h5` or, better aligned, QEOxford's `velodyne_left_calibrateFalse.h5`.
+//! `velodyne_left_False.h5` or, better aligned, QEOxford's `velodyne_left_calibrateFalse.h5`; where NCLT has neither,
+//! in the dataset's own `groundtruth_<day>.csv`, taken at the time of the sweep. A file `<scene>_pose_stats.txt` above
+//! the sequences holds the middle of the training sequences, from which LightLoc counts all positions; so does this
+//! reader where the file is there.
+//!
+//! NCLT's sweeps are in the frame of the robot's body, on the ground below the LiDAR, and so is its ground truth: seen
+//! from (0.002, -0.004, -0.957) m, where the dataset says the LiDAR is, each laser of a sweep keeps its elevation to
+//! within 0.1 degrees; seen from the origin it does not.
 //!
 //! Sensor and world of these recordings have x forward, y right, z **down**: right-handed. LightLoc negates z of the
 //! points alone, which is a mirror, and leaves the poses as they are. Here points and poses take the same half turn
@@ -12,10 +19,12 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use nalgebra::{Isometry3, UnitQuaternion, Vector3};
+use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 use protocol::{CavId, Handedness, Pose};
 
 use super::hdf5_poses::{self, RowOrder};
+use super::kitti_text::{lines, numbers};
+use super::nclt_ground_truth::{self, GroundTruth};
 use super::{FrameSource, Layout, ReadError, Scenario, Tick, files, points, single_vehicle};
 use crate::frame::Frame;
 use crate::pcd::PcdCloud;
@@ -39,7 +48,7 @@ enum Storage {
 struct Sequence {
     points_dir: PathBuf,
     storage: Storage,
-    /// By microseconds; empty where there is no HDF5 file.
+    /// By microseconds; empty where no file has any.
     world_from_lidar: BTreeMap<u64, Pose>,
 }
 
@@ -56,7 +65,6 @@ fn holds_sweeps(dir: &Path) -> bool {
 pub(super) fn open(root: &Path, dir: &Path, problems: &mut Vec<ReadError>) -> Result<Scenario, ReadError> {
     let storage = storage(dir);
     let points_dir = dir.join(if storage == Storage::NcltRaw { RAW } else { CONVERTED });
-    let poses = poses(dir)?;
     let mut stamps = BTreeMap::new();
     for stem in files::stems(&files::list(&points_dir)?.files, ".bin") {
         match stem.parse::<u64>() {
@@ -67,12 +75,17 @@ pub(super) fn open(root: &Path, dir: &Path, problems: &mut Vec<ReadError>) -> Re
             }
         }
     }
+    let poses = poses(dir, storage, &stamps)?;
     if let Some(poses) = &poses {
         for micros in poses.keys().filter(|micros| !stamps.contains_key(micros)) {
             let path = points_dir.join(format!("{micros}.bin"));
             problems.push(ReadError::malformed(&path, "does not exist, but there is a pose for it: left out"));
         }
+        let before = stamps.len();
         stamps.retain(|micros, _| poses.contains_key(micros));
+        if stamps.is_empty() && before > 0 {
+            problems.push(ReadError::malformed(dir, format!("none of {before} sweeps has a pose: all left out")));
+        }
     }
     let tick = |(micros, stem): (u64, String)| Tick { stem, capture_nanos: micros.saturating_mul(1000) };
     let ticks = stamps.into_iter().map(tick).collect();
@@ -83,8 +96,7 @@ pub(super) fn open(root: &Path, dir: &Path, problems: &mut Vec<ReadError>) -> Re
 
 /// NCLT's sequences are named by the day (`2012-01-22`), Oxford's by day and time and more.
 fn storage(dir: &Path) -> Storage {
-    let name_len = dir.canonicalize().ok().and_then(|dir| dir.file_name().map(|name| name.len())).unwrap_or(0);
-    let is_nclt = dir.join(RAW).is_dir() || name_len == "2012-01-22".len();
+    let is_nclt = dir.join(RAW).is_dir() || own_name(dir).len() == "2012-01-22".len();
     match (is_nclt, holds_sweeps(&dir.join(CONVERTED))) {
         (true, true) => Storage::NcltConverted,
         (true, false) => Storage::NcltRaw,
@@ -92,18 +104,62 @@ fn storage(dir: &Path) -> Storage {
     }
 }
 
-/// The poses of the best file there is, turned to z up.
-fn poses(dir: &Path) -> Result<Option<BTreeMap<u64, Pose>>, ReadError> {
-    let files =
-        [("velodyne_left_calibrateFalse.h5", RowOrder::RotationFirst), ("velodyne_left_False.h5", RowOrder::Matrix)];
-    let found = files.into_iter().map(|(name, order)| (dir.join(name), order)).find(|(path, _)| path.is_file());
-    let Some((path, order)) = found else { return Ok(None) };
-    let mut poses = hdf5_poses::read(&path, order)?;
+/// The poses of the best file there is, from the middle of the training sequences where that is known, turned to z up.
+fn poses(
+    dir: &Path,
+    storage: Storage,
+    stamps: &BTreeMap<u64, String>,
+) -> Result<Option<BTreeMap<u64, Pose>>, ReadError> {
+    let Some((scene, mut poses)) = poses_as_stored(dir, storage, stamps)? else { return Ok(None) };
+    let middle = Isometry3::from(middle_m(dir, scene)?);
     let turn = half_turn();
     for pose in poses.values_mut() {
-        *pose = (turn * pose.isometry() * turn.inverse()).into();
+        *pose = (turn * middle.inverse() * pose.isometry() * turn.inverse()).into();
     }
     Ok(Some(poses))
+}
+
+/// What LightLoc calls the scene, and the poses by microseconds in the axes of their file.
+type StoredPoses = (&'static str, BTreeMap<u64, Pose>);
+
+/// The poses of the best file there is, as they stand there.
+fn poses_as_stored(
+    dir: &Path,
+    storage: Storage,
+    stamps: &BTreeMap<u64, String>,
+) -> Result<Option<StoredPoses>, ReadError> {
+    let is_nclt = storage != Storage::Oxford;
+    let aligned = dir.join("velodyne_left_calibrateFalse.h5");
+    if aligned.is_file() {
+        return Ok(Some(("QEOxford", hdf5_poses::read(&aligned, RowOrder::RotationFirst)?)));
+    }
+    let plain = dir.join("velodyne_left_False.h5");
+    if plain.is_file() {
+        let scene = if is_nclt { "NCLT" } else { "Oxford" };
+        return Ok(Some((scene, hdf5_poses::read(&plain, RowOrder::Matrix)?)));
+    }
+    let Some(path) = is_nclt.then(|| nclt_ground_truth::find(dir, &own_name(dir))).flatten() else { return Ok(None) };
+    let truth = GroundTruth::read(&path)?;
+    let at = |&micros: &u64| Some((micros, Pose::from(truth.at(micros)?)));
+    Ok(Some(("NCLT", stamps.keys().filter_map(at).collect())))
+}
+
+/// What LightLoc takes from all positions of a scene, metres in the axes of the poses' file; nothing without its file.
+fn middle_m(dir: &Path, scene: &str) -> Result<Translation3<f64>, ReadError> {
+    let above = dir.parent().map_or_else(|| dir.join(".."), Path::to_path_buf);
+    let path = above.join(format!("{scene}_pose_stats.txt"));
+    if !path.is_file() {
+        return Ok(Translation3::identity());
+    }
+    // Three numbers, one a line.
+    let text: Vec<String> = lines(&path)?.into_iter().map(|(_, line)| line).collect();
+    let [x, y, z] = numbers::<3>(&path, 1, None, &text.join(" "))?;
+    Ok(Translation3::new(x, y, z))
+}
+
+fn own_name(dir: &Path) -> String {
+    let name = dir.canonicalize().ok().and_then(|dir| Some(dir.file_name()?.to_string_lossy().into_owned()));
+    name.unwrap_or_default()
 }
 
 /// z down to z up: half a turn about x.
@@ -230,6 +286,36 @@ mod tests {
         write(&sequence, &format!("velodyne_left/{}.bin", T0 + 250_000), &[]);
         let frame = open(&sequence).scenarios[0].load(0, 0, &LoadOptions::default()).unwrap();
         assert_eq!(frame.world_from_lidar.unwrap().translation_m, [7.0, -8.0, -9.0]);
+    }
+
+    #[test]
+    fn raw_nclt_takes_its_poses_from_the_ground_truth() {
+        let dir = tempfile::tempdir().unwrap();
+        let stamp = 1_326_652_795_280_148u64;
+        for micros in [stamp - 60_000_000, stamp] {
+            let name = format!("2012-01-15/velodyne_sync/{micros}.bin");
+            write(dir.path(), &name, &[0x20, 0x4e, 0x20, 0x4e, 0, 0, 51, 3]);
+        }
+        // 2 m north and 1 m east of where it was, facing east; half the way at the time of the sweep.
+        let turn = std::f64::consts::FRAC_PI_2;
+        let rows = format!("{},0,0,-3,0,0,{turn}\n{},2,1,-3,0,0,{turn}\n", stamp - 5_000, stamp + 5_000);
+        write(dir.path(), "ground_truth/groundtruth_2012-01-15.csv", rows.as_bytes());
+        let load = || {
+            let dataset = open(dir.path());
+            assert_eq!((dataset.problems.len(), dataset.scenarios[0].ticks.len()), (0, 1), "one sweep has no pose");
+            dataset.scenarios[0].load(0, 0, &LoadOptions::default()).unwrap()
+        };
+        let pose = load().world_from_lidar.unwrap();
+        let [x, y, z] = pose.translation_m;
+        assert!((x - 1.0).abs() < 1e-9 && (y + 0.5).abs() < 1e-9 && (z - 3.0).abs() < 1e-9, "{pose:?}");
+        assert!((pose.yaw_rad() + turn).abs() < 1e-9, "east is to the right of north");
+        // LightLoc counts from the middle of the training sequences.
+        write(dir.path(), "NCLT_pose_stats.txt", b"100.0\n-50.0000000\n-4.0\n");
+        let [x, y, z] = load().world_from_lidar.unwrap().translation_m;
+        assert!((x + 99.0).abs() < 1e-9 && (y + 50.5).abs() < 1e-9 && (z + 1.0).abs() < 1e-9, "{x} {y} {z}");
+        write(dir.path(), "NCLT_pose_stats.txt", b"100.0\n-50.0000000\n");
+        let message = dataset::open(dir.path()).unwrap_err().to_string();
+        assert!(message.contains("NCLT_pose_stats.txt") && message.contains("2 numbers, expected 3"), "{message}");
     }
 
     #[test]

@@ -20,6 +20,7 @@ mod kitti_object;
 mod kitti_odometry;
 mod kitti_text;
 mod localization;
+mod nclt_ground_truth;
 mod numpy_tags;
 mod open;
 mod opv2v;

@@ -1,0 +1,151 @@
+//! NCLT's ground truth: one CSV file a day, some hundred poses a second.
+//!
+//! A row is time in microseconds, x, y, z in metres, roll, pitch, heading in radians: the pose of the robot's body in a
+//! local world, both with z down, `R = Rz(heading) Ry(pitch) Rx(roll)`. Rows before the first fix hold NaN.
+
+use std::path::{Path, PathBuf};
+
+use nalgebra::{Isometry3, Translation3, UnitQuaternion};
+
+use super::{ReadError, files};
+
+/// Largest file that is read, bytes: some two million rows.
+const MAX_BYTES: u64 = 256 << 20;
+/// Between rows farther apart than this nothing is known, microseconds.
+const MAX_GAP_MICROS: u64 = 1_000_000;
+/// What the columns hold, for messages.
+const COLUMNS: [&str; 7] = ["utime", "x", "y", "z", "roll", "pitch", "heading"];
+
+/// The poses of one day, in the axes of the file.
+#[derive(Debug)]
+pub(super) struct GroundTruth {
+    /// `world_from_body` by microseconds, in order.
+    poses: Vec<(u64, Isometry3<f64>)>,
+}
+
+/// The file that belongs to a sequence: `groundtruth_<day>.csv` in its folder or the one above, or in a folder
+/// `ground_truth` there.
+pub(super) fn find(dir: &Path, name: &str) -> Option<PathBuf> {
+    let file = format!("groundtruth_{name}.csv");
+    let above = dir.parent().map_or_else(|| dir.join(".."), Path::to_path_buf);
+    let places = [dir.join(&file), dir.join("ground_truth").join(&file), above.join(&file)];
+    places.into_iter().chain([above.join("ground_truth").join(&file)]).find(|path| path.is_file())
+}
+
+impl GroundTruth {
+    pub(super) fn read(path: &Path) -> Result<Self, ReadError> {
+        Self::parse(path, &files::read_text(path, MAX_BYTES)?)
+    }
+
+    fn parse(path: &Path, text: &str) -> Result<Self, ReadError> {
+        let mut poses: Vec<(u64, Isometry3<f64>)> = Vec::new();
+        for (number, line) in (1..).zip(text.lines()).filter(|(_, line)| !line.trim().is_empty()) {
+            let Some((micros, pose)) = row(path, number, line)? else { continue };
+            if let Some((before, _)) = poses.last().filter(|(before, _)| *before >= micros) {
+                return Err(wrong(path, number, 0, format!("{micros} is not after {before}")));
+            }
+            poses.push((micros, pose));
+        }
+        Ok(Self { poses })
+    }
+
+    /// The pose at a time, evenly between the rows around it; `None` before the first, after the last and in gaps.
+    pub(super) fn at(&self, micros: u64) -> Option<Isometry3<f64>> {
+        let after = self.poses.partition_point(|(time, _)| *time < micros);
+        let (next_time, next) = self.poses.get(after)?;
+        if *next_time == micros {
+            return Some(*next);
+        }
+        let (last_time, last) = self.poses.get(after.checked_sub(1)?)?;
+        let gap = next_time - last_time;
+        let share = (micros - last_time) as f64 / gap as f64;
+        // Half a turn within a gap has no middle.
+        (gap <= MAX_GAP_MICROS).then(|| last.try_lerp_slerp(next, share, 1e-9)).flatten()
+    }
+}
+
+/// Time and pose of a row; `None` where it holds no pose.
+fn row(path: &Path, line: u64, text: &str) -> Result<Option<(u64, Isometry3<f64>)>, ReadError> {
+    let words: Vec<&str> = text.split(',').map(str::trim).collect();
+    if words.len() != COLUMNS.len() {
+        let reason = format!("{} columns, expected {}", words.len(), COLUMNS.len());
+        return Err(ReadError::Malformed { path: path.to_owned(), line: Some(line), field: None, reason });
+    }
+    let mut numbers = [0.0; COLUMNS.len()];
+    for (column, word) in words.iter().enumerate() {
+        numbers[column] = word.parse::<f64>().map_err(|_| {
+            let word: String = word.chars().take(40).collect();
+            wrong(path, line, column, format!("{word:?} is no number"))
+        })?;
+    }
+    let [micros, x, y, z, roll, pitch, heading] = numbers;
+    // Times may be written like any other number: 1.326652795e15.
+    if !(0.0..=1e18).contains(&micros) {
+        return Err(wrong(path, line, 0, format!("{micros} are no microseconds")));
+    }
+    if numbers.iter().any(|number| !number.is_finite()) {
+        return Ok(None);
+    }
+    // nalgebra's Euler angles are Rz(yaw) Ry(pitch) Rx(roll) too.
+    let rotation = UnitQuaternion::from_euler_angles(roll, pitch, heading);
+    Ok(Some((micros as u64, Isometry3::from_parts(Translation3::new(x, y, z), rotation))))
+}
+
+fn wrong(path: &Path, line: u64, column: usize, reason: String) -> ReadError {
+    ReadError::Malformed { path: path.to_owned(), line: Some(line), field: Some(COLUMNS[column].to_owned()), reason }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const T0: u64 = 1_326_652_795_000_000;
+
+    fn parse(text: &str) -> Result<GroundTruth, ReadError> {
+        GroundTruth::parse(Path::new("groundtruth_2012-01-15.csv"), text)
+    }
+
+    #[test]
+    fn poses_lie_evenly_between_the_rows() {
+        let text = format!(
+            "{},NaN,NaN,NaN,NaN,NaN,NaN\n{T0},10,20,-1,0,0,3.1\n{:.10e}, 12, 20, -3, 0.2, 0, -3.1\n",
+            T0 - 10_000,
+            (T0 + 100_000) as f64
+        );
+        let truth = parse(&text).unwrap();
+        assert_eq!(truth.at(T0 - 5_000), None);
+        assert_eq!(truth.at(T0).unwrap().translation.vector.as_slice(), [10.0, 20.0, -1.0]);
+        let middle = truth.at(T0 + 25_000).unwrap();
+        assert!((middle.translation.vector - nalgebra::Vector3::new(10.5, 20.0, -1.5)).norm() < 1e-9);
+        // The short way round, through pi.
+        let (_, _, heading) = truth.at(T0 + 50_000).unwrap().rotation.euler_angles();
+        assert!(heading.abs() > 3.13, "{heading}");
+        assert_eq!(truth.at(T0 + 100_001), None);
+    }
+
+    #[test]
+    fn angles_turn_about_z_then_y_then_x() {
+        let truth = parse(&format!("{T0},0,0,0,0.1,0.2,0.3")).unwrap();
+        let axis = |axis, angle| UnitQuaternion::from_axis_angle(&axis, angle);
+        let (x, y, z) = (nalgebra::Vector3::x_axis(), nalgebra::Vector3::y_axis(), nalgebra::Vector3::z_axis());
+        let expected = axis(z, 0.3) * axis(y, 0.2) * axis(x, 0.1);
+        assert!(truth.at(T0).unwrap().rotation.angle_to(&expected) < 1e-12);
+    }
+
+    #[test]
+    fn nothing_is_known_in_gaps() {
+        let truth = parse(&format!("{T0},0,0,0,0,0,0\n{},9,0,0,0,0,0\n", T0 + 1_000_001)).unwrap();
+        assert_eq!(truth.at(T0 + 500_000), None);
+        assert!(truth.at(T0 + 1_000_001).is_some());
+    }
+
+    #[test]
+    fn what_is_wrong_is_named_with_its_line() {
+        let message = |text: &str| parse(text).unwrap_err().to_string();
+        assert_eq!(message("1,0,0,0,0,0,0\n2,0,0"), "groundtruth_2012-01-15.csv:2: 3 columns, expected 7");
+        assert_eq!(message("1,0,up,0,0,0,0"), "groundtruth_2012-01-15.csv:1: y: \"up\" is no number");
+        assert!(message("5,0,0,0,0,0,0\n5,0,0,0,0,0,0").ends_with(":2: utime: 5 is not after 5"));
+        assert!(message("-5,0,0,0,0,0,0").contains("-5 are no microseconds"));
+        assert!(parse("").unwrap().at(0).is_none());
+    }
+}
