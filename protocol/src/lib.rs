@@ -90,6 +90,7 @@ mod ledger;
 mod limits;
 pub mod message;
 mod metadata;
+mod names;
 mod point_cloud;
 mod pose;
 mod stream;

@@ -5,6 +5,7 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
+use crate::names::written_as_text;
 use crate::{KeyError, Kind};
 
 /// A stream of one vehicle.
@@ -105,16 +106,4 @@ impl FromStr for Stream {
     }
 }
 
-impl TryFrom<String> for Stream {
-    type Error = KeyError;
-
-    fn try_from(text: String) -> Result<Self, KeyError> {
-        text.parse()
-    }
-}
-
-impl From<Stream> for String {
-    fn from(stream: Stream) -> Self {
-        stream.to_string()
-    }
-}
+written_as_text!(Stream);

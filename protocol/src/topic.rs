@@ -6,89 +6,44 @@ use std::str::FromStr;
 use serde::{Deserialize, Serialize};
 
 use crate::key::{MAX_KEY_BYTES, beginning};
+use crate::names::{named, written_as_text};
 use crate::{CavId, IdError, Key, KeyError, ProcessId, RunId, Stream};
 
-/// What a process does in a run: the part of a liveliness token that says whom one can expect what from.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Role {
-    /// Publishes one vehicle's poses and features.
-    Agent,
-    /// Fuses and detects for one vehicle.
-    Ego,
-    /// Streams a scene.
-    Replay,
-    /// Emulates the air.
-    Link,
-    /// Compares detections with the truth.
-    Scorer,
-}
-
-impl Role {
-    /// Every role.
-    pub const ALL: [Self; 5] = [Self::Agent, Self::Ego, Self::Replay, Self::Link, Self::Scorer];
-
-    fn as_str(self) -> &'static str {
-        match self {
-            Self::Agent => "agent",
-            Self::Ego => "ego",
-            Self::Replay => "replay",
-            Self::Link => "link",
-            Self::Scorer => "scorer",
-        }
+named! {
+    /// What a process does in a run: the part of a liveliness token that says whom one can expect what from.
+    pub enum Role {
+        /// Publishes one vehicle's poses and features.
+        Agent = "agent",
+        /// Fuses and detects for one vehicle.
+        Ego = "ego",
+        /// Streams a scene.
+        Replay = "replay",
+        /// Emulates the air.
+        Link = "link",
+        /// Compares detections with the truth.
+        Scorer = "scorer",
     }
 }
 
-impl fmt::Display for Role {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.as_str())
-    }
-}
-
-/// What a control message asks for or says: one key each, so that a process hears only what concerns it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Verb {
-    /// Start the scene's clock.
-    Start,
-    /// Halt it.
-    Pause,
-    /// Let it run on.
-    Resume,
-    /// Move on by some ticks and halt.
-    Step,
-    /// Go to a tick.
-    Seek,
-    /// The scene is over.
-    End,
-    /// A process is ready, or has heard a route's probe.
-    Ready,
-    /// A process has finished a tick (stepped runs).
-    Done,
-}
-
-impl Verb {
-    /// Every verb.
-    pub const ALL: [Self; 8] =
-        [Self::Start, Self::Pause, Self::Resume, Self::Step, Self::Seek, Self::End, Self::Ready, Self::Done];
-
-    fn as_str(self) -> &'static str {
-        match self {
-            Self::Start => "start",
-            Self::Pause => "pause",
-            Self::Resume => "resume",
-            Self::Step => "step",
-            Self::Seek => "seek",
-            Self::End => "end",
-            Self::Ready => "ready",
-            Self::Done => "done",
-        }
-    }
-}
-
-impl fmt::Display for Verb {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(self.as_str())
+named! {
+    /// What a control message asks for or says: one key each, so that a process hears only what concerns it.
+    pub enum Verb {
+        /// Start the scene's clock.
+        Start = "start",
+        /// Halt it.
+        Pause = "pause",
+        /// Let it run on.
+        Resume = "resume",
+        /// Move on by some ticks and halt.
+        Step = "step",
+        /// Go to a tick.
+        Seek = "seek",
+        /// The scene is over.
+        End = "end",
+        /// A process is ready, or has heard a route's probe.
+        Ready = "ready",
+        /// A process has finished a tick (stepped runs).
+        Done = "done",
     }
 }
 
@@ -198,16 +153,4 @@ impl FromStr for Topic {
     }
 }
 
-impl TryFrom<String> for Topic {
-    type Error = KeyError;
-
-    fn try_from(text: String) -> Result<Self, KeyError> {
-        text.parse()
-    }
-}
-
-impl From<Topic> for String {
-    fn from(topic: Topic) -> Self {
-        topic.to_string()
-    }
-}
+written_as_text!(Topic);

@@ -6,6 +6,7 @@ use std::str::FromStr;
 use serde::{Deserialize, Serialize};
 
 use super::{check_count, metadata_only};
+use crate::names::written_as_text;
 use crate::{BevGrid, Dtype, Limits, Stream, WireError};
 
 /// What an agent is and sends: agent to ego, once it is ready and to every late joiner.
@@ -75,19 +76,7 @@ impl FromStr for ModelHash {
     }
 }
 
-impl TryFrom<String> for ModelHash {
-    type Error = ModelHashError;
-
-    fn try_from(text: String) -> Result<Self, ModelHashError> {
-        text.parse()
-    }
-}
-
-impl From<ModelHash> for String {
-    fn from(hash: ModelHash) -> Self {
-        hash.to_string()
-    }
-}
+written_as_text!(ModelHash);
 
 #[cfg(test)]
 mod tests {
