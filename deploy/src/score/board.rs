@@ -1,76 +1,23 @@
 //! The score of a run, tick by tick, from what was detected and what was there. Knows no network and no file.
 
-use std::collections::BTreeMap;
-
 use ego_fuser::average_precision::{Ordering, Scorer};
-use protocol::{AgentTruth, Box3d, CavId, Detections, Handedness, PointCloud, Pose, PoseEstimate, Stamp, Truth};
-use serde::Serialize;
-use sim_replay::frame::{Frame, Object, ObjectClass};
-use sim_replay::ground_truth::{self, GroundTruthRule};
+use protocol::{Box3d, CavId, Detections, Pose, PoseEstimate, Stamp, Truth};
+use sim_replay::ground_truth::GroundTruthRule;
 
+use super::frame_record::{FrameRecord, JudgedFrame};
+use super::open_ticks::{OpenTicks, Part, Tick};
+use super::true_boxes::true_boxes;
 use crate::metrics::{ByIou, Communication, Latencies, Percentiles, PoseError, PoseErrors};
 
-/// Ticks that may still be waiting for something: at 10 Hz six seconds, longer than any detection takes.
-const OPEN_TICKS: usize = 64;
 /// Overlap from which a detection counts as found in `frames.csv`.
 const FOUND_IOU: f64 = 0.5;
-
-/// One line of `frames.csv`.
-#[derive(Debug, Clone, PartialEq, Serialize)]
-pub struct FrameRecord {
-    /// Which frame of the scene, counted from 0.
-    pub frame_index: u64,
-    /// Capture time on the scene's clock, nanoseconds.
-    pub capture_nanos: u64,
-    /// From the publication of the tick to that of its detections, milliseconds; none where nothing was published.
-    pub latency_ms: Option<f64>,
-    /// Boxes detected.
-    pub detected: usize,
-    /// Boxes there were.
-    pub truth: usize,
-    /// Detections that overlap a true box by at least 0.5.
-    pub found: usize,
-    /// Neighbours whose data are in the result.
-    pub fused: usize,
-    /// Neighbours whose data could not be.
-    pub skipped: usize,
-    /// Bytes of metadata and body of what was fused, over all neighbours.
-    pub payload_bytes: u64,
-    /// Bytes of everything those neighbours sent for it.
-    pub wire_bytes: u64,
-    /// Distance of the ego's own pose from the truth, metres; empty where it had none.
-    pub ego_error_m: Option<f64>,
-    /// Angle of the ego's own pose to the truth, degrees.
-    pub ego_error_deg: Option<f64>,
-}
-
-/// A result and what it was judged against, for pictures.
-#[derive(Debug, Clone)]
-pub struct JudgedFrame {
-    /// Which frame of the scene, counted from 0.
-    pub frame_index: u64,
-    /// The ego's result.
-    pub result: Detections,
-    /// What was there, in the ego's LiDAR frame.
-    pub truth: Vec<Box3d>,
-    /// True pose of every vehicle's LiDAR.
-    pub world_from_lidar: Vec<(CavId, Pose)>,
-}
-
-/// What has come of one tick so far.
-#[derive(Default)]
-struct Tick {
-    truth: Option<(u64, Truth)>,
-    result: Option<(u64, Detections)>,
-    poses: Vec<(CavId, PoseEstimate)>,
-}
 
 /// The score so far. Ticks are judged in the order of their capture times, whatever order their parts come in.
 pub struct Board {
     ego: CavId,
     rule: GroundTruthRule,
     nominal_values: u64,
-    open: BTreeMap<u64, Tick>,
+    open: OpenTicks,
     scorer: Scorer,
     records: Vec<FrameRecord>,
     pose_errors: Vec<PoseError>,
@@ -78,7 +25,6 @@ pub struct Board {
     bytes: Vec<(u64, u64)>,
     missed: u64,
     best: Option<JudgedFrame>,
-    judged_until: Option<u64>,
 }
 
 impl Board {
@@ -90,7 +36,7 @@ impl Board {
             ego,
             rule,
             nominal_values,
-            open: BTreeMap::new(),
+            open: OpenTicks::default(),
             scorer: Scorer::default(),
             records: Vec::new(),
             pose_errors: Vec::new(),
@@ -98,7 +44,6 @@ impl Board {
             bytes: Vec::new(),
             missed: 0,
             best: None,
-            judged_until: None,
         }
     }
 
@@ -109,31 +54,22 @@ impl Board {
 
     /// What was there at a tick.
     pub fn truth(&mut self, stamp: &Stamp, truth: Truth) {
-        if let Some(tick) = self.tick(stamp.capture_nanos) {
-            tick.truth.get_or_insert((stamp.publish_nanos, truth));
-        }
+        self.add(stamp, Part::Truth(truth));
     }
 
     /// What the ego makes of a tick. A second result of the same tick (of an ego started again) does not count.
     pub fn result(&mut self, stamp: &Stamp, result: Detections) {
-        if let Some(tick) = self.tick(stamp.capture_nanos) {
-            tick.result.get_or_insert((stamp.publish_nanos, result));
-        }
+        self.add(stamp, Part::Result(result));
     }
 
     /// Where a vehicle believes to be at a tick.
     pub fn pose(&mut self, stamp: &Stamp, estimate: PoseEstimate) {
-        let cav = stamp.cav.clone();
-        if let Some(tick) = self.tick(stamp.capture_nanos)
-            && tick.poses.iter().all(|(known, _)| *known != cav)
-        {
-            tick.poses.push((cav, estimate));
-        }
+        self.add(stamp, Part::Pose(estimate));
     }
 
     /// Judges what is still open: nothing more will come.
     pub fn close(&mut self) {
-        while let Some((capture_nanos, tick)) = self.open.pop_first() {
+        while let Some((capture_nanos, tick)) = self.open.close_oldest() {
             self.judge(capture_nanos, tick);
         }
     }
@@ -188,22 +124,13 @@ impl Board {
         Communication::of(&self.bytes, self.nominal_values)
     }
 
-    /// The open tick of a capture time; `None` for one that has been judged already.
-    fn tick(&mut self, capture_nanos: u64) -> Option<&mut Tick> {
-        if self.judged_until.is_some_and(|judged| capture_nanos <= judged) {
-            return None;
+    fn add(&mut self, stamp: &Stamp, part: Part) {
+        if let Some((capture_nanos, tick)) = self.open.add(stamp, part) {
+            self.judge(capture_nanos, tick);
         }
-        if self.open.len() >= OPEN_TICKS
-            && !self.open.contains_key(&capture_nanos)
-            && let Some((oldest, tick)) = self.open.pop_first()
-        {
-            self.judge(oldest, tick);
-        }
-        Some(self.open.entry(capture_nanos).or_default())
     }
 
     fn judge(&mut self, capture_nanos: u64, tick: Tick) {
-        self.judged_until = Some(capture_nanos);
         let Some((began_nanos, truth)) = tick.truth else { return };
         let world_from_lidar: Vec<(CavId, Pose)> =
             truth.agents.iter().map(|agent| (agent.cav.clone(), agent.world_from_lidar)).collect();
@@ -306,44 +233,11 @@ fn true_pose<'a>(truth: &'a [(CavId, Pose)], cav: &CavId) -> Option<&'a Pose> {
     truth.iter().find(|(known, _)| known == cav).map(|(_, pose)| pose)
 }
 
-/// The boxes the ego is expected to find, in its LiDAR frame.
-#[must_use]
-pub fn true_boxes(truth: &Truth, ego: &CavId, rule: &GroundTruthRule) -> Vec<Box3d> {
-    let frames: Vec<Frame> = truth.agents.iter().map(as_frame).collect();
-    let Some(ego_index) = frames.iter().position(|frame| frame.cav == *ego) else { return Vec::new() };
-    let merged = ground_truth::merge(&frames.iter().collect::<Vec<_>>(), ego_index, rule);
-    merged.into_iter().map(|(_, box3d)| box3d).collect()
-}
-
-/// The part of a recorded frame that the rule looks at.
-fn as_frame(agent: &AgentTruth) -> Frame {
-    let class = |name: &str| serde_json::from_value(name.into()).unwrap_or(ObjectClass::Other);
-    let objects = agent.objects.iter().map(|object| Object {
-        id: object.id,
-        class: class(&object.class),
-        world_from_object: object.world_from_object,
-        size_m: object.size_m,
-        speed_mps: object.speed_mps,
-    });
-    Frame {
-        cav: agent.cav.clone(),
-        capture_nanos: 0,
-        points: PointCloud::default(),
-        dropped_points: 0,
-        radar: None,
-        world_from_lidar: Some(agent.world_from_lidar),
-        world_from_vehicle: None,
-        gnss_world_from_vehicle: None,
-        speed_mps: None,
-        objects: objects.collect(),
-        source_handedness: Handedness::Right,
-    }
-}
-
 #[cfg(test)]
 mod tests {
-    use protocol::{Detection, FusedNeighbour, TrueObject};
+    use protocol::{AgentTruth, Detection, FusedNeighbour, TrueObject};
 
+    use super::super::open_ticks::MOST_OPEN;
     use super::*;
 
     const RULE: GroundTruthRule = GroundTruthRule {
@@ -486,7 +380,7 @@ mod tests {
             board.truth(&stamp("replay", tick, 0), truth(tick));
             board.result(&stamp("e", tick, 50), result(tick, &[10.0]));
         }
-        assert!(board.open.len() <= OPEN_TICKS && board.records().len() >= 1_000 - OPEN_TICKS);
+        assert!(board.open.len() <= MOST_OPEN && board.records().len() >= 1_000 - MOST_OPEN);
         board.result(&stamp("e", 3, 50), result(3, &[]));
         board.close();
         assert_eq!(board.records().len(), 1_000, "a late second result of a judged tick adds none");

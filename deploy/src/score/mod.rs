@@ -1,7 +1,12 @@
 //! What a run is worth: detections against the truth, poses, delays, bytes, and whether every message is accounted for.
 
 mod board;
+mod frame_record;
 mod node;
+mod open_ticks;
+mod true_boxes;
 
-pub use board::{Board, FrameRecord, JudgedFrame, true_boxes};
+pub use board::Board;
+pub use frame_record::{FrameRecord, JudgedFrame};
 pub use node::{ProcessBooks, Progress, Scored, ScorerError, ScorerNode, scorer_cav};
+pub use true_boxes::true_boxes;

@@ -1,0 +1,39 @@
+//! What an ego is expected to find.
+
+use protocol::{AgentTruth, Box3d, CavId, Handedness, PointCloud, Truth};
+use sim_replay::frame::{Frame, Object, ObjectClass};
+use sim_replay::ground_truth::{self, GroundTruthRule};
+
+/// The boxes the ego is expected to find, in its LiDAR frame.
+#[must_use]
+pub fn true_boxes(truth: &Truth, ego: &CavId, rule: &GroundTruthRule) -> Vec<Box3d> {
+    let frames: Vec<Frame> = truth.agents.iter().map(as_frame).collect();
+    let Some(ego_index) = frames.iter().position(|frame| frame.cav == *ego) else { return Vec::new() };
+    let merged = ground_truth::merge(&frames.iter().collect::<Vec<_>>(), ego_index, rule);
+    merged.into_iter().map(|(_, box3d)| box3d).collect()
+}
+
+/// The part of a recorded frame that the rule looks at.
+fn as_frame(agent: &AgentTruth) -> Frame {
+    let class = |name: &str| serde_json::from_value(name.into()).unwrap_or(ObjectClass::Other);
+    let objects = agent.objects.iter().map(|object| Object {
+        id: object.id,
+        class: class(&object.class),
+        world_from_object: object.world_from_object,
+        size_m: object.size_m,
+        speed_mps: object.speed_mps,
+    });
+    Frame {
+        cav: agent.cav.clone(),
+        capture_nanos: 0,
+        points: PointCloud::default(),
+        dropped_points: 0,
+        radar: None,
+        world_from_lidar: Some(agent.world_from_lidar),
+        world_from_vehicle: None,
+        gnss_world_from_vehicle: None,
+        speed_mps: None,
+        objects: objects.collect(),
+        source_handedness: Handedness::Right,
+    }
+}
