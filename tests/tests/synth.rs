@@ -211,6 +211,26 @@ fn weather_takes_the_far_and_adds_clutter() {
 }
 
 #[test]
+fn weather_copies_lie_beside_the_plain_sweep_and_change_nothing_else() {
+    let (plain, copied) = (tempfile::tempdir().unwrap(), tempfile::tempdir().unwrap());
+    made(&SynthOptions { frames: 1, ..v2vdet(41, plain.path()) });
+    let copies = vec![Weather::Fog, Weather::Snow];
+    made(&SynthOptions { frames: 1, copies, ..v2vdet(41, copied.path()) });
+    let dataset = dataset::open(copied.path()).unwrap();
+    assert!(dataset.problems.is_empty(), "{:?}", dataset.problems);
+    let scenario = &dataset.scenarios[0];
+    assert_eq!(scenario.lidar_variants, ["fog_0.060", "snow_2.5_2.0"]);
+    let points = |variant: Option<&str>| {
+        let options = LoadOptions { lidar_variant: variant.map(str::to_owned), points: true, radar: false };
+        scenario.load(0, 0, &options).unwrap().points.len()
+    };
+    assert!(points(Some("fog_0.060")) < points(None) && points(Some("snow_2.5_2.0")) != points(None));
+    let mut files = contents(copied.path());
+    files.retain(|path, _| !path.to_string_lossy().contains("fog_") && !path.to_string_lossy().contains("snow_"));
+    assert_eq!(files, contents(plain.path()));
+}
+
+#[test]
 fn a_folder_in_use_is_left_alone() {
     let folder = tempfile::tempdir().unwrap();
     fs::write(folder.path().join("mine.txt"), "keep").unwrap();
@@ -230,6 +250,8 @@ fn bad_options_are_named() {
     assert_eq!(period, "--period is 0.12; expected a multiple of 0.05 s up to 500 s");
     let agents = message(SynthOptions { agents: RangeInclusive::new(4, 2), ..v2vdet(1, folder.path()) });
     assert_eq!(agents, "--agents is 4-2; expected a number or a range within 1-7");
+    let copies = message(SynthOptions { copies: vec![Weather::Sunny], ..v2vdet(1, folder.path()) });
+    assert_eq!(copies, "--copies is sunny; expected fog, snow or both");
     let town = Some(TownSource::OpenDrive("no/such/map.xodr".into()));
     let missing = message(SynthOptions { town, ..v2vdet(1, folder.path()) });
     assert!(missing.contains("no/such/map.xodr"), "{missing}");

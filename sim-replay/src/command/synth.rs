@@ -43,6 +43,10 @@ pub(crate) struct Args {
     /// The weather of all scenarios.
     #[arg(long, value_enum, default_value_t)]
     weather: Weather,
+    /// Write every sweep in these weathers too, beside the plain one and named as in V2X-R: fog, snow or both. What is
+    /// annotated is what the plain sweep hits.
+    #[arg(long, value_enum, value_delimiter = ',', value_name = "WEATHER")]
+    copies: Vec<Weather>,
     /// Frames of each scenario [default: 60 for v2vdet, 2000 for the others].
     #[arg(long)]
     frames: Option<usize>,
@@ -89,6 +93,7 @@ fn options(args: Args) -> SynthOptions {
         scenes: args.scenes,
         agents: args.agents,
         weather: args.weather,
+        copies: args.copies,
         frames: args.frames.unwrap_or_else(|| SynthOptions::default_frames(args.subset)),
         period_s: args.period,
         force: args.force,

@@ -208,18 +208,23 @@ impl Scene<'_, '_> {
 
         let noise = |sensor: u64| derive_seed(self.spec.seed, &[sensor, agent.id as u64, frame.tick]);
         let ground = self.world.ground();
-        let sweep = bench.lidar.sweep(&lidar_motion(&own.motion), ground, &bodies, self.options.weather, noise(5));
-        agent.folder.write_lidar(frame.tick, sweep.points)?;
+        let sensor = lidar_motion(&own.motion);
+        let sweep = bench.lidar.sweep(&sensor, ground, &bodies, self.options.weather, noise(5));
+        agent.folder.write_lidar(frame.tick, None, sweep.points)?;
+        let (points, hits) = (sweep.points.len(), sweep.hits.to_vec());
+        for &weather in &self.options.copies {
+            let copy = bench.lidar.again(&sensor, &bodies, weather, noise(7 + weather as u64));
+            agent.folder.write_lidar(frame.tick, weather.variant(), copy.points)?;
+        }
         let half_length_m = 0.5 * recording.vehicles[agent.vehicle].size_m[0];
         let returns = bench.radar.returns(&own.motion, half_length_m, LIDAR_MOUNT_M, STEP_S, ground, &bodies, noise(6));
         agent.folder.write_radar(frame.tick, returns)?;
 
         let is_hit = |(_, hits): &(Annotation<'_>, &u32)| **hits > 0;
         let mut annotations: Vec<Annotation<'_>> =
-            seen.into_iter().zip(sweep.hits).filter(is_hit).map(|(annotation, _)| annotation).collect();
+            seen.into_iter().zip(&hits).filter(is_hit).map(|(annotation, _)| annotation).collect();
         annotations.sort_unstable_by_key(|annotation| annotation.id);
-        let summary =
-            Summary { scenarios: 0, agent_frames: 1, points: sweep.points.len(), annotations: annotations.len() };
+        let summary = Summary { scenarios: 0, agent_frames: 1, points, annotations: annotations.len() };
         let facts =
             FrameFacts { vehicle: own.motion.end, speed_mps: own.speed_mps, fix: agent.fixes[number], annotations };
         agent.folder.write_facts(frame.tick, &facts)?;

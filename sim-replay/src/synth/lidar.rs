@@ -85,6 +85,12 @@ impl Lidar {
         seed: u64,
     ) -> LidarSweep<'_> {
         self.caster.cast(sensor, ground, bodies);
+        self.again(sensor, bodies, weather, seed)
+    }
+
+    /// The last sweep once more, in another weather or with other noise: `sensor` and `bodies` are those of
+    /// [`Self::sweep`].
+    pub fn again(&mut self, sensor: &Sweep, bodies: &[Body<'_>], weather: Weather, seed: u64) -> LidarSweep<'_> {
         self.points.clear();
         self.hits.clear();
         self.hits.resize(bodies.len(), 0);

@@ -57,6 +57,8 @@ pub struct SynthOptions {
     pub agents: RangeInclusive<usize>,
     /// The weather.
     pub weather: Weather,
+    /// Weathers in which every sweep is written once more, beside the plain one ([`Weather::variant`]).
+    pub copies: Vec<Weather>,
     /// Frames of each scenario.
     pub frames: usize,
     /// Simulated time from one stored frame to the next, seconds; a multiple of 0.05.
@@ -81,6 +83,7 @@ impl SynthOptions {
             scenes: 1,
             agents: 2..=4,
             weather: Weather::Sunny,
+            copies: Vec::new(),
             frames: Self::default_frames(subset),
             period_s: 0.1,
             force: false,
@@ -125,6 +128,9 @@ impl SynthOptions {
             self.traversals.to_string(),
             "expected 1 to 1000",
         )?;
+        let copies: Vec<&str> = self.copies.iter().map(|weather| weather.name()).collect();
+        let have_names = self.copies.iter().all(|weather| weather.variant().is_some());
+        check(have_names, "--copies", copies.join(","), "expected fog, snow or both")?;
         let agents = format!("{}-{}", self.agents.start(), self.agents.end());
         let is_range = *self.agents.start() >= 1 && self.agents.start() <= self.agents.end() && *self.agents.end() <= 7;
         check(is_range, "--agents", agents, "expected a number or a range within 1-7")

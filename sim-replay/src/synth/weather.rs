@@ -54,6 +54,17 @@ impl Weather {
         }
     }
 
+    /// The name of a sweep in this weather beside the plain one, as V2X-R has them: with the extinction of fog per metre,
+    /// with the rate of the snow in millimetres an hour and the speed of its flakes. Clear air has none.
+    #[must_use]
+    pub fn variant(self) -> Option<&'static str> {
+        match self {
+            Self::Sunny => None,
+            Self::Fog => Some("fog_0.060"),
+            Self::Snow => Some("snow_2.5_2.0"),
+        }
+    }
+
     /// What a beam returns whose target has this range (`None`: open sky) and reflectivity.
     pub(crate) fn echo(self, target_m: Option<f32>, reflectivity: f32, random: &mut SplitMix64) -> Echo {
         match self {

@@ -57,10 +57,12 @@ impl AgentFolder {
         Ok(Self(folder))
     }
 
-    pub(crate) fn write_lidar(&self, tick: u64, points: &[[f32; 4]]) -> Result<(), SynthError> {
+    /// The plain sweep of a tick, or a variant of it.
+    pub(crate) fn write_lidar(&self, tick: u64, variant: Option<&str>, points: &[[f32; 4]]) -> Result<(), SynthError> {
         let xyzi = points.iter().map(|&[x, y, z, intensity]| [x, -y, z, intensity]).collect();
         let bytes = pcd::encode(&PointCloud { xyzi }, Encoding::Binary, IntensityField::Intensity);
-        write_file(&self.0.join(format!("{tick:06}.pcd")), bytes)
+        let suffix = variant.map(|variant| format!("_{variant}")).unwrap_or_default();
+        write_file(&self.0.join(format!("{tick:06}{suffix}.pcd")), bytes)
     }
 
     /// `points` hold radial velocities in metres per second; see [`super::radar::velocity_to_red`].
