@@ -23,7 +23,7 @@ const LINE_EVERY: Duration = Duration::from_secs(10);
 /// Resolution of the progress bar.
 const BAR_TICKS: u64 = 10_000;
 
-/// Trains a method on scenes; writes checkpoint, curve.csv, weights.safetensors and model-card.md.
+/// Trains a method on scenes; writes checkpoint, curve.csv and curve.png, weights.safetensors and model-card.md.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Arguments {
     /// Datasets, splits or scenarios to learn from.

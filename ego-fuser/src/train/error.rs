@@ -44,6 +44,9 @@ pub enum TrainError {
         /// What the system said.
         source: std::io::Error,
     },
+    /// The picture of the curve cannot be written.
+    #[error(transparent)]
+    Picture(#[from] agent::canvas::CanvasError),
     /// The tensor library refused.
     #[error("training: {0}")]
     Torch(#[from] tch::TchError),

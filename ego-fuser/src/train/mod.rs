@@ -35,7 +35,7 @@ const READ_EVERY: u64 = 10;
 /// Losses that are not finite in a row before the training gives up.
 const MAX_SKIPPED: u32 = 20;
 
-/// Trains a method and writes checkpoint, curve, weights and model card into `config.out`.
+/// Trains a method and writes checkpoint, curve (CSV and PNG), weights and model card into `config.out`.
 ///
 /// # Errors
 /// [`TrainError`]; the last checkpoint stays.
@@ -213,10 +213,16 @@ impl<'a> Training<'a> {
             let accuracy = accuracy?;
             let seconds = self.seconds_before + self.started.elapsed().as_secs_f64();
             self.curve.validation(self.progress.step, seconds, &accuracy)?;
+            self.draw_curve()?;
             observer.validated(self.progress.step, &accuracy);
             self.accuracy = Some(accuracy);
         }
         Ok(())
+    }
+
+    fn draw_curve(&self) -> Result<(), TrainError> {
+        let Progress { method, seed, .. } = &self.progress;
+        self.curve.draw(&format!("{method}, {} samples a step, seed {seed}", self.progress.batch))
     }
 
     fn checkpoint(&mut self) -> Result<(), TrainError> {
@@ -225,6 +231,7 @@ impl<'a> Training<'a> {
     }
 
     fn finish(self) -> Result<Summary, TrainError> {
+        self.draw_curve()?;
         let weights = self.config.out.join("weights.safetensors");
         let data_sha256 = self.scenes.listing_sha256();
         let about = BTreeMap::from([
