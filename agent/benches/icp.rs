@@ -19,10 +19,14 @@ fn sweep(world_from_sensor: &Isometry3<f64>, seed: u64) -> Vec<[f32; 4]> {
         let mut within = |from: f64, to: f64| random.random_range(from..to);
         let world = match points.len() % 10 {
             0..=4 => Point3::new(within(-60.0, 60.0), within(-9.0, 9.0), 0.0),
-            // Fronts step back and forth by the house.
+            // Houses of 14 m stand at different depths: their gables fix the way along the street.
             5..=8 => {
                 let (x, side) = (within(-60.0, 60.0), if points.len() % 2 == 0 { 1.0 } else { -1.0 });
-                Point3::new(x, side * (10.0 + (x / 14.0).floor().rem_euclid(3.0)), within(0.0, 9.0))
+                let house = (x / 14.0).floor();
+                match points.len() % 7 {
+                    0 => Point3::new(house * 14.0, side * within(10.0, 13.0), within(0.0, 9.0)),
+                    _ => Point3::new(x, side * (10.0 + house.rem_euclid(3.0)), within(0.0, 9.0)),
+                }
             }
             _ => Point3::new(
                 within(-6.0, 6.0).round() * 10.0 + within(0.0, 0.2),
