@@ -20,7 +20,7 @@ use crate::registration::Correspondence;
 use crate::weights::Weights;
 
 /// Cells that are regressed at most, where the head allows for more: poses hardly gain from more, and they take time.
-const CELLS: usize = 512;
+const CELLS: usize = 256;
 /// Share of the regressed cells that may be flat ground, which looks the same everywhere.
 const FLAT_SHARE: f64 = 0.25;
 
