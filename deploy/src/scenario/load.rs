@@ -302,6 +302,8 @@ mod tests {
         let mut plain = parse(SMALL).unwrap();
         (plain.scene.dir, plain.models.weights) = (demo.scene.dir.clone(), demo.models.weights.clone());
         plain.agents.codec.dtype = Dtype::F16;
+        assert!(demo.models.localizer.is_some());
+        (plain.agents.pose, plain.models.localizer) = (PoseSource::Pgc, demo.models.localizer.clone());
         assert_eq!(demo, plain);
     }
 }
