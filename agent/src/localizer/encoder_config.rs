@@ -2,6 +2,9 @@
 
 use serde::{Deserialize, Serialize};
 
+/// Cells of the last level from the sensor to the edge: planes of features have four times its square.
+const MAX_PLANE_CELLS: f64 = 512.0;
+
 /// What a voxel is described by.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -158,7 +161,7 @@ impl SceneEncoderConfig {
         let channels = self.widths.iter().chain(&self.residual_widths);
         match channels.copied().find(|channels| !(1..=4096).contains(channels)) {
             Some(channels) => Err(format!("a layer has {channels} channels, must have 1 to 4096")),
-            None if self.range_m / self.voxel_m > 10_000.0 => {
+            None if self.range_m / self.voxel_m > 10_000.0 || self.range_m / self.coarse_cell_m() > MAX_PLANE_CELLS => {
                 Err(format!("range_m is {} with voxel_m {}: too many voxels", self.range_m, self.voxel_m))
             }
             None => Ok(()),

@@ -2,8 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-/// Corners of a lattice.
-const MAX_CORNERS: i64 = 1_000_000;
+/// Values of a lattice.
+const MAX_LATTICE: i64 = 64_000_000;
 
 /// The head of one town.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -108,10 +108,12 @@ impl RefinerConfig {
             return Err(format!("refiner: spacing_m is {}, must be 0.1 to 100", self.spacing_m));
         }
         let [columns, rows] = self.corners();
-        match columns.saturating_mul(rows) {
-            corners if corners > MAX_CORNERS => {
-                Err(format!("refiner: {corners} corners, must be {MAX_CORNERS} at most"))
-            }
+        // Checked before anything of this size is allocated: the file that the numbers come from may be anybody's.
+        match columns.saturating_mul(rows).saturating_mul(self.keys) {
+            values if values > MAX_LATTICE => Err(format!(
+                "refiner: {columns} x {rows} corners of {} keys are {values} values, must be {MAX_LATTICE} at most",
+                self.keys
+            )),
             _ => Ok(()),
         }
     }
@@ -145,6 +147,21 @@ impl SceneHeadConfig {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn a_lattice_too_large_for_memory_is_refused_with_its_size() {
+        let huge = RefinerConfig {
+            local_channels: 4,
+            low_m: [0.0; 2],
+            high_m: [5e4; 2],
+            spacing_m: 1.5,
+            reach: 2,
+            keys: 4096,
+            width: 8,
+        };
+        let message = huge.validate().unwrap_err();
+        assert!(message.contains("33335 x 33335") && message.contains("4096 keys"), "{message}");
+    }
 
     #[test]
     fn a_cropped_lattice_has_its_corners_where_they_were() {

@@ -126,12 +126,12 @@ pub fn train_encoder(
     let maker = training.maker.clone();
     let batch = config.batch as u64;
     let mut loader = Prefetch::start(config.loader_threads, training.progress.step, move |number| {
-        (number * batch..(number + 1) * batch).map(|pair| maker.pair(pair)).collect::<Vec<_>>()
+        (number * batch..(number + 1) * batch).map(|pair| maker.pair(pair)).collect::<Result<Vec<_>, _>>()
     });
     let mut window = Window::default();
     let mut skipped = 0;
     while training.share_done() < 1.0 {
-        let pairs = loader.next_batch().ok_or(LocalizerTrainError::LoaderGone)?;
+        let pairs = loader.next_batch().ok_or(LocalizerTrainError::LoaderGone)??;
         match training.step(&pairs)? {
             Some(loss) => {
                 window.add(&loss)?;
@@ -256,7 +256,7 @@ impl<'a> Training<'a> {
         let Some(maker) = &self.validation else { return Ok(None) };
         let mut window = Window::default();
         for number in 0..VALIDATION_PAIRS {
-            let pairs = [maker.pair(2 * number), maker.pair(2 * number + 1)];
+            let pairs = [maker.pair(2 * number)?, maker.pair(2 * number + 1)?];
             let loss = no_grad(|| {
                 self.contrast.loss(&self.encoder, &pairs, self.config.precision.kind(), self.config.device)
             })?;

@@ -20,6 +20,9 @@ pub enum LocalizerTrainError {
     /// Sweeps do not overlap, so there is nothing to learn correspondences from.
     #[error("no two sweeps of one world within {0} m of each other")]
     NoPairs(f64),
+    /// Sweeps overlap, but none shows what another one shows.
+    #[error("{0} pairs of sweeps side by side have no cell at the same spot: are the sweeps empty?")]
+    NoMatches(usize),
     /// The network cannot be built or run.
     #[error(transparent)]
     Localizer(#[from] LocalizerError),

@@ -23,6 +23,8 @@ const OTHER_DRIVE: f64 = 0.7;
 const MIN_KEPT: f64 = 0.6;
 /// Cells of each sweep that take part in one loss.
 const CELLS: usize = 640;
+/// Pairs that are tried before the data are given up.
+const TRIES: usize = 200;
 /// Share of those that may be flat ground.
 const FLAT_SHARE: f64 = 0.25;
 
@@ -88,11 +90,14 @@ impl PairMaker {
     }
 
     /// Pair `number`.
-    #[must_use]
-    pub fn pair(&self, number: u64) -> Pair {
+    ///
+    /// # Errors
+    /// [`LocalizerTrainError::NoMatches`] when sweeps that stand side by side show no cell at the same spot, for example
+    /// because they are empty.
+    pub fn pair(&self, number: u64) -> Result<Pair, LocalizerTrainError> {
         let mut rng = ChaCha8Rng::seed_from_u64(self.seed);
         rng.set_stream(number);
-        loop {
+        for _ in 0..TRIES {
             let anchor = self.anchors[rng.random_range(0..self.anchors.len())] as usize;
             let [own, other] = &self.partners[anchor];
             let takes_other = own.is_empty() || (!other.is_empty() && rng.random_bool(OTHER_DRIVE));
@@ -100,9 +105,10 @@ impl PairMaker {
             let Some(&partner) = among.choose(&mut rng) else { continue };
             let pair = self.build(anchor, partner as usize, &mut rng);
             if !pair.matches.is_empty() {
-                return pair;
+                return Ok(pair);
             }
         }
+        Err(LocalizerTrainError::NoMatches(TRIES))
     }
 
     fn build(&self, anchor: usize, partner: usize, rng: &mut ChaCha8Rng) -> Pair {
