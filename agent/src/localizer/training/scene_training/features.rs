@@ -1,0 +1,51 @@
+//! What a head is trained and validated on: the frozen encoder's features of all sweeps.
+
+use std::sync::Arc;
+
+use super::config::{SceneReport, SceneTrainConfig};
+use crate::localizer::training::{CacheOptions, FeatureCache, LocalizerTrainError, SweepAugmentation, SweepList};
+use crate::localizer::{SceneEncoder, SceneEncoderConfig};
+
+/// Features of the sweeps of a town.
+pub(super) struct Features {
+    pub(super) training: FeatureCache,
+    pub(super) validation: Option<FeatureCache>,
+    pub(super) encoder: SceneEncoderConfig,
+    pub(super) encoder_sha256: String,
+    /// SHA-256 of the listing of the data.
+    pub(super) data_sha256: String,
+}
+
+impl Features {
+    /// Reads and encodes the sweeps that `config` names.
+    pub(super) fn compute(
+        config: &SceneTrainConfig,
+        observe: &mut dyn FnMut(&SceneReport),
+    ) -> Result<Self, LocalizerTrainError> {
+        let (encoder, encoder_sha256) = SceneEncoder::load(&config.encoder, config.device)?;
+        let list = Arc::new(SweepList::open(&config.scenes)?);
+        let mut encode = |list: &Arc<SweepList>, augmentation| {
+            let mut progress = |done, total| observe(&SceneReport::Encoding(done, total));
+            let options = CacheOptions {
+                augmentation,
+                seed: config.seed,
+                threads: config.loader_threads,
+                precision: config.precision,
+                device: config.device,
+            };
+            FeatureCache::build(list, &encoder, options, &mut progress)
+        };
+        let training = encode(&list, config.augmentation)?;
+        let validation = match config.validation.as_slice() {
+            [] => None,
+            folders => {
+                let mut list = SweepList::open(folders)?;
+                list.thin_out(config.validation_sweeps);
+                let unchanged = SweepAugmentation { copies: 1, ..config.augmentation };
+                Some(encode(&Arc::new(list), unchanged)?)
+            }
+        };
+        let encoder = encoder.config().clone();
+        Ok(Self { training, validation, encoder, encoder_sha256, data_sha256: list.listing_sha256.clone() })
+    }
+}
