@@ -16,6 +16,10 @@ use crate::synth::vehicle::Vehicle;
 const EDGE_M: f64 = 35.0;
 /// Free room before and behind a new vehicle, metres.
 const SPAWN_ROOM_M: f64 = 4.0;
+/// Vehicles that stand longer than this with nobody before them are stuck in a knot, and leave, seconds.
+const STUCK_S: f64 = 45.0;
+/// Whoever stands farther behind its leader than this has nobody before it, metres.
+const QUEUE_GAP_M: f64 = 8.0;
 /// Tries to place one vehicle in one step.
 const TRIES: usize = 4;
 /// The id of the focus; all others follow.
@@ -114,9 +118,13 @@ impl<'t> Traffic<'t> {
         self.next_id += 1;
     }
 
-    /// Takes out who is too far from the focus or at the end of a road, and lets others in at the edge.
+    /// Takes out who is too far from the focus, at the end of a road or stuck, and lets others in at the edge.
+    ///
+    /// Full roundabouts and long vehicles that meet in a junction tie knots that nobody can undo by waiting; as in other
+    /// traffic simulations, the one who has stood longest at the head of a queue then leaves the scene.
     pub(super) fn exchange_far_cars(&mut self) {
         let center_m = self.cars[0].point_m();
+        let stuck = self.longest_stuck();
         let mut edge: Option<Vec<Spawn>> = None;
         let mut near = Vec::new();
         for index in 1..self.cars.len() {
@@ -125,7 +133,7 @@ impl<'t> Traffic<'t> {
                 let point_m = car.point_m();
                 let distance_m = (point_m[0] - center_m[0]).hypot(point_m[1] - center_m[1]);
                 let is_at_an_end = car.path.remaining_m(self.roads.graph) < car.half_length_m() + 3.0;
-                if distance_m > self.options.radius_m || is_at_an_end {
+                if distance_m > self.options.radius_m || is_at_an_end || Some(index) == stuck {
                     self.index.remove(index as u32, point_m);
                     let car = &mut self.cars[index];
                     car.is_present = false;
@@ -143,6 +151,16 @@ impl<'t> Traffic<'t> {
                 }
             }
         }
+    }
+
+    /// The vehicle that has stood longest at the head of a queue, when that is too long; the focus stays.
+    fn longest_stuck(&self) -> Option<usize> {
+        let is_first = |car: &Car| car.leader.is_none_or(|leader| leader.gap_m > QUEUE_GAP_M);
+        let stuck = (1..self.cars.len()).filter(|&index| {
+            let car = &self.cars[index];
+            car.is_present && car.standing_s > STUCK_S && is_first(car)
+        });
+        stuck.max_by(|&a, &b| self.cars[a].standing_s.total_cmp(&self.cars[b].standing_s))
     }
 
     fn let_in(&mut self, index: usize, spawn: Spawn) {

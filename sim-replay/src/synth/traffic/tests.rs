@@ -166,3 +166,21 @@ fn the_same_seed_drives_the_same_way() {
     assert_eq!(end(4), end(4));
     assert_ne!(end(4), end(5));
 }
+
+#[test]
+fn knots_come_undone() {
+    let town = build(&TownSource::Town4, 0).unwrap();
+    let roads = Roads::new(&town.lanes);
+    let options = TrafficOptions { focus_explores: true, ..options(14.0) };
+    // Seeds whose roundabouts fill up within six minutes.
+    for seed in [0, 6, 23] {
+        let start = roads.spawns[SplitMix64::new(seed).below(roads.spawns.len())];
+        let mut traffic = Traffic::new(&roads, &[], options, start, seed);
+        let mut longest_s: f64 = 0.0;
+        for _ in 0..8000 {
+            traffic.step();
+            longest_s = longest_s.max(traffic.cars[0].standing_s);
+        }
+        assert!(longest_s < 90.0, "seed {seed}: the focus stands for {longest_s} s");
+    }
+}
