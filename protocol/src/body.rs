@@ -1,6 +1,5 @@
 //! The large part of a message: raw little-endian tensor bytes.
 
-use bytemuck::Pod;
 use crc32fast::Hasher;
 
 use crate::WireError;
@@ -150,37 +149,51 @@ impl<'a> PayloadReader<'a> {
             BodyShape::Empty => (Body::Empty, true),
             BodyShape::Bytes { .. } => (Body::Bytes(self.read_bytes(len)), true),
             BodyShape::Floats(_) => {
-                let (values, sound) = self.read_values::<f32>(len, max_abs);
-                (Body::Floats(values), sound)
+                let (values, sound) = self.read_values::<1>(len, max_abs);
+                (Body::Floats(values.into_flattened()), sound)
             }
             BodyShape::Points(_) => {
-                let (points, sound) = self.read_values::<[f32; 4]>(len, max_abs);
+                let (points, sound) = self.read_values(len, max_abs);
                 (Body::Points(points), sound)
             }
         })
     }
 
-    /// `len` bytes as values: the one copy from the network's pieces into aligned memory, and whether every value is
-    /// sound.
+    /// `len` bytes as values of `N` numbers: the one copy from the network's pieces into aligned memory, and whether every
+    /// number is sound.
     ///
-    /// In blocks on the stack, which are aligned wherever pieces end: what comes from another core's memory is read
-    /// once, and the passes over it find it in the first-level cache. Each pass is a loop that every build vectorises;
-    /// fused, some builds are a quarter faster and others fall back to single values and take ten times as long.
-    fn read_values<T: Pod>(&mut self, len: usize, max_abs: f32) -> (Vec<T>, bool) {
-        let mut values = Vec::with_capacity(len / size_of::<T>());
-        let mut sound = true;
-        let mut block = [0f32; BLOCK_BYTES / 4];
+    /// Block by block, so that what comes from another core's memory is read once: the second pass over a block, which
+    /// checks and copies at once, finds it in the first-level cache. Only a value that lies across two pieces goes round
+    /// by the stack.
+    fn read_values<const N: usize>(&mut self, len: usize, max_abs: f32) -> (Vec<[f32; N]>, bool) {
+        let value_bytes = size_of::<[f32; N]>();
+        let headroom = headroom(max_abs);
+        let mut values = Vec::with_capacity(len / value_bytes);
+        let mut excess = 0;
         let mut left = len;
         while left > 0 {
-            let block = &mut block[..left.min(BLOCK_BYTES) / 4];
-            if !self.fill(bytemuck::cast_slice_mut(block)) {
+            let mut across = [[[0; 4]; N]];
+            let whole = self.piece.len().min(left).min(BLOCK_BYTES) / value_bytes * value_bytes;
+            let block = if whole > 0 {
+                let (run, rest) = self.piece.split_at(whole);
+                self.piece = rest;
+                self.crc.update(run);
+                run.as_chunks().0.as_chunks().0
+            } else if self.fill(across.as_flattened_mut().as_flattened_mut()) {
+                &across
+            } else {
                 break;
-            }
-            sound &= all_bounded(block, max_abs);
-            values.extend_from_slice(bytemuck::cast_slice(block));
+            };
             left -= size_of_val(block);
+            values.extend(block.iter().map(|value: &[[u8; 4]; N]| {
+                value.map(|bytes| {
+                    let number = f32::from_le_bytes(bytes);
+                    excess |= excess_over(headroom, number);
+                    number
+                })
+            }));
         }
-        (values, sound)
+        (values, excess >= 0)
     }
 
     /// Fills `bytes`; `false` when the pieces end before.
