@@ -13,6 +13,7 @@ mod head_config;
 mod localize;
 mod pose_evidence;
 pub mod pose_solver;
+mod pose_std;
 mod refiner;
 mod scene_encoder;
 mod scene_head;

@@ -1,14 +1,11 @@
 //! What speaks for a pose that was found.
 
-use nalgebra::{Matrix3, Matrix6, Point3, SMatrix};
 use serde::{Deserialize, Serialize};
 
 use super::localize::{SceneCoordinates, sigma};
+use super::pose_std::PoseStd;
 use super::second_look::SecondLook;
 use crate::registration::Registration;
-
-/// Taken for a standard deviation where the inliers do not bound it, metres and radians.
-const UNBOUNDED: f64 = 1e3;
 
 /// Facts about the cells that a pose was found from.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
@@ -27,7 +24,7 @@ pub struct PoseEvidence {
     pub median_epsilon_m: f64,
     /// Mean of the inliers' confidences (Eq. 6), 0..=1.
     pub inlier_sigma: f64,
-    /// Standard deviation of the position that the inliers' residuals and places leave, metres.
+    /// Standard deviation of the position that the cells' residuals and places leave, metres.
     pub position_std_m: f64,
     /// The same of the orientation, radians.
     pub rotation_std_rad: f64,
@@ -58,8 +55,7 @@ impl PoseEvidence {
         registration: &Registration,
         second: Option<&SecondLook>,
     ) -> Self {
-        let last = second.map_or(registration, |second| &second.registration);
-        let (position_std_m, rotation_std_rad) = standard_deviations(&coordinates.sensor_m, last);
+        let std = second.map_or_else(|| first_std(coordinates, registration), |second| second.std);
         Self {
             cells: coordinates.sensor_m.len(),
             inliers: registration.inliers.len(),
@@ -68,8 +64,8 @@ impl PoseEvidence {
             inlier_epsilon_m: mean_over(&registration.inliers, &coordinates.epsilon_m, f64::from),
             median_epsilon_m: median(&coordinates.epsilon_m),
             inlier_sigma: mean_over(&registration.inliers, &coordinates.epsilon_m, |epsilon| f64::from(sigma(epsilon))),
-            position_std_m,
-            rotation_std_rad,
+            position_std_m: std.position_m,
+            rotation_std_rad: std.rotation_rad,
             second: second.map(|second| SecondEvidence::gather(registration, second)),
         }
     }
@@ -85,7 +81,7 @@ impl PoseEvidence {
 
 impl SecondEvidence {
     fn gather(first: &Registration, second: &SecondLook) -> Self {
-        let SecondLook { registration, epsilon_m } = second;
+        let SecondLook { registration, epsilon_m, .. } = second;
         let moved = registration.target_from_source.translation.vector - first.target_from_source.translation.vector;
         Self {
             inlier_ratio: registration.inlier_ratio,
@@ -110,25 +106,11 @@ fn median(epsilon_m: &[f32]) -> f64 {
     if sorted.is_empty() { 0.0 } else { f64::from(*sorted.select_nth_unstable_by(middle, f32::total_cmp).1) }
 }
 
-/// Standard deviations of position and orientation from the inverse of the normal equations of the fit, as if all inliers
-/// erred independently: too small by a factor, but right in how they compare from sweep to sweep.
-fn standard_deviations(sensor_m: &[[f32; 3]], registration: &Registration) -> (f64, f64) {
-    let rotation = registration.target_from_source.rotation;
-    let mut information = Matrix6::zeros();
-    for &cell in &registration.inliers {
-        let Some(sensor_m) = sensor_m.get(cell as usize) else { continue };
-        let arm = rotation * Point3::from(sensor_m.map(f64::from)).coords;
-        // d(residual) = dt + dw x arm, for a small turn dw about the sensor.
-        let mut jacobian = SMatrix::<f64, 3, 6>::zeros();
-        jacobian.fixed_view_mut::<3, 3>(0, 0).copy_from(&Matrix3::identity());
-        jacobian.fixed_view_mut::<3, 3>(0, 3).copy_from(&(-arm.cross_matrix()));
-        information += jacobian.transpose() * jacobian;
-    }
-    let Some(inverse) = information.try_inverse() else { return (UNBOUNDED, UNBOUNDED) };
-    let variance = registration.rms_m * registration.rms_m / 3.0;
-    let std = |from: usize| ((from..from + 3).map(|axis| inverse[(axis, axis)]).sum::<f64>() * variance).sqrt();
-    let bounded = |std: f64| if std.is_finite() { std.min(UNBOUNDED) } else { UNBOUNDED };
-    (bounded(std(0)), bounded(std(3)))
+/// Spread of the pose of a first look: its inliers count by their confidences.
+fn first_std(coordinates: &SceneCoordinates, registration: &Registration) -> PoseStd {
+    let pairs = coordinates.correspondences();
+    let inliers = registration.inliers.iter().filter_map(|&cell| pairs.get(cell as usize));
+    PoseStd::of(&registration.target_from_source, inliers.map(|pair| (pair, f64::from(pair.weight))))
 }
 
 #[cfg(test)]
@@ -162,7 +144,7 @@ mod tests {
         let found = solve(&pairs, &RansacConfig::default()).unwrap();
         let mut sharper = Registration::judge(&pairs, found.target_from_source, 1.0);
         sharper.target_from_source.translation.vector.x += 0.3;
-        let second = SecondLook { registration: sharper, epsilon_m: vec![0.0; pairs.len()] };
+        let second = SecondLook { registration: sharper, epsilon_m: vec![0.0; pairs.len()], std: PoseStd::UNBOUNDED };
         let evidence = PoseEvidence::gather(&coordinates, &found, Some(&second));
         assert!((evidence.plain_sigma() - found.inlier_ratio).abs() < 1e-9);
         assert!((evidence.second.unwrap().moved_m - 0.3).abs() < 1e-9);
@@ -173,6 +155,6 @@ mod tests {
         let coordinates = SceneCoordinates::default();
         let nothing = Registration::judge(&[], nalgebra::Isometry3::identity(), 1.0);
         let evidence = PoseEvidence::gather(&coordinates, &nothing, None);
-        assert_eq!((evidence.position_std_m, evidence.plain_sigma()), (UNBOUNDED, 0.0));
+        assert_eq!((evidence.position_std_m, evidence.plain_sigma()), (PoseStd::UNBOUNDED.position_m, 0.0));
     }
 }

@@ -3,8 +3,9 @@
 use nalgebra::{Isometry3, Point3, Vector3};
 use tch::{Device, Kind, TchError, Tensor, no_grad};
 
+use super::pose_std::PoseStd;
 use super::scene_head::SceneHead;
-use crate::registration::refine::reweighted;
+use crate::registration::refine::{forgiveness, reweighted};
 use crate::registration::{Correspondence, Registration};
 
 /// Scales of the fits of each round, metres: the first pose may be off by two metres, the second hardly is.
@@ -21,6 +22,8 @@ pub(super) struct SecondLook {
     pub(super) registration: Registration,
     /// `[N]`: predicted L1 error of each cell's last answer, metres.
     pub(super) epsilon_m: Vec<f32>,
+    /// How far it may be off.
+    pub(super) std: PoseStd,
 }
 
 /// Asks the refiner where cells are that `start` puts somewhere.
@@ -71,7 +74,13 @@ pub(super) fn look_again(
             Ok(fitted) => pose = fitted,
             Err(_) => return Ok(None),
         }
-        answer = Some(SecondLook { registration: Registration::judge(&pairs, pose, AGREES_M), epsilon_m });
+        let scale_m = scales_m.last().copied().unwrap_or(AGREES_M);
+        let weighted = pairs.iter().filter(|pair| pair.usable()).map(|pair| {
+            let forgiven = forgiveness(pair.residual_m(&pose), scale_m);
+            (pair, f64::from(pair.weight) * forgiven)
+        });
+        let std = PoseStd::of(&pose, weighted);
+        answer = Some(SecondLook { registration: Registration::judge(&pairs, pose, AGREES_M), epsilon_m, std });
     }
     Ok(answer)
 }

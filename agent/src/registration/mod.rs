@@ -26,7 +26,7 @@ mod compatibility;
 mod pairs;
 mod sampling;
 #[cfg(test)]
-mod synthetic;
+pub(crate) mod synthetic;
 
 use nalgebra::{Isometry3, Point3, Vector3};
 

@@ -60,6 +60,13 @@ where
     Ok(motion)
 }
 
+/// What a pair's weight is multiplied by, 0..=1.
+#[must_use]
+pub fn forgiveness(residual_m: f64, scale_m: f64) -> f64 {
+    let scaled = residual_m / scale_m;
+    if scaled < CUTOFF_SCALES { (1.0 + scaled * scaled).powi(-2) } else { 0.0 }
+}
+
 /// One weighted fit with the weights of the residuals of `motion`.
 fn step(
     pairs: impl IntoIterator<Item = (Vector3<f64>, Vector3<f64>, f64)>,
@@ -67,13 +74,12 @@ fn step(
     scale_m: f64,
 ) -> Result<Isometry3<f64>, Degenerate> {
     let rotation = motion.rotation.to_rotation_matrix();
-    let per_scale_squared = 1.0 / (scale_m * scale_m);
     let mut moments = PairMoments::default();
     for (source_m, target_m, weight) in pairs {
         let residual = rotation * source_m + motion.translation.vector - target_m;
-        let scaled = residual.norm_squared() * per_scale_squared;
-        if scaled < CUTOFF_SCALES * CUTOFF_SCALES {
-            moments.add(&source_m, &target_m, weight / ((1.0 + scaled) * (1.0 + scaled)));
+        let forgiven = forgiveness(residual.norm(), scale_m);
+        if forgiven > 0.0 {
+            moments.add(&source_m, &target_m, weight * forgiven);
         }
     }
     moments.fit()

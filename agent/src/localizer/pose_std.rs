@@ -1,0 +1,80 @@
+//! How far a fitted pose may be off, from the cells that it rests on.
+
+use nalgebra::{Isometry3, Matrix3, Matrix6, Point3, SMatrix, Vector3};
+
+use crate::registration::Correspondence;
+
+/// Standard deviations of a pose.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct PoseStd {
+    /// Of the position, all axes together, metres.
+    pub(super) position_m: f64,
+    /// Of the orientation, all axes together, radians.
+    pub(super) rotation_rad: f64,
+}
+
+impl PoseStd {
+    /// Where the cells do not bound the pose.
+    pub(super) const UNBOUNDED: Self = Self { position_m: 1e3, rotation_rad: 1e3 };
+
+    /// Of the weighted fit of `target_from_source` to pairs, each with its weight there.
+    ///
+    /// The sandwich estimator of White (1980), `A B A` with the inverse of the normal equations `A` and the outer products
+    /// of the pairs' gradients `B`: pairs may differ in how well they are known. That neighbours err together makes it
+    /// too small by a factor, but right in how it compares from sweep to sweep.
+    pub(super) fn of<'a>(
+        target_from_source: &Isometry3<f64>,
+        pairs: impl Iterator<Item = (&'a Correspondence, f64)>,
+    ) -> Self {
+        let (mut information, mut gradients) = (Matrix6::zeros(), Matrix6::zeros());
+        for (pair, weight) in pairs {
+            let arm = target_from_source.rotation * Point3::from(pair.source_m.map(f64::from)).coords;
+            let residual = arm + target_from_source.translation.vector - Vector3::from(pair.target_m.map(f64::from));
+            // d(residual) = dt + dw x arm, for a small turn dw about the sensor.
+            let mut jacobian = SMatrix::<f64, 3, 6>::zeros();
+            jacobian.fixed_view_mut::<3, 3>(0, 0).copy_from(&Matrix3::identity());
+            jacobian.fixed_view_mut::<3, 3>(0, 3).copy_from(&(-arm.cross_matrix()));
+            information += jacobian.transpose() * jacobian * weight;
+            let gradient = jacobian.transpose() * residual * weight;
+            gradients += gradient * gradient.transpose();
+        }
+        let Some(inverse) = information.try_inverse() else { return Self::UNBOUNDED };
+        let covariance = inverse * gradients * inverse;
+        let std = |from: usize, most: f64| {
+            let std = (from..from + 3).map(|axis| covariance[(axis, axis)]).sum::<f64>().sqrt();
+            if std.is_finite() { std.min(most) } else { most }
+        };
+        Self { position_m: std(0, Self::UNBOUNDED.position_m), rotation_rad: std(3, Self::UNBOUNDED.rotation_rad) }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::registration::kabsch::PairMoments;
+    use crate::registration::synthetic::Problem;
+
+    #[test]
+    fn it_is_as_large_as_fits_really_differ() {
+        let (mut square_m, mut expected_m) = (0.0_f64, 0.0_f64);
+        for seed in 0..200 {
+            let problem = Problem { count: 80, outliers: 0.0, noise_m: 0.3, ..Problem::default() }.drawn(seed);
+            let mut moments = PairMoments::default();
+            for pair in &problem.pairs {
+                let point = |point: [f32; 3]| Vector3::from(point.map(f64::from));
+                moments.add(&point(pair.source_m), &point(pair.target_m), 1.0);
+            }
+            let fitted = moments.fit().unwrap();
+            let (off_m, _) = problem.error(&fitted);
+            square_m += off_m * off_m / 200.0;
+            expected_m += PoseStd::of(&fitted, problem.pairs.iter().map(|pair| (pair, 1.0))).position_m / 200.0;
+        }
+        let ratio = expected_m / square_m.sqrt();
+        assert!((0.75..1.25).contains(&ratio), "{ratio}");
+    }
+
+    #[test]
+    fn nothing_bounds_nothing() {
+        assert_eq!(PoseStd::of(&Isometry3::identity(), std::iter::empty()), PoseStd::UNBOUNDED);
+    }
+}
