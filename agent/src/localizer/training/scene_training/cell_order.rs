@@ -18,6 +18,7 @@ pub(super) struct CellOrder {
     order: Vec<i64>,
     place: usize,
     passes: f64,
+    passes_before: f64,
     /// Sweeps and errors of this pass's cells, while they are of interest.
     watched: Vec<(usize, f32)>,
     rng: ChaCha8Rng,
@@ -41,6 +42,7 @@ impl CellOrder {
             order: Vec::new(),
             place: 0,
             passes: steps as f64 * batch as f64 / cache.cell_count() as f64,
+            passes_before: 0.0,
             watched: Vec::new(),
             rng: ChaCha8Rng::seed_from_u64(seed ^ steps),
         })
@@ -64,7 +66,9 @@ impl CellOrder {
         let end = self.place + self.batch;
         let rows = Tensor::f_from_slice(&self.order[self.place..end])?.f_to_device(self.sweep_of_cell.device())?;
         self.place = end;
-        self.passes += self.batch as f64 / self.order.len() as f64;
+        // A whole number at the end of a pass, whatever part of a batch is left over then.
+        let (shown, batches) = (end / self.batch, self.order.len() / self.batch);
+        self.passes = self.passes_before + shown as f64 / batches as f64;
         Ok(rows)
     }
 
@@ -101,6 +105,49 @@ impl CellOrder {
         }
         self.order.shuffle(&mut self.rng);
         self.place = 0;
+        self.passes_before = self.passes;
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tch::Device;
+
+    use super::*;
+    use crate::localizer::training::RedundancyConfig;
+
+    /// Ten sweeps of ten cells each.
+    fn cache() -> FeatureCache {
+        let cells = |columns: i64| Tensor::zeros([100, columns], (Kind::Float, Device::Cpu));
+        FeatureCache {
+            cells: cells(1),
+            sweep_of_cell: Tensor::arange(100, (Kind::Int64, Device::Cpu)).floor_divide_scalar(10),
+            targets_m: cells(3),
+            sensor_m: cells(3),
+            sweeps: Tensor::zeros([10, 1], (Kind::Float, Device::Cpu)),
+            world_from_sensor: vec![nalgebra::Isometry3::identity(); 10],
+            origin_m: [0.0; 3],
+        }
+    }
+
+    #[test]
+    fn sweeps_are_left_out_from_the_end_of_a_window_on_and_come_back() {
+        let redundancy = Redundancy::new(RedundancyConfig::default(), vec![0; 10]);
+        let mut order = CellOrder::new(&cache(), Some(redundancy), 30, 1, 0).unwrap();
+        let (mut steps, mut cells_of_pass) = (0, vec![0; 21]);
+        while order.passes() < 20.0 {
+            let share_done = order.passes() / 20.0;
+            let rows = order.next_batch(share_done).unwrap();
+            let sweeps = order.sweep_of_cell.index_select(0, &rows);
+            let errors: Vec<f32> =
+                Vec::<i64>::try_from(&sweeps).unwrap().iter().map(|&sweep| (sweep * steps) as f32).collect();
+            order.watch(share_done, &sweeps, &Tensor::from_slice(&errors)).unwrap();
+            steps += 1;
+            cells_of_pass[order.passes().ceil() as usize] = order.order.len();
+        }
+        // Windows end after passes 5 and 10; from 84 % on, after pass 17, all are used again.
+        assert_eq!([5, 6, 10, 11, 17, 18].map(|pass| cells_of_pass[pass]), [100, 80, 80, 60, 60, 100]);
+        assert_eq!(steps, 8 * 3 + 12 * 2, "three batches of a full pass, two of a thinned one");
     }
 }
