@@ -22,6 +22,9 @@ pub struct Provenance {
     /// SHA-256 of the localizer's encoder and of its head, where a vehicle finds its pose itself.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub localizer_sha256: Option<[String; 2]>,
+    /// SHA-256 of the network that was trained end to end, where a vehicle finds its pose with that.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub end_to_end_sha256: Option<String>,
     /// SHA-256 over names and contents of the scenario's point clouds and annotations; images do not count.
     pub scene_sha256: String,
     /// Files that `scene_sha256` covers.
@@ -37,6 +40,7 @@ impl Provenance {
         programs: &[PathBuf],
         weights: &Path,
         localizer: Option<&LocalizerModels>,
+        end_to_end: Option<&Path>,
         scene: &Path,
     ) -> io::Result<Self> {
         let scene_files = scene_files(scene)?;
@@ -49,6 +53,7 @@ impl Provenance {
             program_sha256: hash_all(programs.first().and_then(|path| path.parent()).unwrap_or(scene), programs)?,
             weights_sha256: hash_file(weights)?.1,
             localizer_sha256,
+            end_to_end_sha256: end_to_end.map(|weights| Ok::<_, io::Error>(hash_file(weights)?.1)).transpose()?,
             scene_sha256: hash_all(scene, &scene_files)?,
             scene_files: scene_files.len(),
         })
@@ -129,20 +134,22 @@ mod tests {
         std::fs::write(&weights, b"weights").unwrap();
         let networks = LocalizerModels { encoder: weights.clone(), head: weights.clone() };
         let collect = |scene: &Path| {
-            Provenance::collect(std::slice::from_ref(&weights), &weights, Some(&networks), scene).unwrap()
+            Provenance::collect(std::slice::from_ref(&weights), &weights, Some(&networks), Some(&weights), scene)
+                .unwrap()
         };
         let first = collect(&scene(one.path(), "0 0 0"));
         assert_eq!(first.scene_files, 2, "images do not count");
         // From `printf weights | sha256sum`.
         assert!(first.weights_sha256.starts_with("9a129038d9a00aed"), "{}", first.weights_sha256);
         assert_eq!(first.localizer_sha256.as_ref().unwrap()[1], first.weights_sha256);
+        assert_eq!(first.end_to_end_sha256.as_ref(), Some(&first.weights_sha256));
         assert_eq!(first, collect(&scene(two.path(), "0 0 0")));
         assert_ne!(first.scene_sha256, collect(&scene(three.path(), "0 0 1")).scene_sha256);
     }
 
     #[test]
     fn a_missing_file_is_named() {
-        let error = Provenance::collect(&[], Path::new("/nowhere/w"), None, Path::new("/nowhere")).unwrap_err();
+        let error = Provenance::collect(&[], Path::new("/nowhere/w"), None, None, Path::new("/nowhere")).unwrap_err();
         assert!(error.to_string().starts_with("/nowhere"), "{error}");
     }
 }

@@ -3,7 +3,7 @@
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
-use agent::localizer::{Localizer, LocalizerError};
+use agent::localizer::{EndToEndLocalizer, Localizer, LocalizerError};
 use agent::model_config::DetectorConfig;
 use agent::weights::{Weights, WeightsError};
 use ego_fuser::Exchange;
@@ -116,6 +116,9 @@ impl Fleet {
             // Every vehicle loads them for itself; what is wrong with them is better said once.
             Localizer::load(&models.encoder, &models.head, Device::Cpu)?;
         }
+        if let Some(weights) = scenario.models.end_to_end.as_ref().filter(|_| scenario.uses_end_to_end()) {
+            EndToEndLocalizer::load(weights, Device::Cpu)?;
+        }
         let scene = &mut scenario.scene;
         let dataset = dataset::open(&scene.dir)?;
         let recorded = match &scene.scenario {
@@ -222,6 +225,9 @@ impl Fleet {
         if let (PoseSource::Pgc, Some(models)) = (&settings.pose, &self.scenario.models.localizer) {
             args.option("--encoder", &models.encoder);
             args.option("--head", &models.head);
+        }
+        if let (PoseSource::EndToEnd, Some(weights)) = (&settings.pose, &self.scenario.models.end_to_end) {
+            args.option("--end-to-end", weights);
         }
         args.option("--dtype", dtype(settings.codec.dtype));
         if let Some(bytes) = settings.codec.budget_bytes {

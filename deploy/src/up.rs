@@ -254,7 +254,10 @@ fn fingerprint(fleet: &Fleet, programs: &Path) -> JoinHandle<std::io::Result<Pro
     let (programs, weights) = (Fleet::programs(programs), fleet.scenario.models.weights.clone());
     let scene = fleet.scene_dir.clone();
     let localizer = fleet.scenario.models.localizer.clone().filter(|_| fleet.scenario.uses_localizer());
-    std::thread::spawn(move || Provenance::collect(&programs, &weights, localizer.as_ref(), &scene))
+    let end_to_end = fleet.scenario.models.end_to_end.clone().filter(|_| fleet.scenario.uses_end_to_end());
+    std::thread::spawn(move || {
+        Provenance::collect(&programs, &weights, localizer.as_ref(), end_to_end.as_deref(), &scene)
+    })
 }
 
 /// Writes the run folder.

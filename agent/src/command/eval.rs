@@ -1,15 +1,18 @@
 //! `agent eval`: how well a localizer finds poses on recorded sweeps.
 
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
 use agent::chart;
 use agent::localizer::confidence::{CONFIDENCE_KEY, Confidence, ConfidenceModel, FitReport};
 use agent::localizer::evaluation::{
-    EvaluatedSweep, EvaluationError, EvaluationOptions, LocalizationSummary, evaluate, reliability_charts, write_csv,
-    write_error_table,
+    EvaluatedSweep, EvaluationError, EvaluationOptions, LocalizationSummary, evaluate, evaluate_source,
+    reliability_charts, write_csv, write_error_table,
 };
 use agent::localizer::pose_solver::{PoseSolver, Solver};
-use agent::localizer::{Localizer, LocalizerError};
+use agent::localizer::{EndToEndLocalizer, Localize, Localizer, LocalizerError};
+use agent::pose_source::{IcpMapPose, PoseSource, read_map};
+use agent::registration::icp::IcpConfig;
 use agent::registration::ransac::RansacConfig;
 use agent::registration::sc2pcr::Sc2PcrConfig;
 use agent::weights::annotate;
@@ -37,6 +40,21 @@ pub(crate) struct Args {
         default_value = "deploy/weights/pgc-town1.safetensors"
     )]
     head: PathBuf,
+    /// Instead of encoder and head: weights of a network that `agent train end-to-end` wrote.
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["encoder", "head", "fit_confidence"])]
+    end_to_end: Option<PathBuf>,
+    /// Instead of networks: register every sweep against a map of these drives through the same town (ICP), beginning where
+    /// the GNSS receiver believes to be.
+    #[arg(
+        long,
+        value_name = "DIR",
+        num_args = 1..,
+        conflicts_with_all = ["encoder", "head", "end_to_end", "fit_confidence", "solver"]
+    )]
+    icp_map: Vec<PathBuf>,
+    /// Way between two sweeps on that map, metres.
+    #[arg(long, value_name = "METRES", default_value_t = 5.0, requires = "icp_map")]
+    map_spacing: f64,
     /// Sweeps of another weather, where the data set has them, for example fog_0.060.
     #[arg(long, value_name = "NAME")]
     variant: Option<String>,
@@ -95,11 +113,18 @@ enum ComputeOn {
     Cuda,
 }
 
+/// What is evaluated.
+enum Subject {
+    /// Looks at sweeps alone.
+    Localizer(Box<dyn Localize>),
+    /// Is told where the GNSS receiver believes to be.
+    Source(Box<dyn PoseSource>),
+}
+
 /// Localises, fits, writes and prints.
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     tch::set_num_threads(i32::from(args.threads));
-    let mut localizer = args.localizer().map_err(|error| BadInput(error.into()))?;
-    let mut sweeps = args.evaluate(&mut localizer)?;
+    let mut sweeps = args.evaluate(args.subject()?)?;
     if args.fit_confidence {
         let report = args.fit(&mut sweeps)?;
         eprintln!("{}", report_line(&report));
@@ -115,26 +140,43 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
 }
 
 impl Args {
-    fn localizer(&self) -> Result<Localizer, LocalizerError> {
+    fn subject(&self) -> Result<Subject, BadInput> {
+        if self.icp_map.is_empty() {
+            return Ok(Subject::Localizer(self.localizer().map_err(|error| BadInput(error.into()))?));
+        }
+        if !self.map_spacing.is_finite() || self.map_spacing < 0.0 {
+            return Err(BadInput(anyhow::anyhow!("--map-spacing is {}, must be 0 or more", self.map_spacing)));
+        }
+        let config = IcpConfig::default();
+        let map = read_map(&self.icp_map, self.map_spacing, &config).map_err(|error| BadInput(error.into()))?;
+        Ok(Subject::Source(Box::new(IcpMapPose::new(Arc::new(map), config))))
+    }
+
+    fn localizer(&self) -> Result<Box<dyn Localize>, LocalizerError> {
         let device = match self.device {
             ComputeOn::Cpu => Device::Cpu,
             ComputeOn::Cuda => Device::Cuda(0),
         };
-        let mut localizer = Localizer::load(&self.encoder(), &self.head, device)?;
         let solver = match self.solver {
             Search::Ransac => Solver::Ransac(RansacConfig { seed: self.seed, ..RansacConfig::default() }),
             Search::Sc2pcr => Solver::Sc2Pcr(Sc2PcrConfig::default()),
         };
+        if let Some(weights) = &self.end_to_end {
+            let mut localizer = EndToEndLocalizer::load(weights, device)?;
+            localizer.set_solver(PoseSolver { solver, ..PoseSolver::default() });
+            return Ok(Box::new(localizer));
+        }
+        let mut localizer = Localizer::load(&self.encoder(), &self.head, device)?;
         let confidence = localizer.solver().confidence.clone();
         localizer.set_solver(PoseSolver { solver, confidence });
-        Ok(localizer)
+        Ok(Box::new(localizer))
     }
 
     fn encoder(&self) -> PathBuf {
         self.encoder.clone().unwrap_or_else(|| self.head.with_file_name("pgc-encoder.safetensors"))
     }
 
-    fn evaluate(&self, localizer: &mut Localizer) -> anyhow::Result<Vec<EvaluatedSweep>> {
+    fn evaluate(&self, subject: Subject) -> anyhow::Result<Vec<EvaluatedSweep>> {
         let count = |number: u32| usize::try_from(number).unwrap_or(usize::MAX);
         let options = EvaluationOptions {
             scenes: self.scene.clone(),
@@ -144,10 +186,14 @@ impl Args {
         };
         let bar =
             ProgressBar::new(0).with_style(ProgressStyle::with_template("{bar:30} {pos}/{len} sweeps  {eta} left")?);
-        let evaluated = evaluate(localizer, &options, &mut |done, all| {
+        let mut on_sweep = |done, all| {
             bar.set_length(all as u64);
             bar.set_position(done as u64);
-        });
+        };
+        let evaluated = match subject {
+            Subject::Localizer(mut localizer) => evaluate(localizer.as_mut(), &options, &mut on_sweep),
+            Subject::Source(mut source) => evaluate_source(source.as_mut(), &options, &mut on_sweep),
+        };
         bar.finish_and_clear();
         match evaluated {
             Ok(sweeps) => Ok(sweeps),

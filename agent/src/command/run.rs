@@ -6,7 +6,7 @@ use agent::agent::Agent;
 use agent::detector::Detector;
 use agent::node::{self, NodeOptions};
 use agent::pose_source::sanity::SanityConfig;
-use agent::pose_source::{NoiseMode, NoisyPoseConfig, PgcConfig, PoseSource, PoseSourceConfig};
+use agent::pose_source::{EndToEndPoseConfig, NoiseMode, NoisyPoseConfig, PgcConfig, PoseSource, PoseSourceConfig};
 use anyhow::Context;
 use clap::ValueEnum;
 use protocol::{CavId, CodecConfig, Dtype, Role, Stream};
@@ -85,9 +85,9 @@ struct NoiseArgs {
     noise_table: Option<PathBuf>,
 }
 
-/// Networks that find the pose, with --pose-source pgc.
+/// Networks that find the pose, with --pose-source pgc or end-to-end.
 #[derive(Debug, clap::Args)]
-#[command(next_help_heading = "Pose from the sweep alone (--pose-source pgc)")]
+#[command(next_help_heading = "Pose from the sweep alone (--pose-source pgc, end-to-end)")]
 struct LocalizerArgs {
     /// Weights of the localizer's encoder.
     #[arg(long, required_if_eq("pose_source", "pgc"))]
@@ -95,6 +95,9 @@ struct LocalizerArgs {
     /// Weights of the town's head.
     #[arg(long, required_if_eq("pose_source", "pgc"))]
     head: Option<PathBuf>,
+    /// Weights of a network that was trained end to end.
+    #[arg(long, value_name = "FILE", required_if_eq_any([("pose_source", "end-to-end"), ("pose_source", "end_to_end")]))]
+    end_to_end: Option<PathBuf>,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -105,6 +108,9 @@ enum PoseFrom {
     Noisy,
     /// From the LiDAR sweep alone.
     Pgc,
+    /// The same by a network that was trained end to end, to compare with.
+    #[value(alias = "end_to_end")]
+    EndToEnd,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -169,7 +175,8 @@ impl Args {
         let config = match self.pose_source {
             PoseFrom::Recorded => PoseSourceConfig::Recorded,
             PoseFrom::Noisy => PoseSourceConfig::Noisy(self.noise.config()),
-            PoseFrom::Pgc => PoseSourceConfig::Pgc(self.localizer.config()?),
+            PoseFrom::Pgc => PoseSourceConfig::Pgc(self.localizer.pgc()?),
+            PoseFrom::EndToEnd => PoseSourceConfig::EndToEnd(self.localizer.end_to_end()?),
         };
         Ok(config.build()?)
     }
@@ -195,7 +202,7 @@ impl Args {
 }
 
 impl LocalizerArgs {
-    fn config(&self) -> anyhow::Result<PgcConfig> {
+    fn pgc(&self) -> anyhow::Result<PgcConfig> {
         let needed =
             |path: &Option<PathBuf>, name| path.clone().with_context(|| format!("--pose-source pgc needs {name}"));
         Ok(PgcConfig {
@@ -203,6 +210,11 @@ impl LocalizerArgs {
             head: needed(&self.head, "--head")?,
             sanity: SanityConfig::default(),
         })
+    }
+
+    fn end_to_end(&self) -> anyhow::Result<EndToEndPoseConfig> {
+        let weights = self.end_to_end.clone().context("--pose-source end-to-end needs --end-to-end")?;
+        Ok(EndToEndPoseConfig { weights, sanity: SanityConfig::default() })
     }
 }
 

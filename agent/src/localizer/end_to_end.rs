@@ -1,11 +1,17 @@
-//! Competitors of the localizer that are trained end to end on one town: what the paper compares itself with.
+//! Competitors of the localizer that are trained end to end on one town: what the paper compares itself with. They are no
+//! re-implementations of those works; each keeps their idea and leaves out what they build around it.
 //!
 //! `scene_coordinates` stands for SGLoc: coordinates of cells regressed without classification and without predicted error,
 //! all cells trusted alike by the solver. It has our encoder in place of SGLoc's, and neither its tri-scale attention nor
-//! its inter-geometric-consistency term. `pose` stands for absolute pose regression, HypLiLoc and DiffLoc: one network
-//! from a sweep to a pose. It has none of what these add to that idea (HypLiLoc's second branch on the spherical
-//! projection and its hyperbolic fusion; DiffLoc's foundation-model features and its denoising over a window of sweeps),
-//! and it regresses heading only, since vehicles stand upright.
+//! its inter-geometric-consistency term.
+//!
+//! `pose` stands for absolute pose regression, HypLiLoc and DiffLoc: one network from a sweep to a pose. It has none of
+//! what these add to that idea (HypLiLoc's second branch on the spherical projection and its hyperbolic fusion; DiffLoc's
+//! foundation-model features and its denoising over a window of sweeps), and it regresses heading only, since vehicles
+//! stand upright.
+//!
+//! Both have our encoder (`lean`), the localizer's sweeps and a comparable time of training, not the hours on a GPU that
+//! the papers spend: so the comparison is one of ideas at equal means.
 
 use serde::{Deserialize, Serialize};
 use tch::nn;

@@ -10,6 +10,7 @@ use tch::{Device, Kind, Tensor, no_grad};
 use super::confidence::{CONFIDENCE_KEY, Confidence};
 use super::error::LocalizerError;
 use super::head_config::SceneHeadConfig;
+use super::pose_evidence::PoseEvidence;
 use super::pose_solver::{self, FoundPose, PoseSolver, Solved};
 use super::scene_encoder::SceneEncoder;
 use super::scene_head::SceneHead;
@@ -20,7 +21,7 @@ use crate::registration::Correspondence;
 use crate::weights::Weights;
 
 /// Cells that are regressed at most, where the head allows for more: poses hardly gain from more, and they take time.
-const CELLS: usize = 256;
+pub(super) const CELLS: usize = 256;
 /// Share of the regressed cells that may be flat ground, which looks the same everywhere.
 const FLAT_SHARE: f64 = 0.25;
 
@@ -103,6 +104,7 @@ impl Localizer {
     pub fn load(encoder: &Path, head: &Path, device: Device) -> Result<Self, LocalizerError> {
         let (network, encoder_sha256) = SceneEncoder::load(encoder, device)?;
         let weights = Weights::load(head)?;
+        weights.check_kind(SceneHead::KIND)?;
         let config: SceneHeadConfig = weights.config()?;
         if config.encoder_sha256 != encoder_sha256 {
             return Err(LocalizerError::OtherEncoder {
@@ -242,6 +244,22 @@ impl Localization {
     }
 }
 
+impl Localization {
+    /// The answer of something that does not look at cells one by one: nothing speaks for a pose but the answer itself.
+    #[must_use]
+    pub fn told(estimate: PoseEstimate, times: LocalizerTimes) -> Self {
+        let (found, inlier_count) = match estimate {
+            PoseEstimate::Pose { world_from_cav, confidence } => {
+                let (world_from_sensor, sigma) = (world_from_cav.isometry(), f64::from(confidence));
+                let evidence = PoseEvidence::none();
+                (Some(FoundPose { world_from_sensor, evidence, sigma, is_withheld: false }), 0)
+            }
+            PoseEstimate::NoPose { inlier_count, .. } => (None, inlier_count),
+        };
+        Self { estimate, found, inlier_count, inlier_ratio: 0.0, times }
+    }
+}
+
 impl LocalizerTimes {
     /// The stages by name, in the order they run.
     #[must_use]
@@ -283,7 +301,7 @@ pub fn sigma(epsilon_m: f32) -> f32 {
 }
 
 /// Up to `count` cells, evenly over the sweep, flat ground no more than its share.
-fn choose_evenly(cells: &[Cell], count: usize) -> Vec<usize> {
+pub(super) fn choose_evenly(cells: &[Cell], count: usize) -> Vec<usize> {
     let (flat, high): (Vec<usize>, Vec<usize>) = (0..cells.len()).partition(|&cell| cells[cell].is_flat());
     let flat_count = (count as f64 * FLAT_SHARE) as usize;
     let mut chosen = every_nth(&high, count - flat_count);

@@ -7,6 +7,7 @@ pub mod confidence;
 mod dense;
 mod encoder_config;
 mod end_to_end;
+mod end_to_end_localizer;
 mod error;
 pub mod evaluation;
 mod head_config;
@@ -26,6 +27,7 @@ mod voxel_batch;
 
 pub use encoder_config::{SceneEncoderConfig, VoxelInput};
 pub use end_to_end::{EndToEnd, EndToEndConfig, EndToEndKind};
+pub use end_to_end_localizer::EndToEndLocalizer;
 pub use error::LocalizerError;
 pub use head_config::{RefinerConfig, SceneHeadConfig};
 pub use localize::{Localization, Localize, Localizer, LocalizerTimes, SceneCoordinates, sigma};

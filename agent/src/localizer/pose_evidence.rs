@@ -70,6 +70,23 @@ impl PoseEvidence {
         }
     }
 
+    /// Of a pose that was not found from cells: nothing speaks for it but the answer itself.
+    #[must_use]
+    pub(super) fn none() -> Self {
+        Self {
+            cells: 0,
+            inliers: 0,
+            inlier_ratio: 0.0,
+            rms_m: 0.0,
+            inlier_epsilon_m: 0.0,
+            median_epsilon_m: 0.0,
+            inlier_sigma: 0.0,
+            position_std_m: PoseStd::UNBOUNDED.position_m,
+            rotation_std_rad: PoseStd::UNBOUNDED.rotation_rad,
+            second: None,
+        }
+    }
+
     /// Confidence without any calibration: mean confidence of the inliers, as last known, times the share of cells that
     /// agreed when nothing was known yet.
     #[must_use]

@@ -12,7 +12,7 @@ use crate::registration::sc2pcr::{self, Sc2PcrConfig};
 use crate::registration::{NoRegistration, Registration};
 
 /// Sweeps with fewer cells are not localised.
-const MIN_CELLS: usize = 30;
+pub(super) const MIN_CELLS: usize = 30;
 
 /// Which search finds the pose.
 #[derive(Debug, Clone, PartialEq)]

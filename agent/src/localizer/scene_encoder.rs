@@ -40,6 +40,9 @@ pub struct SceneEncoder {
 }
 
 impl SceneEncoder {
+    /// Kind of the weights, as their file says it.
+    pub const KIND: &'static str = "scene encoder";
+
     /// Builds the layers below `path`.
     ///
     /// # Errors
@@ -67,6 +70,7 @@ impl SceneEncoder {
     /// [`LocalizerError`] when the file is missing, cut off or of something else.
     pub fn load(path: &Path, device: Device) -> Result<(Self, String), LocalizerError> {
         let weights = Weights::load(path)?;
+        weights.check_kind(Self::KIND)?;
         let config: SceneEncoderConfig = weights.config()?;
         let mut network = VarStore::new(device);
         let encoder = Self::new(&network.root(), &config)?;

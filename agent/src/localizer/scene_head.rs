@@ -42,6 +42,9 @@ pub struct SceneHead {
 }
 
 impl SceneHead {
+    /// Kind of the weights, as their file says it.
+    pub const KIND: &'static str = "scene head";
+
     /// Builds the layers below `path`.
     ///
     /// # Errors

@@ -5,9 +5,9 @@
 
 mod error_table;
 mod icp_map;
+mod localized;
 mod noise;
 mod noisy;
-mod pgc;
 pub mod sanity;
 
 use std::path::PathBuf;
@@ -17,9 +17,9 @@ use serde::{Deserialize, Serialize};
 
 pub use error_table::{ErrorTable, ErrorTableError, TableRow};
 pub use icp_map::{IcpMapPose, MapError, read_map};
+pub use localized::{EndToEndPoseConfig, LocalizedPose, PgcConfig};
 pub use noise::{PlanarError, PoseNoise};
 pub use noisy::NoisyPose;
-pub use pgc::{PgcConfig, PgcPose};
 
 use crate::localizer::LocalizerError;
 
@@ -79,6 +79,8 @@ pub enum PoseSourceConfig {
     Noisy(NoisyPoseConfig),
     /// From the sweep alone, by networks.
     Pgc(PgcConfig),
+    /// From the sweep alone, by a network that was trained end to end.
+    EndToEnd(EndToEndPoseConfig),
 }
 
 /// An error on the measured pose.
@@ -164,6 +166,7 @@ impl PoseSourceConfig {
             Self::Recorded => "recorded",
             Self::Noisy(_) => "noisy",
             Self::Pgc(_) => "pgc",
+            Self::EndToEnd(_) => "end_to_end",
         }
     }
 
@@ -175,7 +178,8 @@ impl PoseSourceConfig {
         Ok(match self {
             Self::Recorded => Box::new(RecordedPose),
             Self::Noisy(config) => Box::new(NoisyPose::new(config)?),
-            Self::Pgc(config) => Box::new(PgcPose::load(config)?),
+            Self::Pgc(config) => Box::new(LocalizedPose::pgc(config)?),
+            Self::EndToEnd(config) => Box::new(LocalizedPose::end_to_end(config)?),
         })
     }
 }
@@ -209,5 +213,8 @@ mod tests {
         assert_eq!(config.name(), "pgc");
         let message = config.build().unwrap_err().to_string();
         assert!(message.starts_with("e.safetensors"), "{message}");
+        let config: PoseSourceConfig = serde_saphyr::from_str("end_to_end:\n  weights: w.safetensors\n").unwrap();
+        let message = config.build().unwrap_err().to_string();
+        assert!(config.name() == "end_to_end" && message.starts_with("w.safetensors"), "{message}");
     }
 }

@@ -29,6 +29,16 @@ pub enum WeightsError {
         /// What is wrong.
         source: SafeTensorError,
     },
+    /// The weights are those of another network.
+    #[error("{}: weights of kind {found:?}, needed are those of kind {expected:?}", path.display())]
+    Kind {
+        /// The file.
+        path: PathBuf,
+        /// What it holds.
+        found: String,
+        /// What is needed.
+        expected: &'static str,
+    },
     /// The metadata has no such key.
     #[error("{}: metadata has no key {key:?}; it has {found:?}", path.display())]
     NoMetadata {

@@ -24,6 +24,8 @@ pub use save::{Precision, save};
 
 /// Metadata key of the configuration.
 pub const CONFIG_KEY: &str = "config";
+/// Metadata key of what the network is for.
+pub const KIND_KEY: &str = "kind";
 
 /// One file of parameters, read and checked.
 #[derive(Debug)]
@@ -97,6 +99,19 @@ impl Weights {
     #[must_use]
     pub fn metadata(&self, key: &str) -> Option<&str> {
         self.metadata.get(key).map(String::as_str)
+    }
+
+    /// Checks what the network is for, where the file says it.
+    ///
+    /// # Errors
+    /// [`WeightsError::Kind`] when it says something else.
+    pub fn check_kind(&self, expected: &'static str) -> Result<(), WeightsError> {
+        match self.metadata(KIND_KEY) {
+            Some(found) if found != expected => {
+                Err(WeightsError::Kind { path: self.path.clone(), found: found.to_owned(), expected })
+            }
+            _ => Ok(()),
+        }
     }
 
     /// The configuration under the key `config`.

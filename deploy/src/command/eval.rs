@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use agent::pose_source::sanity::SanityConfig;
-use agent::pose_source::{NoiseMode, NoisyPoseConfig, PgcConfig, PoseSourceConfig};
+use agent::pose_source::{EndToEndPoseConfig, NoiseMode, NoisyPoseConfig, PgcConfig, PoseSourceConfig};
 use clap::ValueEnum;
 use deploy::evaluation::{EvaluationOptions, evaluate, frame_count};
 use deploy::report;
@@ -45,6 +45,9 @@ pub(crate) struct Arguments {
     /// Weights of the town's head (--pose-source pgc).
     #[arg(long, value_name = "FILE", required_if_eq("pose_source", "pgc"))]
     head: Option<PathBuf>,
+    /// Weights of a network that was trained end to end (--pose-source end-to-end).
+    #[arg(long, value_name = "FILE", required_if_eq("pose_source", "end-to-end"))]
+    end_to_end: Option<PathBuf>,
     /// How exactly feature values cross the air.
     #[arg(long, value_enum, default_value_t = Exactness::F32)]
     dtype: Exactness,
@@ -73,6 +76,8 @@ enum PoseFrom {
     Noisy,
     /// From the LiDAR sweep alone.
     Pgc,
+    /// The same by a network that was trained end to end, to compare with.
+    EndToEnd,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -155,6 +160,13 @@ impl Arguments {
                     sanity: SanityConfig::default(),
                 })),
                 _ => Err(BadInput("--pose-source pgc needs --encoder and --head".into())),
+            },
+            PoseFrom::EndToEnd => match &self.end_to_end {
+                Some(weights) => Ok(PoseSourceConfig::EndToEnd(EndToEndPoseConfig {
+                    weights: weights.clone(),
+                    sanity: SanityConfig::default(),
+                })),
+                None => Err(BadInput("--pose-source end-to-end needs --end-to-end".into())),
             },
         }
     }

@@ -88,7 +88,8 @@ impl Scenario {
         let folder = folder.parent().unwrap_or(Path::new("/"));
         let Scenario { scene, models, .. } = &mut scenario;
         let localizer = models.localizer.iter_mut().flat_map(|models| [&mut models.encoder, &mut models.head]);
-        for place in [&mut scene.dir, &mut models.weights].into_iter().chain(localizer) {
+        let networks = localizer.chain(&mut models.end_to_end);
+        for place in [&mut scene.dir, &mut models.weights].into_iter().chain(networks) {
             *place = without_dots(&folder.join(&place));
         }
         Ok(scenario)
@@ -146,9 +147,17 @@ impl Scenario {
                 "must name encoder and head: a vehicle's pose is pgc",
             ));
         }
+        if self.uses_end_to_end() && self.models.end_to_end.is_none() {
+            return Err(value(
+                "models.end_to_end",
+                "left out".into(),
+                "must name weights: a vehicle's pose is end_to_end",
+            ));
+        }
         let networks = localizer.flat_map(|models| {
             [("models.localizer.encoder", &models.encoder), ("models.localizer.head", &models.head)]
         });
+        let networks = networks.chain(self.models.end_to_end.iter().map(|weights| ("models.end_to_end", weights)));
         let places = [("scene.dir", &self.scene.dir), ("models.weights", &self.models.weights)];
         for (field, place) in places.into_iter().chain(networks) {
             if !place.exists() {
@@ -232,6 +241,25 @@ mod tests {
         assert!(scenario.models.localizer.as_ref().unwrap().encoder.is_absolute());
         assert_eq!(scenario.settings_of(&CavId::new("4288").unwrap()).pose, PoseSource::Pgc);
         assert_eq!(scenario.settings_of(&CavId::new("4279").unwrap()).pose, PoseSource::Recorded);
+        assert_eq!(parse(&scenario.to_yaml()).unwrap(), scenario);
+    }
+
+    #[test]
+    fn a_pose_by_a_network_trained_end_to_end_needs_its_weights() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("s.yaml");
+        let text = |more: &str| {
+            format!("scene: {{dir: .}}\nmodels: {{weights: s.yaml{more}}}\nagents: {{pose: end_to_end}}\n")
+        };
+        std::fs::write(&file, text("")).unwrap();
+        let message = Scenario::load(&file).unwrap_err().to_string();
+        assert!(message.contains("models.end_to_end is left out"), "{message}");
+        std::fs::write(&file, text(", end_to_end: w.safetensors")).unwrap();
+        let message = Scenario::load(&file).unwrap_err().to_string();
+        assert!(message.contains("models.end_to_end: ") && message.contains("w.safetensors"), "{message}");
+        std::fs::write(folder.path().join("w.safetensors"), b"").unwrap();
+        let scenario = Scenario::load(&file).unwrap();
+        assert!(scenario.models.end_to_end.as_ref().unwrap().is_absolute() && !scenario.uses_localizer());
         assert_eq!(parse(&scenario.to_yaml()).unwrap(), scenario);
     }
 

@@ -110,6 +110,10 @@ pub struct Models {
     /// The networks that find poses; needed by vehicles whose pose is `pgc`.
     #[serde(default)]
     pub localizer: Option<LocalizerModels>,
+    /// A network that was trained end to end on the scene's town; needed by vehicles whose pose is `end_to_end`. Relative
+    /// to the scenario file.
+    #[serde(default)]
+    pub end_to_end: Option<PathBuf>,
     /// Threads each process computes with.
     #[serde(default = "Models::default_threads")]
     pub threads: usize,
@@ -186,6 +190,8 @@ pub enum PoseSource {
     Noisy(PoseNoise),
     /// From the vehicle's own LiDAR sweep, by the networks of `models.localizer`.
     Pgc,
+    /// The same by the network of `models.end_to_end`, to compare with.
+    EndToEnd,
 }
 
 impl PoseSource {
@@ -196,6 +202,7 @@ impl PoseSource {
             Self::Recorded => "recorded",
             Self::Noisy(_) => "noisy",
             Self::Pgc => "pgc",
+            Self::EndToEnd => "end_to_end",
         }
     }
 }
@@ -277,11 +284,21 @@ impl Scenario {
         Method::Max
     }
 
-    /// Whether some vehicle finds its pose itself.
+    /// Whether some vehicle finds its pose itself with the networks of `models.localizer`.
     #[must_use]
     pub fn uses_localizer(&self) -> bool {
+        self.some_pose_is(PoseSource::Pgc)
+    }
+
+    /// Whether some vehicle finds its pose itself with the network of `models.end_to_end`.
+    #[must_use]
+    pub fn uses_end_to_end(&self) -> bool {
+        self.some_pose_is(PoseSource::EndToEnd)
+    }
+
+    fn some_pose_is(&self, source: PoseSource) -> bool {
         let own = self.vehicles.values().filter_map(|vehicle| vehicle.pose.as_ref());
-        own.chain([&self.agents.pose]).any(|pose| *pose == PoseSource::Pgc)
+        own.chain([&self.agents.pose]).any(|pose| *pose == source)
     }
 
     /// What vehicle `cav` does: `agents`, with its own entry of `vehicles` on top.

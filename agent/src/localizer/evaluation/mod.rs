@@ -4,17 +4,20 @@ mod summary;
 mod table;
 
 use std::path::PathBuf;
+use std::time::Instant;
 
 use protocol::{CavId, Pose, PoseEstimate};
 use sim_replay::dataset::{self, LoadOptions, ReadError, Scenario};
+use sim_replay::frame::Frame;
 
 pub use summary::{CalibrationBin, LocalizationSummary, WithheldSummary, reliability_charts};
 pub use table::{write_csv, write_error_table};
 
 use super::confidence::{Confidence, Labelled};
 use super::error::LocalizerError;
-use super::localize::{Localization, Localize};
+use super::localize::{Localization, Localize, LocalizerTimes};
 use crate::pose_error::PoseError;
+use crate::pose_source::{PoseInput, PoseSource};
 
 /// Which sweeps.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -113,6 +116,34 @@ pub fn evaluate(
     options: &EvaluationOptions,
     on_sweep: &mut dyn FnMut(usize, usize),
 ) -> Result<Vec<EvaluatedSweep>, EvaluationError> {
+    evaluate_with(&mut |frame| localizer.localize(&frame.points), options, on_sweep)
+}
+
+/// The same for a pose source, which is shown what the GNSS receiver believed.
+///
+/// # Errors
+/// As [`evaluate`].
+pub fn evaluate_source(
+    source: &mut dyn PoseSource,
+    options: &EvaluationOptions,
+    on_sweep: &mut dyn FnMut(usize, usize),
+) -> Result<Vec<EvaluatedSweep>, EvaluationError> {
+    let mut ask = |frame: &Frame| {
+        let measured = frame.gnss_world_from_lidar();
+        let Frame { cav, capture_nanos, points, .. } = frame;
+        let start = Instant::now();
+        let input = PoseInput { cav, capture_nanos: *capture_nanos, cloud: points, measured: measured.as_ref() };
+        let estimate = source.estimate(&input);
+        Ok(Localization::told(estimate, LocalizerTimes { solve: start.elapsed(), ..LocalizerTimes::default() }))
+    };
+    evaluate_with(&mut ask, options, on_sweep)
+}
+
+fn evaluate_with(
+    localize: &mut dyn FnMut(&Frame) -> Result<Localization, LocalizerError>,
+    options: &EvaluationOptions,
+    on_sweep: &mut dyn FnMut(usize, usize),
+) -> Result<Vec<EvaluatedSweep>, EvaluationError> {
     let datasets = options.scenes.iter().map(|dir| dataset::open(dir)).collect::<Result<Vec<_>, _>>()?;
     let scenarios = datasets.iter().flat_map(|dataset| &dataset.scenarios);
     let all: Vec<Sweep<'_>> = scenarios.flat_map(|scenario| sweeps_of(scenario, options.every)).collect();
@@ -129,7 +160,7 @@ pub fn evaluate(
         let Some(truth) = frame.world_from_lidar else {
             return Err(EvaluationError::NoTruth { scenario: scenario.name.clone(), cav: frame.cav, stem });
         };
-        let localization = localizer.localize(&frame.points)?;
+        let localization = localize(&frame)?;
         evaluated.push(EvaluatedSweep { scenario: scenario.name.clone(), cav: frame.cav, stem, truth, localization });
         on_sweep(place + 1, count);
     }

@@ -16,7 +16,7 @@ use super::pairs::{Pair, PairMaker};
 use super::sweep_store::SweepStore;
 use crate::localizer::{SceneEncoder, SceneEncoderConfig};
 use crate::training::{AdamW, AdamWConfig, ComputePrecision, Length, OneCycle, Prefetch, Step, checkpoint};
-use crate::weights::{self, CONFIG_KEY};
+use crate::weights::{self, CONFIG_KEY, KIND_KEY};
 
 /// Pairs that a validation looks at.
 const VALIDATION_PAIRS: u64 = 24;
@@ -283,7 +283,7 @@ impl<'a> Training<'a> {
         let config = serde_json::to_string(&self.config.encoder).expect("a configuration is JSON");
         let about = BTreeMap::from([
             (CONFIG_KEY.to_owned(), config),
-            ("kind".to_owned(), "scene encoder".to_owned()),
+            (KIND_KEY.to_owned(), SceneEncoder::KIND.to_owned()),
             ("seed".to_owned(), self.config.seed.to_string()),
             ("steps".to_owned(), self.progress.step.to_string()),
             ("data_sha256".to_owned(), self.store.listing_sha256.clone()),

@@ -16,9 +16,9 @@ use super::error::LocalizerTrainError;
 use super::pairs::choose;
 use super::sweep_store::{SweepList, yaw};
 use crate::localizer::end_to_end::{EndToEnd, EndToEndConfig, EndToEndKind};
-use crate::localizer::{SceneEncoderConfig, SweepVoxels, VoxelBatch};
+use crate::localizer::{EndToEndLocalizer, SceneEncoderConfig, SweepVoxels, VoxelBatch};
 use crate::training::{AdamW, AdamWConfig, ComputePrecision, Length, OneCycle, Prefetch, Step};
-use crate::weights::{self, CONFIG_KEY};
+use crate::weights::{self, CONFIG_KEY, KIND_KEY};
 
 /// Cells of each sweep that the loss looks at.
 const CELLS: usize = 400;
@@ -145,7 +145,7 @@ pub fn train_end_to_end(
     }
     let about = BTreeMap::from([
         (CONFIG_KEY.to_owned(), serde_json::to_string(&network_config).expect("a configuration is JSON")),
-        ("kind".to_owned(), "end to end".to_owned()),
+        (KIND_KEY.to_owned(), EndToEndLocalizer::KIND.to_owned()),
         ("seed".to_owned(), config.seed.to_string()),
         ("steps".to_owned(), step.to_string()),
         ("data_sha256".to_owned(), list.listing_sha256.clone()),

@@ -32,7 +32,7 @@ use super::scene_validation::{SceneAccuracy, validate};
 use crate::localizer::head_config::SceneHeadConfig;
 use crate::localizer::scene_head::SceneHead;
 use crate::training::{AdamW, AdamWConfig, Length, OneCycle, Step, checkpoint};
-use crate::weights::{self, CONFIG_KEY};
+use crate::weights::{self, CONFIG_KEY, KIND_KEY};
 
 /// What a unit of cross entropy over the centres weighs, metres.
 const CENTRE_WEIGHT_M: f64 = 5.0;
@@ -256,7 +256,7 @@ impl<'a> Training<'a> {
         let variables = lattice::crop(&mut self.head_config, self.variables, &self.cache.targets_m)?;
         let about = BTreeMap::from([
             (CONFIG_KEY.to_owned(), serde_json::to_string(&self.head_config).expect("a configuration is JSON")),
-            ("kind".to_owned(), "scene head".to_owned()),
+            (KIND_KEY.to_owned(), SceneHead::KIND.to_owned()),
             ("seed".to_owned(), self.config.seed.to_string()),
             ("steps".to_owned(), self.progress.step.to_string()),
             ("data_sha256".to_owned(), self.data_sha256.clone()),

@@ -8,7 +8,7 @@ use tch::Device;
 
 use super::sanity::{MotionSanity, SanityConfig};
 use super::{PoseInput, PoseSource};
-use crate::localizer::{Localize, Localizer, LocalizerError};
+use crate::localizer::{EndToEndLocalizer, Localize, Localizer, LocalizerError};
 
 /// The networks of a pose generator.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -23,21 +23,41 @@ pub struct PgcConfig {
     pub sanity: SanityConfig,
 }
 
+/// A network that was trained end to end, to compare a pose generator with.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EndToEndPoseConfig {
+    /// Weights of the town; they say what is regressed.
+    pub weights: PathBuf,
+    /// What the vehicle can do.
+    #[serde(default)]
+    pub sanity: SanityConfig,
+}
+
 /// Localises every sweep and judges the pose by those before it.
 #[derive(Debug)]
-pub struct PgcPose {
+pub struct LocalizedPose {
     localizer: Box<dyn Localize>,
     sanity: MotionSanity,
     times: Vec<StageTiming>,
 }
 
-impl PgcPose {
-    /// Reads the networks, to compute with on the CPU.
+impl LocalizedPose {
+    /// Reads the networks of a pose generator, to compute with on the CPU.
     ///
     /// # Errors
     /// [`LocalizerError`] names the file and what is wrong with it.
-    pub fn load(config: &PgcConfig) -> Result<Self, LocalizerError> {
+    pub fn pgc(config: &PgcConfig) -> Result<Self, LocalizerError> {
         let localizer = Localizer::load(&config.encoder, &config.head, Device::Cpu)?;
+        Ok(Self::new(Box::new(localizer), config.sanity.clone()))
+    }
+
+    /// Reads a network that was trained end to end, to compute with on the CPU.
+    ///
+    /// # Errors
+    /// [`LocalizerError`] names the file and what is wrong with it.
+    pub fn end_to_end(config: &EndToEndPoseConfig) -> Result<Self, LocalizerError> {
+        let localizer = EndToEndLocalizer::load(&config.weights, Device::Cpu)?;
         Ok(Self::new(Box::new(localizer), config.sanity.clone()))
     }
 
@@ -48,7 +68,7 @@ impl PgcPose {
     }
 }
 
-impl PoseSource for PgcPose {
+impl PoseSource for LocalizedPose {
     /// Does not look at the measured pose.
     fn estimate(&mut self, input: &PoseInput<'_>) -> PoseEstimate {
         self.times.clear();
@@ -88,7 +108,7 @@ mod tests {
     use crate::localizer::synthetic::SyntheticTown;
     use crate::localizer::{Localization, LocalizerTimes};
 
-    fn estimates(source: &mut PgcPose, count: u64) -> Vec<PoseEstimate> {
+    fn estimates(source: &mut LocalizedPose, count: u64) -> Vec<PoseEstimate> {
         let cav = CavId::new("7").unwrap();
         let cloud = PointCloud::default();
         // A measured pose that is nowhere near: it must not matter.
@@ -101,7 +121,7 @@ mod tests {
     #[test]
     fn the_pose_comes_from_the_sweep_and_jumps_cost_confidence() {
         let town = SyntheticTown::default();
-        let mut source = PgcPose::new(Box::new(town.clone()), SanityConfig::default());
+        let mut source = LocalizedPose::new(Box::new(town.clone()), SanityConfig::default());
         let found = estimates(&mut source, 2);
         for (seed, estimate) in found.iter().enumerate() {
             let off = town.world_from_sensor(seed as u64).inv_mul(&estimate.world_from_cav().unwrap().isometry());
@@ -125,14 +145,14 @@ mod tests {
     #[test]
     fn a_localizer_that_fails_gives_no_pose() {
         let none = PoseEstimate::NoPose { reason: NoPoseReason::Failed, inlier_count: 0 };
-        assert_eq!(estimates(&mut PgcPose::new(Box::new(Broken), SanityConfig::default()), 1), [none]);
+        assert_eq!(estimates(&mut LocalizedPose::new(Box::new(Broken), SanityConfig::default()), 1), [none]);
         assert_eq!(LocalizerTimes::default().stages().len(), 5);
     }
 
     #[test]
     fn no_pose_stays_no_pose() {
         let empty = SyntheticTown { cells: 0, ..SyntheticTown::default() };
-        let found = estimates(&mut PgcPose::new(Box::new(empty), SanityConfig::default()), 3);
+        let found = estimates(&mut LocalizedPose::new(Box::new(empty), SanityConfig::default()), 3);
         assert!(found.iter().all(|estimate| estimate.world_from_cav().is_none()));
     }
 }

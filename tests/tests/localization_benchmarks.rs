@@ -1,0 +1,139 @@
+//! Drives in the layouts of NCLT and Oxford train and evaluate through the commands that all other drives do; and a real
+//! sweep of NCLT goes through the shipped networks.
+
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::time::Duration;
+
+use agent::localizer::training::{
+    EncoderTrainConfig, SceneTrainConfig, SweepAugmentation, train_encoder, train_scene,
+};
+use agent::localizer::{Localizer, SceneEncoderConfig};
+use agent::training::{ComputePrecision, Length};
+use serde_json::Value;
+use sim_replay::dataset::{self, Layout, LoadOptions, Scenario};
+use sim_replay::synth::{Subset, SynthOptions, generate};
+use tch::Device;
+use tests::fleet::programs;
+use tests::sequences::{Benchmark, LEFT_OUT, write};
+
+/// Two drives through one town.
+fn drives(folder: &Path) -> Vec<Scenario> {
+    let options = SynthOptions {
+        traversals: 2,
+        frames: 30,
+        period_s: 0.5,
+        ..SynthOptions::new(Subset::Town1loc, 12, folder.join("drives"))
+    };
+    generate(&options, &|_| {}).unwrap();
+    dataset::open(&folder.join("drives")).unwrap().scenarios
+}
+
+/// Trains an encoder and a head on sequences; their files.
+fn train(sequences: &Path, out: &Path) -> [PathBuf; 2] {
+    let encoder = SceneEncoderConfig {
+        voxel_m: 1.0,
+        range_m: 40.0,
+        widths: vec![8, 12, 16],
+        residual_widths: vec![16],
+        ..SceneEncoderConfig::lean()
+    };
+    let encoder = EncoderTrainConfig {
+        scenes: vec![sequences.to_owned()],
+        validation: vec![sequences.to_owned()],
+        encoder,
+        length: Length::Steps(30),
+        batch: 2,
+        learning_rate: 3e-3,
+        seed: 5,
+        device: Device::Cpu,
+        precision: ComputePrecision::F32,
+        loader_threads: 1,
+        validate_every: 30,
+        out: out.join("encoder"),
+        resume: false,
+    };
+    let encoder = train_encoder(&encoder, &mut |_| (), &mut |_, _| ()).unwrap().weights;
+    let head = SceneTrainConfig {
+        scenes: vec![sequences.to_owned()],
+        validation: vec![sequences.to_owned()],
+        validation_sweeps: 10,
+        encoder: encoder.clone(),
+        town: "sequences".into(),
+        classes: 4,
+        centres: 12,
+        width: 64,
+        blocks: 1,
+        refiner: true,
+        augmentation: SweepAugmentation { copies: 1, turn_rad: 0.1, keep: 0.8 },
+        redundancy: None,
+        length: Length::Steps(300),
+        batch: 512,
+        learning_rate: 4e-3,
+        seed: 5,
+        device: Device::Cpu,
+        precision: ComputePrecision::F32,
+        loader_threads: 1,
+        validate_every: Duration::from_secs(3600),
+        out: out.join("head"),
+        resume: false,
+    };
+    let summary = train_scene(&head, &mut |_| ()).unwrap();
+    assert_eq!(summary.sweeps, 2 * (30 - 2 * LEFT_OUT));
+    [encoder, summary.weights]
+}
+
+fn eval(sequences: &Path, [encoder, head]: &[PathBuf; 2]) -> Value {
+    let mut command = Command::new(programs().join("agent"));
+    command.args(["eval", "--json", "--scene"]).arg(sequences).arg("--encoder").arg(encoder).arg("--head").arg(head);
+    let output = command.output().unwrap();
+    assert!(output.status.success(), "{}", String::from_utf8_lossy(&output.stderr));
+    serde_json::from_slice(&output.stdout).unwrap()
+}
+
+#[test]
+fn sequences_of_both_benchmarks_train_and_evaluate_like_any_drive() {
+    tch::set_num_threads(1);
+    let folder = tempfile::tempdir().unwrap();
+    let drives = drives(folder.path());
+    for (benchmark, layout) in [(Benchmark::Nclt, Layout::Nclt), (Benchmark::Oxford, Layout::Oxford)] {
+        let sequences = write(folder.path(), benchmark, &drives);
+        let read = dataset::open(&sequences).unwrap();
+        assert_eq!((read.layout, read.problems.len(), read.scenarios.len()), (layout, 0, 2));
+        for (read, drive) in read.scenarios.iter().zip(&drives) {
+            assert_eq!(read.ticks.len(), drive.ticks.len() - 2 * LEFT_OUT);
+            let [found, wanted] = [(read, 0), (drive, LEFT_OUT)]
+                .map(|(scenario, tick)| scenario.load(0, tick, &LoadOptions::default()).unwrap());
+            let off = found.world_from_lidar.unwrap().isometry().inv_mul(&wanted.world_from_lidar.unwrap().isometry());
+            assert!(off.translation.vector.norm() < 1e-6 && off.rotation.angle() < 1e-6, "{off}");
+            let apart = |(a, b): (&[f32; 4], &[f32; 4])| a.iter().zip(b).any(|(a, b)| (a - b).abs() > 1e-5);
+            assert_eq!(found.points.len(), wanted.points.len());
+            assert!(!found.points.xyzi.iter().zip(&wanted.points.xyzi).any(apart));
+        }
+
+        let networks = train(&sequences, &folder.path().join(format!("{layout:?}")));
+        let summary = eval(&sequences, &networks);
+        assert_eq!(summary["sweeps"], 2 * (30 - 2 * LEFT_OUT));
+        // Points and poses that did not belong together would leave nothing to learn.
+        assert!(summary["success_3m"].as_f64().unwrap() > 0.4, "{layout:?}: {summary}");
+        assert!(summary["p50_m"].as_f64().unwrap() < 3.0 && summary["p50_deg"].as_f64().unwrap() < 3.0, "{summary}");
+        assert!(summary["ms"]["encode"].as_f64().unwrap() > 0.0, "{summary}");
+    }
+}
+
+#[test]
+fn a_real_sweep_passes_through_the_shipped_networks_and_is_placed_nowhere() {
+    let Some(dir) = tests::fixtures::data("nclt") else { return };
+    tch::set_num_threads(1);
+    let weights = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/weights");
+    let [encoder, head] = ["pgc-encoder", "pgc-town1"].map(|name| weights.join(format!("{name}.safetensors")));
+    let localizer = Localizer::load(&encoder, &head, Device::Cpu).unwrap();
+    let dataset = dataset::open(&dir).unwrap();
+    let frame = dataset.scenarios[0].load(0, 0, &LoadOptions::default()).unwrap();
+    let (coordinates, _) = localizer.scene_coordinates(&frame.points).unwrap();
+    assert!(coordinates.sensor_m.len() > 100, "{} cells", coordinates.sensor_m.len());
+    assert!(coordinates.world_m.iter().flatten().chain(&coordinates.epsilon_m).all(|number| number.is_finite()));
+    // It was made in a town that is not the head's.
+    let estimate = localizer.localize(&frame.points).unwrap().estimate;
+    assert!(estimate.confidence() < 0.1, "{estimate:?}");
+}
