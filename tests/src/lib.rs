@@ -5,3 +5,4 @@ pub mod fixtures;
 pub mod fleet;
 pub mod localizer;
 pub mod scene;
+pub mod sequences;

@@ -150,7 +150,7 @@ fn a_localizer_learns_two_drives_and_finds_itself_on_them() {
     assert!(matches!(error, LocalizerError::OtherEncoder { .. }), "{error}");
     // And an encoder is no head.
     let message = Localizer::load(&encoder, &encoder, Device::Cpu).unwrap_err().to_string();
-    assert!(message.contains("weights.safetensors") && message.contains("config"), "{message}");
+    assert!(message.contains("weights.safetensors") && message.contains("\"scene encoder\""), "{message}");
 }
 
 #[test]

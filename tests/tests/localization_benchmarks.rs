@@ -5,9 +5,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::Duration;
 
-use agent::localizer::training::{
-    EncoderTrainConfig, SceneTrainConfig, SweepAugmentation, train_encoder, train_scene,
-};
+use agent::localizer::training::{EncoderTrainConfig, SceneTrainConfig, SweepAugmentation, train_encoder, train_scene};
 use agent::localizer::{Localizer, SceneEncoderConfig};
 use agent::training::{ComputePrecision, Length};
 use serde_json::Value;
