@@ -10,7 +10,8 @@ use agent::model_config::{ConfigError, DetectorConfig};
 use agent::pillar_batch::PillarBatch;
 use agent::point_pillars::PointPillars;
 use agent::postprocess::{AgentBoxes, PostprocessConfig, postprocess};
-use agent::weights::{self, CONFIG_KEY, Weights, WeightsError};
+use agent::training::ComputePrecision;
+use agent::weights::{CONFIG_KEY, Weights, WeightsError};
 use nalgebra::Isometry3;
 use protocol::{Box3d, Detection, Pose};
 use tch::nn::VarStore;
@@ -58,15 +59,6 @@ pub enum ModelError {
     },
 }
 
-/// In which numbers the convolutions of a training compute.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum ComputePrecision {
-    /// Single precision throughout.
-    F32,
-    /// Convolutions in bfloat16; parameters, statistics, fusion, head and loss stay single.
-    Bf16,
-}
-
 /// Encoder, fusion and head of one method under one set of variables.
 #[derive(Debug)]
 pub struct CooperativeModel {
@@ -111,21 +103,11 @@ impl CooperativeModel {
         Ok(model)
     }
 
-    /// Writes the weights with configuration and method; `about` adds further metadata. Returns the file's SHA-256.
-    ///
-    /// # Errors
-    /// [`ModelError::Weights`] when a parameter is not finite or the file cannot be written.
-    pub fn save(
-        &self,
-        path: &Path,
-        about: &BTreeMap<String, String>,
-        precision: weights::Precision,
-    ) -> Result<String, ModelError> {
-        let mut metadata = about.clone();
-        let config = serde_json::to_string(&self.network.config).unwrap_or_default();
-        metadata.insert(CONFIG_KEY.to_owned(), config);
-        metadata.insert(METHOD_KEY.to_owned(), self.method.name().to_owned());
-        Ok(weights::save(path, &self.variables, &metadata, precision)?)
+    /// What the header of its weights says of it: configuration and method.
+    #[must_use]
+    pub fn about(&self) -> BTreeMap<String, String> {
+        let config = serde_json::to_string(&self.network.config).expect("a configuration is JSON");
+        BTreeMap::from([(CONFIG_KEY.to_owned(), config), (METHOD_KEY.to_owned(), self.method.name().to_owned())])
     }
 
     /// The numbers it was built from.
@@ -142,10 +124,7 @@ impl CooperativeModel {
 
     /// In which numbers the convolutions compute from now on.
     pub fn set_precision(&mut self, precision: ComputePrecision) {
-        self.network.compute = match precision {
-            ComputePrecision::F32 => Kind::Float,
-            ComputePrecision::Bf16 => Kind::BFloat16,
-        };
+        self.network.compute = precision.kind();
     }
 
     /// Where the variables are.

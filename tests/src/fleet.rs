@@ -10,6 +10,7 @@ use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
 use std::time::{Duration, Instant};
 
 use agent::model_config::{DetectorConfig, ShrinkConfig};
+use agent::weights;
 use ego_fuser::Method;
 use ego_fuser::model::CooperativeModel;
 use serde_json::Value;
@@ -64,7 +65,7 @@ pub fn write_weights(path: &Path) {
         ..DetectorConfig::lean()
     };
     let model = CooperativeModel::new(&config, Method::Max, tch::Device::Cpu).expect("a configuration that fits");
-    model.save(path, &BTreeMap::new(), agent::weights::Precision::Single).expect("a writable folder");
+    weights::save(path, &model.variables, &model.about(), weights::Precision::Single).expect("a writable folder");
 }
 
 /// A folder with a scene of two vehicles, weights and a scenario.

@@ -9,7 +9,7 @@ use agent::localizer::training::{
     train_encoder, train_scene,
 };
 use agent::localizer::{Localizer, LocalizerError, SceneEncoderConfig};
-use agent::training::{ComputePrecision, Length};
+use agent::training::{Length, RunConfig, TrainingError};
 use protocol::{NoPoseReason, PointCloud, PoseEstimate};
 use sim_replay::dataset::{self, LoadOptions};
 use sim_replay::synth::{Subset, SynthOptions, generate};
@@ -46,21 +46,17 @@ fn small() -> SceneEncoderConfig {
     }
 }
 
+fn run(out: &Path, steps: u64) -> RunConfig {
+    RunConfig { seed: 5, loader_threads: 2, ..RunConfig::new(Length::Steps(steps), out) }
+}
+
 fn encoder_config(scenes: &Path, out: &Path, steps: u64) -> EncoderTrainConfig {
     EncoderTrainConfig {
         scenes: vec![scenes.to_owned()],
         validation: vec![scenes.to_owned()],
         encoder: small(),
-        length: Length::Steps(steps),
-        batch: 2,
-        learning_rate: 3e-3,
-        seed: 5,
-        device: Device::Cpu,
-        precision: ComputePrecision::F32,
-        loader_threads: 2,
+        run: RunConfig { batch: 2, learning_rate: 3e-3, ..run(out, steps) },
         validate_every: 10,
-        out: out.to_owned(),
-        resume: false,
     }
 }
 
@@ -78,16 +74,8 @@ fn scene_config(scenes: &Path, encoder: &Path, out: &Path, steps: u64) -> SceneT
         refiner: true,
         augmentation: SweepAugmentation { copies: 1, turn_rad: 0.1, keep: 0.8 },
         redundancy: Some(RedundancyConfig::default()),
-        length: Length::Steps(steps),
-        batch: 512,
-        learning_rate: 4e-3,
-        seed: 5,
-        device: Device::Cpu,
-        precision: ComputePrecision::F32,
-        loader_threads: 2,
+        run: RunConfig { batch: 512, learning_rate: 4e-3, ..run(out, steps) },
         validate_every: Duration::from_secs(3600),
-        out: out.to_owned(),
-        resume: false,
     }
 }
 
@@ -96,10 +84,10 @@ fn trained_encoder(scenes: &Path, out: &Path) -> PathBuf {
     let mut validations = 0;
     let config = encoder_config(scenes, out, 40);
     let summary = train_encoder(&config, &mut |report| losses.push(report.loss), &mut |_, _| validations += 1).unwrap();
-    assert_eq!((summary.steps, validations), (40, 4));
+    assert_eq!((summary.trained.steps, validations), (40, 4));
     assert!(losses.last().unwrap() < &(0.9 * losses[0]), "{losses:?}");
     assert!(summary.accuracy.unwrap().top1 > 0.005, "chance is below one in five hundred: {:?}", summary.accuracy);
-    summary.weights
+    summary.trained.weights
 }
 
 #[test]
@@ -120,7 +108,7 @@ fn a_localizer_learns_two_drives_and_finds_itself_on_them() {
     assert!(errors.last().unwrap() < &(0.3 * errors[0]), "{errors:?}");
     assert!(summary.accuracy.unwrap().success_3m > 0.5, "{:?}", summary.accuracy);
 
-    let localizer = Localizer::load(&encoder, &summary.weights, Device::Cpu).unwrap();
+    let localizer = Localizer::load(&encoder, &summary.trained.weights, Device::Cpu).unwrap();
     let dataset = dataset::open(&scenes).unwrap();
     let mut found = 0;
     for tick in 0..12 {
@@ -144,9 +132,10 @@ fn a_localizer_learns_two_drives_and_finds_itself_on_them() {
 
     // A head belongs to one encoder.
     let other = dir.path().join("other");
-    train_encoder(&EncoderTrainConfig { seed: 6, ..encoder_config(&scenes, &other, 1) }, &mut |_| (), &mut |_, _| ())
-        .unwrap();
-    let error = Localizer::load(&other.join("weights.safetensors"), &summary.weights, Device::Cpu).unwrap_err();
+    let mut config = encoder_config(&scenes, &other, 1);
+    config.run.seed = 6;
+    train_encoder(&config, &mut |_| (), &mut |_, _| ()).unwrap();
+    let error = Localizer::load(&other.join("weights.safetensors"), &summary.trained.weights, Device::Cpu).unwrap_err();
     assert!(matches!(error, LocalizerError::OtherEncoder { .. }), "{error}");
     // And an encoder is no head.
     let message = Localizer::load(&encoder, &encoder, Device::Cpu).unwrap_err().to_string();
@@ -171,17 +160,24 @@ fn trainings_go_on_where_they_stopped_and_refuse_what_is_not_theirs() {
         train_encoder(&encoder_config(&scenes, &b, 20), &mut |_| (), &mut stop)
     }));
     assert!(stopped.is_err());
-    let resumed = EncoderTrainConfig { resume: true, ..encoder_config(&scenes, &b, 20) };
-    let resumed = train_encoder(&resumed, &mut |_| (), &mut |_, _| ()).unwrap();
-    assert_eq!(resumed.sha256, whole.sha256, "bit for bit");
+    let going_on = |steps| {
+        let mut config = encoder_config(&scenes, &b, steps);
+        config.run.resume = true;
+        config
+    };
+    let resumed = train_encoder(&going_on(20), &mut |_| (), &mut |_, _| ()).unwrap();
+    assert_eq!(resumed.trained.sha256, whole.trained.sha256, "bit for bit");
 
-    let other = EncoderTrainConfig { resume: true, seed: 9, ..encoder_config(&scenes, &b, 30) };
+    let mut other = going_on(30);
+    other.run.seed = 9;
     let error = train_encoder(&other, &mut |_| (), &mut |_, _| ()).unwrap_err();
-    assert!(matches!(error, LocalizerTrainError::OtherTraining { field: "seed", .. }), "{error}");
+    assert!(
+        matches!(error, LocalizerTrainError::Training(TrainingError::OtherTraining { field: "seed", .. })),
+        "{error}"
+    );
     let checkpoint = b.join("checkpoint.safetensors");
     let bytes = std::fs::read(&checkpoint).unwrap();
     std::fs::write(&checkpoint, &bytes[..bytes.len() / 2]).unwrap();
-    let cut = EncoderTrainConfig { resume: true, ..encoder_config(&scenes, &b, 30) };
-    let message = train_encoder(&cut, &mut |_| (), &mut |_, _| ()).unwrap_err().to_string();
+    let message = train_encoder(&going_on(30), &mut |_| (), &mut |_, _| ()).unwrap_err().to_string();
     assert!(message.contains("checkpoint.safetensors") && message.contains("not a whole"), "{message}");
 }

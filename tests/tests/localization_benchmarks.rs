@@ -7,7 +7,7 @@ use std::time::Duration;
 
 use agent::localizer::training::{EncoderTrainConfig, SceneTrainConfig, SweepAugmentation, train_encoder, train_scene};
 use agent::localizer::{Localizer, SceneEncoderConfig};
-use agent::training::{ComputePrecision, Length};
+use agent::training::{Length, RunConfig};
 use serde_json::Value;
 use sim_replay::dataset::{self, Layout, LoadOptions, Scenario};
 use sim_replay::synth::{Subset, SynthOptions, generate};
@@ -40,18 +40,15 @@ fn train(sequences: &Path, out: &Path) -> [PathBuf; 2] {
         scenes: vec![sequences.to_owned()],
         validation: vec![sequences.to_owned()],
         encoder,
-        length: Length::Steps(30),
-        batch: 2,
-        learning_rate: 3e-3,
-        seed: 5,
-        device: Device::Cpu,
-        precision: ComputePrecision::F32,
-        loader_threads: 1,
+        run: RunConfig {
+            batch: 2,
+            learning_rate: 3e-3,
+            seed: 5,
+            ..RunConfig::new(Length::Steps(30), &out.join("encoder"))
+        },
         validate_every: 30,
-        out: out.join("encoder"),
-        resume: false,
     };
-    let encoder = train_encoder(&encoder, &mut |_| (), &mut |_, _| ()).unwrap().weights;
+    let encoder = train_encoder(&encoder, &mut |_| (), &mut |_, _| ()).unwrap().trained.weights;
     let head = SceneTrainConfig {
         scenes: vec![sequences.to_owned()],
         validation: vec![sequences.to_owned()],
@@ -65,20 +62,17 @@ fn train(sequences: &Path, out: &Path) -> [PathBuf; 2] {
         refiner: true,
         augmentation: SweepAugmentation { copies: 1, turn_rad: 0.1, keep: 0.8 },
         redundancy: None,
-        length: Length::Steps(300),
-        batch: 512,
-        learning_rate: 4e-3,
-        seed: 5,
-        device: Device::Cpu,
-        precision: ComputePrecision::F32,
-        loader_threads: 1,
+        run: RunConfig {
+            batch: 512,
+            learning_rate: 4e-3,
+            seed: 5,
+            ..RunConfig::new(Length::Steps(300), &out.join("head"))
+        },
         validate_every: Duration::from_secs(3600),
-        out: out.join("head"),
-        resume: false,
     };
     let summary = train_scene(&head, &mut |_| ()).unwrap();
     assert_eq!(summary.sweeps, 2 * (30 - 2 * LEFT_OUT));
-    [encoder, summary.weights]
+    [encoder, summary.trained.weights]
 }
 
 fn eval(sequences: &Path, [encoder, head]: &[PathBuf; 2]) -> Value {

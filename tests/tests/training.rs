@@ -6,16 +6,14 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use agent::model_config::DetectorConfig;
 use agent::pose_source::PoseSourceConfig;
-use agent::training::AdamWConfig;
+use agent::training::{Length, RunConfig};
 use ego_fuser::Method;
 use ego_fuser::evaluate::{EvaluateConfig, EvaluatedFrame, Evaluator};
 use ego_fuser::loss::LossConfig;
-use ego_fuser::model::ComputePrecision;
 use ego_fuser::samples::{SampleConfig, SampleKind};
-use ego_fuser::train::{self, Accuracy, Length, Observer, StepReport, Summary, TrainConfig, TrainError};
+use ego_fuser::train::{self, Accuracy, Observer, StepReport, Summary, TrainConfig, TrainError};
 use protocol::{CodecConfig, Dtype};
 use sim_replay::dataset;
-use tch::Device;
 use tests::fixtures::data;
 
 /// libtorch has one generator of random numbers per process: who begins a training has it alone.
@@ -65,21 +63,17 @@ fn config(scene: &Path, out: &Path, method: Method, steps: u64) -> TrainConfig {
         method,
         detector: small(),
         init: None,
-        length: Length::Steps(steps),
-        batch: 1,
-        learning_rate: 2e-3,
-        seed: 3,
-        device: Device::Cpu,
-        loader_threads: 2,
-        precision: ComputePrecision::F32,
-        out: out.to_owned(),
-        resume: false,
+        run: RunConfig {
+            learning_rate: 2e-3,
+            seed: 3,
+            loader_threads: 2,
+            command: "a test".to_owned(),
+            ..RunConfig::new(Length::Steps(steps), out)
+        },
         validate_every: 5,
         validation_frames: 1,
         samples: SampleConfig::training(SampleKind::Single),
         loss: LossConfig::default(),
-        optimizer: AdamWConfig::default(),
-        command: "a test".to_owned(),
     }
 }
 
@@ -113,17 +107,17 @@ fn a_training_that_was_interrupted_ends_like_one_that_was_not() {
     // The learning rate follows the share that is done, so a stop in the middle is a checkpoint of the whole length.
     let uninterrupted = config(&scene, whole.path(), Method::Attention, 10);
     let (summary, ear) = run(&uninterrupted);
-    assert_eq!((summary.steps, ear.validations.as_slice()), (10, [5, 10].as_slice()));
+    assert_eq!((summary.trained.steps, ear.validations.as_slice()), (10, [5, 10].as_slice()));
     assert!(ear.losses.iter().all(|loss| loss.is_finite() && *loss > 0.0));
 
     let first = TrainConfig { validation: vec![], ..config(&scene, parts.path(), Method::Attention, 10) };
     let stopped = train_until_checkpoint(&first);
-    let resumed = TrainConfig { resume: true, loader_threads: 1, ..first };
-    let (resumed, _) = run(&resumed);
-    assert_eq!((stopped, resumed.steps), (5, 10));
-    assert_eq!(resumed.sha256, summary.sha256, "the same weights, byte for byte");
+    let again = RunConfig { resume: true, loader_threads: 1, ..first.run.clone() };
+    let (resumed, _) = run(&TrainConfig { run: again, ..first });
+    assert_eq!((stopped, resumed.trained.steps), (5, 10));
+    assert_eq!(resumed.trained.sha256, summary.trained.sha256, "the same weights, byte for byte");
     let card = std::fs::read_to_string(whole.path().join("model-card.md")).unwrap();
-    assert!(card.contains(&summary.sha256) && card.contains("a test") && card.contains("attention"), "{card}");
+    assert!(card.contains(&summary.trained.sha256) && card.contains("a test") && card.contains("attention"), "{card}");
     let curve = std::fs::read_to_string(whole.path().join("curve.csv")).unwrap();
     let columns: Vec<usize> = curve.lines().map(|line| line.split(',').count()).collect();
     assert_eq!(columns, [12; 4], "a header, one report, two validations:\n{curve}");
@@ -140,7 +134,7 @@ fn train_until_checkpoint(config: &TrainConfig) -> u64 {
         }
         fn validated(&mut self, _: u64, _: &Accuracy) {}
     }
-    let mut plug = Plug(config.out.join("checkpoint.safetensors"));
+    let mut plug = Plug(config.run.out.join("checkpoint.safetensors"));
     let hook = std::panic::take_hook();
     std::panic::set_hook(Box::new(|_| {}));
     let outcome = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| train::run(config, &mut plug)));
@@ -158,9 +152,10 @@ fn every_method_that_learns_trains_and_evaluates_the_same_twice() {
     let (base, _) = run(&none);
     for method in [Method::Early, Method::Max, Method::Attention] {
         let out = folder.path().join(method.name());
-        let (summary, _) = run(&TrainConfig { init: Some(base.weights.clone()), ..config(&scene, &out, method, 5) });
-        let frames = evaluate(summary.weights.clone(), &scene, method, Dtype::F32);
-        let again = evaluate(summary.weights, &scene, method, Dtype::F32);
+        let (summary, _) =
+            run(&TrainConfig { init: Some(base.trained.weights.clone()), ..config(&scene, &out, method, 5) });
+        let frames = evaluate(summary.trained.weights.clone(), &scene, method, Dtype::F32);
+        let again = evaluate(summary.trained.weights, &scene, method, Dtype::F32);
         assert_eq!(frames.len(), 1, "{method}");
         assert_eq!(frames[0].result.detections, again[0].result.detections, "{method}");
         assert_eq!(frames[0].result.fused.len(), 1, "{method}: the scene has one neighbour");
@@ -176,7 +171,8 @@ fn half_precision_on_the_air_takes_half_the_bytes() {
     let _alone = alone();
     let folder = tempfile::tempdir().unwrap();
     let (summary, _) = run(&config(&scene, folder.path(), Method::None, 5));
-    let bytes = |dtype| evaluate(summary.weights.clone(), &scene, Method::Max, dtype)[0].result.fused[0].payload_bytes;
+    let bytes =
+        |dtype| evaluate(summary.trained.weights.clone(), &scene, Method::Max, dtype)[0].result.fused[0].payload_bytes;
     let (single, half) = (bytes(Dtype::F32), bytes(Dtype::F16));
     let values = 16 * 64 * 48;
     assert!(single >= 4 * values && single < 4 * values + 256, "{single}");
@@ -190,10 +186,12 @@ fn a_checkpoint_of_another_training_is_refused_with_both_values() {
     let folder = tempfile::tempdir().unwrap();
     let first = config(&scene, folder.path(), Method::None, 5);
     run(&first);
-    let other = TrainConfig { resume: true, seed: 4, length: Length::Steps(9), ..first };
+    let again = RunConfig { resume: true, seed: 4, length: Length::Steps(9), ..first.run.clone() };
+    let other = TrainConfig { run: again, ..first };
     let message = train::run(&other, &mut Ear::default()).unwrap_err().to_string();
     assert!(message.contains("seed 3") && message.contains('4'), "{message}");
-    let missing = TrainConfig { out: folder.path().join("elsewhere"), ..other };
+    let elsewhere = RunConfig { out: folder.path().join("elsewhere"), ..other.run.clone() };
+    let missing = TrainConfig { run: elsewhere, ..other };
     let message = train::run(&missing, &mut Ear::default()).unwrap_err().to_string();
     assert!(message.contains("checkpoint.safetensors"), "{message}");
 }

@@ -1,16 +1,27 @@
-//! What every training here has in common: optimizer, learning rate, checkpoints, batches ahead, a progress bar.
+//! What every training here has in common: how it is told what to do, steps and checkpoints, batches ahead, and what it
+//! leaves behind.
 
 pub mod checkpoint;
 
 mod adamw;
 mod bar;
+mod card;
+mod curve;
+mod error;
 mod options;
 mod prefetch;
+mod run_config;
 mod schedule;
+mod trainer;
 
 pub use adamw::{AdamW, AdamWConfig, Step};
 pub use bar::TrainingBar;
+pub use card::ModelCard;
 pub use checkpoint::CheckpointError;
-pub use options::{ComputePrecision, Length};
+pub use curve::Curve;
+pub use error::TrainingError;
+pub use options::{OptionsError, TrainingOptions};
 pub use prefetch::Prefetch;
+pub use run_config::{ComputePrecision, Length, RunConfig};
 pub use schedule::OneCycle;
+pub use trainer::{Trained, Trainer};

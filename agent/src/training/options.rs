@@ -1,48 +1,157 @@
-//! How long, and in which numbers.
+//! The part of the command line that all trainings share.
 
+use std::path::PathBuf;
 use std::time::Duration;
 
-use tch::Kind;
+use clap::ValueEnum;
+use tch::{Cuda, Device};
 
-/// In which numbers the products of a training compute.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum ComputePrecision {
-    /// Single precision throughout.
-    F32,
-    /// Convolutions and products in bfloat16; parameters, statistics and losses stay single.
-    Bf16,
+use super::run_config::{ComputePrecision, Length, RunConfig};
+use super::trainer::Trained;
+
+/// Options that no training can run with.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum OptionsError {
+    /// No length, or none at all.
+    #[error("one of --steps, --epochs and --minutes is needed, above zero")]
+    Length,
+    /// Steps without samples.
+    #[error("--batch is above zero")]
+    Batch,
+    /// There is no such device.
+    #[error("no CUDA device, or a libtorch without CUDA")]
+    NoCuda,
 }
 
-impl ComputePrecision {
-    /// The tensor library's name for it.
-    #[must_use]
-    pub fn kind(self) -> Kind {
-        match self {
-            Self::F32 => Kind::Float,
-            Self::Bf16 => Kind::BFloat16,
+/// How long, where, and in which numbers.
+#[derive(Debug, clap::Args)]
+pub struct TrainingOptions {
+    /// Length in steps.
+    #[arg(long, group = "length")]
+    steps: Option<u64>,
+    /// Length in passes over the data.
+    #[arg(long, group = "length")]
+    epochs: Option<f64>,
+    /// Length in minutes; the learning rate follows the clock, so the result is not repeatable to the bit.
+    #[arg(long, group = "length")]
+    minutes: Option<f64>,
+    /// Seed of parameters, order and augmentation.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Where to compute.
+    #[arg(long, value_enum, default_value_t = DeviceName::Cpu)]
+    device: DeviceName,
+    /// Threads of the network on the CPU.
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
+    threads: u16,
+    /// Threads that prepare batches.
+    #[arg(long, default_value_t = 1)]
+    loader_threads: usize,
+    /// Numbers that products are computed in.
+    #[arg(long, value_enum, default_value_t = ComputePrecision::F32)]
+    precision: ComputePrecision,
+    /// Folder of the results.
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// Go on from the checkpoint in --out.
+    #[arg(long)]
+    resume: bool,
+    /// Print the summary as JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum DeviceName {
+    /// The processor.
+    Cpu,
+    /// The first CUDA device.
+    Cuda,
+}
+
+impl TrainingOptions {
+    /// What a training is told; sets the tensor library's number of threads on the way.
+    ///
+    /// # Errors
+    /// [`OptionsError`] says which option is at fault.
+    pub fn run_config(&self, batch: usize, learning_rate: f64) -> Result<RunConfig, OptionsError> {
+        if batch == 0 {
+            return Err(OptionsError::Batch);
+        }
+        tch::set_num_threads(i32::from(self.threads));
+        Ok(RunConfig {
+            batch,
+            learning_rate,
+            seed: self.seed,
+            device: self.device()?,
+            precision: self.precision,
+            loader_threads: self.loader_threads,
+            resume: self.resume,
+            command: std::env::args().collect::<Vec<_>>().join(" "),
+            ..RunConfig::new(self.length()?, &self.out)
+        })
+    }
+
+    /// Prints how a training ended; `more` is an object of what JSON has beside steps, time and weights.
+    pub fn print(&self, trained: &Trained, more: &serde_json::Value) {
+        let Trained { steps, seconds, weights, sha256, .. } = trained;
+        if self.json {
+            let mut report =
+                serde_json::json!({"steps": steps, "seconds": seconds, "weights": weights, "sha256": sha256});
+            if let (Some(report), Some(more)) = (report.as_object_mut(), more.as_object()) {
+                report.extend(more.clone());
+            }
+            println!("{report}");
+        } else {
+            println!("{steps} steps in {seconds:.0} s: {}", weights.display());
+        }
+    }
+
+    fn length(&self) -> Result<Length, OptionsError> {
+        match (self.steps, self.epochs, self.minutes) {
+            (Some(steps), _, _) if steps > 0 => Ok(Length::Steps(steps)),
+            (_, Some(epochs), _) if epochs > 0.0 => Ok(Length::Epochs(epochs)),
+            (_, _, Some(minutes)) if minutes > 0.0 => Ok(Length::Time(Duration::from_secs_f64(60.0 * minutes))),
+            _ => Err(OptionsError::Length),
+        }
+    }
+
+    fn device(&self) -> Result<Device, OptionsError> {
+        match self.device {
+            DeviceName::Cpu => Ok(Device::Cpu),
+            DeviceName::Cuda if Cuda::is_available() => Ok(Device::Cuda(0)),
+            DeviceName::Cuda => Err(OptionsError::NoCuda),
         }
     }
 }
 
-/// Length of a training.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub enum Length {
-    /// So many steps.
-    Steps(u64),
-    /// So many passes over the data.
-    Epochs(f64),
-    /// As many steps as fit into a time; the learning rate follows the clock. Not repeatable to the bit.
-    Time(Duration),
-}
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
 
-impl Length {
-    /// The share that is done, 0 at the start, 1 or more at the end.
-    #[must_use]
-    pub fn share_done(self, step: u64, epoch: f64, seconds: f64) -> f64 {
-        match self {
-            Self::Steps(steps) => step as f64 / steps.max(1) as f64,
-            Self::Epochs(epochs) => epoch / epochs.max(f64::MIN_POSITIVE),
-            Self::Time(limit) => seconds / limit.as_secs_f64().max(f64::MIN_POSITIVE),
+    use super::*;
+
+    #[derive(Debug, Parser)]
+    struct Line {
+        #[command(flatten)]
+        options: TrainingOptions,
+    }
+
+    fn run_config(arguments: &str, batch: usize) -> Result<RunConfig, OptionsError> {
+        let line = Line::try_parse_from(arguments.split_whitespace()).unwrap();
+        line.options.run_config(batch, 1e-3)
+    }
+
+    #[test]
+    fn a_length_above_zero_is_needed() {
+        let run = run_config("train --minutes 1.5 --precision bf16 --out runs/x", 4).unwrap();
+        assert_eq!(run.length, Length::Time(Duration::from_secs(90)));
+        assert_eq!((run.precision, run.batch, run.seed, run.resume), (ComputePrecision::Bf16, 4, 0, false));
+        for line in ["train --out x", "train --out x --steps 0", "train --out x --epochs -1"] {
+            let asked = line.replace("--epochs -1", "--epochs=-1");
+            assert_eq!(run_config(&asked, 4).unwrap_err(), OptionsError::Length, "{line}");
         }
+        assert_eq!(run_config("train --out x --steps 3", 0).unwrap_err(), OptionsError::Batch);
+        assert!(Line::try_parse_from(["train", "--out", "x", "--steps", "3", "--minutes", "3"]).is_err());
     }
 }

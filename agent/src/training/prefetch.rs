@@ -3,6 +3,8 @@
 use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
 use std::thread;
 
+use super::error::TrainingError;
+
 /// Batches that one thread may be ahead.
 const AHEAD: usize = 3;
 
@@ -19,26 +21,29 @@ pub struct Prefetch<T> {
 impl<T: Send + 'static> Prefetch<T> {
     /// Starts `threads` threads; `prepare` gets the numbers of batches from `first` on.
     #[must_use]
-    pub fn start(threads: usize, first: u64, prepare: impl Fn(u64) -> T + Clone + Send + 'static) -> Self {
+    pub fn start(threads: usize, first: u64, prepare: impl FnMut(u64) -> T + Clone + Send + 'static) -> Self {
         let threads = threads.max(1);
         let queues = (0..threads).map(|thread| {
             let (sender, receiver) = sync_channel(AHEAD);
             let prepare = prepare.clone();
-            thread::spawn(move || work(&prepare, first + thread as u64, threads, &sender));
+            thread::spawn(move || work(prepare, first + thread as u64, threads, &sender));
             receiver
         });
         Self { queues: queues.collect(), next: 0 }
     }
 
-    /// The next batch; nothing when the thread that should have prepared it has died.
-    pub fn next_batch(&mut self) -> Option<T> {
+    /// The next batch.
+    ///
+    /// # Errors
+    /// [`TrainingError::LoaderGone`] when the thread that should have prepared it has died.
+    pub fn next_batch(&mut self) -> Result<T, TrainingError> {
         let queue = self.next;
         self.next = (queue + 1) % self.queues.len();
-        self.queues[queue].recv().ok()
+        self.queues[queue].recv().map_err(|_| TrainingError::LoaderGone)
     }
 }
 
-fn work<T>(prepare: &impl Fn(u64) -> T, first: u64, step: usize, queue: &SyncSender<T>) {
+fn work<T>(mut prepare: impl FnMut(u64) -> T, first: u64, step: usize, queue: &SyncSender<T>) {
     for number in (first..).step_by(step) {
         // The receiver is gone when the training has ended.
         if queue.send(prepare(number)).is_err() {
@@ -55,7 +60,7 @@ mod tests {
     fn batches_come_in_order_from_any_number_of_threads() {
         for threads in 1..4 {
             let mut batches = Prefetch::start(threads, 5, |number| number * number);
-            let got: Vec<u64> = (0..10).filter_map(|_| batches.next_batch()).collect();
+            let got: Vec<u64> = (0..10).map(|_| batches.next_batch().unwrap()).collect();
             assert_eq!(got, (5..15).map(|number| number * number).collect::<Vec<u64>>());
         }
     }

@@ -1,10 +1,8 @@
-//! Threads that prepare batches ahead of the training.
-
-use std::sync::mpsc::{Receiver, SyncSender, sync_channel};
-use std::thread;
+//! Samples in batches, in the order of a training.
 
 use agent::pillar_batch::{PillarBatch, PillarLattice};
 use agent::pillars::Pillars;
+use agent::training::{Prefetch, RunConfig};
 use protocol::Pose;
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
@@ -12,9 +10,6 @@ use rand_chacha::ChaCha8Rng;
 
 use super::{Sample, SampleBuilder, SampleError, TickRef};
 use crate::targets::Labels;
-
-/// Batches that one thread may be ahead.
-const AHEAD: usize = 3;
 
 /// Samples of one training step.
 #[derive(Debug)]
@@ -38,94 +33,31 @@ impl Batch {
     }
 }
 
-/// Which samples in which order.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct LoaderConfig {
-    /// Seed of order and augmentation.
-    pub seed: u64,
-    /// Samples of a batch.
-    pub batch: usize,
-    /// The batch to begin with: that of a resumed training.
-    pub first_batch: u64,
-    /// Threads that prepare batches.
-    pub threads: usize,
-}
-
-/// An endless sequence of batches, the same for any number of threads.
-///
-/// Thread k of T prepares batches k, k + T, k + 2T and so on into a queue of its own, and the queues are read in turn:
-/// that keeps the order without a word between threads. They end when the loader is dropped.
-#[derive(Debug)]
-pub struct Loader {
-    queues: Vec<Receiver<Result<Batch, SampleError>>>,
-    next: usize,
-}
-
-impl Loader {
-    /// Starts the threads.
-    #[must_use]
-    pub fn start(builder: &SampleBuilder, lattice: PillarLattice, config: &LoaderConfig) -> Self {
-        let threads = config.threads.max(1);
-        let queues = (0..threads).map(|thread| {
-            let (sender, receiver) = sync_channel(AHEAD);
-            let worker = Worker {
-                order: Order::new(builder.scenes().ticks().to_vec(), config.seed),
-                builder: builder.clone(),
-                lattice,
-                batch: config.batch.max(1),
-            };
-            let first = config.first_batch + thread as u64;
-            thread::spawn(move || worker.run(first, threads, &sender));
-            receiver
-        });
-        Self { queues: queues.collect(), next: 0 }
-    }
-
-    /// The next batch.
-    ///
-    /// # Errors
-    /// [`SampleError`] when a sample of it could not be made.
-    pub fn next_batch(&mut self) -> Result<Batch, SampleError> {
-        let queue = self.next;
-        self.next = (queue + 1) % self.queues.len();
-        self.queues[queue].recv().unwrap_or(Err(SampleError::LoaderGone(queue)))
-    }
-}
-
-struct Worker {
-    order: Order,
-    builder: SampleBuilder,
+/// Batches from number `first` on, the same for any number of threads.
+#[must_use]
+pub fn batches(
+    builder: &SampleBuilder,
     lattice: PillarLattice,
-    batch: usize,
-}
-
-impl Worker {
-    fn run(mut self, first: u64, step: usize, queue: &SyncSender<Result<Batch, SampleError>>) {
-        for number in (first..).step_by(step) {
-            let batch = self.prepare(number);
-            let failed = batch.is_err();
-            // The receiver is gone when the training has ended.
-            if queue.send(batch).is_err() || failed {
-                return;
-            }
-        }
-    }
-
-    fn prepare(&mut self, number: u64) -> Result<Batch, SampleError> {
-        let first = number * self.batch as u64;
-        let samples: Result<Vec<_>, _> = (first..first + self.batch as u64)
-            .map(|index| {
-                let mut rng = ChaCha8Rng::seed_from_u64(self.order.seed);
-                // Streams are independent sequences of one seed.
-                rng.set_stream(index + 1);
-                self.builder.build(self.order.tick(index), &mut rng)
-            })
-            .collect();
-        Ok(Batch::collate(samples?, &self.lattice))
-    }
+    run: &RunConfig,
+    first: u64,
+) -> Prefetch<Result<Batch, SampleError>> {
+    let mut order = Order::new(builder.scenes().ticks().to_vec(), run.seed);
+    let mut builder = builder.clone();
+    let size = run.batch as u64;
+    Prefetch::start(run.loader_threads, first, move |number| {
+        let sample = |index| {
+            let mut rng = ChaCha8Rng::seed_from_u64(order.seed);
+            // Streams are independent sequences of one seed.
+            rng.set_stream(index + 1);
+            builder.build(order.tick(index), &mut rng)
+        };
+        let samples: Result<Vec<Sample>, _> = (number * size..(number + 1) * size).map(sample).collect();
+        Ok(Batch::collate(samples?, &lattice))
+    })
 }
 
 /// Every tick once per epoch, in an order that only the seed and the epoch decide.
+#[derive(Clone)]
 struct Order {
     ticks: Vec<TickRef>,
     shuffled: Vec<TickRef>,

@@ -10,7 +10,7 @@ mod scenes;
 
 pub use augment::{Augmentation, SceneAugment, ViewAugment};
 pub use builder::{PoseNoise, Sample, SampleBuilder, SampleConfig, SampleKind, merge_points};
-pub use loader::{Batch, Loader, LoaderConfig};
+pub use loader::{Batch, batches};
 pub use scenes::{SceneSet, TickRef};
 
 use sim_replay::dataset::ReadError;
@@ -39,7 +39,4 @@ pub enum SampleError {
     /// The anchors of the configuration are no lattice.
     #[error(transparent)]
     Lattice(#[from] LatticeError),
-    /// A loader thread ended without saying why.
-    #[error("loader thread {0} ended early")]
-    LoaderGone(usize),
 }

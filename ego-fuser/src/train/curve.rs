@@ -1,10 +1,7 @@
 //! The course of a training as CSV, one row per report, with AP where a validation was made; and as a picture.
 
-use std::fs::{File, OpenOptions};
-use std::io::Write;
-use std::path::{Path, PathBuf};
-
 use agent::chart::{self, Axis, Chart, Mark, Series};
+use agent::training::{Curve, Trainer, TrainingError};
 
 use super::validation::Accuracy;
 use super::{StepReport, TrainError};
@@ -14,50 +11,36 @@ const HEADER: &str =
 /// The losses of single batches jump; a line of the picture has about this many points that do not.
 const SMOOTH_POINTS: usize = 150;
 
-/// Appends rows to the curve; every row is on disk when the call returns.
+/// Rows of reports and validations.
 #[derive(Debug)]
-pub(super) struct Curve {
-    path: PathBuf,
-    file: File,
-}
+pub(super) struct DetectorCurve(Curve);
 
-impl Curve {
-    pub(super) fn open(path: &Path, resume: bool) -> Result<Self, TrainError> {
-        let io = |source| TrainError::Io { path: path.to_owned(), source };
-        let is_new = !(resume && path.exists());
-        let file =
-            OpenOptions::new().create(true).write(true).append(!is_new).truncate(is_new).open(path).map_err(io)?;
-        let mut curve = Self { path: path.to_owned(), file };
-        if is_new {
-            curve.row(HEADER)?;
-        }
-        Ok(curve)
+impl DetectorCurve {
+    pub(super) fn open(trainer: &Trainer) -> Result<Self, TrainingError> {
+        Ok(Self(trainer.curve(HEADER)?))
     }
 
-    pub(super) fn step(&mut self, report: &StepReport) -> Result<(), TrainError> {
+    pub(super) fn step(&mut self, report: &StepReport) -> Result<(), TrainingError> {
         let StepReport {
             step, epoch, seconds, learning_rate, score_loss, box_loss, samples_per_second, waiting, ..
         } = *report;
         let loss = score_loss + box_loss;
-        self.row(&format!(
+        self.0.row(&format!(
             "{step},{epoch:.3},{seconds:.1},{learning_rate:.3e},{loss:.5},{score_loss:.5},{box_loss:.5},{samples_per_second:.2},{waiting:.3},,,"
         ))
     }
 
-    pub(super) fn validation(&mut self, step: u64, seconds: f64, accuracy: &Accuracy) -> Result<(), TrainError> {
+    pub(super) fn validation(&mut self, step: u64, seconds: f64, accuracy: &Accuracy) -> Result<(), TrainingError> {
         let [ap_30, ap_50, ap_70] = accuracy.ap_global;
-        self.row(&format!("{step},,{seconds:.1},,,,,,,{ap_30:.4},{ap_50:.4},{ap_70:.4}"))
+        self.0.row(&format!("{step},,{seconds:.1},,,,,,,{ap_30:.4},{ap_50:.4},{ap_70:.4}"))
     }
 
     /// Draws the curve so far, with what an interrupted training wrote before, into a PNG file beside it.
     pub(super) fn draw(&self, title: &str) -> Result<(), TrainError> {
-        let io = |source| TrainError::Io { path: self.path.clone(), source };
-        let text = std::fs::read_to_string(&self.path).map_err(io)?;
-        Ok(chart::save(&charts(title, &text), &self.path.with_extension("png"))?)
-    }
-
-    fn row(&mut self, row: &str) -> Result<(), TrainError> {
-        writeln!(self.file, "{row}").map_err(|source| TrainError::Io { path: self.path.clone(), source })
+        let path = self.0.path();
+        let text =
+            std::fs::read_to_string(path).map_err(|source| TrainingError::Io { path: path.to_owned(), source })?;
+        Ok(chart::save(&charts(title, &text), &path.with_extension("png"))?)
     }
 }
 
@@ -117,8 +100,8 @@ mod tests {
     fn the_picture_shows_what_the_file_holds_also_after_a_break() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("curve.csv");
-        Curve::open(&path, false).unwrap().step(&report(10, 2.0)).unwrap();
-        let mut curve = Curve::open(&path, true).unwrap();
+        DetectorCurve(Curve::open(&path, HEADER, None).unwrap()).step(&report(10, 2.0)).unwrap();
+        let mut curve = DetectorCurve(Curve::open(&path, HEADER, Some(10)).unwrap());
         curve.step(&report(20, f64::NAN)).unwrap();
         curve.step(&report(30, 1.0)).unwrap();
         curve

@@ -1,6 +1,6 @@
 //! What a training tells.
 
-use std::path::PathBuf;
+use agent::training::Trained;
 
 use super::Accuracy;
 
@@ -38,14 +38,8 @@ pub trait Observer {
 /// How a training ended.
 #[derive(Debug, Clone)]
 pub struct Summary {
-    /// Steps done.
-    pub steps: u64,
-    /// Seconds spent, in all runs together.
-    pub seconds: f64,
+    /// The weights and what it took.
+    pub trained: Trained,
     /// The last validation.
     pub accuracy: Option<Accuracy>,
-    /// The weights, in half precision.
-    pub weights: PathBuf,
-    /// Their SHA-256.
-    pub sha256: String,
 }

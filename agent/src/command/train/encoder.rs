@@ -4,9 +4,9 @@ use std::path::PathBuf;
 
 use agent::localizer::SceneEncoderConfig;
 use agent::localizer::training::{EncoderSummary, EncoderTrainConfig, train_encoder};
-use agent::training::TrainingBar;
+use agent::training::{ModelCard, TrainingBar, TrainingOptions};
 
-use super::options::{Options, bad, check_folders, command_line, write_card};
+use super::options::{bad, check_folders, run_config};
 
 /// Train a scene encoder on sweeps that overlap; writes checkpoint, curve.csv, weights.safetensors and model-card.md.
 ///
@@ -32,7 +32,7 @@ pub(crate) struct Args {
     #[arg(long, default_value_t = 500)]
     validate_every: u64,
     #[command(flatten)]
-    options: Options,
+    options: TrainingOptions,
 }
 
 fn parse_config(name: &str) -> Result<SceneEncoderConfig, String> {
@@ -63,71 +63,47 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         },
     )?;
     bar.finish();
-    write_card(&config.out, &card(&config, &summary))?;
-    if args.options.json {
-        let accuracy = serde_json::to_value(summary.accuracy)?;
-        println!(
-            "{}",
-            serde_json::json!({"steps": summary.steps, "seconds": summary.seconds, "accuracy": accuracy,
-                "weights": summary.weights, "sha256": summary.sha256})
-        );
-    } else {
-        println!("{} steps in {:.0} s: {}", summary.steps, summary.seconds, summary.weights.display());
-    }
+    card(&config, &summary).write(&config.run.out)?;
+    args.options.print(&summary.trained, &serde_json::json!({"accuracy": summary.accuracy}));
     Ok(())
 }
 
 impl Args {
     fn config(&self) -> anyhow::Result<EncoderTrainConfig> {
-        if self.batch == 0 || self.validate_every == 0 {
-            return Err(bad("--batch and --validate-every are above zero"));
+        if self.validate_every == 0 {
+            return Err(bad("--validate-every is above zero"));
         }
         check_folders(self.scenes.iter().chain(&self.validation))?;
-        let (length, device) = self.options.start()?;
         Ok(EncoderTrainConfig {
             scenes: self.scenes.clone(),
             validation: self.validation.clone(),
             encoder: self.config.clone(),
-            length,
-            batch: self.batch,
-            learning_rate: self.lr,
-            seed: self.options.seed,
-            device,
-            precision: self.options.precision(),
-            loader_threads: self.options.loader_threads,
+            run: run_config(&self.options, self.batch, self.lr)?,
             validate_every: self.validate_every,
-            out: self.options.out.clone(),
-            resume: self.options.resume,
         })
     }
 }
 
-fn card(config: &EncoderTrainConfig, summary: &EncoderSummary) -> String {
-    let validation = summary.accuracy.map_or_else(String::new, |accuracy| {
-        format!(
-            "| validation | {:.1} % of cells find their match among those of two pairs, offset known to {:.2} m (L1) |\n",
-            100.0 * accuracy.top1,
-            accuracy.offset_m
-        )
-    });
-    format!(
-        "# Scene encoder `{}`\n\nSparse 3-D convolutions over voxels of {} m; trained on correspondences between overlapping sweeps.\n\n\
-         | | |\n| --- | --- |\n| command | `{}` |\n| parameters | {} |\n| weights | SHA-256 `{}` |\n\
-         | data | {} sweeps of {} towns, listing SHA-256 `{}` |\n| seed | {} |\n| steps | {} of {} pairs |\n\
-         | numbers | {:?} |\n| time | {:.0} s |\n{validation}\nConfiguration:\n\n```json\n{}\n```\n",
-        config.encoder.name,
-        config.encoder.voxel_m,
-        command_line(),
-        summary.parameters,
-        summary.sha256,
-        summary.sweeps,
-        config.scenes.len(),
-        summary.data_sha256,
-        config.seed,
-        summary.steps,
-        config.batch,
-        config.precision,
-        summary.seconds,
-        serde_json::to_string_pretty(&config.encoder).unwrap_or_default()
-    )
+fn card(config: &EncoderTrainConfig, summary: &EncoderSummary) -> ModelCard {
+    let mut card = ModelCard::new(
+        &format!("Scene encoder `{}`", config.encoder.name),
+        &format!(
+            "Sparse 3-D convolutions over voxels of {} m; trained on correspondences between overlapping sweeps.",
+            config.encoder.voxel_m
+        ),
+    );
+    let data = format!("{} sweeps of {} towns", summary.sweeps, config.scenes.len());
+    card.trained(&config.run, &summary.trained, &data, "pairs");
+    if let Some(accuracy) = summary.accuracy {
+        card.row(
+            "validation",
+            format_args!(
+                "{:.1} % of cells find their match among those of two pairs, offset known to {:.2} m (L1)",
+                100.0 * accuracy.top1,
+                accuracy.offset_m
+            ),
+        );
+    }
+    card.configuration(&config.encoder);
+    card
 }

@@ -6,9 +6,9 @@ use std::time::Duration;
 use agent::localizer::training::{
     RedundancyConfig, SceneReport, SceneSummary, SceneTrainConfig, SweepAugmentation, train_scene,
 };
-use agent::training::TrainingBar;
+use agent::training::{ModelCard, TrainingBar, TrainingOptions};
 
-use super::options::{Options, bad, check_folders, command_line, write_card};
+use super::options::{bad, check_folders, run_config};
 
 /// Train the head of one town on the features of a frozen encoder; writes checkpoint, curve.csv, weights.safetensors and
 /// model-card.md.
@@ -63,7 +63,7 @@ pub(crate) struct Args {
     #[arg(long, default_value_t = 2e-3)]
     lr: f64,
     #[command(flatten)]
-    options: Options,
+    options: TrainingOptions,
 }
 
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
@@ -71,17 +71,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let bar = TrainingBar::default();
     let summary = train_scene(&config, &mut |report| tell(&bar, report))?;
     bar.finish();
-    write_card(&config.out, &card(&config, &summary))?;
-    if args.options.json {
-        println!(
-            "{}",
-            serde_json::json!({"steps": summary.steps, "seconds": summary.seconds,
-                "preparing_seconds": summary.preparing_seconds, "accuracy": serde_json::to_value(summary.accuracy)?,
-                "cells_shown": summary.cells_shown, "weights": summary.weights, "sha256": summary.sha256})
-        );
-    } else {
-        println!("{} steps in {:.0} s: {}", summary.steps, summary.seconds, summary.weights.display());
-    }
+    card(&config, &summary).write(&config.run.out)?;
+    let SceneSummary { preparing_seconds, accuracy, cells_shown, .. } = summary;
+    let more =
+        serde_json::json!({"preparing_seconds": preparing_seconds, "accuracy": accuracy, "cells_shown": cells_shown});
+    args.options.print(&summary.trained, &more);
     Ok(())
 }
 
@@ -110,11 +104,10 @@ fn tell(bar: &TrainingBar, report: &SceneReport) {
 
 impl Args {
     fn config(&self) -> anyhow::Result<SceneTrainConfig> {
-        if self.batch == 0 || self.copies == 0 || self.validation_sweeps == 0 {
-            return Err(bad("--batch, --copies and --validation-sweeps are above zero"));
+        if self.copies == 0 || self.validation_sweeps == 0 {
+            return Err(bad("--copies and --validation-sweeps are above zero"));
         }
         check_folders(self.scenes.iter().chain(&self.validation))?;
-        let (length, device) = self.options.start()?;
         Ok(SceneTrainConfig {
             scenes: self.scenes.clone(),
             validation: self.validation.clone(),
@@ -128,47 +121,29 @@ impl Args {
             refiner: !self.no_refiner,
             augmentation: SweepAugmentation { copies: self.copies, turn_rad: self.turn.to_radians(), keep: 0.7 },
             redundancy: self.rsd.then(RedundancyConfig::default),
-            length,
-            batch: self.batch,
-            learning_rate: self.lr,
-            seed: self.options.seed,
-            device,
-            precision: self.options.precision(),
-            loader_threads: self.options.loader_threads,
+            run: run_config(&self.options, self.batch, self.lr)?,
             validate_every: Duration::from_secs(self.validate_every),
-            out: self.options.out.clone(),
-            resume: self.options.resume,
         })
     }
 }
 
-fn card(config: &SceneTrainConfig, summary: &SceneSummary) -> String {
-    let validation = summary.accuracy.map_or_else(String::new, |accuracy| {
-        format!(
-            "| validation | poses: median {:.3} m and {:.3} degrees, under 3 m {:.1} %, under 1 m {:.1} %; cells: median {:.2} m (L1) |\n",
-            accuracy.pose_p50_m,
-            accuracy.pose_p50_deg,
-            100.0 * accuracy.success_3m,
-            100.0 * accuracy.success_1m,
-            accuracy.cell_p50_m
-        )
-    });
-    format!(
-        "# Scene head of {}\n\nWorld coordinates of cells on the features of a frozen encoder.\n\n\
-         | | |\n| --- | --- |\n| command | `{}` |\n| parameters | {} |\n| weights | SHA-256 `{}` |\n\
-         | data | {} sweeps, listing SHA-256 `{}` |\n| seed | {} |\n| steps | {} of {} cells |\n| numbers | {:?} |\n\
-         | time | {:.0} s, of which {:.0} s reading and encoding |\n{validation}",
-        config.town,
-        command_line(),
-        summary.parameters,
-        summary.sha256,
-        summary.sweeps,
-        summary.data_sha256,
-        config.seed,
-        summary.steps,
-        config.batch,
-        config.precision,
-        summary.seconds,
-        summary.preparing_seconds,
-    )
+fn card(config: &SceneTrainConfig, summary: &SceneSummary) -> ModelCard {
+    let title = format!("Scene head of {}", config.town);
+    let mut card = ModelCard::new(&title, "World coordinates of cells on the features of a frozen encoder.");
+    card.trained(&config.run, &summary.trained, &format!("{} sweeps", summary.sweeps), "cells");
+    card.row("of which reading and encoding", format_args!("{:.0} s", summary.preparing_seconds));
+    if let Some(accuracy) = summary.accuracy {
+        card.row(
+            "validation",
+            format_args!(
+                "poses: median {:.3} m and {:.3} degrees, under 3 m {:.1} %, under 1 m {:.1} %; cells: median {:.2} m (L1)",
+                accuracy.pose_p50_m,
+                accuracy.pose_p50_deg,
+                100.0 * accuracy.success_3m,
+                100.0 * accuracy.success_1m,
+                accuracy.cell_p50_m
+            ),
+        );
+    }
+    card
 }

@@ -5,8 +5,7 @@ use std::path::PathBuf;
 use sim_replay::dataset::ReadError;
 
 use crate::localizer::LocalizerError;
-use crate::training::CheckpointError;
-use crate::weights::WeightsError;
+use crate::training::TrainingError;
 
 /// Why a training ended early.
 #[derive(Debug, thiserror::Error)]
@@ -26,36 +25,9 @@ pub enum LocalizerTrainError {
     /// The network cannot be built or run.
     #[error(transparent)]
     Localizer(#[from] LocalizerError),
-    /// Weights cannot be read or written.
+    /// The training itself has failed.
     #[error(transparent)]
-    Weights(#[from] WeightsError),
-    /// The checkpoint cannot be written or continued.
-    #[error(transparent)]
-    Checkpoint(#[from] CheckpointError),
-    /// The checkpoint is of another training.
-    #[error("the checkpoint was made with {field} {found}, not {asked}")]
-    OtherTraining {
-        /// What differs.
-        field: &'static str,
-        /// In the checkpoint.
-        found: String,
-        /// On the command line.
-        asked: String,
-    },
-    /// The loss has left the numbers.
-    #[error("the gradient was not finite {0} times in a row; try a lower learning rate")]
-    Diverged(u32),
-    /// A thread that prepares batches has died.
-    #[error("a thread that prepares batches has ended early")]
-    LoaderGone,
-    /// A file cannot be written.
-    #[error("{}: {source}", path.display())]
-    Io {
-        /// The file.
-        path: PathBuf,
-        /// What the system said.
-        source: std::io::Error,
-    },
+    Training(#[from] TrainingError),
     /// The tensor library refused.
     #[error("training: {}", crate::detector::first_line(.0))]
     Tensor(#[from] tch::TchError),

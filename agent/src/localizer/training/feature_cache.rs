@@ -112,7 +112,7 @@ impl FeatureCache {
         let mut builder = Builder::new(rows, encoder.config().cell_channels(), device)?;
         let mut done = 0;
         while done < total {
-            let batch = loader.next_batch().ok_or(LocalizerTrainError::LoaderGone)??;
+            let batch = loader.next_batch()??;
             if !batch.is_empty() {
                 builder.add(&batch, encoder, precision.kind(), device)?;
             }

@@ -174,7 +174,7 @@ impl SweepStore {
         });
         let mut sweeps = Vec::with_capacity(count);
         for _ in 0..count {
-            sweeps.extend(reader.next_batch().ok_or(LocalizerTrainError::LoaderGone)??);
+            sweeps.extend(reader.next_batch()??);
         }
         match sweeps.is_empty() {
             true => Err(LocalizerTrainError::NoSweeps(folders.to_vec())),

@@ -3,10 +3,8 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use tch::Device;
-
 use crate::localizer::training::{RedundancyConfig, SceneAccuracy, SweepAugmentation};
-use crate::training::{ComputePrecision, Length};
+use crate::training::{RunConfig, Trained};
 
 /// What to train, on what, for how long.
 #[derive(Debug, Clone)]
@@ -35,26 +33,10 @@ pub struct SceneTrainConfig {
     pub augmentation: SweepAugmentation,
     /// Which sweeps may be left out; nothing: none.
     pub redundancy: Option<RedundancyConfig>,
-    /// How long; a time counts from the start, reading and encoding included.
-    pub length: Length,
-    /// Cells of a step.
-    pub batch: usize,
-    /// Highest learning rate.
-    pub learning_rate: f64,
-    /// Seed of parameters and order.
-    pub seed: u64,
-    /// Where the network computes.
-    pub device: Device,
-    /// In which numbers.
-    pub precision: ComputePrecision,
-    /// Threads that read and sort sweeps.
-    pub loader_threads: usize,
+    /// How; a batch are cells, a time counts from the start, reading and encoding included.
+    pub run: RunConfig,
     /// Time between two validations and checkpoints.
     pub validate_every: Duration,
-    /// Folder of checkpoint, curve and weights.
-    pub out: PathBuf,
-    /// Whether to go on from the checkpoint in `out`.
-    pub resume: bool,
 }
 
 /// Where a training of a head is.
@@ -88,11 +70,9 @@ pub enum SceneReport {
 /// How a training of a head ended.
 #[derive(Debug, Clone)]
 pub struct SceneSummary {
-    /// Steps done.
-    pub steps: u64,
-    /// Seconds spent, reading and encoding included.
-    pub seconds: f64,
-    /// Of these, before the head's first step.
+    /// The weights and what it took, reading and encoding included.
+    pub trained: Trained,
+    /// Seconds before the head's first step.
     pub preparing_seconds: f64,
     /// Sweeps it learnt from.
     pub sweeps: usize,
@@ -100,12 +80,4 @@ pub struct SceneSummary {
     pub cells_shown: u64,
     /// The last validation.
     pub accuracy: Option<SceneAccuracy>,
-    /// SHA-256 of the listing of the data.
-    pub data_sha256: String,
-    /// The weights, in half precision.
-    pub weights: PathBuf,
-    /// Their SHA-256.
-    pub sha256: String,
-    /// Number of parameters.
-    pub parameters: usize,
 }

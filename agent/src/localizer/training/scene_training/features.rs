@@ -5,6 +5,7 @@ use std::sync::Arc;
 use super::config::{SceneReport, SceneTrainConfig};
 use crate::localizer::training::{CacheOptions, FeatureCache, LocalizerTrainError, SweepAugmentation, SweepList};
 use crate::localizer::{SceneEncoder, SceneEncoderConfig};
+use crate::training::RunConfig;
 
 /// Features of the sweeps of a town.
 pub(super) struct Features {
@@ -22,17 +23,12 @@ impl Features {
         config: &SceneTrainConfig,
         observe: &mut dyn FnMut(&SceneReport),
     ) -> Result<Self, LocalizerTrainError> {
-        let (encoder, encoder_sha256) = SceneEncoder::load(&config.encoder, config.device)?;
+        let RunConfig { seed, device, precision, loader_threads: threads, .. } = config.run;
+        let (encoder, encoder_sha256) = SceneEncoder::load(&config.encoder, device)?;
         let list = Arc::new(SweepList::open(&config.scenes)?);
         let mut encode = |list: &Arc<SweepList>, augmentation| {
             let mut progress = |done, total| observe(&SceneReport::Encoding(done, total));
-            let options = CacheOptions {
-                augmentation,
-                seed: config.seed,
-                threads: config.loader_threads,
-                precision: config.precision,
-                device: config.device,
-            };
+            let options = CacheOptions { augmentation, seed, threads, precision, device };
             FeatureCache::build(list, &encoder, options, &mut progress)
         };
         let training = encode(&list, config.augmentation)?;

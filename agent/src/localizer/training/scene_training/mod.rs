@@ -10,10 +10,8 @@ mod rough_pose;
 mod statistics;
 
 use std::collections::BTreeMap;
-use std::path::PathBuf;
 use std::time::Instant;
 
-use serde::{Deserialize, Serialize};
 use tch::nn::VarStore;
 use tch::{Kind, Tensor, no_grad};
 
@@ -23,7 +21,6 @@ use self::cell_order::CellOrder;
 use self::features::Features;
 use self::losses::{centre_loss, weighted_loss};
 use self::rough_pose::RoughPoses;
-use super::curve::Curve;
 use super::error::LocalizerTrainError;
 use super::feature_cache::FeatureCache;
 use super::kmeans::kmeans;
@@ -31,8 +28,8 @@ use super::redundancy::Redundancy;
 use super::scene_validation::{SceneAccuracy, validate};
 use crate::localizer::head_config::SceneHeadConfig;
 use crate::localizer::scene_head::SceneHead;
-use crate::training::{AdamW, AdamWConfig, Length, OneCycle, Step, checkpoint};
-use crate::weights::{self, CONFIG_KEY, KIND_KEY};
+use crate::training::{Curve, Length, Trainer};
+use crate::weights::{CONFIG_KEY, KIND_KEY};
 
 /// What a unit of cross entropy over the centres weighs, metres.
 const CENTRE_WEIGHT_M: f64 = 5.0;
@@ -40,21 +37,10 @@ const CENTRE_WEIGHT_M: f64 = 5.0;
 const LOGITS_EVERY: u64 = 50;
 /// Steps between two reports.
 const REPORT_EVERY: u64 = 20;
-/// Gradients that are not finite in a row before the training gives up.
-const MAX_SKIPPED: u32 = 20;
 /// Cells of a sweep that a head regresses at most.
 const MAX_CELLS: usize = 1024;
 
-/// What a checkpoint remembers.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-struct Progress {
-    step: u64,
-    seconds: f64,
-    seed: u64,
-    batch: usize,
-}
-
-/// Trains a head; writes checkpoint, curve and weights into `config.out`.
+/// Trains a head; writes checkpoint, curve and weights into `config.run.out`.
 ///
 /// # Errors
 /// [`LocalizerTrainError`]; the last checkpoint stays.
@@ -63,14 +49,10 @@ pub fn train_scene(
     observe: &mut dyn FnMut(&SceneReport),
 ) -> Result<SceneSummary, LocalizerTrainError> {
     let mut training = Training::prepare(config, observe)?;
-    let mut skipped = 0;
     let mut last_validation = Instant::now();
     while training.share_done() < 1.0 {
-        skipped = if training.step()? { 0 } else { skipped + 1 };
-        if skipped >= MAX_SKIPPED {
-            return Err(LocalizerTrainError::Diverged(skipped));
-        }
-        if training.progress.step.is_multiple_of(REPORT_EVERY) {
+        training.step()?;
+        if training.trainer.steps().is_multiple_of(REPORT_EVERY) {
             observe(&training.report());
         }
         if last_validation.elapsed() >= config.validate_every {
@@ -89,20 +71,17 @@ struct Training<'a> {
     validation: Option<FeatureCache>,
     variables: VarStore,
     head: SceneHead,
-    optimizer: AdamW,
+    trainer: Trainer,
     order: CellOrder,
     rough_poses: RoughPoses,
     /// What the classifier says of each sweep at the moment.
     logits: Option<Tensor>,
-    progress: Progress,
     cells_shown: u64,
     window: Window,
     accuracy: Option<SceneAccuracy>,
     curve: Curve,
     data_sha256: String,
-    started: Instant,
     preparing_seconds: f64,
-    seconds_before: f64,
 }
 
 impl<'a> Training<'a> {
@@ -111,29 +90,22 @@ impl<'a> Training<'a> {
         observe: &mut dyn FnMut(&SceneReport),
     ) -> Result<Self, LocalizerTrainError> {
         let started = Instant::now();
-        std::fs::create_dir_all(&config.out)
-            .map_err(|source| LocalizerTrainError::Io { path: config.out.clone(), source })?;
-        tch::manual_seed(config.seed as i64);
+        let run = &config.run;
+        run.start()?;
         let features = Features::compute(config, observe)?;
         let head_config = head_config(config, &features)?;
         let Features { training: cache, validation, data_sha256, .. } = features;
-        let variables = VarStore::new(config.device);
+        let variables = VarStore::new(run.device);
         let mut head = SceneHead::new(&variables.root(), &head_config)?;
         let positions: Vec<[f64; 3]> =
             cache.world_from_sensor.iter().map(|pose| pose.translation.vector.into()).collect();
-        let (_, class_of_sweep) = kmeans(&positions, config.classes as usize, config.seed);
-        statistics::set_statistics(&mut head, &cache, config.seed)?;
-        let mut progress = Progress { step: 0, seconds: 0.0, seed: config.seed, batch: config.batch };
-        let mut optimizer = AdamW::new(&variables, AdamWConfig::default());
-        if config.resume {
-            let stored: Progress = checkpoint::restore(&checkpoint_path(config), &variables, &mut optimizer)?;
-            progress = same_training(&progress, stored)?;
-        } else {
-            let share = classifier::train_classifier(&head, &variables, &cache, &class_of_sweep, config.seed)?;
+        let (_, class_of_sweep) = kmeans(&positions, config.classes as usize, run.seed);
+        statistics::set_statistics(&mut head, &cache, run.seed)?;
+        if !run.resume {
+            let share = classifier::train_classifier(&head, &variables, &cache, &class_of_sweep, run.seed)?;
             observe(&SceneReport::Classified(share));
-            // Moments of the classifier's training are of no use to the regressor's.
-            optimizer = AdamW::new(&variables, AdamWConfig::default());
         }
+        let trainer = Trainer::begin(run, &variables, None, started)?;
         let redundancy = config.redundancy.map(|redundancy| Redundancy::new(redundancy, class_of_sweep));
         let header = "step,seconds,error_m,epsilon_m,cell_p50_m,pose_p50_m,pose_p50_deg,success_3m,success_1m";
         Ok(Self {
@@ -141,51 +113,44 @@ impl<'a> Training<'a> {
             head_config,
             variables,
             head,
-            optimizer,
-            order: CellOrder::new(&cache, redundancy, config.batch, config.seed, progress.step)?,
-            rough_poses: RoughPoses::new(&cache.world_from_sensor, config.device)?,
+            order: CellOrder::new(&cache, redundancy, run.batch, run.seed, trainer.steps())?,
+            rough_poses: RoughPoses::new(&cache.world_from_sensor, run.device)?,
             cache,
             validation,
             logits: None,
             cells_shown: 0,
             window: Window::default(),
             accuracy: None,
-            curve: Curve::open(&config.out.join("curve.csv"), header, config.resume)?,
+            curve: trainer.curve(header)?,
+            trainer,
             data_sha256,
-            started,
             preparing_seconds: started.elapsed().as_secs_f64(),
-            seconds_before: progress.seconds,
-            progress,
         })
     }
 
-    fn seconds(&self) -> f64 {
-        self.seconds_before + self.started.elapsed().as_secs_f64()
-    }
-
     fn share_done(&self) -> f64 {
-        match self.config.length {
+        match self.config.run.length {
             Length::Time(limit) => {
                 // The schedule of the head begins when the features are there.
                 let limit = (limit.as_secs_f64() - self.preparing_seconds).max(1.0);
-                (self.seconds() - self.preparing_seconds) / limit
+                (self.trainer.seconds() - self.preparing_seconds) / limit
             }
-            length => length.share_done(self.progress.step, self.order.passes(), self.seconds()),
+            _ => self.trainer.share_done(self.order.passes()),
         }
     }
 
-    /// Eq. 4 and 5. Whether the step was taken.
-    fn step(&mut self) -> Result<bool, LocalizerTrainError> {
+    /// Eq. 4 and 5.
+    fn step(&mut self) -> Result<(), LocalizerTrainError> {
         let share_done = self.share_done();
         let rows = self.order.next_batch(share_done)?;
         let sweeps = self.cache.sweep_of_cell.f_index_select(0, &rows)?;
         let cells = self.head.normalise(&self.cache.cells.f_index_select(0, &rows)?)?;
         let logits = match self.logits.take() {
-            Some(logits) if !self.progress.step.is_multiple_of(LOGITS_EVERY) => logits,
+            Some(logits) if !self.trainer.steps().is_multiple_of(LOGITS_EVERY) => logits,
             // Channels drop out here too: where nobody has driven the classifier is less sure than on what it has seen.
             _ => no_grad(|| self.head.classify(&self.cache.sweeps, true))?,
         };
-        let kind = self.config.precision.kind();
+        let kind = self.config.run.precision.kind();
         let (regression, log_shares) =
             self.head.regress_among_centres(&cells, &logits.f_index_select(0, &sweeps)?, kind)?;
         self.logits = Some(logits);
@@ -200,28 +165,23 @@ impl<'a> Training<'a> {
             loss += refiner_loss;
             self.window.refined_m += mean(&refined)?;
         }
-        self.optimizer.zero_grad();
-        loss.f_backward()?;
-        let learning_rate = OneCycle { peak: self.config.learning_rate }.at(self.share_done());
-        let taken = matches!(self.optimizer.step(learning_rate)?, Step::Taken(_));
+        self.trainer.step(&loss, self.share_done())?;
         self.window.error_m += mean(&error)?;
         self.window.epsilon_m += mean(&regression.epsilon_m)?;
         self.window.steps += 1;
-        self.progress.step += 1;
-        self.cells_shown += self.config.batch as u64;
+        self.cells_shown += self.config.run.batch as u64;
         let share_done = self.share_done();
-        self.order.watch(share_done, &sweeps, &error)?;
-        Ok(taken)
+        Ok(self.order.watch(share_done, &sweeps, &error)?)
     }
 
     fn report(&mut self) -> SceneReport {
         let window = std::mem::take(&mut self.window);
         let mean = |sum: f64| sum / f64::from(window.steps.max(1));
         SceneReport::Stepped {
-            step: self.progress.step,
+            step: self.trainer.steps(),
             epoch: self.order.passes(),
             share_done: self.share_done().min(1.0),
-            seconds: self.seconds(),
+            seconds: self.trainer.seconds(),
             error_m: mean(window.error_m),
             epsilon_m: mean(window.epsilon_m),
             refined_m: mean(window.refined_m),
@@ -232,10 +192,10 @@ impl<'a> Training<'a> {
     fn look_back(&mut self, observe: &mut dyn FnMut(&SceneReport)) -> Result<(), LocalizerTrainError> {
         let report = self.report();
         let SceneReport::Stepped { error_m, epsilon_m, .. } = report else { unreachable!("a report of steps") };
-        let seconds = self.seconds();
-        let mut row = vec![self.progress.step as f64, seconds, error_m, epsilon_m];
+        let seconds = self.trainer.seconds();
+        let mut row = vec![self.trainer.steps() as f64, seconds, error_m, epsilon_m];
         if let Some(validation) = &self.validation {
-            let accuracy = validate(&self.head, validation, self.config.precision.kind())?;
+            let accuracy = validate(&self.head, validation, self.config.run.precision.kind())?;
             row.extend([
                 accuracy.cell_p50_m,
                 accuracy.pose_p50_m,
@@ -246,10 +206,8 @@ impl<'a> Training<'a> {
             observe(&SceneReport::Validated(seconds, accuracy));
             self.accuracy = Some(accuracy);
         }
-        self.curve.row(&row)?;
-        self.progress.seconds = seconds;
-        checkpoint::save(&checkpoint_path(self.config), &self.variables, &self.optimizer, &self.progress)?;
-        Ok(())
+        self.curve.numbers(&row)?;
+        Ok(self.trainer.checkpoint(&self.variables)?)
     }
 
     fn finish(mut self) -> Result<SceneSummary, LocalizerTrainError> {
@@ -257,23 +215,13 @@ impl<'a> Training<'a> {
         let about = BTreeMap::from([
             (CONFIG_KEY.to_owned(), serde_json::to_string(&self.head_config).expect("a configuration is JSON")),
             (KIND_KEY.to_owned(), SceneHead::KIND.to_owned()),
-            ("seed".to_owned(), self.config.seed.to_string()),
-            ("steps".to_owned(), self.progress.step.to_string()),
-            ("data_sha256".to_owned(), self.data_sha256.clone()),
         ]);
-        let path = self.config.out.join("weights.safetensors");
-        let sha256 = weights::save(&path, &variables, &about, weights::Precision::Half)?;
         Ok(SceneSummary {
-            steps: self.progress.step,
-            seconds: self.progress.seconds,
+            trained: self.trainer.save_weights(&variables, about, self.data_sha256)?,
             preparing_seconds: self.preparing_seconds,
             sweeps: self.cache.sweep_count(),
             cells_shown: self.cells_shown,
             accuracy: self.accuracy,
-            data_sha256: self.data_sha256,
-            weights: path,
-            sha256,
-            parameters: variables.variables().values().map(|tensor| tensor.numel()).sum(),
         })
     }
 }
@@ -308,19 +256,4 @@ struct Window {
 
 fn mean(values: &Tensor) -> Result<f64, tch::TchError> {
     values.f_mean(Kind::Float)?.f_double_value(&[])
-}
-
-fn checkpoint_path(config: &SceneTrainConfig) -> PathBuf {
-    config.out.join("checkpoint.safetensors")
-}
-
-fn same_training(asked: &Progress, stored: Progress) -> Result<Progress, LocalizerTrainError> {
-    let fields = [
-        ("seed", stored.seed.to_string(), asked.seed.to_string()),
-        ("batch", stored.batch.to_string(), asked.batch.to_string()),
-    ];
-    match fields.into_iter().find(|(_, found, asked)| found != asked) {
-        Some((field, found, asked)) => Err(LocalizerTrainError::OtherTraining { field, found, asked }),
-        None => Ok(stored),
-    }
 }

@@ -1,0 +1,62 @@
+//! What stands beside weights: what was trained on what, and how good it is.
+
+use std::fmt::{Display, Write};
+use std::path::Path;
+
+use serde::Serialize;
+
+use super::error::TrainingError;
+use super::run_config::RunConfig;
+use super::trainer::Trained;
+
+/// A model card in Markdown: a title, a sentence, a table, and what else there is to say.
+#[derive(Debug)]
+pub struct ModelCard {
+    text: String,
+}
+
+impl ModelCard {
+    /// A card whose table is still empty.
+    #[must_use]
+    pub fn new(title: &str, about: &str) -> Self {
+        Self { text: format!("# {title}\n\n{about}\n\n| | |\n| --- | --- |\n") }
+    }
+
+    /// A row of the table.
+    pub fn row(&mut self, name: &str, value: impl Display) {
+        // Writing into a string cannot fail.
+        let _ = writeln!(self.text, "| {name} | {value} |");
+    }
+
+    /// The rows that every card has; `data` says what was learnt from, `unit` what a batch consists of.
+    pub fn trained(&mut self, run: &RunConfig, trained: &Trained, data: &str, unit: &str) {
+        self.row("command", format_args!("`{}`", run.command));
+        self.row("parameters", trained.parameters);
+        self.row("weights", format_args!("SHA-256 `{}`", trained.sha256));
+        self.row("data", format_args!("{data}, listing SHA-256 `{}`", trained.data_sha256));
+        self.row("seed", run.seed);
+        self.row("steps", format_args!("{} of {} {unit}", trained.steps, run.batch));
+        self.row("numbers", format_args!("{:?}", run.precision));
+        self.row("time", format_args!("{:.0} s", trained.seconds));
+    }
+
+    /// A paragraph or a table below.
+    pub fn paragraph(&mut self, text: &str) {
+        let _ = writeln!(self.text, "\n{text}");
+    }
+
+    /// The configuration of the network.
+    pub fn configuration(&mut self, config: &impl Serialize) {
+        let config = serde_json::to_string_pretty(config).unwrap_or_default();
+        self.paragraph(&format!("Configuration:\n\n```json\n{config}\n```"));
+    }
+
+    /// Writes it into the folder of the weights.
+    ///
+    /// # Errors
+    /// [`TrainingError::Io`] when the file cannot be written.
+    pub fn write(&self, out: &Path) -> Result<(), TrainingError> {
+        let path = out.join("model-card.md");
+        std::fs::write(&path, &self.text).map_err(|source| TrainingError::Io { path, source })
+    }
+}

@@ -1,0 +1,109 @@
+//! What every training is told: how long, how fast, where, and in which numbers.
+
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use tch::{Device, Kind};
+
+use super::adamw::AdamWConfig;
+use super::error::TrainingError;
+
+/// How a training runs, whatever it trains.
+#[derive(Debug, Clone)]
+pub struct RunConfig {
+    /// How long.
+    pub length: Length,
+    /// Samples, pairs, sweeps or cells of a step.
+    pub batch: usize,
+    /// Highest learning rate.
+    pub learning_rate: f64,
+    /// The optimizer.
+    pub optimizer: AdamWConfig,
+    /// Seed of parameters, order and augmentation.
+    pub seed: u64,
+    /// Where the network computes.
+    pub device: Device,
+    /// In which numbers.
+    pub precision: ComputePrecision,
+    /// Threads that prepare batches.
+    pub loader_threads: usize,
+    /// Folder of checkpoint, curve, weights and model card.
+    pub out: PathBuf,
+    /// Whether to go on from the checkpoint in `out`.
+    pub resume: bool,
+    /// The command as the user gave it, for the model card.
+    pub command: String,
+}
+
+impl RunConfig {
+    /// One sample at a time on the processor, in single precision, into `out`.
+    #[must_use]
+    pub fn new(length: Length, out: &Path) -> Self {
+        Self {
+            length,
+            batch: 1,
+            learning_rate: 1e-3,
+            optimizer: AdamWConfig::default(),
+            seed: 0,
+            device: Device::Cpu,
+            precision: ComputePrecision::F32,
+            loader_threads: 1,
+            out: out.to_owned(),
+            resume: false,
+            command: String::new(),
+        }
+    }
+
+    /// Makes the folder of the results and seeds the tensor library: comes before any parameter is drawn.
+    ///
+    /// # Errors
+    /// [`TrainingError::Io`] when there cannot be such a folder.
+    pub fn start(&self) -> Result<(), TrainingError> {
+        tch::manual_seed(self.seed as i64);
+        std::fs::create_dir_all(&self.out).map_err(|source| TrainingError::Io { path: self.out.clone(), source })
+    }
+}
+
+/// In which numbers the products of a training compute.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub enum ComputePrecision {
+    /// Single precision throughout.
+    F32,
+    /// Convolutions and products in bfloat16, several times faster where the processor has it; parameters, statistics and
+    /// losses stay single.
+    Bf16,
+}
+
+impl ComputePrecision {
+    /// The tensor library's name for it.
+    #[must_use]
+    pub fn kind(self) -> Kind {
+        match self {
+            Self::F32 => Kind::Float,
+            Self::Bf16 => Kind::BFloat16,
+        }
+    }
+}
+
+/// Length of a training.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum Length {
+    /// So many steps.
+    Steps(u64),
+    /// So many passes over the data.
+    Epochs(f64),
+    /// As many steps as fit into a time; the learning rate follows the clock. Not repeatable to the bit.
+    Time(Duration),
+}
+
+impl Length {
+    /// The share that is done, 0 at the start, 1 or more at the end.
+    #[must_use]
+    pub fn share_done(self, step: u64, epoch: f64, seconds: f64) -> f64 {
+        match self {
+            Self::Steps(steps) => step as f64 / steps.max(1) as f64,
+            Self::Epochs(epochs) => epoch / epochs.max(f64::MIN_POSITIVE),
+            Self::Time(limit) => seconds / limit.as_secs_f64().max(f64::MIN_POSITIVE),
+        }
+    }
+}
