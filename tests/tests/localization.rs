@@ -5,8 +5,8 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use agent::localizer::training::{
-    EncoderTrainConfig, LocalizerTrainError, RedundancyConfig, SceneReport, SceneTrainConfig, SweepAugmentation,
-    train_encoder, train_scene,
+    EncoderReport, EncoderTrainConfig, LocalizerTrainError, RedundancyConfig, SceneReport, SceneTrainConfig,
+    SweepAugmentation, train_encoder, train_scene,
 };
 use agent::localizer::{Localizer, LocalizerError, SceneEncoderConfig};
 use agent::training::{Length, RunConfig, TrainingError};
@@ -83,7 +83,12 @@ fn trained_encoder(scenes: &Path, out: &Path) -> PathBuf {
     let mut losses = Vec::new();
     let mut validations = 0;
     let config = encoder_config(scenes, out, 40);
-    let summary = train_encoder(&config, &mut |report| losses.push(report.loss), &mut |_, _| validations += 1).unwrap();
+    let mut observe = |report: &EncoderReport| match report {
+        EncoderReport::Read(data) => assert_eq!(data.left_out(), None),
+        EncoderReport::Stepped { loss, .. } => losses.push(*loss),
+        EncoderReport::Validated(..) => validations += 1,
+    };
+    let summary = train_encoder(&config, &mut observe).unwrap();
     assert_eq!((summary.trained.steps, validations), (40, 4));
     assert!(losses.last().unwrap() < &(0.9 * losses[0]), "{losses:?}");
     assert!(summary.accuracy.unwrap().top1 > 0.005, "chance is below one in five hundred: {:?}", summary.accuracy);
@@ -134,7 +139,7 @@ fn a_localizer_learns_two_drives_and_finds_itself_on_them() {
     let other = dir.path().join("other");
     let mut config = encoder_config(&scenes, &other, 1);
     config.run.seed = 6;
-    train_encoder(&config, &mut |_| (), &mut |_, _| ()).unwrap();
+    train_encoder(&config, &mut |_| ()).unwrap();
     let error = Localizer::load(&other.join("weights.safetensors"), &summary.trained.weights, Device::Cpu).unwrap_err();
     assert!(matches!(error, LocalizerError::OtherEncoder { .. }), "{error}");
     // And an encoder is no head.
@@ -147,17 +152,16 @@ fn trainings_go_on_where_they_stopped_and_refuse_what_is_not_theirs() {
     let _alone = alone();
     let dir = tempfile::tempdir().unwrap();
     let scenes = drives(dir.path());
-    let whole =
-        train_encoder(&encoder_config(&scenes, &dir.path().join("a"), 20), &mut |_| (), &mut |_, _| ()).unwrap();
+    let whole = train_encoder(&encoder_config(&scenes, &dir.path().join("a"), 20), &mut |_| ()).unwrap();
     let b = dir.path().join("b");
     // Stopped at the second validation, whose checkpoint is then not yet written.
     let mut validations = 0;
     let stopped = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| {
-        let mut stop = |_: u64, _: &_| {
-            validations += 1;
+        let mut stop = |report: &EncoderReport| {
+            validations += u32::from(matches!(report, EncoderReport::Validated(..)));
             assert!(validations < 2, "stopped by the test");
         };
-        train_encoder(&encoder_config(&scenes, &b, 20), &mut |_| (), &mut stop)
+        train_encoder(&encoder_config(&scenes, &b, 20), &mut stop)
     }));
     assert!(stopped.is_err());
     let going_on = |steps| {
@@ -165,12 +169,12 @@ fn trainings_go_on_where_they_stopped_and_refuse_what_is_not_theirs() {
         config.run.resume = true;
         config
     };
-    let resumed = train_encoder(&going_on(20), &mut |_| (), &mut |_, _| ()).unwrap();
+    let resumed = train_encoder(&going_on(20), &mut |_| ()).unwrap();
     assert_eq!(resumed.trained.sha256, whole.trained.sha256, "bit for bit");
 
     let mut other = going_on(30);
     other.run.seed = 9;
-    let error = train_encoder(&other, &mut |_| (), &mut |_, _| ()).unwrap_err();
+    let error = train_encoder(&other, &mut |_| ()).unwrap_err();
     assert!(
         matches!(error, LocalizerTrainError::Training(TrainingError::OtherTraining { field: "seed", .. })),
         "{error}"
@@ -178,6 +182,6 @@ fn trainings_go_on_where_they_stopped_and_refuse_what_is_not_theirs() {
     let checkpoint = b.join("checkpoint.safetensors");
     let bytes = std::fs::read(&checkpoint).unwrap();
     std::fs::write(&checkpoint, &bytes[..bytes.len() / 2]).unwrap();
-    let message = train_encoder(&going_on(30), &mut |_| (), &mut |_, _| ()).unwrap_err().to_string();
+    let message = train_encoder(&going_on(30), &mut |_| ()).unwrap_err().to_string();
     assert!(message.contains("checkpoint.safetensors") && message.contains("not a whole"), "{message}");
 }

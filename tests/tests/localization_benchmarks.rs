@@ -48,7 +48,7 @@ fn train(sequences: &Path, out: &Path) -> [PathBuf; 2] {
         },
         validate_every: 30,
     };
-    let encoder = train_encoder(&encoder, &mut |_| (), &mut |_, _| ()).unwrap().trained.weights;
+    let encoder = train_encoder(&encoder, &mut |_| ()).unwrap().trained.weights;
     let head = SceneTrainConfig {
         scenes: vec![sequences.to_owned()],
         validation: vec![sequences.to_owned()],

@@ -12,6 +12,7 @@ use tch::nn::VarStore;
 use super::adamw::{AdamW, Step};
 use super::checkpoint;
 use super::curve::Curve;
+use super::data_listing::DataListing;
 use super::error::TrainingError;
 use super::run_config::RunConfig;
 use super::schedule::OneCycle;
@@ -54,8 +55,8 @@ pub struct Trained {
     pub steps: u64,
     /// Seconds spent, in all runs together.
     pub seconds: f64,
-    /// SHA-256 of the listing of the data.
-    pub data_sha256: String,
+    /// What it learnt from.
+    pub data: DataListing,
     /// The weights, in half precision.
     pub weights: PathBuf,
     /// Their SHA-256.
@@ -165,17 +166,17 @@ impl Trainer {
         &self,
         variables: &VarStore,
         mut about: BTreeMap<String, String>,
-        data_sha256: String,
+        data: DataListing,
     ) -> Result<Trained, TrainingError> {
         about.insert("seed".to_owned(), self.run.seed.to_string());
         about.insert("steps".to_owned(), self.steps().to_string());
-        about.insert("data_sha256".to_owned(), data_sha256.clone());
+        about.insert("data_sha256".to_owned(), data.sha256.clone());
         let path = self.run.out.join("weights.safetensors");
         let sha256 = weights::save(&path, variables, &about, weights::Precision::Half)?;
         Ok(Trained {
             steps: self.steps(),
             seconds: self.seconds(),
-            data_sha256,
+            data,
             weights: path,
             sha256,
             parameters: variables.variables().values().map(Tensor::numel).sum(),

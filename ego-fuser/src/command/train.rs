@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use agent::model_config::DetectorConfig;
-use agent::training::{AdamWConfig, RunConfig, TrainingBar, TrainingOptions};
+use agent::training::{AdamWConfig, DataListing, RunConfig, TrainingBar, TrainingOptions};
 use anyhow::{Context, Result};
 use ego_fuser::Method;
 use ego_fuser::loss::{LossConfig, Unassigned};
@@ -121,6 +121,10 @@ impl Arguments {
 struct Progress(TrainingBar);
 
 impl Observer for Progress {
+    fn opened(&mut self, data: &DataListing) {
+        data.left_out().iter().for_each(|text| self.0.say(text));
+    }
+
     fn stepped(&mut self, report: &StepReport) {
         let text = format!(
             "step {} epoch {:.2} loss {:.3} = {:.3} + {:.3} lr {:.1e} {:.1} samples/s, {:.0} % waiting",

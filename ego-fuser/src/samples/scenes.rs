@@ -4,8 +4,8 @@ use std::collections::HashMap;
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 
+use agent::training::DataListing;
 use protocol::PointCloud;
-use sha2::{Digest, Sha256};
 use sim_replay::dataset::{self, LoadOptions, Scenario};
 use sim_replay::frame::Frame;
 
@@ -28,6 +28,8 @@ pub struct TickRef {
 pub struct SceneSet {
     scenarios: Vec<Scenario>,
     ticks: Vec<TickRef>,
+    /// What was wrong with the datasets and could be left out.
+    problems: Vec<String>,
     known: Mutex<HashMap<TickRef, Arc<Vec<Frame>>>>,
 }
 
@@ -37,11 +39,13 @@ impl SceneSet {
     /// # Errors
     /// [`SampleError::Read`] when a folder cannot be read, [`SampleError::Empty`] when there is no tick in any of them.
     pub fn open(folders: &[PathBuf]) -> Result<Self, SampleError> {
-        let mut scenarios = Vec::new();
+        let (mut scenarios, mut problems) = (Vec::new(), Vec::new());
         for folder in folders {
-            scenarios.extend(dataset::open(folder)?.scenarios);
+            let dataset = dataset::open(folder)?;
+            scenarios.extend(dataset.scenarios);
+            problems.extend(dataset.problems.iter().map(ToString::to_string));
         }
-        let set = Self::new(scenarios);
+        let set = Self { problems, ..Self::new(scenarios) };
         if set.ticks.is_empty() {
             return Err(SampleError::Empty(format!("no tick of any scenario in {folders:?}")));
         }
@@ -55,7 +59,7 @@ impl SceneSet {
             (0..found.ticks.len()).map(move |tick| TickRef { scenario, tick }).collect::<Vec<_>>()
         };
         let ticks = scenarios.iter().enumerate().flat_map(of_scenario).collect();
-        Self { scenarios, ticks, known: Mutex::default() }
+        Self { scenarios, ticks, problems: Vec::new(), known: Mutex::default() }
     }
 
     /// All ticks, scenario after scenario.
@@ -102,15 +106,10 @@ impl SceneSet {
         Ok(self.scenario(tick).load(agent, tick.tick, &LoadOptions::default())?.points)
     }
 
-    /// SHA-256 over names, agents and capture times: which data it was, for model cards.
+    /// Which data it is, and what was wrong with it.
     #[must_use]
-    pub fn listing_sha256(&self) -> String {
-        let mut hash = Sha256::new();
-        for scenario in &self.scenarios {
-            hash.update(scenario.name.as_bytes());
-            scenario.agents.iter().for_each(|agent| hash.update(format!("/{agent}")));
-            scenario.ticks.iter().for_each(|tick| hash.update(format!("\n{} {}", tick.stem, tick.capture_nanos)));
-        }
-        hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
+    pub fn data(&self) -> DataListing {
+        let sha256 = dataset::listing_sha256(&self.scenarios);
+        DataListing { sha256, problems: self.problems.clone(), without_pose: 0 }
     }
 }

@@ -79,6 +79,7 @@ impl<'a> Training<'a> {
     }
 
     fn run(mut self, observer: &mut dyn Observer) -> Result<Summary, TrainError> {
+        observer.opened(&self.scenes.data());
         let lattice = *self.model.network().lattice();
         let mut loader = batches(&self.builder, lattice, &self.config.run, self.trainer.steps());
         let mut window = Window::new();
@@ -165,7 +166,7 @@ impl<'a> Training<'a> {
     fn finish(self) -> Result<Summary, TrainError> {
         self.draw_curve()?;
         let Self { config, model, scenes, accuracy, .. } = &self;
-        let trained = self.trainer.save_weights(&model.variables, model.about(), scenes.listing_sha256())?;
+        let trained = self.trainer.save_weights(&model.variables, model.about(), scenes.data())?;
         let summary = Summary { trained, accuracy: *accuracy };
         card::card(config, model, scenes, &summary).write(&config.run.out)?;
         Ok(summary)

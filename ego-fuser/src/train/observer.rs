@@ -1,6 +1,6 @@
 //! What a training tells.
 
-use agent::training::Trained;
+use agent::training::{DataListing, Trained};
 
 use super::Accuracy;
 
@@ -29,6 +29,10 @@ pub struct StepReport {
 
 /// Hears how a training goes.
 pub trait Observer {
+    /// The data to learn from is known.
+    fn opened(&mut self, data: &DataListing) {
+        let _ = data;
+    }
     /// Some steps are done.
     fn stepped(&mut self, report: &StepReport);
     /// A validation is done.

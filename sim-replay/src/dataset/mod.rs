@@ -19,6 +19,7 @@ mod hdf5_poses;
 mod kitti_object;
 mod kitti_odometry;
 mod kitti_text;
+mod listing;
 mod localization;
 mod nclt_ground_truth;
 mod numpy_tags;
@@ -35,6 +36,7 @@ use protocol::{CavId, Handedness};
 use serde::Serialize;
 
 pub use error::ReadError;
+pub use listing::listing_sha256;
 pub use open::{OpenOptions, open, open_with};
 
 use crate::frame::Frame;

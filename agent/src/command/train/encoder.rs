@@ -3,10 +3,10 @@
 use std::path::PathBuf;
 
 use agent::localizer::SceneEncoderConfig;
-use agent::localizer::training::{EncoderSummary, EncoderTrainConfig, train_encoder};
+use agent::localizer::training::{EncoderAccuracy, EncoderReport, EncoderSummary, EncoderTrainConfig, train_encoder};
 use agent::training::{ModelCard, TrainingBar, TrainingOptions};
 
-use super::options::{bad, check_folders, run_config};
+use super::options::{bad, check_folders, run_config, say_left_out};
 
 /// Train a scene encoder on sweeps that overlap; writes checkpoint, curve.csv, weights.safetensors and model-card.md.
 ///
@@ -42,30 +42,25 @@ fn parse_config(name: &str) -> Result<SceneEncoderConfig, String> {
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let config = args.config()?;
     let bar = TrainingBar::default();
-    let summary = train_encoder(
-        &config,
-        &mut |report| {
-            let text = format!(
-                "step {} loss {:.3} top-1 {:.1} % offset {:.2} m",
-                report.step,
-                report.loss,
-                100.0 * report.accuracy.top1,
-                report.accuracy.offset_m
-            );
-            bar.report(report.share_done, report.seconds, &text);
-        },
-        &mut |step, accuracy| {
-            bar.say(&format!(
-                "step {step}: validation top-1 {:.1} % offset {:.2} m",
-                100.0 * accuracy.top1,
-                accuracy.offset_m
-            ));
-        },
-    )?;
+    let summary = train_encoder(&config, &mut |report| tell(&bar, report))?;
     bar.finish();
     card(&config, &summary).write(&config.run.out)?;
     args.options.print(&summary.trained, &serde_json::json!({"accuracy": summary.accuracy}));
     Ok(())
+}
+
+fn tell(bar: &TrainingBar, report: &EncoderReport) {
+    match report {
+        EncoderReport::Read(data) => say_left_out(bar, data),
+        EncoderReport::Stepped { step, share_done, seconds, loss, accuracy } => {
+            let EncoderAccuracy { top1, offset_m } = accuracy;
+            let text = format!("step {step} loss {loss:.3} top-1 {:.1} % offset {offset_m:.2} m", 100.0 * top1);
+            bar.report(*share_done, *seconds, &text);
+        }
+        EncoderReport::Validated(step, EncoderAccuracy { top1, offset_m }) => {
+            bar.say(&format!("step {step}: validation top-1 {:.1} % offset {offset_m:.2} m", 100.0 * top1));
+        }
+    }
 }
 
 impl Args {

@@ -6,7 +6,7 @@ use agent::localizer::training::{EndToEndTrainConfig, train_end_to_end};
 use agent::localizer::{EndToEndKind, SceneEncoderConfig};
 use agent::training::{ModelCard, TrainingBar, TrainingOptions};
 
-use super::options::{check_folders, run_config};
+use super::options::{check_folders, run_config, say_left_out};
 
 /// Train a competitor of the localizer on one town, from nothing; writes checkpoint,
 /// weights.safetensors and model-card.md.
@@ -56,6 +56,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         bar.report(report.share_done, report.seconds, &format!("step {} error {:.2} m", report.step, report.error_m));
     })?;
     bar.finish();
+    say_left_out(&bar, &trained.data);
     let title = format!("End-to-end regressor of {}: {:?}", config.town, config.regresses);
     let mut card = ModelCard::new(&title, "Trained from nothing on the sweeps of one town.");
     card.trained(&config.run, &trained, "all sweeps", "sweeps");

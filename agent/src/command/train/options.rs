@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use agent::training::{RunConfig, TrainingOptions};
+use agent::training::{DataListing, RunConfig, TrainingBar, TrainingOptions};
 use anyhow::Context;
 
 use crate::cli::BadInput;
@@ -23,4 +23,9 @@ pub(crate) fn check_folders<'a>(folders: impl IntoIterator<Item = &'a PathBuf>) 
         std::fs::read_dir(folder).with_context(|| folder.display().to_string()).map_err(BadInput)?;
     }
     Ok(())
+}
+
+/// Says what of the data is of no use.
+pub(crate) fn say_left_out(bar: &TrainingBar, data: &DataListing) {
+    data.left_out().iter().for_each(|text| bar.say(text));
 }

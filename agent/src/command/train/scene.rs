@@ -8,7 +8,7 @@ use agent::localizer::training::{
 };
 use agent::training::{ModelCard, TrainingBar, TrainingOptions};
 
-use super::options::{bad, check_folders, run_config};
+use super::options::{bad, check_folders, run_config, say_left_out};
 
 /// Train the head of one town on the features of a frozen encoder; writes checkpoint, curve.csv, weights.safetensors and
 /// model-card.md.
@@ -82,6 +82,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
 fn tell(bar: &TrainingBar, report: &SceneReport) {
     match report {
         SceneReport::Encoding(done, total) => bar.report(0.0, 0.0, &format!("{done} of {total} sweeps encoded")),
+        SceneReport::Encoded(data) => say_left_out(bar, data),
         SceneReport::Classified(share) => {
             bar.say(&format!("{:.1} % of the training sweeps are put into their cluster", 100.0 * share));
         }

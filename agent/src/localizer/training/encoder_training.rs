@@ -14,7 +14,7 @@ use super::error::LocalizerTrainError;
 use super::pairs::{Pair, PairMaker};
 use super::sweep_store::SweepStore;
 use crate::localizer::{SceneEncoder, SceneEncoderConfig};
-use crate::training::{Curve, Prefetch, RunConfig, Trained, Trainer};
+use crate::training::{Curve, DataListing, Prefetch, RunConfig, Trained, Trainer};
 use crate::weights::{CONFIG_KEY, KIND_KEY};
 
 /// Pairs that a validation looks at.
@@ -47,18 +47,25 @@ pub struct EncoderAccuracy {
 }
 
 /// Where a training of an encoder is.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct EncoderReport {
-    /// Steps done.
-    pub step: u64,
-    /// Share that is done, 0..1.
-    pub share_done: f64,
-    /// Seconds spent so far.
-    pub seconds: f64,
-    /// Mean loss since the last report.
-    pub loss: f64,
-    /// Mean accuracy on the training pairs since the last report.
-    pub accuracy: EncoderAccuracy,
+#[derive(Debug, Clone, PartialEq)]
+pub enum EncoderReport {
+    /// Sweeps to learn from or to validate on have been read.
+    Read(DataListing),
+    /// Some steps are done.
+    Stepped {
+        /// Steps done.
+        step: u64,
+        /// Share that is done, 0..1.
+        share_done: f64,
+        /// Seconds spent so far.
+        seconds: f64,
+        /// Mean loss since the last report.
+        loss: f64,
+        /// Mean accuracy on the training pairs since the last report.
+        accuracy: EncoderAccuracy,
+    },
+    /// A validation is done, after so many steps.
+    Validated(u64, EncoderAccuracy),
 }
 
 /// How a training of an encoder ended.
@@ -72,17 +79,15 @@ pub struct EncoderSummary {
     pub accuracy: Option<EncoderAccuracy>,
 }
 
-/// Trains an encoder; writes checkpoint, curve and weights into `config.run.out`. `report` hears of some steps, `validated`
-/// of every validation.
+/// Trains an encoder; writes checkpoint, curve and weights into `config.run.out`.
 ///
 /// # Errors
 /// [`LocalizerTrainError`]; the last checkpoint stays.
 pub fn train_encoder(
     config: &EncoderTrainConfig,
-    report: &mut dyn FnMut(&EncoderReport),
-    validated: &mut dyn FnMut(u64, &EncoderAccuracy),
+    observe: &mut dyn FnMut(&EncoderReport),
 ) -> Result<EncoderSummary, LocalizerTrainError> {
-    let mut training = Training::prepare(config)?;
+    let mut training = Training::prepare(config, observe)?;
     let maker = training.maker.clone();
     let batch = config.run.batch as u64;
     let mut loader = Prefetch::start(config.run.loader_threads, training.trainer.steps(), move |number| {
@@ -93,14 +98,11 @@ pub fn train_encoder(
         training.step(&loader.next_batch()??, &mut window)?;
         let step = training.trainer.steps();
         if step.is_multiple_of(REPORT_EVERY) {
-            let told = training.report(std::mem::take(&mut window));
-            let EncoderAccuracy { top1, offset_m } = told.accuracy;
-            training.curve.numbers(&[step as f64, told.seconds, told.loss, top1, offset_m])?;
-            report(&told);
+            observe(&training.report(std::mem::take(&mut window))?);
         }
         if step.is_multiple_of(config.validate_every) || training.share_done() >= 1.0 {
             if let Some(accuracy) = training.validate()? {
-                validated(step, &accuracy);
+                observe(&EncoderReport::Validated(step, accuracy));
             }
             training.trainer.checkpoint(&training.variables)?;
         }
@@ -122,14 +124,18 @@ struct Training<'a> {
 }
 
 impl<'a> Training<'a> {
-    fn prepare(config: &'a EncoderTrainConfig) -> Result<Self, LocalizerTrainError> {
+    fn prepare(
+        config: &'a EncoderTrainConfig,
+        observe: &mut dyn FnMut(&EncoderReport),
+    ) -> Result<Self, LocalizerTrainError> {
         let run = &config.run;
         run.start()?;
         let variables = VarStore::new(run.device);
         let encoder = SceneEncoder::new(&(variables.root() / "encoder"), &config.encoder)?;
         let contrast = Contrast::new(&(variables.root() / "contrast"), config.encoder.local_channels());
-        let maker = |folders: &[PathBuf], seed| {
+        let mut maker = |folders: &[PathBuf], seed| {
             let store = Arc::new(SweepStore::read(folders, config.encoder.range_m)?);
+            observe(&EncoderReport::Read(store.data.clone()));
             Ok::<_, LocalizerTrainError>((PairMaker::new(Arc::clone(&store), config.encoder.clone(), seed)?, store))
         };
         let (training, store) = maker(&config.scenes, run.seed)?;
@@ -170,15 +176,13 @@ impl<'a> Training<'a> {
         Ok(())
     }
 
-    fn report(&self, window: Window) -> EncoderReport {
-        let mean = |sum: f64| sum / window.steps.max(1) as f64;
-        EncoderReport {
-            step: self.trainer.steps(),
-            share_done: self.share_done().min(1.0),
-            seconds: self.trainer.seconds(),
-            loss: mean(window.loss),
-            accuracy: EncoderAccuracy { top1: mean(window.top1), offset_m: mean(window.offset_m) },
-        }
+    /// What the steps of `window` were like, in the curve too.
+    fn report(&mut self, window: Window) -> Result<EncoderReport, LocalizerTrainError> {
+        let (loss, accuracy) = window.means();
+        let (step, seconds) = (self.trainer.steps(), self.trainer.seconds());
+        self.curve.numbers(&[step as f64, seconds, loss, accuracy.top1, accuracy.offset_m])?;
+        let share_done = self.share_done().min(1.0);
+        Ok(EncoderReport::Stepped { step, share_done, seconds, loss, accuracy })
     }
 
     fn validate(&mut self) -> Result<Option<EncoderAccuracy>, LocalizerTrainError> {
@@ -189,7 +193,7 @@ impl<'a> Training<'a> {
             let loss = no_grad(|| self.loss(&pairs))?;
             window.add(&loss)?;
         }
-        self.accuracy = Some(self.report(window).accuracy);
+        self.accuracy = Some(window.means().1);
         Ok(self.accuracy)
     }
 
@@ -204,9 +208,8 @@ impl<'a> Training<'a> {
         let config = serde_json::to_string(&self.config.encoder).expect("a configuration is JSON");
         let about =
             BTreeMap::from([(CONFIG_KEY.to_owned(), config), (KIND_KEY.to_owned(), SceneEncoder::KIND.to_owned())]);
-        let data_sha256 = self.store.listing_sha256.clone();
         Ok(EncoderSummary {
-            trained: self.trainer.save_weights(&encoder, about, data_sha256)?,
+            trained: self.trainer.save_weights(&encoder, about, self.store.data.clone())?,
             sweeps: self.store.sweeps.len(),
             accuracy: self.accuracy,
         })
@@ -229,5 +232,11 @@ impl Window {
         self.top1 += loss.top1;
         self.offset_m += loss.offset_m;
         Ok(())
+    }
+
+    /// Mean loss and accuracy.
+    fn means(&self) -> (f64, EncoderAccuracy) {
+        let mean = |sum: f64| sum / self.steps.max(1) as f64;
+        (mean(self.loss), EncoderAccuracy { top1: mean(self.top1), offset_m: mean(self.offset_m) })
     }
 }

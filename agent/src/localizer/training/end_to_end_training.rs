@@ -112,7 +112,7 @@ pub fn train_end_to_end(
         (CONFIG_KEY.to_owned(), serde_json::to_string(&network_config).expect("a configuration is JSON")),
         (KIND_KEY.to_owned(), EndToEndLocalizer::KIND.to_owned()),
     ]);
-    Ok(trainer.save_weights(&variables, about, list.listing_sha256.clone())?)
+    Ok(trainer.save_weights(&variables, about, list.data())?)
 }
 
 /// Middle of the positions; reads a tenth of them.

@@ -1,16 +1,16 @@
 //! Sweeps with true poses, kept in memory: centimetres as 16-bit integers, a third of a megabyte each.
 
+use std::collections::BTreeSet;
 use std::path::PathBuf;
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 use rand::Rng;
-use sha2::{Digest, Sha256};
 use sim_replay::dataset::{self, LoadOptions, Scenario};
 
 use super::error::LocalizerTrainError;
 use crate::localizer::{SceneEncoderConfig, SweepVoxels};
-use crate::training::Prefetch;
+use crate::training::{DataListing, Prefetch};
 
 /// Units of stored coordinates, metres.
 const UNIT_M: f32 = 0.01;
@@ -68,8 +68,10 @@ pub(super) fn yaw(angle_rad: f64) -> Isometry3<f64> {
 #[derive(Debug)]
 pub struct SweepList {
     places: Vec<Place>,
-    /// SHA-256 over names, agents and capture times: which data it is, for model cards.
-    pub listing_sha256: String,
+    sha256: String,
+    problems: Vec<String>,
+    /// Of those read so far.
+    without_pose: Mutex<BTreeSet<usize>>,
 }
 
 #[derive(Debug)]
@@ -87,27 +89,32 @@ impl SweepList {
     /// # Errors
     /// [`LocalizerTrainError`] when a folder cannot be read or holds no sweep.
     pub fn open(folders: &[PathBuf]) -> Result<Self, LocalizerTrainError> {
-        let mut places = Vec::new();
-        let mut hash = Sha256::new();
+        let (mut places, mut scenarios, mut problems) = (Vec::new(), Vec::new(), Vec::new());
         let mut drive = 0;
         for (world, folder) in folders.iter().enumerate() {
-            for scenario in dataset::open(folder)?.scenarios {
-                hash.update(scenario.name.as_bytes());
-                scenario.agents.iter().for_each(|agent| hash.update(format!("/{agent}")));
-                scenario.ticks.iter().for_each(|tick| hash.update(format!("\n{} {}", tick.stem, tick.capture_nanos)));
-                let scenario = Arc::new(scenario);
+            let dataset = dataset::open(folder)?;
+            problems.extend(dataset.problems.iter().map(ToString::to_string));
+            for scenario in dataset.scenarios.into_iter().map(Arc::new) {
                 for agent in 0..scenario.agents.len() {
                     let place = |tick| Place { scenario: Arc::clone(&scenario), agent, tick, world, drive };
                     places.extend((0..scenario.ticks.len()).map(place));
                     drive += 1;
                 }
+                scenarios.push(scenario);
             }
         }
         if places.is_empty() {
             return Err(LocalizerTrainError::NoSweeps(folders.to_vec()));
         }
-        let listing_sha256 = hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect();
-        Ok(Self { places, listing_sha256 })
+        let sha256 = dataset::listing_sha256(scenarios.iter().map(AsRef::as_ref));
+        Ok(Self { places, sha256, problems, without_pose: Mutex::default() })
+    }
+
+    /// Which data it is, and what of it has been found to be of no use so far.
+    #[must_use]
+    pub fn data(&self) -> DataListing {
+        let without_pose = self.without_pose.lock().unwrap_or_else(PoisonError::into_inner).len();
+        DataListing { sha256: self.sha256.clone(), without_pose, problems: self.problems.clone() }
     }
 
     /// Keeps at most `count` sweeps, evenly spread.
@@ -142,7 +149,10 @@ impl SweepList {
     pub fn read(&self, index: usize, range_m: f64) -> Result<Option<StoredSweep>, LocalizerTrainError> {
         let Place { scenario, agent, tick, world, drive } = &self.places[index];
         let mut frame = scenario.load(*agent, *tick, &LoadOptions::default())?;
-        let Some(pose) = frame.world_from_lidar else { return Ok(None) };
+        let Some(pose) = frame.world_from_lidar else {
+            self.without_pose.lock().unwrap_or_else(PoisonError::into_inner).insert(index);
+            return Ok(None);
+        };
         let range = range_m as f32;
         frame.points.xyzi.retain(|[x, y, z, _]| x * x + y * y <= range * range && z.is_finite());
         Ok(Some(StoredSweep::new(*world, *drive, pose.isometry(), &frame.points.xyzi)))
@@ -154,8 +164,8 @@ impl SweepList {
 pub struct SweepStore {
     /// The sweeps, drive after drive.
     pub sweeps: Vec<StoredSweep>,
-    /// SHA-256 over names, agents and capture times: which data it is, for model cards.
-    pub listing_sha256: String,
+    /// Which data it is.
+    pub data: DataListing,
 }
 
 impl SweepStore {
@@ -166,10 +176,10 @@ impl SweepStore {
     pub fn read(folders: &[PathBuf], range_m: f64) -> Result<Self, LocalizerTrainError> {
         let list = Arc::new(SweepList::open(folders)?);
         let count = list.len();
-        let listing_sha256 = list.listing_sha256.clone();
+        let source = Arc::clone(&list);
         let threads = std::thread::available_parallelism().map_or(1, usize::from);
         let mut reader = Prefetch::start(threads, 0, move |number| match (number as usize) < count {
-            true => list.read(number as usize, range_m),
+            true => source.read(number as usize, range_m),
             false => Ok(None),
         });
         let mut sweeps = Vec::with_capacity(count);
@@ -178,7 +188,7 @@ impl SweepStore {
         }
         match sweeps.is_empty() {
             true => Err(LocalizerTrainError::NoSweeps(folders.to_vec())),
-            false => Ok(Self { sweeps, listing_sha256 }),
+            false => Ok(Self { sweeps, data: list.data() }),
         }
     }
 }

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use crate::localizer::training::{RedundancyConfig, SceneAccuracy, SweepAugmentation};
-use crate::training::{RunConfig, Trained};
+use crate::training::{DataListing, RunConfig, Trained};
 
 /// What to train, on what, for how long.
 #[derive(Debug, Clone)]
@@ -40,10 +40,12 @@ pub struct SceneTrainConfig {
 }
 
 /// Where a training of a head is.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, PartialEq)]
 pub enum SceneReport {
     /// Sweeps are being encoded: how many of how many are done.
     Encoding(usize, usize),
+    /// All sweeps to learn from or to validate on are encoded.
+    Encoded(DataListing),
     /// The classifier is done: share of training sweeps that it puts into their class.
     Classified(f64),
     /// Some steps are done.

@@ -5,7 +5,7 @@ use std::sync::Arc;
 use super::config::{SceneReport, SceneTrainConfig};
 use crate::localizer::training::{CacheOptions, FeatureCache, LocalizerTrainError, SweepAugmentation, SweepList};
 use crate::localizer::{SceneEncoder, SceneEncoderConfig};
-use crate::training::RunConfig;
+use crate::training::{DataListing, RunConfig};
 
 /// Features of the sweeps of a town.
 pub(super) struct Features {
@@ -13,8 +13,8 @@ pub(super) struct Features {
     pub(super) validation: Option<FeatureCache>,
     pub(super) encoder: SceneEncoderConfig,
     pub(super) encoder_sha256: String,
-    /// SHA-256 of the listing of the data.
-    pub(super) data_sha256: String,
+    /// What the training ones are of.
+    pub(super) data: DataListing,
 }
 
 impl Features {
@@ -29,7 +29,9 @@ impl Features {
         let mut encode = |list: &Arc<SweepList>, augmentation| {
             let mut progress = |done, total| observe(&SceneReport::Encoding(done, total));
             let options = CacheOptions { augmentation, seed, threads, precision, device };
-            FeatureCache::build(list, &encoder, options, &mut progress)
+            let cache = FeatureCache::build(list, &encoder, options, &mut progress)?;
+            observe(&SceneReport::Encoded(list.data()));
+            Ok::<_, LocalizerTrainError>(cache)
         };
         let training = encode(&list, config.augmentation)?;
         let validation = match config.validation.as_slice() {
@@ -42,6 +44,6 @@ impl Features {
             }
         };
         let encoder = encoder.config().clone();
-        Ok(Self { training, validation, encoder, encoder_sha256, data_sha256: list.listing_sha256.clone() })
+        Ok(Self { training, validation, encoder, encoder_sha256, data: list.data() })
     }
 }

@@ -28,7 +28,7 @@ use super::redundancy::Redundancy;
 use super::scene_validation::{SceneAccuracy, validate};
 use crate::localizer::head_config::SceneHeadConfig;
 use crate::localizer::scene_head::SceneHead;
-use crate::training::{Curve, Length, Trainer};
+use crate::training::{Curve, DataListing, Length, Trainer};
 use crate::weights::{CONFIG_KEY, KIND_KEY};
 
 /// What a unit of cross entropy over the centres weighs, metres.
@@ -80,7 +80,7 @@ struct Training<'a> {
     window: Window,
     accuracy: Option<SceneAccuracy>,
     curve: Curve,
-    data_sha256: String,
+    data: DataListing,
     preparing_seconds: f64,
 }
 
@@ -94,7 +94,7 @@ impl<'a> Training<'a> {
         run.start()?;
         let features = Features::compute(config, observe)?;
         let head_config = head_config(config, &features)?;
-        let Features { training: cache, validation, data_sha256, .. } = features;
+        let Features { training: cache, validation, data, .. } = features;
         let variables = VarStore::new(run.device);
         let mut head = SceneHead::new(&variables.root(), &head_config)?;
         let positions: Vec<[f64; 3]> =
@@ -123,7 +123,7 @@ impl<'a> Training<'a> {
             accuracy: None,
             curve: trainer.curve(header)?,
             trainer,
-            data_sha256,
+            data,
             preparing_seconds: started.elapsed().as_secs_f64(),
         })
     }
@@ -217,7 +217,7 @@ impl<'a> Training<'a> {
             (KIND_KEY.to_owned(), SceneHead::KIND.to_owned()),
         ]);
         Ok(SceneSummary {
-            trained: self.trainer.save_weights(&variables, about, self.data_sha256)?,
+            trained: self.trainer.save_weights(&variables, about, self.data)?,
             preparing_seconds: self.preparing_seconds,
             sweeps: self.cache.sweep_count(),
             cells_shown: self.cells_shown,
