@@ -1,6 +1,5 @@
 //! `ego-fuser align`: approaches to alignment without GNSS, side by side.
 
-use std::io::IsTerminal;
 use std::path::PathBuf;
 use std::str::FromStr;
 use std::sync::Arc;
@@ -14,11 +13,10 @@ use clap::ValueEnum;
 use ego_fuser::alignment::compare::{self, BoxSource};
 use ego_fuser::alignment::table::{Row, Tally, markdown};
 use ego_fuser::alignment::{Approach, BoxIcp, CloudIcp, FreeAlign, Measured, Poses};
-use indicatif::{ProgressBar, ProgressStyle};
 use protocol::CavId;
-use sim_replay::dataset::{self, Scenario};
+use sim_replay::dataset::Scenario;
 
-use super::BadInput;
+use super::{BadInput, progress, scenarios};
 
 /// Compares ways to align the ego and a neighbour: time per pair, bytes on the air, success.
 ///
@@ -111,10 +109,7 @@ impl Arguments {
     /// Compares, and prints the table.
     pub(crate) fn run(self) -> Result<()> {
         tch::set_num_threads(i32::from(self.threads.max(1)));
-        let mut scenarios = Vec::new();
-        for folder in &self.data {
-            scenarios.extend(dataset::open(folder).map_err(|error| BadInput(error.to_string()))?.scenarios);
-        }
+        let scenarios = scenarios(&self.data)?;
         let mut approaches = self.approaches()?;
         let mut boxes = self.box_source(&approaches)?;
         let rows = self.compare(&mut approaches, &mut boxes, &scenarios)?;
@@ -175,7 +170,7 @@ impl Arguments {
         boxes: &mut BoxSource,
         scenarios: &[Scenario],
     ) -> Result<Vec<Row>> {
-        let bar = progress(scenarios.len());
+        let bar = progress("scenes", scenarios.len());
         let mut tallies = vec![Tally::default(); approaches.len()];
         for scenario in scenarios {
             let ticks = (0..scenario.ticks.len()).step_by(self.every as usize).take(self.frames.unwrap_or(usize::MAX));
@@ -195,12 +190,4 @@ fn from_source(source: &NamedSource) -> Result<Box<dyn Approach>> {
     // Once in vain, so that a missing file is found before the first scene.
     config.build().map_err(|error| bad(&error))?;
     Ok(Box::new(Poses::new(name.clone(), Measured::True, move || config.build())))
-}
-
-fn progress(scenarios: usize) -> ProgressBar {
-    let bar = if std::io::stderr().is_terminal() { ProgressBar::new(scenarios as u64) } else { ProgressBar::hidden() };
-    if let Ok(style) = ProgressStyle::with_template("scenes {wide_bar} {pos}/{len} eta {eta}") {
-        bar.set_style(style);
-    }
-    bar
 }

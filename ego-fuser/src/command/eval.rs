@@ -1,6 +1,5 @@
 //! `ego-fuser eval`: AP of a method on recorded scenes.
 
-use std::io::IsTerminal;
 use std::ops::ControlFlow;
 use std::path::PathBuf;
 
@@ -9,12 +8,11 @@ use anyhow::Result;
 use ego_fuser::Method;
 use ego_fuser::average_precision::{Ordering, Scorer, THRESHOLDS};
 use ego_fuser::evaluate::{EvaluateConfig, EvaluatedFrame, Evaluator};
-use indicatif::{ProgressBar, ProgressStyle};
 use protocol::CodecConfig;
 use serde_json::json;
-use sim_replay::dataset::{self, Scenario};
+use sim_replay::dataset::Scenario;
 
-use super::BadInput;
+use super::{progress, scenarios};
 
 /// Measures AP on datasets, with true poses, nothing late and nothing lost.
 #[derive(Debug, clap::Args)]
@@ -43,11 +41,7 @@ impl Arguments {
     /// Evaluates and prints a line per method.
     pub(crate) fn run(self) -> Result<()> {
         tch::set_num_threads(i32::from(self.threads.max(1)));
-        let mut scenarios = Vec::new();
-        for folder in &self.data {
-            let found = dataset::open(folder).map_err(|error| BadInput(error.to_string()))?.scenarios;
-            scenarios.extend(found);
-        }
+        let scenarios = scenarios(&self.data)?;
         let methods =
             if self.method.is_empty() { vec![None] } else { self.method.iter().map(|method| Some(*method)).collect() };
         let mut rows = Vec::new();
@@ -71,12 +65,8 @@ impl Arguments {
 fn evaluate(config: EvaluateConfig, scenarios: &[Scenario], frames: usize, json: bool) -> Result<serde_json::Value> {
     let mut evaluator = Evaluator::new(config)?;
     let ticks: usize = scenarios.iter().map(|scenario| scenario.ticks.len().min(frames)).sum();
-    let bar = if std::io::stderr().is_terminal() { ProgressBar::new(ticks as u64) } else { ProgressBar::hidden() };
-    if let Ok(style) = ProgressStyle::with_template("{msg} {wide_bar} {pos}/{len} eta {eta}") {
-        bar.set_style(style);
-    }
     let method = evaluator.ego().method();
-    bar.set_message(method.name());
+    let bar = progress(method.name(), ticks);
     let mut tally = Tally::default();
     for scenario in scenarios {
         let mut done = 0;

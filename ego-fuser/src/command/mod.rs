@@ -6,7 +6,12 @@ mod methods;
 mod run;
 mod train;
 
+use std::io::IsTerminal;
+use std::path::PathBuf;
 use std::process::ExitCode;
+
+use indicatif::{ProgressBar, ProgressStyle};
+use sim_replay::dataset::{self, Scenario};
 
 /// What `ego-fuser` can be asked to do.
 #[derive(Debug, clap::Subcommand)]
@@ -44,4 +49,22 @@ pub(crate) struct BadInput(pub(crate) String);
 /// Exit code of a failed command: 2 for bad usage or input, 1 otherwise.
 pub(crate) fn exit_code(error: &anyhow::Error) -> ExitCode {
     if error.chain().any(|cause| cause.is::<BadInput>()) { ExitCode::from(2) } else { ExitCode::FAILURE }
+}
+
+/// All scenarios of some datasets.
+fn scenarios(folders: &[PathBuf]) -> anyhow::Result<Vec<Scenario>> {
+    let mut scenarios = Vec::new();
+    for folder in folders {
+        scenarios.extend(dataset::open(folder).map_err(|error| BadInput(error.to_string()))?.scenarios);
+    }
+    Ok(scenarios)
+}
+
+/// A bar where somebody watches; `what` stands before it.
+fn progress(what: &'static str, total: usize) -> ProgressBar {
+    let bar = if std::io::stderr().is_terminal() { ProgressBar::new(total as u64) } else { ProgressBar::hidden() };
+    if let Ok(style) = ProgressStyle::with_template("{msg} {wide_bar} {pos}/{len} eta {eta}") {
+        bar.set_style(style);
+    }
+    bar.with_message(what)
 }
