@@ -7,6 +7,7 @@ use agent::localizer::{EndToEndKind, SceneEncoderConfig};
 use agent::training::{ModelCard, TrainingBar, TrainingOptions};
 
 use super::options::{check_folders, run_config, say_left_out};
+use super::product_caches;
 
 /// Train a competitor of the localizer on one town, from nothing; writes checkpoint,
 /// weights.safetensors and model-card.md.
@@ -40,6 +41,7 @@ enum Regresses {
 }
 
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
+    product_caches::keep_few()?;
     check_folders(&args.scenes)?;
     let config = EndToEndTrainConfig {
         scenes: args.scenes.clone(),

@@ -3,6 +3,7 @@
 mod encoder;
 mod end_to_end;
 mod options;
+mod product_caches;
 mod scene;
 
 use clap::Subcommand;
