@@ -7,7 +7,6 @@ use agent::localizer::training::{EncoderAccuracy, EncoderReport, EncoderSummary,
 use agent::training::{ModelCard, TrainingBar, TrainingOptions};
 
 use super::options::{bad, check_folders, run_config, say_left_out};
-use super::product_caches;
 
 /// Train a scene encoder on sweeps that overlap; writes checkpoint, curve.csv, weights.safetensors and model-card.md.
 ///
@@ -41,7 +40,6 @@ fn parse_config(name: &str) -> Result<SceneEncoderConfig, String> {
 }
 
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
-    product_caches::keep_few()?;
     let config = args.config()?;
     let bar = TrainingBar::default();
     let summary = train_encoder(&config, &mut |report| tell(&bar, report))?;

@@ -7,7 +7,6 @@ use agent::localizer::{EndToEndKind, SceneEncoderConfig};
 use agent::training::{ModelCard, TrainingBar, TrainingOptions};
 
 use super::options::{check_folders, run_config, say_left_out};
-use super::product_caches;
 
 /// Train a competitor of the localizer on one town, from nothing; writes checkpoint,
 /// weights.safetensors and model-card.md.
@@ -41,7 +40,6 @@ enum Regresses {
 }
 
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
-    product_caches::keep_few()?;
     check_folders(&args.scenes)?;
     let config = EndToEndTrainConfig {
         scenes: args.scenes.clone(),

@@ -24,6 +24,7 @@ enum Stage {
 
 /// Trains what was asked for.
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
+    product_caches::keep_few()?;
     match &args.stage {
         Stage::Encoder(args) => encoder::run(args),
         Stage::Scene(args) => scene::run(args),

@@ -8,7 +8,7 @@ use anyhow::Context;
 
 /// Where libtorch and the library it computes with in bfloat16 look up how many they keep; both keep 1024 where this is not set.
 const CAPACITIES: [&str; 2] = ["LRU_CACHE_CAPACITY", "ONEDNN_PRIMITIVE_CACHE_CAPACITY"];
-/// Enough where no shape comes again.
+/// Enough where no shape comes again; a head's steps, of equal shapes all, take no longer with it either.
 const FEW: &str = "16";
 
 /// Goes on as the same process with few compiled products, unless somebody has said how many.
