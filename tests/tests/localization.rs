@@ -5,15 +5,17 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
 use agent::localizer::training::{
-    EncoderReport, EncoderTrainConfig, LocalizerTrainError, RedundancyConfig, SceneReport, SceneTrainConfig,
-    SweepAugmentation, train_encoder, train_scene,
+    EncoderReport, EncoderStart, EncoderTrainConfig, EndToEndReport, EndToEndTrainConfig, LocalizerTrainError,
+    RedundancyConfig, SceneReport, SceneTrainConfig, SweepAugmentation, train_encoder, train_end_to_end, train_scene,
 };
-use agent::localizer::{Localizer, LocalizerError, SceneEncoderConfig};
+use agent::localizer::{EndToEndKind, EndToEndLocalizer, Localizer, LocalizerError, SceneEncoder, SceneEncoderConfig};
 use agent::training::{Length, RunConfig, TrainingError};
+use agent::weights::Weights;
 use protocol::{NoPoseReason, PointCloud, PoseEstimate};
 use sim_replay::dataset::{self, LoadOptions};
 use sim_replay::synth::{Subset, SynthOptions, generate};
 use tch::Device;
+use tch::nn::VarStore;
 
 /// libtorch has one generator of random numbers per process: who begins a training has it alone.
 fn alone() -> MutexGuard<'static, ()> {
@@ -145,6 +147,48 @@ fn a_localizer_learns_two_drives_and_finds_itself_on_them() {
     // And an encoder is no head.
     let message = Localizer::load(&encoder, &encoder, Device::Cpu).unwrap_err().to_string();
     assert!(message.contains("weights.safetensors") && message.contains("\"scene encoder\""), "{message}");
+}
+
+#[test]
+fn competitors_learn_on_the_features_of_an_encoder_that_stays_as_it_is() {
+    let _alone = alone();
+    let dir = tempfile::tempdir().unwrap();
+    let scenes = drives(dir.path());
+    let encoder = train_encoder(&encoder_config(&scenes, &dir.path().join("encoder"), 1), &mut |_| ()).unwrap();
+    let encoder = encoder.trained.weights;
+    for (regresses, batch, steps) in [(EndToEndKind::SceneCoordinates, 2, 150), (EndToEndKind::Pose, 32, 300)] {
+        let config = |steps| EndToEndTrainConfig {
+            scenes: vec![scenes.clone()],
+            regresses,
+            town: "small".into(),
+            encoder: EncoderStart::Frozen(encoder.clone()),
+            run: RunConfig { batch, learning_rate: 3e-3, ..run(&dir.path().join(format!("{regresses:?}")), steps) },
+        };
+        let (mut errors, mut encoded) = (Vec::new(), 0);
+        let trained = train_end_to_end(&config(steps), &mut |report| match report {
+            EndToEndReport::Encoding(done, _) => encoded = *done,
+            EndToEndReport::Stepped { error_m, .. } => errors.push(*error_m),
+        })
+        .unwrap();
+        assert!(encoded == 48 && errors.last().unwrap() < &(0.7 * errors[0]), "{regresses:?}: {errors:?}");
+
+        // In the file lie the layers that were trained, behind the encoder as it was.
+        let localizer = EndToEndLocalizer::load(&trained.weights, Device::Cpu).unwrap();
+        assert_eq!(localizer.config().encoder, small());
+        let (before, after) = (VarStore::new(Device::Cpu), VarStore::new(Device::Cpu));
+        SceneEncoder::new(&before.root(), &small()).unwrap();
+        SceneEncoder::new(&(after.root() / "encoder"), &small()).unwrap();
+        Weights::load(&encoder).unwrap().copy_into(&before).unwrap();
+        Weights::load(&trained.weights).unwrap().copy_into(&after).unwrap();
+        let kept = after.variables();
+        for (name, tensor) in before.variables() {
+            assert!(tensor.equal(&kept[&format!("encoder.{name}")]), "{name}");
+        }
+
+        let mut resumed = config(steps + 10);
+        resumed.run.resume = true;
+        assert_eq!(train_end_to_end(&resumed, &mut |_| ()).unwrap().steps, steps + 10);
+    }
 }
 
 #[test]

@@ -99,7 +99,7 @@ impl EndToEndLocalizer {
     fn directly(&self, features: &SceneFeatures, mut times: LocalizerTimes) -> Result<Localization, LocalizerError> {
         let start = Instant::now();
         let answer: Vec<f32> = no_grad(|| {
-            let (position, heading) = self.network.poses(features, Kind::Float)?;
+            let (position, heading) = self.network.poses(&features.sweeps)?;
             Vec::try_from(&Tensor::f_cat(&[position, heading], 1)?.f_reshape([-1])?.f_to_device(Device::Cpu)?)
         })?;
         times.regress = start.elapsed();

@@ -2,14 +2,13 @@
 
 use std::path::PathBuf;
 
-use agent::localizer::training::{EndToEndTrainConfig, train_end_to_end};
+use agent::localizer::training::{EncoderStart, EndToEndReport, EndToEndTrainConfig, train_end_to_end};
 use agent::localizer::{EndToEndKind, SceneEncoderConfig};
 use agent::training::{ModelCard, TrainingBar, TrainingOptions};
 
 use super::options::{check_folders, run_config, say_left_out};
 
-/// Train a competitor of the localizer on one town, from nothing; writes checkpoint,
-/// weights.safetensors and model-card.md.
+/// Train a competitor of the localizer on one town; writes checkpoint, weights.safetensors and model-card.md.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
     /// Folders of scenes, all of the same town.
@@ -21,7 +20,10 @@ pub(crate) struct Args {
     /// Name of the town, for messages and the model card.
     #[arg(long, default_value = "town")]
     town: String,
-    /// Sweeps of a step.
+    /// Weights of an encoder that stays as it is [default: the encoder is trained with the rest, from nothing].
+    #[arg(long, value_name = "FILE")]
+    encoder: Option<PathBuf>,
+    /// Sweeps of a step; with --encoder, 400 cells for each.
     #[arg(long, default_value_t = 6)]
     batch: usize,
     /// Highest learning rate.
@@ -48,17 +50,27 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
             Regresses::Pose => EndToEndKind::Pose,
         },
         town: args.town.clone(),
-        encoder: SceneEncoderConfig::lean(),
+        encoder: match &args.encoder {
+            Some(path) => EncoderStart::Frozen(path.clone()),
+            None => EncoderStart::Untrained(SceneEncoderConfig::lean()),
+        },
         run: run_config(&args.options, args.batch, args.lr)?,
     };
     let bar = TrainingBar::default();
-    let trained = train_end_to_end(&config, &mut |report| {
-        bar.report(report.share_done, report.seconds, &format!("step {} error {:.2} m", report.step, report.error_m));
+    let trained = train_end_to_end(&config, &mut |report| match report {
+        EndToEndReport::Encoding(done, total) => bar.report(0.0, 0.0, &format!("{done} of {total} sweeps encoded")),
+        EndToEndReport::Stepped { step, share_done, seconds, error_m } => {
+            bar.report(*share_done, *seconds, &format!("step {step} error {error_m:.2} m"));
+        }
     })?;
     bar.finish();
     say_left_out(&bar, &trained.data);
     let title = format!("End-to-end regressor of {}: {:?}", config.town, config.regresses);
-    let mut card = ModelCard::new(&title, "Trained from nothing on the sweeps of one town.");
+    let how = match args.encoder {
+        Some(_) => "Last layers on the features of a frozen encoder, trained on the sweeps of one town.",
+        None => "Trained from nothing on the sweeps of one town.",
+    };
+    let mut card = ModelCard::new(&title, how);
     card.trained(&config.run, &trained, "all sweeps", "sweeps");
     card.write(&config.run.out)?;
     args.options.print(&trained, &serde_json::json!({}));

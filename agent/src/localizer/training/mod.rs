@@ -14,7 +14,7 @@ mod scene_validation;
 mod sweep_store;
 
 pub use encoder_training::{EncoderAccuracy, EncoderReport, EncoderSummary, EncoderTrainConfig, train_encoder};
-pub use end_to_end_training::{EndToEndReport, EndToEndTrainConfig, train_end_to_end};
+pub use end_to_end_training::{EncoderStart, EndToEndReport, EndToEndTrainConfig, train_end_to_end};
 pub use error::LocalizerTrainError;
 pub use feature_cache::{CacheOptions, FeatureCache, SweepAugmentation};
 pub use kmeans::kmeans;
