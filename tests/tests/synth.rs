@@ -8,6 +8,7 @@ use std::path::{Path, PathBuf};
 use nalgebra::Point3;
 use sim_replay::dataset::{self, LoadOptions};
 use sim_replay::frame::{Frame, Object};
+use sim_replay::pcd;
 use sim_replay::synth::lidar::LIDAR_MOUNT_M;
 use sim_replay::synth::radar::red_to_velocity;
 use sim_replay::synth::{Subset, Summary, SynthError, SynthOptions, Weather, generate};
@@ -229,6 +230,41 @@ fn weather_copies_lie_beside_the_plain_sweep_and_change_nothing_else() {
     let mut files = contents(copied.path());
     files.retain(|path, _| !path.to_string_lossy().contains("fog_") && !path.to_string_lossy().contains("snow_"));
     assert_eq!(files, contents(plain.path()));
+}
+
+#[test]
+fn weather_copies_label_what_is_in_the_air() {
+    let folder = tempfile::tempdir().unwrap();
+    made(&SynthOptions { frames: 1, copies: vec![Weather::Fog, Weather::Snow], ..v2vdet(42, folder.path()) });
+    let files = contents(folder.path());
+    // The first file of each variant is of the first agent.
+    let sweep = |variant: &str| {
+        let is_wanted = |path: &Path| {
+            let stem = path.extension().is_some_and(|kind| kind == "pcd").then(|| path.file_stem().unwrap());
+            stem.is_some_and(|stem| {
+                stem.to_str().unwrap().split_once('_').map_or("", |(_, variant)| variant) == variant
+            })
+        };
+        let (_, bytes) = files.iter().find(|(path, _)| is_wanted(path)).unwrap();
+        pcd::decode(bytes).unwrap()
+    };
+    let plain = sweep("");
+    assert_eq!(plain.labels, None);
+    for variant in ["fog_0.060", "snow_2.5_2.0"] {
+        let copy = sweep(variant);
+        let labels = copy.labels.unwrap();
+        assert!(labels.iter().all(|label| *label <= 1));
+        // The noise of a range is some centimetres; the plain sweep loses other rays.
+        let share_in_plain = |wanted: u8| {
+            let labelled = copy.points.xyzi.iter().zip(&labels).filter(|(_, label)| **label == wanted);
+            let some: Vec<_> = labelled.map(|(point, _)| point).step_by(37).collect();
+            let is_near = |a: &[f32; 4], b: &[f32; 4]| (0..3).map(|k| (a[k] - b[k]).powi(2)).sum::<f32>() < 0.15 * 0.15;
+            let found = some.iter().filter(|point| plain.points.xyzi.iter().any(|other| is_near(point, other)));
+            found.count() as f64 / some.len() as f64
+        };
+        let (clean, clutter) = (share_in_plain(0), share_in_plain(1));
+        assert!(clean > 0.8 && clutter < 0.2, "{variant}: {clean:.2} of the clean points, {clutter:.2} of the clutter");
+    }
 }
 
 #[test]

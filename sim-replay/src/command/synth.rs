@@ -43,8 +43,8 @@ pub(crate) struct Args {
     /// The weather of all scenarios.
     #[arg(long, value_enum, default_value_t)]
     weather: Weather,
-    /// Write every sweep in these weathers too, beside the plain one and named as in V2X-R: fog, snow or both. What is
-    /// annotated is what the plain sweep hits.
+    /// Write every sweep in these weathers too, beside the plain one and named as in V2X-R: fog, snow or both. Points in
+    /// the air have 1 in the green byte of their colour, all others 0. What is annotated is what the plain sweep hits.
     #[arg(long, value_enum, value_delimiter = ',', value_name = "WEATHER")]
     copies: Vec<Weather>,
     /// Frames of each scenario [default: 60 for v2vdet, 2000 for the others].

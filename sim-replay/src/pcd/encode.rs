@@ -15,32 +15,39 @@ pub enum Encoding {
 
 /// Where intensity is written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum IntensityField {
+pub enum IntensityField<'a> {
     /// A float field `intensity`, exact.
     Intensity,
     /// The red byte of a float field `rgb`, as OPV2V's tools expect it: 0..1 in steps of 1/255.
     Red,
+    /// The same, and in its green byte a label for each point, as in V2X-R's weather. Points beyond the labels have 0.
+    RedAndLabel(&'a [u8]),
 }
 
 /// A PCD file of these points, in the frame and handedness they are in.
 #[must_use]
-pub fn encode(cloud: &PointCloud, encoding: Encoding, intensity: IntensityField) -> Vec<u8> {
+pub fn encode(cloud: &PointCloud, encoding: Encoding, intensity: IntensityField<'_>) -> Vec<u8> {
     let (data, bytes_per_point) = match encoding {
         Encoding::Ascii => ("ascii", 48),
         Encoding::Binary => ("binary", 16),
     };
     let field = match intensity {
         IntensityField::Intensity => "intensity",
-        IntensityField::Red => "rgb",
+        IntensityField::Red | IntensityField::RedAndLabel(_) => "rgb",
     };
     let points = cloud.len();
     let header = format!(
         "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z {field}\nSIZE 4 4 4 4\nTYPE F F F F\n\
          COUNT 1 1 1 1\nWIDTH {points}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {points}\nDATA {data}\n"
     );
-    let stored = cloud.xyzi.iter().map(|&[x, y, z, fourth]| match intensity {
-        IntensityField::Intensity => [x, y, z, fourth],
-        IntensityField::Red => [x, y, z, f32::from_bits(red_byte(fourth) << 16)],
+    let stored = cloud.xyzi.iter().enumerate().map(|(index, &[x, y, z, fourth])| {
+        let packed = |green: u8| f32::from_bits(red_byte(fourth) << 16 | u32::from(green) << 8);
+        let fourth = match intensity {
+            IntensityField::Intensity => fourth,
+            IntensityField::Red => packed(0),
+            IntensityField::RedAndLabel(labels) => packed(labels.get(index).copied().unwrap_or(0)),
+        };
+        [x, y, z, fourth]
     });
     match encoding {
         Encoding::Ascii => {
@@ -95,6 +102,17 @@ mod tests {
             let file = encode(&PointCloud { xyzi: vec![[1.0, 2.0, 3.0, intensity]] }, encoding, IntensityField::Red);
             let back = decode(&file).unwrap().points.xyzi[0][3];
             prop_assert!((back - intensity).abs() <= 0.5 / 255.0 + 1e-6);
+        }
+    }
+
+    #[test]
+    fn labels_come_back_beside_intensity() {
+        let cloud = PointCloud { xyzi: vec![[1.0, 2.0, 3.0, 0.2], [4.0, 5.0, 6.0, 1.0], [7.0, 8.0, 9.0, 0.0]] };
+        for encoding in [Encoding::Ascii, Encoding::Binary] {
+            let back = decode(&encode(&cloud, encoding, IntensityField::RedAndLabel(&[0, 1]))).unwrap();
+            assert_eq!((back.points, back.labels), (cloud.clone(), Some(vec![0, 1, 0])));
+            let back = decode(&encode(&cloud, encoding, IntensityField::RedAndLabel(&[0; 3]))).unwrap();
+            assert_eq!(back.labels, None);
         }
     }
 

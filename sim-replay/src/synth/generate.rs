@@ -210,11 +210,11 @@ impl Scene<'_, '_> {
         let ground = self.world.ground();
         let sensor = lidar_motion(&own.motion);
         let sweep = bench.lidar.sweep(&sensor, ground, &bodies, self.options.weather, noise(5));
-        agent.folder.write_lidar(frame.tick, None, sweep.points)?;
+        agent.folder.write_lidar(frame.tick, None, &sweep)?;
         let (points, hits) = (sweep.points.len(), sweep.hits.to_vec());
         for &weather in &self.options.copies {
             let copy = bench.lidar.again(&sensor, &bodies, weather, noise(7 + weather as u64));
-            agent.folder.write_lidar(frame.tick, weather.variant(), copy.points)?;
+            agent.folder.write_lidar(frame.tick, weather.variant(), &copy)?;
         }
         let half_length_m = 0.5 * recording.vehicles[agent.vehicle].size_m[0];
         let returns = bench.radar.returns(&own.motion, half_length_m, LIDAR_MOUNT_M, STEP_S, ground, &bodies, noise(6));

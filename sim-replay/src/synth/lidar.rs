@@ -55,6 +55,7 @@ pub struct Lidar {
     caster: Caster,
     points: Vec<[f32; 4]>,
     hits: Vec<u32>,
+    labels: Vec<u8>,
 }
 
 /// One sweep as the sensor reports it.
@@ -64,11 +65,13 @@ pub struct LidarSweep<'a> {
     pub points: &'a [[f32; 4]],
     /// How many of the points lie on each body.
     pub hits: &'a [u32],
+    /// For each point 0 where it lies on a surface, as in clear air, and 1 where it is clutter: fog or a flake.
+    pub labels: &'a [u8],
 }
 
 impl Default for Lidar {
     fn default() -> Self {
-        Self { caster: Caster::new(lidar_pattern()), points: Vec::new(), hits: Vec::new() }
+        Self { caster: Caster::new(lidar_pattern()), points: Vec::new(), hits: Vec::new(), labels: Vec::new() }
     }
 }
 
@@ -92,6 +95,7 @@ impl Lidar {
     /// [`Self::sweep`].
     pub fn again(&mut self, sensor: &Sweep, bodies: &[Body<'_>], weather: Weather, seed: u64) -> LidarSweep<'_> {
         self.points.clear();
+        self.labels.clear();
         self.hits.clear();
         self.hits.resize(bodies.len(), 0);
         let mut random = SplitMix64::new(seed);
@@ -107,12 +111,13 @@ impl Lidar {
                 };
                 let [x, y, z] = column.point_m(elevation, range_m);
                 self.points.push([x, y, z, intensity]);
+                self.labels.push(u8::from(hit == MISS));
                 if let Some(count) = self.hits.get_mut(hit as usize) {
                     *count += 1;
                 }
             }
         }
-        LidarSweep { points: &self.points, hits: &self.hits }
+        LidarSweep { points: &self.points, hits: &self.hits, labels: &self.labels }
     }
 }
 

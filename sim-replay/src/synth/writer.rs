@@ -11,7 +11,7 @@ use protocol::PointCloud;
 
 use super::cast::Placement;
 use super::error::SynthError;
-use super::lidar::LIDAR_MOUNT_M;
+use super::lidar::{LIDAR_MOUNT_M, LidarSweep};
 use super::positioning::Fix;
 use super::radar::velocity_to_red;
 use super::vehicle::{Vehicle, VehicleKind};
@@ -57,10 +57,17 @@ impl AgentFolder {
         Ok(Self(folder))
     }
 
-    /// The plain sweep of a tick, or a variant of it.
-    pub(crate) fn write_lidar(&self, tick: u64, variant: Option<&str>, points: &[[f32; 4]]) -> Result<(), SynthError> {
-        let xyzi = points.iter().map(|&[x, y, z, intensity]| [x, -y, z, intensity]).collect();
-        let bytes = pcd::encode(&PointCloud { xyzi }, Encoding::Binary, IntensityField::Intensity);
+    /// The plain sweep of a tick, or a copy of it in another weather: as in V2X-R, with a label that says which points are
+    /// clutter in the green byte beside intensity in the red one.
+    pub(crate) fn write_lidar(
+        &self,
+        tick: u64,
+        variant: Option<&str>,
+        sweep: &LidarSweep<'_>,
+    ) -> Result<(), SynthError> {
+        let xyzi = sweep.points.iter().map(|&[x, y, z, intensity]| [x, -y, z, intensity]).collect();
+        let field = variant.map_or(IntensityField::Intensity, |_| IntensityField::RedAndLabel(sweep.labels));
+        let bytes = pcd::encode(&PointCloud { xyzi }, Encoding::Binary, field);
         let suffix = variant.map(|variant| format!("_{variant}")).unwrap_or_default();
         write_file(&self.0.join(format!("{tick:06}{suffix}.pcd")), bytes)
     }
