@@ -192,3 +192,40 @@ impl SweepStore {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+    use std::path::Path;
+
+    use super::*;
+
+    /// A KITTI sequence of two sweeps of one point each, with or without poses.
+    fn sequence(folder: &Path, poses: &str) {
+        fs::create_dir_all(folder.join("velodyne")).unwrap();
+        for scan in ["000000", "000001"] {
+            let point: Vec<u8> = [7.0f32, 1.0, 0.5, 0.1].iter().flat_map(|axis| axis.to_le_bytes()).collect();
+            fs::write(folder.join("velodyne").join(format!("{scan}.bin")), point).unwrap();
+        }
+        fs::write(folder.join("calib.txt"), "Tr: 1 0 0 0 0 1 0 0 0 0 1 0\n").unwrap();
+        if !poses.is_empty() {
+            fs::write(folder.join("poses.txt"), poses).unwrap();
+        }
+    }
+
+    #[test]
+    fn sweeps_without_a_pose_are_counted() {
+        let folder = tempfile::tempdir().unwrap();
+        let (known, unknown) = (folder.path().join("00"), folder.path().join("11"));
+        sequence(&known, "1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 2 0 1 0 0 0 0 1 0\n");
+        sequence(&unknown, "");
+        let store = SweepStore::read(&[known.clone(), unknown.clone()], 50.0).unwrap();
+        assert_eq!((store.sweeps.len(), store.data.without_pose), (2, 2));
+        assert_eq!(store.data.left_out().unwrap(), "2 sweeps without a pose left out");
+        let alone = SweepStore::read(&[known], 50.0).unwrap();
+        assert_eq!((alone.sweeps.len(), alone.data.left_out()), (2, None));
+        assert_ne!(alone.data.sha256, store.data.sha256);
+        let error = SweepStore::read(&[unknown], 50.0).unwrap_err();
+        assert!(matches!(error, LocalizerTrainError::NoSweeps(_)), "{error}");
+    }
+}

@@ -78,6 +78,8 @@ struct Training<'a> {
     logits: Option<Tensor>,
     cells_shown: u64,
     window: Window,
+    /// The window of the last report.
+    told: Window,
     accuracy: Option<SceneAccuracy>,
     curve: Curve,
     data: DataListing,
@@ -120,6 +122,7 @@ impl<'a> Training<'a> {
             logits: None,
             cells_shown: 0,
             window: Window::default(),
+            told: Window::default(),
             accuracy: None,
             curve: trainer.curve(header)?,
             trainer,
@@ -175,16 +178,19 @@ impl<'a> Training<'a> {
     }
 
     fn report(&mut self) -> SceneReport {
-        let window = std::mem::take(&mut self.window);
-        let mean = |sum: f64| sum / f64::from(window.steps.max(1));
+        // A validation right after a report has nothing newer to tell.
+        if self.window.steps > 0 {
+            self.told = std::mem::take(&mut self.window);
+        }
+        let mean = |sum: f64| sum / f64::from(self.told.steps.max(1));
         SceneReport::Stepped {
             step: self.trainer.steps(),
             epoch: self.order.passes(),
             share_done: self.share_done().min(1.0),
             seconds: self.trainer.seconds(),
-            error_m: mean(window.error_m),
-            epsilon_m: mean(window.epsilon_m),
-            refined_m: mean(window.refined_m),
+            error_m: mean(self.told.error_m),
+            epsilon_m: mean(self.told.epsilon_m),
+            refined_m: mean(self.told.refined_m),
         }
     }
 
