@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::path::Path;
-use std::sync::{Mutex, PoisonError};
+use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{Scope, ScopedJoinHandle};
 use std::time::{Duration, Instant};
 
@@ -20,12 +20,12 @@ use protocol::message::{Descriptor, ModelHash};
 use protocol::{Account, CavId, DecodedFeatures, Detection, Detections, DropReason, Ledger, Limits, Stream, Topic};
 use sim_replay::bus::mailbox::Taken;
 use sim_replay::bus::shutdown::Stop;
-use sim_replay::bus::{Bus, Event, PublisherOptions, Route, process_id};
+use sim_replay::bus::{Bus, Event, Inbox, PublisherOptions, Route, Subscription, process_id};
 use sim_replay::dataset::{self, LoadOptions, Scenario};
 use sim_replay::stream::{Replay, StreamOptions};
 use tch::Device;
 use tch::nn::VarStore;
-use tests::bus::{PATIENCE, TestRouter};
+use tests::bus::{PATIENCE, TestRouter, next_event};
 use tests::scene;
 use zenoh::Wait;
 
@@ -262,6 +262,32 @@ impl Puppet {
     }
 }
 
+/// What vehicle 10 detects, as a scorer hears it.
+struct Results {
+    inbox: Arc<Inbox>,
+    _subscription: Subscription,
+    _bus: Bus,
+}
+
+impl Results {
+    fn of_10(router: &TestRouter) -> Self {
+        let bus = router.join("scorer", "scorer");
+        let inbox = bus.inbox(100, 1);
+        let subscription = bus.subscribe(topic("10", Stream::Detections), &inbox).unwrap();
+        Self { inbox, _subscription: subscription, _bus: bus }
+    }
+
+    fn next(&self) -> Detections {
+        let (_, Event::Message(arrival)) = next_event(&self.inbox) else { panic!("an end") };
+        self.inbox.decode(&arrival, &Limits::DEFAULT).unwrap()
+    }
+}
+
+/// Whose messages a result is made of, beside the ego's own.
+fn fused(result: &Detections) -> Vec<&str> {
+    result.fused.iter().map(|fused| fused.cav.as_str()).collect()
+}
+
 #[test]
 fn late_killed_and_lying_neighbours_are_named_and_the_ego_goes_on() {
     let folder = tempfile::tempdir().unwrap();
@@ -270,14 +296,7 @@ fn late_killed_and_lying_neighbours_are_named_and_the_ego_goes_on() {
     let router = TestRouter::open();
     let stop = Stop::new();
     let mut fleet: Vec<Puppet> = (0..3).map(|index| Puppet::new(&router, index)).collect();
-    let scorer = router.join("scorer", "scorer");
-    let inbox = scorer.inbox(100, 1);
-    let _subscription = scorer.subscribe(topic("10", Stream::Detections), &inbox).unwrap();
-    let next = || match inbox.take(Some(Instant::now() + PATIENCE)) {
-        Taken::Item(_, Event::Message(arrival)) => inbox.decode::<Detections>(&arrival, &Limits::DEFAULT).unwrap(),
-        other => panic!("{other:?}"),
-    };
-    let names = |result: &Detections| result.fused.iter().map(|fused| fused.cav.to_string()).collect::<Vec<_>>();
+    let results = Results::of_10(&router);
 
     let ledger = std::thread::scope(|scope| {
         let ego = scope.spawn(|| {
@@ -297,20 +316,20 @@ fn late_killed_and_lying_neighbours_are_named_and_the_ego_goes_on() {
         for index in [1, 2, 0] {
             fleet[index].send(&scenario, 0);
         }
-        assert_eq!(names(&next()), ["20", "30"]);
+        assert_eq!(fused(&results.next()), ["20", "30"]);
 
         // 30 is late: its message of the tick before is still young enough, and is used with its age.
         fleet[1].send(&scenario, 1);
         fleet[0].send(&scenario, 1);
-        let result = next();
-        assert_eq!(names(&result), ["20", "30"]);
+        let result = results.next();
+        assert_eq!(fused(&result), ["20", "30"]);
         assert_eq!(result.fused[1].age_nanos, 100_000_000);
 
         // Still silent: too old now, masked and named.
         fleet[1].send(&scenario, 2);
         fleet[0].send(&scenario, 2);
-        let result = next();
-        assert_eq!(names(&result), ["20"]);
+        let result = results.next();
+        assert_eq!(fused(&result), ["20"]);
         assert_eq!((result.skipped[0].cav.as_str(), result.skipped[0].reason), ("30", None));
 
         // 20 sends garbage under its own name: counted, and the ego goes on without it.
@@ -318,8 +337,8 @@ fn late_killed_and_lying_neighbours_are_named_and_the_ego_goes_on() {
         fleet[1].bus.session().put(&key, vec![0xAB; 4096]).wait().unwrap();
         fleet[2].send(&scenario, 3);
         fleet[0].send(&scenario, 3);
-        let result = next();
-        assert!(names(&result).contains(&"30".to_owned()), "{result:?}");
+        let result = results.next();
+        assert!(fused(&result).contains(&"30"), "{result:?}");
 
         // 20 dies without a word.
         let dead = fleet.remove(1);
@@ -327,7 +346,7 @@ fn late_killed_and_lying_neighbours_are_named_and_the_ego_goes_on() {
         for tick in 4..6 {
             fleet[1].send(&scenario, tick);
             fleet[0].send(&scenario, tick);
-            assert!(names(&next()).contains(&"30".to_owned()));
+            assert!(fused(&results.next()).contains(&"30"));
         }
         stop.request();
         ego.join().unwrap()
@@ -347,14 +366,7 @@ fn maps_of_a_network_that_a_neighbour_names_as_another_are_left_out() {
     let scenario = dataset::open(folder.path()).unwrap().scenarios.remove(0);
     let (router, stop) = (TestRouter::open(), Stop::new());
     let mut fleet: Vec<Puppet> = (0..3).map(|index| Puppet::new(&router, index)).collect();
-    let scorer = router.join("scorer", "scorer");
-    let inbox = scorer.inbox(100, 1);
-    let _subscription = scorer.subscribe(topic("10", Stream::Detections), &inbox).unwrap();
-    let next = || match inbox.take(Some(Instant::now() + PATIENCE)) {
-        Taken::Item(_, Event::Message(arrival)) => inbox.decode::<Detections>(&arrival, &Limits::DEFAULT).unwrap(),
-        other => panic!("{other:?}"),
-    };
-    let names = |result: &Detections| result.fused.iter().map(|fused| fused.cav.to_string()).collect::<Vec<_>>();
+    let results = Results::of_10(&router);
     let own = Descriptor {
         model_hash: detector().model_hash(),
         grid: detector().grid(),
@@ -381,13 +393,13 @@ fn maps_of_a_network_that_a_neighbour_names_as_another_are_left_out() {
         let send_all = |fleet: &mut [Puppet], tick| [1, 2, 0].map(|index| fleet[index].send(&scenario, tick));
 
         send_all(&mut fleet, 0);
-        assert_eq!(names(&next()), ["20", "30"], "nothing is known of anybody");
+        assert_eq!(fused(&results.next()), ["20", "30"], "nothing is known of anybody");
 
         say(&fleet[1], Descriptor { model_hash: ModelHash([9; 32]), ..own.clone() });
         for tick in 1..3 {
             send_all(&mut fleet, tick);
-            let result = next();
-            assert_eq!(names(&result), ["30"]);
+            let result = results.next();
+            assert_eq!(fused(&result), ["30"]);
             assert_eq!((result.skipped[0].cav.as_str(), result.skipped[0].reason), ("20", Some(DropReason::Shape)));
         }
 
@@ -398,7 +410,7 @@ fn maps_of_a_network_that_a_neighbour_names_as_another_are_left_out() {
         fleet[1].wait_until_heard("ego-10");
         say(&fleet[1], own);
         send_all(&mut fleet, 3);
-        assert_eq!(names(&next()), ["20", "30"]);
+        assert_eq!(fused(&results.next()), ["20", "30"]);
         stop.request();
         ego.join().unwrap()
     });
