@@ -21,6 +21,7 @@ use tch::{Kind, TchError, Tensor};
 use super::dense::Dense;
 use super::encoder_config::SceneEncoderConfig;
 use super::error::LocalizerError;
+use super::feature_norm::FeatureNorm;
 use super::scene_encoder::SceneEncoder;
 
 /// Channels inside the regressors.
@@ -57,6 +58,7 @@ pub struct EndToEndConfig {
 pub struct EndToEnd {
     config: EndToEndConfig,
     encoder: SceneEncoder,
+    norm: FeatureNorm,
     layers: [Dense; 3],
 }
 
@@ -71,9 +73,10 @@ impl EndToEnd {
             EndToEndKind::SceneCoordinates => (config.encoder.cell_channels(), 3),
             EndToEndKind::Pose => (config.encoder.sweep_channels(), 5),
         };
+        let norm = FeatureNorm::new(&(path / "regressor" / "norm"), inputs);
         let layer = |number: usize, from, to, gain| Dense::new(&(path / "regressor" / number), from, to, gain);
         let layers = [layer(0, inputs, WIDTH, 1.0), layer(1, WIDTH, WIDTH, 1.0), layer(2, WIDTH, outputs, 0.1)];
-        Ok(Self { config: config.clone(), encoder, layers })
+        Ok(Self { config: config.clone(), encoder, norm, layers })
     }
 
     /// What it was built from.
@@ -108,10 +111,19 @@ impl EndToEnd {
         Ok((output.f_narrow(1, 0, 3)? * SCALE_M, heading / norm))
     }
 
+    /// Takes what features look like, `[N, cell_channels]` or `[N, sweep_channels]`; without that they are regressed from as
+    /// they are.
+    ///
+    /// # Errors
+    /// The tensor library's.
+    pub fn set_statistics(&mut self, features: &Tensor) -> Result<(), TchError> {
+        self.norm.fit(features)
+    }
+
     /// In single precision, whatever the encoder computes in: bfloat16 knows a place 200 m away to half a metre.
     fn regress(&self, x: &Tensor) -> Result<Tensor, TchError> {
         let [first, second, third] = &self.layers;
-        let x = second.forward(&first.forward(&x.f_to_kind(Kind::Float)?)?.f_relu()?)?.f_relu()?;
+        let x = second.forward(&first.forward(&self.norm.forward(x)?)?.f_relu()?)?.f_relu()?;
         third.forward(&x)
     }
 }

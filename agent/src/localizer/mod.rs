@@ -10,6 +10,7 @@ mod end_to_end;
 mod end_to_end_localizer;
 mod error;
 pub mod evaluation;
+mod feature_norm;
 mod head_config;
 mod localize;
 mod pose_evidence;

@@ -5,6 +5,7 @@ use tch::{Kind, TchError, Tensor};
 
 use super::dense::Dense;
 use super::error::LocalizerError;
+use super::feature_norm::FeatureNorm;
 use super::head_config::SceneHeadConfig;
 use super::refiner::Refiner;
 use crate::convolution::Norm;
@@ -136,43 +137,15 @@ impl SceneHead {
         &self.centres
     }
 
-    /// Sets what is computed from the training data, not learnt: statistics of the features, and the centres.
+    /// Sets what is computed from the training data, not learnt: statistics of the features `[N, cell_channels]` and
+    /// `[S, sweep_channels]`, and the centres.
     ///
     /// # Errors
     /// The tensor library's, when shapes do not fit.
-    pub fn set_statistics(
-        &mut self,
-        cells: [Tensor; 2],
-        sweeps: [Tensor; 2],
-        centres: &Tensor,
-    ) -> Result<(), TchError> {
-        self.cell_norm.set(cells)?;
-        self.sweep_norm.set(sweeps)?;
+    pub fn set_statistics(&mut self, cells: &Tensor, sweeps: &Tensor, centres: &Tensor) -> Result<(), TchError> {
+        self.cell_norm.fit(cells)?;
+        self.sweep_norm.fit(sweeps)?;
         tch::no_grad(|| self.centres.f_copy_(centres))
-    }
-}
-
-/// Brings features to mean 0 and deviation 1.
-#[derive(Debug)]
-struct FeatureNorm {
-    mean: Tensor,
-    scale: Tensor,
-}
-
-impl FeatureNorm {
-    fn new(path: &nn::Path<'_>, channels: i64) -> Self {
-        Self { mean: path.zeros_no_train("mean", &[channels]), scale: path.ones_no_train("scale", &[channels]) }
-    }
-
-    fn set(&mut self, [mean, deviation]: [Tensor; 2]) -> Result<(), TchError> {
-        tch::no_grad(|| {
-            self.mean.f_copy_(&mean)?;
-            self.scale.f_copy_(&deviation.f_clamp_min(1e-4)?.f_reciprocal()?)
-        })
-    }
-
-    fn forward(&self, x: &Tensor) -> Result<Tensor, TchError> {
-        Ok((x.f_to_kind(Kind::Float)? - &self.mean) * &self.scale)
     }
 }
 

@@ -13,6 +13,9 @@ use crate::localizer::end_to_end::{EndToEnd, EndToEndKind};
 use crate::localizer::training::{CacheOptions, FeatureCache, LocalizerTrainError, SweepAugmentation, SweepList};
 use crate::training::RunConfig;
 
+/// Cells that statistics are computed from.
+const SAMPLE: usize = 20_000;
+
 /// Rows of a cache, drawn at random.
 pub(super) struct Features {
     cache: FeatureCache,
@@ -50,6 +53,15 @@ impl Features {
 impl Examples for Features {
     fn origin_m(&self) -> [f64; 3] {
         self.cache.origin_m
+    }
+
+    fn features(&self, regresses: EndToEndKind) -> Result<Option<Tensor>, LocalizerTrainError> {
+        Ok(Some(match regresses {
+            EndToEndKind::Pose => self.cache.sweeps.shallow_clone(),
+            EndToEndKind::SceneCoordinates => {
+                self.cache.cells.f_index_select(0, &self.draw(self.cache.cell_count() as usize, SAMPLE)?)?
+            }
+        }))
     }
 
     fn begin(&mut self, step: u64) {

@@ -77,6 +77,9 @@ trait Examples {
     /// Middle of the positions, metres in the world.
     fn origin_m(&self) -> [f64; 3];
 
+    /// What features look like, `[N, channels]`, where that is known before a step is done.
+    fn features(&self, regresses: EndToEndKind) -> Result<Option<Tensor>, LocalizerTrainError>;
+
     /// Begins with the batch of a step.
     fn begin(&mut self, step: u64);
 
@@ -110,7 +113,10 @@ pub fn train_end_to_end(
         encoder,
     };
     let variables = VarStore::new(run.device);
-    let network = EndToEnd::new(&variables.root(), &network_config)?;
+    let mut network = EndToEnd::new(&variables.root(), &network_config)?;
+    if let Some(features) = examples.features(config.regresses)? {
+        network.set_statistics(&features)?;
+    }
     if let EncoderStart::Frozen(path) = &config.encoder {
         adopt_encoder(&variables, path, &network_config.encoder)?;
     }

@@ -55,6 +55,10 @@ impl Examples for Sweeps {
         self.origin_m
     }
 
+    fn features(&self, _: EndToEndKind) -> Result<Option<Tensor>, LocalizerTrainError> {
+        Ok(None)
+    }
+
     fn begin(&mut self, step: u64) {
         self.batches = batches(&self.list, &self.encoder, &self.run, step);
     }

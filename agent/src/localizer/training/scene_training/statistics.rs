@@ -2,7 +2,7 @@
 
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use tch::{Kind, TchError, Tensor};
+use tch::{TchError, Tensor};
 
 use crate::localizer::scene_head::SceneHead;
 use crate::localizer::training::{FeatureCache, kmeans};
@@ -16,17 +16,11 @@ pub(super) fn set_statistics(head: &mut SceneHead, cache: &FeatureCache, seed: u
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
     let sample: Vec<i64> = (0..SAMPLE).map(|_| rng.random_range(0..cache.cell_count())).collect();
     let sample = Tensor::f_from_slice(&sample)?.f_to_device(cache.cells.device())?;
-    let statistics = |features: &Tensor| -> Result<[Tensor; 2], TchError> {
-        let features = features.f_to_kind(Kind::Float)?;
-        Ok([features.f_mean_dim(0_i64, false, Kind::Float)?, features.f_std_dim(0_i64, false, false)?])
-    };
-    let cells = statistics(&cache.cells.f_index_select(0, &sample)?)?;
-    let sweeps = statistics(&cache.sweeps)?;
     let places: Vec<f32> = Vec::try_from(&cache.targets_m.f_index_select(0, &sample)?.f_view([-1])?)?;
     let places: Vec<[f64; 3]> = places.as_chunks::<3>().0.iter().map(|place| place.map(f64::from)).collect();
     let (mut centres, _) = kmeans(&places, centre_count, seed);
     centres.resize(centre_count, [0.0; 3]);
     let centres: Vec<f32> = centres.as_flattened().iter().map(|&axis| axis as f32).collect();
-    head.set_statistics(cells, sweeps, &Tensor::f_from_slice(&centres)?.f_view([-1, 3])?)?;
-    Ok(())
+    let cells = cache.cells.f_index_select(0, &sample)?;
+    head.set_statistics(&cells, &cache.sweeps, &Tensor::f_from_slice(&centres)?.f_view([-1, 3])?)
 }
