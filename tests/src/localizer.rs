@@ -3,8 +3,11 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use agent::localizer::{SceneEncoder, SceneEncoderConfig, SceneHead, SceneHeadConfig};
-use agent::weights::{CONFIG_KEY, Precision, save};
+use agent::localizer::{
+    EndToEnd, EndToEndConfig, EndToEndKind, EndToEndLocalizer, SceneEncoder, SceneEncoderConfig, SceneHead,
+    SceneHeadConfig,
+};
+use agent::weights::{CONFIG_KEY, KIND_KEY, Precision, save};
 use serde::Serialize;
 use tch::Device;
 use tch::nn::VarStore;
@@ -17,16 +20,11 @@ pub fn write(folder: &Path, seed: i64) -> (PathBuf, PathBuf) {
     tch::manual_seed(seed);
     tch::set_num_threads(1);
     let (encoder, head) = (folder.join("encoder.safetensors"), folder.join("head.safetensors"));
-    let config = SceneEncoderConfig {
-        voxel_m: 1.0,
-        range_m: 40.0,
-        widths: vec![4, 8],
-        residual_widths: vec![8],
-        ..SceneEncoderConfig::lean()
-    };
+    let config = tiny();
     let network = VarStore::new(Device::Cpu);
     SceneEncoder::new(&network.root(), &config).expect("a configuration that fits");
-    let encoder_sha256 = save(&encoder, &network, &metadata(&config), Precision::Single).expect("a writable folder");
+    let encoder_sha256 =
+        save(&encoder, &network, &metadata(SceneEncoder::KIND, &config), Precision::Single).expect("a writable folder");
     let config = SceneHeadConfig {
         town: "nowhere".into(),
         encoder_sha256,
@@ -42,11 +40,36 @@ pub fn write(folder: &Path, seed: i64) -> (PathBuf, PathBuf) {
     };
     let network = VarStore::new(Device::Cpu);
     SceneHead::new(&network.root(), &config).expect("a configuration that fits");
-    save(&head, &network, &metadata(&config), Precision::Single).expect("a writable folder");
+    save(&head, &network, &metadata(SceneHead::KIND, &config), Precision::Single).expect("a writable folder");
     (encoder, head)
 }
 
-fn metadata(config: &impl Serialize) -> BTreeMap<String, String> {
+/// Writes a network as if it had been trained end to end, with random parameters, the same for the same seed.
+///
+/// # Panics
+/// When the disk refuses.
+pub fn write_end_to_end(folder: &Path, regresses: EndToEndKind, seed: i64) -> PathBuf {
+    tch::manual_seed(seed);
+    tch::set_num_threads(1);
+    let config = EndToEndConfig { regresses, town: "nowhere".into(), origin_m: [0.0; 3], encoder: tiny() };
+    let network = VarStore::new(Device::Cpu);
+    EndToEnd::new(&network.root(), &config).expect("a configuration that fits");
+    let path = folder.join(format!("{regresses:?}.safetensors"));
+    save(&path, &network, &metadata(EndToEndLocalizer::KIND, &config), Precision::Single).expect("a writable folder");
+    path
+}
+
+fn tiny() -> SceneEncoderConfig {
+    SceneEncoderConfig {
+        voxel_m: 1.0,
+        range_m: 40.0,
+        widths: vec![4, 8],
+        residual_widths: vec![8],
+        ..SceneEncoderConfig::lean()
+    }
+}
+
+fn metadata(kind: &str, config: &impl Serialize) -> BTreeMap<String, String> {
     let text = serde_json::to_string(config).expect("plain numbers and texts");
-    BTreeMap::from([(CONFIG_KEY.to_owned(), text)])
+    BTreeMap::from([(CONFIG_KEY.to_owned(), text), (KIND_KEY.to_owned(), kind.to_owned())])
 }

@@ -27,8 +27,8 @@ fn drives(folder: &Path) -> Vec<Scenario> {
     dataset::open(&folder.join("drives")).unwrap().scenarios
 }
 
-/// Trains an encoder and a head on sequences; their files.
-fn train(sequences: &Path, out: &Path) -> [PathBuf; 2] {
+/// Trains an encoder on sequences.
+fn train_on(sequences: &Path, out: &Path) -> PathBuf {
     let encoder = SceneEncoderConfig {
         voxel_m: 1.0,
         range_m: 40.0,
@@ -40,20 +40,19 @@ fn train(sequences: &Path, out: &Path) -> [PathBuf; 2] {
         scenes: vec![sequences.to_owned()],
         validation: vec![sequences.to_owned()],
         encoder,
-        run: RunConfig {
-            batch: 2,
-            learning_rate: 3e-3,
-            seed: 5,
-            ..RunConfig::new(Length::Steps(30), &out.join("encoder"))
-        },
-        validate_every: 30,
+        run: RunConfig { batch: 2, learning_rate: 3e-3, seed: 5, ..RunConfig::new(Length::Steps(20), out) },
+        validate_every: 20,
     };
-    let encoder = train_encoder(&encoder, &mut |_| ()).unwrap().trained.weights;
+    train_encoder(&encoder, &mut |_| ()).unwrap().trained.weights
+}
+
+/// Trains a head on sequences, on the features of an encoder.
+fn train_head_on(sequences: &Path, encoder: &Path, out: &Path) -> PathBuf {
     let head = SceneTrainConfig {
         scenes: vec![sequences.to_owned()],
         validation: vec![sequences.to_owned()],
         validation_sweeps: 10,
-        encoder: encoder.clone(),
+        encoder: encoder.to_owned(),
         town: "sequences".into(),
         classes: 4,
         centres: 12,
@@ -62,20 +61,15 @@ fn train(sequences: &Path, out: &Path) -> [PathBuf; 2] {
         refiner: true,
         augmentation: SweepAugmentation { copies: 1, turn_rad: 0.1, keep: 0.8 },
         redundancy: None,
-        run: RunConfig {
-            batch: 512,
-            learning_rate: 4e-3,
-            seed: 5,
-            ..RunConfig::new(Length::Steps(300), &out.join("head"))
-        },
+        run: RunConfig { batch: 512, learning_rate: 4e-3, seed: 5, ..RunConfig::new(Length::Steps(250), out) },
         validate_every: Duration::from_secs(3600),
     };
     let summary = train_scene(&head, &mut |_| ()).unwrap();
     assert_eq!(summary.sweeps, 2 * (30 - 2 * LEFT_OUT));
-    [encoder, summary.trained.weights]
+    summary.trained.weights
 }
 
-fn eval(sequences: &Path, [encoder, head]: &[PathBuf; 2]) -> Value {
+fn eval(sequences: &Path, encoder: &Path, head: &Path) -> Value {
     let mut command = Command::new(programs().join("agent"));
     command.args(["eval", "--json", "--scene"]).arg(sequences).arg("--encoder").arg(encoder).arg("--head").arg(head);
     let output = command.output().unwrap();
@@ -88,6 +82,8 @@ fn sequences_of_both_benchmarks_train_and_evaluate_like_any_drive() {
     tch::set_num_threads(1);
     let folder = tempfile::tempdir().unwrap();
     let drives = drives(folder.path());
+    // An encoder serves any town: the second benchmark takes the first one's.
+    let mut encoder: Option<PathBuf> = None;
     for (benchmark, layout) in [(Benchmark::Nclt, Layout::Nclt), (Benchmark::Oxford, Layout::Oxford)] {
         let sequences = write(folder.path(), benchmark, &drives);
         let read = dataset::open(&sequences).unwrap();
@@ -103,8 +99,9 @@ fn sequences_of_both_benchmarks_train_and_evaluate_like_any_drive() {
             assert!(!found.points.xyzi.iter().zip(&wanted.points.xyzi).any(apart));
         }
 
-        let networks = train(&sequences, &folder.path().join(format!("{layout:?}")));
-        let summary = eval(&sequences, &networks);
+        let encoder = encoder.get_or_insert_with(|| train_on(&sequences, &folder.path().join("encoder"))).as_path();
+        let head = train_head_on(&sequences, encoder, &folder.path().join(format!("head-{layout:?}")));
+        let summary = eval(&sequences, encoder, &head);
         assert_eq!(summary["sweeps"], 2 * (30 - 2 * LEFT_OUT));
         // Points and poses that did not belong together would leave nothing to learn.
         assert!(summary["success_3m"].as_f64().unwrap() > 0.4, "{layout:?}: {summary}");

@@ -1,9 +1,11 @@
 //! Poses from the sweep alone, through the programs: a vehicle of a fleet, `agent eval`, and what is wrong with files.
 
+use std::ffi::OsStr;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use agent::localizer::EndToEndKind;
 use deploy::scenario::Scenario;
 use serde_json::Value;
 use tests::fleet::{Up, alone, programs, results, write_scenario};
@@ -11,13 +13,17 @@ use tests::{localizer, scene};
 
 /// Runs `agent eval` on the scene in `folder`; exit code, standard output and standard error.
 fn eval(folder: &Path, encoder: &Path, head: &Path, more: &[&str]) -> (Option<i32>, String, String) {
+    let [encoder, head] =
+        [("--encoder", encoder), ("--head", head)].map(|(name, file)| [name.as_ref(), file.as_os_str()]);
+    eval_with(folder, &[encoder, head].concat(), more)
+}
+
+/// The same of other networks than encoder and head.
+fn eval_with(folder: &Path, networks: &[&OsStr], more: &[&str]) -> (Option<i32>, String, String) {
     let output = Command::new(programs().join("agent"))
         .args(["eval", "--scene"])
         .arg(folder.join("scene"))
-        .arg("--encoder")
-        .arg(encoder)
-        .arg("--head")
-        .arg(head)
+        .args(networks)
         .args(more)
         .output()
         .unwrap();
@@ -84,6 +90,38 @@ fn eval_prints_the_numbers_that_others_read_and_writes_what_was_asked_for() {
 }
 
 #[test]
+fn competitors_are_evaluated_on_the_same_sweeps_with_the_same_numbers() {
+    let folder = tempfile::tempdir().unwrap();
+    let (encoder, _) = scene_and_networks(folder.path());
+    let scene = folder.path().join("scene");
+    let eval =
+        |option: &str, file: &Path, more: &[&str]| eval_with(folder.path(), &[option.as_ref(), file.as_os_str()], more);
+    let json = |option: &str, file: &Path| -> Value {
+        let (code, said, complained) = eval(option, file, &["--json"]);
+        assert_eq!(code, Some(0), "{complained}");
+        serde_json::from_str(&said).unwrap()
+    };
+    // What has learnt nothing: cells that do not agree are no pose; a regressed pose is always told, and never doubted.
+    let cells = localizer::write_end_to_end(folder.path(), EndToEndKind::SceneCoordinates, 3);
+    let summary = json("--end-to-end", &cells);
+    assert_eq!((&summary["sweeps"], &summary["outcomes"]["too_few_inliers"]), (&8.into(), &8.into()), "{summary}");
+    assert!(summary["ms"]["solve"].as_f64().unwrap() > 0.0, "{summary}");
+    let pose = localizer::write_end_to_end(folder.path(), EndToEndKind::Pose, 3);
+    let summary = json("--end-to-end", &pose);
+    assert_eq!((&summary["outcomes"]["pose"], &summary["ms"]["solve"]), (&8.into(), &0.0.into()), "{summary}");
+    assert!(summary["mean_m"].as_f64().unwrap() > 0.0 && summary["calibration"][0]["sigma"] == 1.0, "{summary}");
+    // Registration against a map begins where a receiver believes to be, and these vehicles have none.
+    assert_eq!(json("--icp-map", &scene)["outcomes"]["no_source"], 8);
+
+    let (code, _, complained) = eval("--end-to-end", &encoder, &[]);
+    assert!(code == Some(2) && complained.contains("encoder.safetensors: weights of kind"), "{complained}");
+    let (code, _, complained) = eval("--end-to-end", &pose, &["--fit-confidence"]);
+    assert!(code == Some(2) && complained.contains("cannot be used with"), "{complained}");
+    let (code, _, complained) = eval("--icp-map", &folder.path().join("nowhere"), &[]);
+    assert!(code == Some(2) && complained.contains("nowhere"), "{complained}");
+}
+
+#[test]
 fn a_confidence_needs_poses_to_be_fitted_on() {
     let folder = tempfile::tempdir().unwrap();
     let (encoder, head) = scene_and_networks(folder.path());
@@ -106,8 +144,8 @@ fn files_that_are_wrong_are_named() {
     for (encoder, head, parts) in [
         (&encoder, &cut, ["cut.safetensors", "not a whole safetensors file"]),
         (&encoder, &missing, ["missing.safetensors", "No such file"]),
-        (&head, &head, ["head.safetensors", "config"]),
-        (&encoder, &encoder, ["encoder.safetensors", "config"]),
+        (&head, &head, ["head.safetensors", "\"scene encoder\""]),
+        (&encoder, &encoder, ["encoder.safetensors", "\"scene head\""]),
         (&other_encoder, &head, ["head.safetensors", "trained on encoder"]),
     ] {
         let (code, _, complained) = eval(folder.path(), encoder, head, &[]);
@@ -123,7 +161,7 @@ fn an_agent_without_its_networks_does_not_start() {
     let folder = tempfile::tempdir().unwrap();
     let run = |more: &[&str]| {
         let output = Command::new(programs().join("agent"))
-            .args(["run", "--cav", "7", "--run", "test", "--connect", "tcp/127.0.0.1:9", "--pose-source", "pgc"])
+            .args(["run", "--cav", "7", "--run", "test", "--connect", "tcp/127.0.0.1:9"])
             .arg("--weights")
             .arg(folder.path().join("weights.safetensors"))
             .args(more)
@@ -132,10 +170,14 @@ fn an_agent_without_its_networks_does_not_start() {
         (output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned())
     };
     tests::fleet::write_weights(&folder.path().join("weights.safetensors"));
-    let (code, said) = run(&[]);
+    let (code, said) = run(&["--pose-source", "pgc"]);
     assert!(code == Some(2) && said.contains("--encoder"), "{said}");
-    let (code, said) = run(&["--encoder", "/nowhere/e", "--head", "/nowhere/h"]);
+    let (code, said) = run(&["--pose-source", "pgc", "--encoder", "/nowhere/e", "--head", "/nowhere/h"]);
     assert!(code == Some(2) && said.contains("/nowhere/e"), "{said}");
+    let (code, said) = run(&["--pose-source", "end-to-end"]);
+    assert!(code == Some(2) && said.contains("--end-to-end"), "{said}");
+    let (code, said) = run(&["--pose-source", "end_to_end", "--end-to-end", "/nowhere/w"]);
+    assert!(code == Some(2) && said.contains("/nowhere/w"), "{said}");
 }
 
 #[test]
