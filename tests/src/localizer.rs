@@ -1,4 +1,4 @@
-//! Localizers that have learnt nothing, for tests that need files but no meaning.
+//! Small localizers, and such as have learnt nothing, for tests that need files but no meaning.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -11,6 +11,18 @@ use agent::weights::{CONFIG_KEY, KIND_KEY, Precision, save};
 use serde::Serialize;
 use tch::Device;
 use tch::nn::VarStore;
+
+/// An encoder that a test has time to train.
+#[must_use]
+pub fn small_encoder() -> SceneEncoderConfig {
+    SceneEncoderConfig {
+        voxel_m: 1.0,
+        range_m: 40.0,
+        widths: vec![8, 12, 16],
+        residual_widths: vec![16],
+        ..SceneEncoderConfig::lean()
+    }
+}
 
 /// Writes an encoder and a head that belong together, with random parameters, the same for the same seed.
 ///
@@ -60,13 +72,7 @@ pub fn write_end_to_end(folder: &Path, regresses: EndToEndKind, seed: i64) -> Pa
 }
 
 fn tiny() -> SceneEncoderConfig {
-    SceneEncoderConfig {
-        voxel_m: 1.0,
-        range_m: 40.0,
-        widths: vec![4, 8],
-        residual_widths: vec![8],
-        ..SceneEncoderConfig::lean()
-    }
+    SceneEncoderConfig { widths: vec![4, 8], residual_widths: vec![8], ..small_encoder() }
 }
 
 fn metadata(kind: &str, config: &impl Serialize) -> BTreeMap<String, String> {

@@ -8,7 +8,7 @@ use agent::localizer::training::{
     EncoderReport, EncoderStart, EncoderTrainConfig, EndToEndReport, EndToEndTrainConfig, LocalizerTrainError,
     RedundancyConfig, SceneReport, SceneTrainConfig, SweepAugmentation, train_encoder, train_end_to_end, train_scene,
 };
-use agent::localizer::{EndToEndKind, EndToEndLocalizer, Localizer, LocalizerError, SceneEncoder, SceneEncoderConfig};
+use agent::localizer::{EndToEndKind, EndToEndLocalizer, Localizer, LocalizerError, SceneEncoder};
 use agent::training::{Length, RunConfig, TrainingError};
 use agent::weights::Weights;
 use protocol::{NoPoseReason, PointCloud, PoseEstimate};
@@ -16,6 +16,7 @@ use sim_replay::dataset::{self, LoadOptions};
 use sim_replay::synth::{Subset, SynthOptions, generate};
 use tch::Device;
 use tch::nn::VarStore;
+use tests::localizer::small_encoder;
 
 /// libtorch has one generator of random numbers per process: who begins a training has it alone.
 fn alone() -> MutexGuard<'static, ()> {
@@ -37,17 +38,6 @@ fn drives(out: &Path) -> PathBuf {
     folder
 }
 
-/// An encoder that a test has time for.
-fn small() -> SceneEncoderConfig {
-    SceneEncoderConfig {
-        voxel_m: 1.0,
-        range_m: 40.0,
-        widths: vec![8, 12, 16],
-        residual_widths: vec![16],
-        ..SceneEncoderConfig::lean()
-    }
-}
-
 fn run(out: &Path, steps: u64) -> RunConfig {
     RunConfig { seed: 5, loader_threads: 2, ..RunConfig::new(Length::Steps(steps), out) }
 }
@@ -56,7 +46,7 @@ fn encoder_config(scenes: &Path, out: &Path, steps: u64) -> EncoderTrainConfig {
     EncoderTrainConfig {
         scenes: vec![scenes.to_owned()],
         validation: vec![scenes.to_owned()],
-        encoder: small(),
+        encoder: small_encoder(),
         run: RunConfig { batch: 2, learning_rate: 3e-3, ..run(out, steps) },
         validate_every: 10,
     }
@@ -174,10 +164,10 @@ fn competitors_learn_on_the_features_of_an_encoder_that_stays_as_it_is() {
 
         // In the file lie the layers that were trained, behind the encoder as it was.
         let localizer = EndToEndLocalizer::load(&trained.weights, Device::Cpu).unwrap();
-        assert_eq!(localizer.config().encoder, small());
+        assert_eq!(localizer.config().encoder, small_encoder());
         let (before, after) = (VarStore::new(Device::Cpu), VarStore::new(Device::Cpu));
-        SceneEncoder::new(&before.root(), &small()).unwrap();
-        SceneEncoder::new(&(after.root() / "encoder"), &small()).unwrap();
+        SceneEncoder::new(&before.root(), &small_encoder()).unwrap();
+        SceneEncoder::new(&(after.root() / "encoder"), &small_encoder()).unwrap();
         Weights::load(&encoder).unwrap().copy_into(&before).unwrap();
         Weights::load(&trained.weights).unwrap().copy_into(&after).unwrap();
         let kept = after.variables();

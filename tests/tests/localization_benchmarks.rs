@@ -5,14 +5,15 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::Duration;
 
+use agent::localizer::Localizer;
 use agent::localizer::training::{EncoderTrainConfig, SceneTrainConfig, SweepAugmentation, train_encoder, train_scene};
-use agent::localizer::{Localizer, SceneEncoderConfig};
 use agent::training::{Length, RunConfig};
 use serde_json::Value;
 use sim_replay::dataset::{self, Layout, LoadOptions, Scenario};
 use sim_replay::synth::{Subset, SynthOptions, generate};
 use tch::Device;
 use tests::fleet::programs;
+use tests::localizer::small_encoder;
 use tests::sequences::{Benchmark, LEFT_OUT, write};
 
 /// Two drives through one town.
@@ -29,17 +30,10 @@ fn drives(folder: &Path) -> Vec<Scenario> {
 
 /// Trains an encoder on sequences.
 fn train_on(sequences: &Path, out: &Path) -> PathBuf {
-    let encoder = SceneEncoderConfig {
-        voxel_m: 1.0,
-        range_m: 40.0,
-        widths: vec![8, 12, 16],
-        residual_widths: vec![16],
-        ..SceneEncoderConfig::lean()
-    };
     let encoder = EncoderTrainConfig {
         scenes: vec![sequences.to_owned()],
         validation: vec![sequences.to_owned()],
-        encoder,
+        encoder: small_encoder(),
         run: RunConfig { batch: 2, learning_rate: 3e-3, seed: 5, ..RunConfig::new(Length::Steps(20), out) },
         validate_every: 20,
     };

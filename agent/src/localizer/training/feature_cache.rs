@@ -9,13 +9,11 @@ use rand_chacha::ChaCha8Rng;
 use tch::{Device, Kind, TchError, Tensor, no_grad};
 
 use super::error::LocalizerTrainError;
-use super::pairs::choose;
 use super::sweep_store::{SweepList, yaw};
+use super::turned_sweep::{CELLS, TurnedSweep};
 use crate::localizer::{Cell, SceneEncoder, SweepVoxels, VoxelBatch};
-use crate::training::{ComputePrecision, Prefetch};
+use crate::training::{Prefetch, RunConfig};
 
-/// Cells kept of each sweep.
-const CELLS: usize = 400;
 /// Sweeps of one forward pass.
 const BATCH: u64 = 4;
 
@@ -28,28 +26,6 @@ pub struct SweepAugmentation {
     pub turn_rad: f64,
     /// Least share of points that is kept in the other copies.
     pub keep: f64,
-}
-
-/// How a cache is built.
-#[derive(Debug, Clone, Copy, PartialEq)]
-pub struct CacheOptions {
-    /// How sweeps are changed.
-    pub augmentation: SweepAugmentation,
-    /// Seed of changes and of the choice of cells.
-    pub seed: u64,
-    /// Threads that read and sort sweeps.
-    pub threads: usize,
-    /// In which numbers the encoder computes.
-    pub precision: ComputePrecision,
-    /// Where the encoder computes and the features lie.
-    pub device: Device,
-}
-
-/// One sweep, ready to be encoded.
-struct Prepared {
-    voxels: SweepVoxels,
-    rows: Vec<usize>,
-    world_from_sensor: Isometry3<f64>,
 }
 
 /// Cached features of cells, with what they should be regressed to.
@@ -72,21 +48,23 @@ pub struct FeatureCache {
 }
 
 impl FeatureCache {
-    /// Encodes every sweep of `list` once per copy; `progress` hears how many of how many sweeps are done.
+    /// Encodes every sweep of `list` once per copy, where and in which numbers `run` says; `progress` hears how many of how
+    /// many sweeps are done.
     ///
     /// # Errors
     /// [`LocalizerTrainError`] when a sweep cannot be read or encoded, or none has a pose.
     pub fn build(
         list: &Arc<SweepList>,
         encoder: &SceneEncoder,
-        options: CacheOptions,
+        augmentation: SweepAugmentation,
+        run: &RunConfig,
         progress: &mut dyn FnMut(usize, usize),
     ) -> Result<Self, LocalizerTrainError> {
-        let CacheOptions { augmentation, seed, threads, precision, device } = options;
+        let RunConfig { seed, loader_threads, precision, device, .. } = *run;
         let total = list.len() * augmentation.copies.max(1);
         let config = encoder.config().clone();
         let source = Arc::clone(list);
-        let prepare = move |batch: u64| -> Result<Vec<Prepared>, LocalizerTrainError> {
+        let prepare = move |batch: u64| -> Result<Vec<TurnedSweep>, LocalizerTrainError> {
             let numbers = (batch * BATCH..(batch + 1) * BATCH).filter(|&number| (number as usize) < total);
             let prepared = numbers.map(|number| {
                 let (index, copy) = (number as usize % source.len(), number as usize / source.len());
@@ -100,14 +78,11 @@ impl FeatureCache {
                         (yaw(rng.random_range(-angle..angle)), rng.random_range(augmentation.keep..=1.0))
                     }
                 };
-                let voxels = stored.turned_voxels(&turn, keep, &mut rng, &config);
-                let rows = choose(voxels.cells(), CELLS, &mut rng);
-                let world_from_sensor = stored.world_from_sensor * turn.inverse();
-                Ok(Some(Prepared { voxels, rows, world_from_sensor }))
+                Ok(Some(TurnedSweep::new(&stored, &turn, keep, &mut rng, &config)))
             });
             prepared.filter_map(Result::transpose).collect()
         };
-        let mut loader = Prefetch::start(threads, 0, prepare);
+        let mut loader = Prefetch::start(loader_threads, 0, prepare);
         let rows = (total * CELLS) as i64;
         let mut builder = Builder::new(rows, encoder.config().cell_channels(), device)?;
         let mut done = 0;
@@ -150,7 +125,13 @@ impl Builder {
         Ok(Self { cells, sweeps: Vec::new(), sweep_of_cell: Vec::new(), places: Vec::new(), poses: Vec::new() })
     }
 
-    fn add(&mut self, batch: &[Prepared], encoder: &SceneEncoder, kind: Kind, device: Device) -> Result<(), TchError> {
+    fn add(
+        &mut self,
+        batch: &[TurnedSweep],
+        encoder: &SceneEncoder,
+        kind: Kind,
+        device: Device,
+    ) -> Result<(), TchError> {
         let sweeps: Vec<&SweepVoxels> = batch.iter().map(|prepared| &prepared.voxels).collect();
         let voxels = VoxelBatch::new(&sweeps, encoder.config(), device)?;
         let features = encoder.encode(&voxels, kind)?;

@@ -12,11 +12,12 @@ mod redundancy;
 mod scene_training;
 mod scene_validation;
 mod sweep_store;
+mod turned_sweep;
 
 pub use encoder_training::{EncoderAccuracy, EncoderReport, EncoderSummary, EncoderTrainConfig, train_encoder};
 pub use end_to_end_training::{EncoderStart, EndToEndReport, EndToEndTrainConfig, train_end_to_end};
 pub use error::LocalizerTrainError;
-pub use feature_cache::{CacheOptions, FeatureCache, SweepAugmentation};
+pub use feature_cache::{FeatureCache, SweepAugmentation};
 pub use kmeans::kmeans;
 pub use pairs::{Pair, PairMaker};
 pub use redundancy::{Redundancy, RedundancyConfig};

@@ -10,7 +10,7 @@ use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
 use super::error::LocalizerTrainError;
-use super::sweep_store::{SweepStore, yaw};
+use super::sweep_store::{SweepStore, heading_rad, yaw};
 use crate::localizer::{Cell, SceneEncoderConfig, SweepVoxels};
 
 /// Sensors of a pair are at most so far apart in the plane, metres.
@@ -143,11 +143,7 @@ impl PairMaker {
         }
         let matches = matched.iter().map(|(_, partner)| seen[partner]).collect();
         let anchor_rows: Vec<usize> = matched.iter().map(|&(cell, _)| cell).collect();
-        let yaw_of = |pose: &Isometry3<f64>| {
-            let ahead = pose.rotation * nalgebra::Vector3::x();
-            ahead.y.atan2(ahead.x)
-        };
-        let relative_yaw_rad = yaw_of(&world_from_partner) - yaw_of(&world_from_anchor);
+        let relative_yaw_rad = heading_rad(&world_from_partner) - heading_rad(&world_from_anchor);
         Pair {
             anchor: chosen(anchor_sweep, anchor_rows, &anchor_places, &world_from_anchor),
             partner: chosen(partner_sweep, distinct, &partner_places, &world_from_partner),

@@ -63,6 +63,13 @@ pub(super) fn yaw(angle_rad: f64) -> Isometry3<f64> {
     Isometry3::from_parts(Translation3::identity(), UnitQuaternion::from_axis_angle(&Vector3::z_axis(), angle_rad))
 }
 
+/// Heading of what stands at a pose, radians.
+#[must_use]
+pub(super) fn heading_rad(world_from_sensor: &Isometry3<f64>) -> f64 {
+    let ahead = world_from_sensor.rotation * Vector3::x();
+    ahead.y.atan2(ahead.x)
+}
+
 /// Where sweeps with true poses lie on disk. Each folder is one world: poses in different folders have nothing to do with
 /// each other.
 #[derive(Debug)]

@@ -7,10 +7,11 @@ use rand_chacha::ChaCha8Rng;
 use tch::{Kind, Tensor};
 
 use super::loss::{Truth, coordinate_loss, pose_loss};
-use super::{CELLS, EndToEndReport, Examples};
+use super::{EndToEndReport, Examples};
 use crate::localizer::SceneEncoder;
 use crate::localizer::end_to_end::{EndToEnd, EndToEndKind};
-use crate::localizer::training::{CacheOptions, FeatureCache, LocalizerTrainError, SweepAugmentation, SweepList};
+use crate::localizer::training::turned_sweep::CELLS;
+use crate::localizer::training::{FeatureCache, LocalizerTrainError, SweepAugmentation, SweepList};
 use crate::training::RunConfig;
 
 /// Cells that statistics are computed from.
@@ -32,12 +33,10 @@ impl Features {
         run: &RunConfig,
         observe: &mut dyn FnMut(&EndToEndReport),
     ) -> Result<Self, LocalizerTrainError> {
-        let RunConfig { seed, device, precision, loader_threads: threads, .. } = *run;
         let augmentation = SweepAugmentation { copies: 1, turn_rad: 0.0, keep: 1.0 };
-        let options = CacheOptions { augmentation, seed, threads, precision, device };
         let mut progress = |done, total| observe(&EndToEndReport::Encoding(done, total));
-        let cache = FeatureCache::build(list, encoder, options, &mut progress)?;
-        let truth = Truth::new(cache.world_from_sensor.iter(), cache.origin_m, device)?;
+        let cache = FeatureCache::build(list, encoder, augmentation, run, &mut progress)?;
+        let truth = Truth::new(cache.world_from_sensor.iter(), cache.origin_m, run.device)?;
         Ok(Self { cache, truth, run: run.clone(), step: 0 })
     }
 

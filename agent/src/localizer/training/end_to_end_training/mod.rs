@@ -23,8 +23,6 @@ use crate::weights::{CONFIG_KEY, KIND_KEY, Weights};
 use features::Features;
 use sweeps::Sweeps;
 
-/// Cells of each sweep that the loss looks at.
-const CELLS: usize = 400;
 /// Steps between two reports.
 const REPORT_EVERY: u64 = 10;
 /// Steps between two checkpoints.

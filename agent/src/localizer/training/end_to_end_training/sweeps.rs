@@ -3,24 +3,24 @@
 use std::f64::consts::PI;
 use std::sync::Arc;
 
-use nalgebra::{Isometry3, Point3, Vector3};
+use nalgebra::{Point3, Vector3};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use tch::Tensor;
 
+use super::Examples;
 use super::loss::{Truth, coordinate_loss, pose_loss};
-use super::{CELLS, Examples};
 use crate::localizer::end_to_end::{EndToEnd, EndToEndKind};
 use crate::localizer::training::LocalizerTrainError;
-use crate::localizer::training::pairs::choose;
 use crate::localizer::training::sweep_store::{SweepList, yaw};
+use crate::localizer::training::turned_sweep::TurnedSweep;
 use crate::localizer::{SceneEncoderConfig, SweepVoxels, VoxelBatch};
 use crate::training::{Prefetch, RunConfig};
 
 /// Largest turn of a sweep, radians.
 const TURN_RAD: f64 = 10.0 * PI / 180.0;
 
-type Batches = Prefetch<Result<Vec<Example>, LocalizerTrainError>>;
+type Batches = Prefetch<Result<Vec<TurnedSweep>, LocalizerTrainError>>;
 
 /// Batches of sweeps.
 pub(super) struct Sweeps {
@@ -29,12 +29,6 @@ pub(super) struct Sweeps {
     run: RunConfig,
     origin_m: [f64; 3],
     batches: Batches,
-}
-
-struct Example {
-    voxels: SweepVoxels,
-    rows: Vec<usize>,
-    world_from_sensor: Isometry3<f64>,
 }
 
 impl Sweeps {
@@ -120,9 +114,7 @@ fn batches(list: &Arc<SweepList>, encoder: &SceneEncoderConfig, run: &RunConfig,
             };
             let turn = yaw(rng.random_range(-TURN_RAD..TURN_RAD));
             let keep = rng.random_range(0.7..1.0);
-            let voxels = stored.turned_voxels(&turn, keep, &mut rng, &encoder);
-            let rows = choose(voxels.cells(), CELLS, &mut rng);
-            Ok(Example { voxels, rows, world_from_sensor: stored.world_from_sensor * turn.inverse() })
+            Ok(TurnedSweep::new(&stored, &turn, keep, &mut rng, &encoder))
         };
         (number * batch..(number + 1) * batch).map(example).collect()
     })

@@ -3,9 +3,9 @@
 use std::sync::Arc;
 
 use super::config::{SceneReport, SceneTrainConfig};
-use crate::localizer::training::{CacheOptions, FeatureCache, LocalizerTrainError, SweepAugmentation, SweepList};
+use crate::localizer::training::{FeatureCache, LocalizerTrainError, SweepAugmentation, SweepList};
 use crate::localizer::{SceneEncoder, SceneEncoderConfig};
-use crate::training::{DataListing, RunConfig};
+use crate::training::DataListing;
 
 /// Features of the sweeps of a town.
 pub(super) struct Features {
@@ -23,13 +23,11 @@ impl Features {
         config: &SceneTrainConfig,
         observe: &mut dyn FnMut(&SceneReport),
     ) -> Result<Self, LocalizerTrainError> {
-        let RunConfig { seed, device, precision, loader_threads: threads, .. } = config.run;
-        let (encoder, encoder_sha256) = SceneEncoder::load(&config.encoder, device)?;
+        let (encoder, encoder_sha256) = SceneEncoder::load(&config.encoder, config.run.device)?;
         let list = Arc::new(SweepList::open(&config.scenes)?);
         let mut encode = |list: &Arc<SweepList>, augmentation| {
             let mut progress = |done, total| observe(&SceneReport::Encoding(done, total));
-            let options = CacheOptions { augmentation, seed, threads, precision, device };
-            let cache = FeatureCache::build(list, &encoder, options, &mut progress)?;
+            let cache = FeatureCache::build(list, &encoder, augmentation, &config.run, &mut progress)?;
             observe(&SceneReport::Encoded(list.data()));
             Ok::<_, LocalizerTrainError>(cache)
         };

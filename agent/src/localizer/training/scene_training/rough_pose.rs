@@ -1,7 +1,9 @@
 //! Poses as rough as those that the refiner meets, made from true ones.
 
-use nalgebra::{Isometry3, Vector3};
+use nalgebra::Isometry3;
 use tch::{Device, Kind, TchError, Tensor};
+
+use crate::localizer::training::sweep_store::heading_rad;
 
 /// Deviation of the largest errors that the refiner starts from, metres.
 const MAX_ERROR_M: f64 = 2.5;
@@ -17,11 +19,7 @@ pub(super) struct RoughPoses {
 
 impl RoughPoses {
     pub(super) fn new(world_from_sensor: &[Isometry3<f64>], device: Device) -> Result<Self, TchError> {
-        let heading = |pose: &Isometry3<f64>| {
-            let ahead = pose.rotation * Vector3::x();
-            ahead.y.atan2(ahead.x) as f32
-        };
-        let headings: Vec<f32> = world_from_sensor.iter().map(heading).collect();
+        let headings: Vec<f32> = world_from_sensor.iter().map(|pose| heading_rad(pose) as f32).collect();
         Ok(Self { headings: Tensor::f_from_slice(&headings)?.f_to_device(device)? })
     }
 
