@@ -21,6 +21,9 @@ pub(crate) fn keep_few() -> anyhow::Result<()> {
         return Ok(());
     }
     let program = env::current_exe().context("the program's own file")?;
-    let error = Command::new(&program).args(env::args_os().skip(1)).envs(CAPACITIES.map(|name| (name, FEW))).exec();
+    let mut again = Command::new(&program);
+    // Model cards tell the command as it was given.
+    env::args_os().next().map(|name| again.arg0(name));
+    let error = again.args(env::args_os().skip(1)).envs(CAPACITIES.map(|name| (name, FEW))).exec();
     Err(error).with_context(|| program.display().to_string())
 }
