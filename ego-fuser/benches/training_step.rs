@@ -10,6 +10,7 @@ use agent::pillars::{Pillars, Voxeliser};
 use agent::training::{AdamW, AdamWConfig, ComputePrecision};
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
 use ego_fuser::Method;
+use ego_fuser::fusion::ViewFacts;
 use ego_fuser::loss::{LabelTensors, LossConfig, Unassigned, detection_loss};
 use ego_fuser::model::CooperativeModel;
 use protocol::{Box3d, Pose};
@@ -50,10 +51,9 @@ fn training_step(criterion: &mut Criterion) {
     let mut voxeliser = Voxeliser::for_detector(&config);
     let pillars: Vec<Pillars> = (0..AGENTS * SAMPLES).map(|_| voxeliser.voxelise(&sweep(&mut rng))).collect();
     let poses =
-        vec![
-            vec![Pose::IDENTITY, Pose::from_xyz_yaw([12.0, 3.0, 0.0], 0.4), Pose::from_xyz_yaw([-20.0, 5.0, 0.0], 3.0)];
-            SAMPLES
-        ];
+        [Pose::IDENTITY, Pose::from_xyz_yaw([12.0, 3.0, 0.0], 0.4), Pose::from_xyz_yaw([-20.0, 5.0, 0.0], 3.0)];
+    let facts: Vec<_> = poses.into_iter().enumerate().map(|(agent, pose)| ViewFacts::fresh(agent, pose)).collect();
+    let facts = vec![facts; SAMPLES];
     let mut group = criterion.benchmark_group("training_step/lean/2x3");
     group.sample_size(10).throughput(Throughput::Elements(SAMPLES as u64));
     for (name, precision) in [("f32", ComputePrecision::F32), ("bf16", ComputePrecision::Bf16)] {
@@ -67,7 +67,7 @@ fn training_step(criterion: &mut Criterion) {
         let batch = PillarBatch::new(&pillars.iter().collect::<Vec<_>>(), model.network().lattice());
         group.bench_function(name, |bencher| {
             bencher.iter(|| {
-                let output = model.forward(&batch, &poses, true).expect("views and poses add up");
+                let output = model.forward(&batch, &facts, true).expect("views and facts add up");
                 let loss = detection_loss(&output.scores, &output.offsets, &labels, &LossConfig::default());
                 optimizer.zero_grad();
                 loss.expect("labels fit").total().backward();

@@ -14,11 +14,11 @@ use nalgebra::Isometry3;
 use protocol::{BevGrid, CavId, DecodedFeatures, Detection, DropReason, PointCloud, Pose, PoseEstimate, StageTiming};
 use tch::{Kind, TchError, Tensor, no_grad};
 
-use crate::fusion::{self, AlignedViews, Fusion, Steering};
+use crate::fusion::{FusionStage, StageError, ViewFacts};
 use crate::method::{Exchange, Method, UnknownMethod};
 use crate::model::{METHOD_KEY, SCORE_THRESHOLD};
 use crate::samples::merge_points;
-use crate::warp::{WarpError, warp_to_ego};
+use crate::warp::WarpError;
 
 /// What one vehicle sees, as it arrived.
 #[derive(Debug, Clone, PartialEq)]
@@ -90,6 +90,9 @@ pub enum EgoError {
     /// The weights name a method that is not known.
     #[error(transparent)]
     Method(#[from] UnknownMethod),
+    /// The fusion does not fit the weights.
+    #[error(transparent)]
+    Fusion(#[from] StageError),
     /// Own maps cannot be aligned.
     #[error(transparent)]
     Warp(#[from] WarpError),
@@ -125,8 +128,7 @@ pub enum EgoError {
 pub struct Ego {
     method: Method,
     detector: Detector,
-    fusion: Box<dyn Fusion>,
-    steering: Option<Steering>,
+    fusion: FusionStage,
     limits: PostprocessConfig,
     comm_range_m: f64,
 }
@@ -146,18 +148,24 @@ impl Ego {
             (None, Some(name)) => name.parse()?,
             (None, None) => Method::None,
         };
-        let ego = Self::new(Detector::from_weights(&weights, &weights.config()?)?, method);
-        let steering = Steering::from_weights(&weights, ego.detector.map_shape()[0])?;
-        Ok(Self { steering, ..ego })
+        let detector = Detector::from_weights(&weights, &weights.config()?)?;
+        let fusion = FusionStage::from_weights(&weights, method, detector.config())?;
+        Ok(Self::assembled(detector, method, fusion))
     }
 
-    /// The pipeline of a method around a detector, with the channels of neighbours as they come.
-    #[must_use]
-    pub fn new(detector: Detector, method: Method) -> Self {
+    /// The pipeline of a method around a detector, with an untrained fusion and the channels of neighbours as they come.
+    ///
+    /// # Errors
+    /// [`EgoError::Fusion`] when no fusion can be built behind the detector.
+    pub fn new(detector: Detector, method: Method) -> Result<Self, EgoError> {
+        let fusion = FusionStage::untrained(method, detector.config()).map_err(StageError::from)?;
+        Ok(Self::assembled(detector, method, fusion))
+    }
+
+    fn assembled(detector: Detector, method: Method, fusion: FusionStage) -> Self {
         let limits = PostprocessConfig::for_detector(detector.config());
         let limits = PostprocessConfig { score_threshold: SCORE_THRESHOLD, ..limits };
-        let fusion = fusion::build(method);
-        Self { method, detector, fusion, steering: None, limits, comm_range_m: Self::COMM_RANGE_M }
+        Self { method, detector, fusion, limits, comm_range_m: Self::COMM_RANGE_M }
     }
 
     /// The same with other limits of the clean-up.
@@ -265,22 +273,10 @@ impl Ego {
             sent.push(sent_cells(map, maps.len() == 1, [height, width])?);
         }
         let (maps, sent) = (Tensor::f_cat(&maps, 0)?, Tensor::f_cat(&sent, 0)?);
-        let poses: Vec<Pose> = aligned.iter().map(|view| view.ego_from_cav).collect();
-        let maps = match &self.steering {
-            Some(steering) => steering.turn(&maps, &poses)?,
-            None => maps,
-        };
-        let warped = warp_to_ego(&maps, Some(&sent), &poses, &self.detector.grid())?;
+        let facts: Vec<ViewFacts> = aligned.iter().enumerate().map(|(agent, view)| view.facts(agent)).collect();
+        let maps = self.fusion.align(&maps, Some(&sent), &facts)?;
         stages.lap("align");
-        let confidence: Vec<f64> = aligned.iter().map(|view| f64::from(view.view.pose.confidence())).collect();
-        let age_secs: Vec<f64> = aligned.iter().map(|view| view.view.age_nanos as f64 * 1e-9).collect();
-        let views = AlignedViews {
-            features: &warped.features,
-            mask: &warped.mask,
-            confidence: &confidence,
-            age_secs: &age_secs,
-        };
-        let fused = self.fusion.fuse(&views)?.f_unsqueeze(0)?.f_contiguous()?;
+        let fused = self.fusion.fuse(&maps, &facts, false)?.f_unsqueeze(0)?.f_contiguous()?;
         stages.lap("fuse");
         self.boxes_of(&fused, stages)
     }
@@ -343,6 +339,13 @@ pub fn own_content(method: Method) -> Exchange {
 struct Aligned<'a> {
     view: &'a View,
     ego_from_cav: Pose,
+}
+
+impl Aligned<'_> {
+    fn facts(&self, agent: usize) -> ViewFacts {
+        let confidence = f64::from(self.view.pose.confidence());
+        ViewFacts { agent, ego_from_cav: self.ego_from_cav, confidence, age_secs: self.view.age_nanos as f64 * 1e-9 }
+    }
 }
 
 /// `[1, 1, H, W]`: 1 where the sender sent its cell. The ego has all of its own map.

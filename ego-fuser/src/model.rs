@@ -13,14 +13,14 @@ use agent::postprocess::{AgentBoxes, PostprocessConfig, postprocess};
 use agent::training::ComputePrecision;
 use agent::weights::{CONFIG_KEY, Weights, WeightsError};
 use nalgebra::Isometry3;
-use protocol::{Box3d, Detection, Pose};
+use protocol::{Box3d, Detection};
 use tch::nn::VarStore;
 use tch::{Device, Kind, TchError, Tensor};
 
-use crate::fusion::{self, AlignedViews, Fusion, Steering, steering};
-use crate::method::{Exchange, Method, UnknownMethod};
+use crate::fusion::{FUSION_KEY, FUSION_PREFIX, FusionConfig, FusionStage, ViewFacts, steering, stored_config};
+use crate::method::{Method, UnknownMethod};
 use crate::targets::{LatticeError, TargetAssigner, TargetRule};
-use crate::warp::{WarpError, warp_to_ego};
+use crate::warp::WarpError;
 
 /// Metadata key of the method that weights were trained with.
 pub const METHOD_KEY: &str = "method";
@@ -49,13 +49,13 @@ pub enum ModelError {
     /// The head's output does not fit the anchors.
     #[error(transparent)]
     Decode(#[from] DecodeError),
-    /// Poses and views do not add up.
-    #[error("{views} views encoded, but the samples name {poses}")]
+    /// Facts and views do not add up.
+    #[error("{views} views encoded, but the samples name {told}")]
     ViewCount {
         /// Feature maps.
         views: i64,
-        /// Poses over all samples.
-        poses: usize,
+        /// Facts over all samples.
+        told: usize,
     },
 }
 
@@ -68,8 +68,7 @@ pub struct CooperativeModel {
     pub variables: VarStore,
     network: PointPillars,
     anchors: Anchors,
-    fusion: Box<dyn Fusion>,
-    steering: Option<Steering>,
+    fusion: FusionStage,
 }
 
 impl CooperativeModel {
@@ -78,12 +77,24 @@ impl CooperativeModel {
     /// # Errors
     /// [`ModelError::Config`] when no network can be built from `config`.
     pub fn new(config: &DetectorConfig, method: Method, device: Device) -> Result<Self, ModelError> {
+        Self::with_fusion(config, method, &FusionConfig::for_detector(method, config), device)
+    }
+
+    /// The same with a fusion of another size.
+    ///
+    /// # Errors
+    /// As [`Self::new`].
+    pub fn with_fusion(
+        config: &DetectorConfig,
+        method: Method,
+        fusion: &FusionConfig,
+        device: Device,
+    ) -> Result<Self, ModelError> {
         let variables = VarStore::new(device);
         let network = PointPillars::new(&variables.root(), config)?;
-        let shares_maps = method.exchange() == Exchange::Features;
-        let steering = shares_maps.then(|| Steering::new(&variables.root(), config.feature_channels()));
+        let fusion = FusionStage::new(&variables.root(), fusion, method, config)?;
         let anchors = Anchors::for_detector(config);
-        Ok(Self { method, network, variables, anchors, fusion: fusion::build(method), steering })
+        Ok(Self { method, network, variables, anchors, fusion })
     }
 
     /// Builds the model of a weights file; `method` overrides the one that the file names.
@@ -97,17 +108,21 @@ impl CooperativeModel {
             (None, Some(name)) => name.parse()?,
             (None, None) => Method::None,
         };
-        let model = Self::new(&weights.config()?, method, device)?;
-        // A network that was trained alone becomes a cooperative one whose steering has everything to learn.
-        weights.copy_some_into(&model.variables, |name| name != steering::WEIGHT || weights.contains(name))?;
+        let config = weights.config()?;
+        let model = Self::with_fusion(&config, method, &stored_config(&weights, method, &config)?, device)?;
+        // A network that was trained alone becomes a cooperative one whose fusion has everything to learn.
+        let is_fusion = |name: &str| name == steering::WEIGHT || name.starts_with(FUSION_PREFIX);
+        weights.copy_some_into(&model.variables, |name| !is_fusion(name) || weights.contains(name))?;
         Ok(model)
     }
 
-    /// What the header of its weights says of it: configuration and method.
+    /// What the header of its weights says of it: configuration, method and fusion.
     #[must_use]
     pub fn about(&self) -> BTreeMap<String, String> {
         let config = serde_json::to_string(&self.network.config).expect("a configuration is JSON");
-        BTreeMap::from([(CONFIG_KEY.to_owned(), config), (METHOD_KEY.to_owned(), self.method.name().to_owned())])
+        let fusion = serde_json::to_string(self.fusion.config()).expect("a configuration is JSON");
+        let method = self.method.name().to_owned();
+        [(CONFIG_KEY, config), (METHOD_KEY, method), (FUSION_KEY, fusion)].map(|(key, value)| (key.to_owned(), value)).into()
     }
 
     /// The numbers it was built from.
@@ -133,57 +148,54 @@ impl CooperativeModel {
         self.variables.device()
     }
 
+    /// How it makes one map of many.
+    #[must_use]
+    pub fn fusion(&self) -> &FusionStage {
+        &self.fusion
+    }
+
     /// The forward pass of a training step: all views are encoded together, then fused sample by sample.
     ///
-    /// `ego_from_cav` holds the poses of each sample's views, ego first; views lie in `pillars` in the same order.
+    /// `facts` tell of each sample's views, ego first; views lie in `pillars` in the same order.
     ///
     /// # Errors
-    /// [`ModelError`] when poses and views do not add up.
+    /// [`ModelError`] when facts and views do not add up.
     pub fn forward(
         &self,
         pillars: &PillarBatch,
-        ego_from_cav: &[Vec<Pose>],
+        facts: &[Vec<ViewFacts>],
         train: bool,
     ) -> Result<HeadOutput, ModelError> {
         let features = self.network.features(pillars, train);
-        let features = self.network.through_compressor(&features, train);
-        let poses: usize = ego_from_cav.iter().map(Vec::len).sum();
-        let views = features.size4()?.0;
-        if views != poses as i64 {
-            return Err(ModelError::ViewCount { views, poses });
-        }
-        if ego_from_cav.iter().all(|sample| sample.len() == 1) {
-            return Ok(self.network.heads(&features)?);
-        }
-        let mut fused = Vec::with_capacity(ego_from_cav.len());
-        let mut first = 0;
-        for poses in ego_from_cav {
-            let views = features.f_narrow(0, first, poses.len() as i64)?;
-            first += poses.len() as i64;
-            let (confidence, age_secs) = (vec![1.0; poses.len()], vec![0.0; poses.len()]);
-            fused.push(self.fuse(&views, poses, &confidence, &age_secs)?);
-        }
-        Ok(self.network.heads(&Tensor::f_stack(&fused, 0)?)?)
+        self.fuse_and_detect(&self.network.through_compressor(&features, train), facts, train)
     }
 
-    /// Fuses the maps of one sample, each `[C, H, W]` in its own frame, into `[C, H, W]` in the frame of the first.
+    /// The rest of the forward pass, from the maps of all views `[sum(views), C, H, W]` on, each in its own frame.
     ///
     /// # Errors
-    /// [`ModelError::Warp`] when the maps do not lie on the lattice of this model.
-    pub fn fuse(
+    /// [`ModelError`] when facts and views do not add up.
+    pub fn fuse_and_detect(
         &self,
         features: &Tensor,
-        ego_from_cav: &[Pose],
-        confidence: &[f64],
-        age_secs: &[f64],
-    ) -> Result<Tensor, ModelError> {
-        let features = match &self.steering {
-            Some(steering) => &steering.turn(features, ego_from_cav)?,
-            None => features,
-        };
-        let warped = warp_to_ego(features, None, ego_from_cav, &self.network.config.feature_grid())?;
-        let views = AlignedViews { features: &warped.features, mask: &warped.mask, confidence, age_secs };
-        Ok(self.fusion.fuse(&views)?)
+        facts: &[Vec<ViewFacts>],
+        train: bool,
+    ) -> Result<HeadOutput, ModelError> {
+        let told: usize = facts.iter().map(Vec::len).sum();
+        let views = features.size4()?.0;
+        if views != told as i64 {
+            return Err(ModelError::ViewCount { views, told });
+        }
+        if self.fusion.config() == &FusionConfig::Own && told == facts.len() {
+            return Ok(self.network.heads(features)?);
+        }
+        let mut fused = Vec::with_capacity(facts.len());
+        let mut first = 0;
+        for facts in facts {
+            let views = features.f_narrow(0, first, facts.len() as i64)?;
+            first += facts.len() as i64;
+            fused.push(self.fusion.fuse(&self.fusion.align(&views, None, facts)?, facts, train)?);
+        }
+        Ok(self.network.heads(&Tensor::f_stack(&fused, 0)?)?)
     }
 
     /// Boxes of every sample of a head's output, cleaned up by `limits`.

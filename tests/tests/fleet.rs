@@ -134,7 +134,7 @@ fn play_in_lockstep(dir: &Path, method: Method) -> (Vec<(u64, Detections)>, Ledg
         let ego = scope.spawn(|| {
             let bus = router.join("ego-10", "10");
             let options = ego_node::NodeOptions { deadline: PATIENCE, ..ego_node::NodeOptions::default() };
-            let report = ego_node::run(&bus, &cav("10"), Ego::new(detector(), method), &options, &stop).unwrap();
+            let report = ego_node::run(&bus, &cav("10"), Ego::new(detector(), method).unwrap(), &options, &stop).unwrap();
             assert_eq!((report.frames, report.at_deadline, report.failed), (TICKS as u64, 0, 0));
             leave(bus)
         });
@@ -164,7 +164,7 @@ fn play_in_lockstep(dir: &Path, method: Method) -> (Vec<(u64, Detections)>, Ledg
 /// The same pipelines without any network.
 fn play_offline(scenario: &Scenario, method: Method) -> Vec<(u64, Vec<Detection>)> {
     let mut agents: Vec<Agent> = AGENTS.iter().map(|cav_id| agent(cav_id)).collect();
-    let mut ego = Ego::new(detector(), method);
+    let mut ego = Ego::new(detector(), method).unwrap();
     let mut results = Vec::new();
     for (tick_index, tick) in scenario.ticks.iter().enumerate() {
         let views: Vec<View> = (agents.iter_mut().enumerate())
@@ -307,7 +307,7 @@ fn late_killed_and_lying_neighbours_are_named_and_the_ego_goes_on() {
                 keeps_running: true,
                 ..ego_node::NodeOptions::default()
             };
-            ego_node::run(&bus, &cav("10"), Ego::new(detector(), Method::Max), &options, &stop).unwrap();
+            ego_node::run(&bus, &cav("10"), Ego::new(detector(), Method::Max).unwrap(), &options, &stop).unwrap();
             leave(bus)
         });
         fleet.iter().for_each(|puppet| puppet.wait_until_heard("ego-10"));
@@ -379,7 +379,7 @@ fn maps_of_a_network_that_a_neighbour_names_as_another_are_left_out() {
             let bus = router.join("ego-10", "10");
             // A frame that waited for what is left out would take for ever.
             let options = ego_node::NodeOptions { deadline: PATIENCE, keeps_running: true, ..Default::default() };
-            let report = ego_node::run(&bus, &cav("10"), Ego::new(detector(), Method::Max), &options, &stop).unwrap();
+            let report = ego_node::run(&bus, &cav("10"), Ego::new(detector(), Method::Max).unwrap(), &options, &stop).unwrap();
             assert_eq!((report.frames, report.at_deadline), (4, 0));
             leave(bus)
         });

@@ -1,9 +1,8 @@
 //! Training targets, loss, AP, warps and fusion against the reference implementations.
 
 use agent::rotated_iou::Polygon;
-use ego_fuser::Method;
 use ego_fuser::average_precision::{Curve, Ordering, Scorer};
-use ego_fuser::fusion::{self, AlignedViews, regroup};
+use ego_fuser::fusion::{AlignedViews, AttentionFusion, Fusion, MaxFusion, ViewFacts, regroup};
 use ego_fuser::loss::{LabelTensors, LossConfig, Unassigned, detection_loss};
 use ego_fuser::targets::{BOX_CODE, Labels, Positive, TargetAssigner, TargetRule};
 use ego_fuser::warp::opencood::{self, Interpolation};
@@ -199,8 +198,8 @@ fn golden_c6_att_max() {
     let Some(golden) = golden("c6_att_max") else { return };
     let features = tensor(&golden, "in.x");
     let (_, agents) = golden.i64("in.record_len");
-    check_fusion(&golden, "out.att", Method::Attention, &features, &agents);
-    check_fusion(&golden, "out.max", Method::Max, &features, &agents);
+    check_fusion(&golden, "out.att", &AttentionFusion, &features, &agents);
+    check_fusion(&golden, "out.max", &MaxFusion, &features, &agents);
     let (groups, mask) = regroup(&features, &agents, golden.config()["max_cav"].as_i64().unwrap()).unwrap();
     assert_eq!(groups, tensor(&golden, "out.regroup"));
     assert_eq!(Vec::<i64>::try_from(mask.to_kind(Kind::Int64).view(-1)).unwrap(), golden.i64("out.regroup_mask").1);
@@ -225,9 +224,9 @@ fn golden_c6_coalign_att_max() {
     }
     let warped = Tensor::cat(&warped, 0);
     assert_close("warped", &values(&warped), &golden.f32("out.warped_to_ego").1, 1e-4, 0.0);
-    check_fusion(&golden, "out.att", Method::Attention, &warped, &agents);
-    check_fusion(&golden, "out.att_raw", Method::Attention, &warped, &agents);
-    check_fusion(&golden, "out.max", Method::Max, &warped, &agents);
+    check_fusion(&golden, "out.att", &AttentionFusion, &warped, &agents);
+    check_fusion(&golden, "out.att_raw", &AttentionFusion, &warped, &agents);
+    check_fusion(&golden, "out.max", &MaxFusion, &warped, &agents);
 }
 
 #[test]
@@ -261,16 +260,18 @@ fn golden_c7_loss() {
     assert_close("grad_rm", &values(&boxes.grad()), &golden.f32("out.grad_rm").1, 1e-6, 1e-4);
 }
 
-fn check_fusion(golden: &Golden, name: &str, method: Method, features: &Tensor, agents: &[i64]) {
-    let fusion = fusion::build(method);
+fn check_fusion(golden: &Golden, name: &str, fusion: &dyn Fusion, features: &Tensor, agents: &[i64]) {
     let fused: Vec<Tensor> = features
         .split_with_sizes(agents, 0)
         .iter()
         .map(|features| {
             let [views, _, height, width] = features.size()[..] else { panic!("features have four dimensions") };
             let mask = Tensor::ones([views, 1, height, width], (Kind::Float, Device::Cpu));
-            let (confidence, age_secs) = (vec![1.0; views as usize], vec![0.0; views as usize]);
-            fusion.fuse(&AlignedViews { features, mask: &mask, confidence: &confidence, age_secs: &age_secs }).unwrap()
+            let facts: Vec<_> = (0..views as usize).map(|agent| ViewFacts::fresh(agent, Pose::IDENTITY)).collect();
+            let [width, height] = [width, height].map(|size| size as u32);
+            let grid = BevGrid { x_min_m: 0.0, y_min_m: 0.0, cell_m: 0.4, width, height };
+            let views = AlignedViews { features, mask: &mask, own_frame: features, grid: &grid, facts: &facts };
+            fusion.fuse(&views, false).unwrap()
         })
         .collect();
     assert_close(name, &values(&Tensor::stack(&fused, 0)), &golden.f32(name).1, 1e-4, 0.0);

@@ -63,13 +63,13 @@ fn near() -> Pose {
 fn a_neighbour_changes_what_is_seen_and_the_same_views_give_the_same_bits() {
     for method in [Method::Early, Method::Max, Method::Attention] {
         let (own, other) = (view("a", HERE, method, 0.0), view("b", near(), method, 0.15));
-        let mut ego = Ego::new(detector(), method);
+        let mut ego = Ego::new(detector(), method).unwrap();
         let alone = ego.detect(&own, &[]).unwrap();
         let together = ego.detect(&own, std::slice::from_ref(&other)).unwrap();
         assert_eq!(together.fused, [0], "{method}");
         assert!(!together.detections.is_empty(), "{method}");
         assert!(alone.detections != together.detections, "{method}: the neighbour changed nothing");
-        let again = Ego::new(detector(), method).detect(&own, std::slice::from_ref(&other)).unwrap();
+        let again = Ego::new(detector(), method).unwrap().detect(&own, std::slice::from_ref(&other)).unwrap();
         assert_eq!(again.detections, together.detections, "{method}");
     }
 }
@@ -91,7 +91,7 @@ fn late_fusion_moves_boxes_and_keeps_the_better_of_two() {
     let own = boxes("a", HERE, vec![found(5.2, 0.6)]);
     let ahead = Pose { translation_m: [104.0, 50.0, 2.0], ..HERE };
     let other = boxes("b", ahead, vec![found(1.0, 0.9), found(-10.0, 0.5), found(-6.0, 0.05)]);
-    let output = Ego::new(detector(), Method::Late).detect(&own, &[other]).unwrap();
+    let output = Ego::new(detector(), Method::Late).unwrap().detect(&own, &[other]).unwrap();
     let seen: Vec<_> = (output.detections.iter())
         .map(|found| (found.box3d.center_m[0].round(), found.source.as_ref().unwrap().as_str()))
         .collect();
@@ -101,12 +101,12 @@ fn late_fusion_moves_boxes_and_keeps_the_better_of_two() {
 #[test]
 fn with_none_left_the_maps_of_every_method_are_those_of_the_ego_alone() {
     let own = view("a", HERE, Method::None, 0.0);
-    let alone = Ego::new(detector(), Method::None).detect(&own, &[]).unwrap().detections;
+    let alone = Ego::new(detector(), Method::None).unwrap().detect(&own, &[]).unwrap().detections;
     assert!(!alone.is_empty());
     let far = view("b", Pose::from_xyz_yaw([200.0, 50.0, 2.0], 0.0), Method::Max, 0.0);
     let lost = View { pose: PoseEstimate::NoPose { reason: NoPoseReason::NoSource, inlier_count: 0 }, ..far.clone() };
     for method in [Method::Max, Method::Attention] {
-        let output = Ego::new(detector(), method).detect(&own, &[far.clone(), lost.clone()]).unwrap();
+        let output = Ego::new(detector(), method).unwrap().detect(&own, &[far.clone(), lost.clone()]).unwrap();
         assert_eq!(output.detections, alone, "{method}");
         let reasons = [(0, Skipped::Unusable(DropReason::OutOfRange)), (1, Skipped::Unusable(DropReason::NoPose))];
         assert_eq!((output.fused, output.skipped), (vec![], reasons.to_vec()), "{method}");
@@ -117,7 +117,7 @@ fn with_none_left_the_maps_of_every_method_are_those_of_the_ego_alone() {
 fn an_ego_without_pose_goes_on_alone() {
     let own = view("a", HERE, Method::Max, 0.0);
     let lost = View { pose: PoseEstimate::NoPose { reason: NoPoseReason::NoSource, inlier_count: 0 }, ..own.clone() };
-    let mut ego = Ego::new(detector(), Method::Max);
+    let mut ego = Ego::new(detector(), Method::Max).unwrap();
     let output = ego.detect(&lost, &[view("b", near(), Method::Max, 0.1)]).unwrap();
     assert_eq!(output.detections, ego.detect(&own, &[]).unwrap().detections);
     assert_eq!(output.skipped, [(0, Skipped::Unusable(DropReason::NoPose))]);
@@ -127,7 +127,7 @@ fn an_ego_without_pose_goes_on_alone() {
 fn cells_that_were_not_sent_have_no_part() {
     let own = view("a", HERE, Method::Attention, 0.0);
     let mut other = view("b", near(), Method::Attention, 0.1);
-    let mut ego = Ego::new(detector(), Method::Attention);
+    let mut ego = Ego::new(detector(), Method::Attention).unwrap();
     let Content::Features(map) = &mut other.content else { panic!("attention exchanges maps") };
     map.sent = Some(vec![false; map.features.grid.cells()]);
     let output = ego.detect(&own, &[other]).unwrap();
@@ -141,7 +141,7 @@ fn maps_of_another_network_are_left_out_and_named_where_they_are_the_egos_own() 
     let mut other = view("b", near(), Method::Max, 0.1);
     let Content::Features(map) = &mut other.content else { panic!("max exchanges maps") };
     map.features.channels = 3;
-    let mut ego = Ego::new(detector(), Method::Max);
+    let mut ego = Ego::new(detector(), Method::Max).unwrap();
     let output = ego.detect(&own, std::slice::from_ref(&other)).unwrap();
     assert_eq!(output.skipped, [(0, Skipped::Unusable(DropReason::Shape))]);
     assert!(ego.detect(&other, &[]).unwrap_err().to_string().contains("3 x"));

@@ -11,7 +11,7 @@ use super::{AlignedViews, Fusion};
 pub struct AttentionFusion;
 
 impl Fusion for AttentionFusion {
-    fn fuse(&self, views: &AlignedViews<'_>) -> Result<Tensor, TchError> {
+    fn fuse(&self, views: &AlignedViews<'_>, _train: bool) -> Result<Tensor, TchError> {
         let features = views.features;
         let (agents, channels, _, _) = features.size4()?;
         if agents == 1 {

@@ -9,7 +9,7 @@ use super::{AlignedViews, Fusion};
 pub struct MaxFusion;
 
 impl Fusion for MaxFusion {
-    fn fuse(&self, views: &AlignedViews<'_>) -> Result<Tensor, TchError> {
+    fn fuse(&self, views: &AlignedViews<'_>, _train: bool) -> Result<Tensor, TchError> {
         if views.features.size4()?.0 == 1 {
             return views.features.f_get(0);
         }

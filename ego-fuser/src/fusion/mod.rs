@@ -1,41 +1,73 @@
 //! Many feature maps on the ego lattice, one feature map out.
 
 mod attention;
+mod config;
 mod max;
+mod stage;
 pub(crate) mod steering;
 
 use std::fmt::Debug;
 
+use protocol::{BevGrid, Pose};
 use tch::{TchError, Tensor};
 
 pub use attention::AttentionFusion;
+pub use config::{FUSION_KEY, FusionConfig};
 pub use max::MaxFusion;
+pub(crate) use stage::{FUSION_PREFIX, stored_config};
+pub use stage::{AlignedMaps, FusionStage, StageError};
 pub use steering::Steering;
 
-use crate::Method;
+/// What is known of one map besides its values.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ViewFacts {
+    /// Which agent it is of, 0 being the ego. With history an agent has several maps.
+    pub agent: usize,
+    /// Where its sender was when it was made, in the frame of the ego now.
+    pub ego_from_cav: Pose,
+    /// Confidence of its sender's pose, 0..1.
+    pub confidence: f64,
+    /// Its age relative to the ego's newest map, seconds.
+    pub age_secs: f64,
+}
 
-/// The views of one sample, aligned; the ego is the first agent.
+impl ViewFacts {
+    /// A fresh map with a pose beyond doubt.
+    #[must_use]
+    pub fn fresh(agent: usize, ego_from_cav: Pose) -> Self {
+        Self { agent, ego_from_cav, confidence: 1.0, age_secs: 0.0 }
+    }
+}
+
+/// The maps of one sample, aligned; the first is the ego's newest.
 ///
 /// Missing agents are either not in it or have a mask of zeros: both mean the same to every method.
 #[derive(Debug)]
 pub struct AlignedViews<'a> {
     /// `[N, C, H, W]` features on the ego lattice.
     pub features: &'a Tensor,
-    /// `[N, 1, H, W]` 1 where an agent's map reaches, 0 elsewhere; 1 everywhere for the ego.
+    /// `[N, 1, H, W]` 1 where a map reaches and was sent, 0 elsewhere; 1 everywhere for the ego.
     pub mask: &'a Tensor,
-    /// Confidence of each agent's pose, 0..1.
-    pub confidence: &'a [f64],
-    /// Age of each map relative to the ego's, seconds.
-    pub age_secs: &'a [f64],
+    /// `[N, C, H, W]` the maps before they were moved, for methods that move them themselves.
+    pub own_frame: &'a Tensor,
+    /// The lattice of all maps, each in the frame of its vehicle.
+    pub grid: &'a BevGrid,
+    /// `N`: what is known of each.
+    pub facts: &'a [ViewFacts],
 }
 
 /// A way to fuse aligned feature maps.
 pub trait Fusion: Debug + Send {
-    /// Fuses the views of one sample into `[C, H, W]` in the frame of the ego.
+    /// Fuses the maps of one sample into `[C, H, W]` in the frame of the ego.
     ///
     /// # Errors
     /// [`TchError`] when the shapes of features and mask do not fit.
-    fn fuse(&self, views: &AlignedViews<'_>) -> Result<Tensor, TchError>;
+    fn fuse(&self, views: &AlignedViews<'_>, train: bool) -> Result<Tensor, TchError>;
+
+    /// Time steps that it wants of every agent, the newest included.
+    fn frames(&self) -> usize {
+        1
+    }
 }
 
 /// The ego's own map, whatever the others have.
@@ -43,18 +75,8 @@ pub trait Fusion: Debug + Send {
 pub struct NoFusion;
 
 impl Fusion for NoFusion {
-    fn fuse(&self, views: &AlignedViews<'_>) -> Result<Tensor, TchError> {
+    fn fuse(&self, views: &AlignedViews<'_>, _train: bool) -> Result<Tensor, TchError> {
         views.features.f_get(0)
-    }
-}
-
-/// The fusion of feature maps that belongs to `method`; methods that exchange something else fuse no maps.
-#[must_use]
-pub fn build(method: Method) -> Box<dyn Fusion> {
-    match method {
-        Method::None | Method::Late | Method::Early => Box::new(NoFusion),
-        Method::Max => Box::new(MaxFusion),
-        Method::Attention => Box::new(AttentionFusion),
     }
 }
 
@@ -77,46 +99,75 @@ pub fn regroup(features: &Tensor, agents: &[i64], longest: i64) -> Result<(Tenso
 
 #[cfg(test)]
 mod tests {
-    use tch::{Device, Kind};
+    use agent::model_config::{DetectorConfig, ShrinkConfig};
+    use tch::nn::VarStore;
+    use tch::{Device, Kind, no_grad};
 
     use super::*;
+    use crate::Method;
 
     const FLOAT: (Kind, Device) = (Kind::Float, Device::Cpu);
+    const SHAPE: [i64; 3] = [16, 16, 24];
 
-    fn fuse(method: Method, features: &Tensor, mask: &Tensor) -> Tensor {
-        let agents = features.size()[0] as usize;
-        let (confidence, age_secs) = (vec![1.0; agents], vec![0.0; agents]);
-        build(method).fuse(&AlignedViews { features, mask, confidence: &confidence, age_secs: &age_secs }).unwrap()
+    /// The fusion of every method, untrained.
+    fn all() -> impl Iterator<Item = (Method, Box<dyn Fusion>)> {
+        tch::set_num_threads(1);
+        let shrink = Some(ShrinkConfig::Pointwise { channels: SHAPE[0] });
+        let detector = DetectorConfig { shrink, ..DetectorConfig::lean() };
+        Method::ALL.into_iter().map(move |method| {
+            let variables = VarStore::new(Device::Cpu);
+            (method, FusionConfig::for_detector(method, &detector).build(&variables.root()).unwrap())
+        })
     }
 
-    #[test]
-    fn alone_every_method_gives_the_ego_back() {
-        let features = Tensor::randn([1, 4, 5, 6], FLOAT);
-        let mask = Tensor::ones([1, 1, 5, 6], FLOAT);
-        for method in Method::ALL {
-            assert_eq!(fuse(method, &features, &mask), features.get(0), "{method}");
-        }
+    fn random(agents: i64) -> Tensor {
+        Tensor::rand([agents, SHAPE[0], SHAPE[1], SHAPE[2]], FLOAT)
+    }
+
+    fn fuse(fusion: &dyn Fusion, features: &Tensor, reach: &[f32]) -> Tensor {
+        let mask = Tensor::from_slice(reach).view([-1, 1, 1, 1]).expand([-1, 1, SHAPE[1], SHAPE[2]], false);
+        let facts: Vec<_> = (0..reach.len()).map(|agent| ViewFacts::fresh(agent, Pose::IDENTITY)).collect();
+        let (height, width) = (SHAPE[1] as u32, SHAPE[2] as u32);
+        let grid = BevGrid { x_min_m: -12.0, y_min_m: -8.0, cell_m: 1.0, width, height };
+        let views = AlignedViews { features, mask: &mask, own_frame: features, grid: &grid, facts: &facts };
+        let fused = no_grad(|| fusion.fuse(&views, false)).unwrap();
+        assert_eq!(fused.size(), SHAPE);
+        fused
+    }
+
+    fn difference(one: &Tensor, other: &Tensor) -> f64 {
+        (one - other).abs().max().double_value(&[])
     }
 
     #[test]
     fn masked_neighbours_change_nothing() {
-        let features = Tensor::randn([3, 4, 5, 6], FLOAT);
-        let mask = Tensor::zeros([3, 1, 5, 6], FLOAT);
-        let _ = mask.get(0).fill_(1.0);
-        for method in Method::ALL {
-            let difference = fuse(method, &features, &mask) - features.get(0);
-            assert!(difference.abs().max().double_value(&[]) < 1e-6, "{method}");
+        let features = random(3);
+        for (method, fusion) in all() {
+            let alone = fuse(&*fusion, &features.narrow(0, 0, 1), &[1.0]);
+            assert!(alone.isfinite().all().double_value(&[]) == 1.0, "{method}");
+            let masked = fuse(&*fusion, &features, &[1.0, 0.0, 0.0]);
+            assert!(difference(&alone, &masked) < 1e-4, "{method}");
+        }
+    }
+
+    #[test]
+    fn neighbours_that_are_seen_change_something_unless_maps_are_not_exchanged() {
+        let features = random(3);
+        for (method, fusion) in all() {
+            let alone = fuse(&*fusion, &features.narrow(0, 0, 1), &[1.0]);
+            let together = fuse(&*fusion, &features, &[1.0, 1.0, 1.0]);
+            let shares_maps = method.exchange() == crate::method::Exchange::Features;
+            assert_eq!(difference(&alone, &together) > 1e-4, shares_maps, "{method}");
         }
     }
 
     #[test]
     fn the_order_of_neighbours_does_not_matter() {
-        let features = Tensor::randn([3, 4, 5, 6], FLOAT);
-        let mask = Tensor::ones([3, 1, 5, 6], FLOAT);
+        let features = random(3);
         let swapped = features.index_select(0, &Tensor::from_slice(&[0i64, 2, 1]));
-        for method in Method::ALL {
-            let difference = fuse(method, &features, &mask) - fuse(method, &swapped, &mask);
-            assert!(difference.abs().max().double_value(&[]) < 1e-5, "{method}");
+        for (method, fusion) in all() {
+            let [one, other] = [&features, &swapped].map(|features| fuse(&*fusion, features, &[1.0; 3]));
+            assert!(difference(&one, &other) < 1e-4, "{method}");
         }
     }
 

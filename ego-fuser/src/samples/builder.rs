@@ -13,6 +13,7 @@ use sim_replay::frame::Frame;
 use sim_replay::ground_truth::{self, GroundTruthRule};
 
 use super::{Augmentation, SampleError, SceneSet, TickRef, ViewAugment};
+use crate::fusion::ViewFacts;
 use crate::targets::{Labels, TargetAssigner};
 
 /// Beyond any lattice, metres: which objects count is decided after the augmentation.
@@ -78,8 +79,8 @@ impl SampleConfig {
 pub struct Sample {
     /// Pillars of every view, the ego first.
     pub pillars: Vec<Pillars>,
-    /// Pose of every view, identity first.
-    pub ego_from_cav: Vec<Pose>,
+    /// What is known of every view, the ego's pose being the identity.
+    pub facts: Vec<ViewFacts>,
     /// True boxes in the ego frame with their centre on the lattice.
     pub objects: Vec<Box3d>,
     /// Targets of those boxes.
@@ -154,7 +155,7 @@ impl SampleBuilder {
         let objects = self.objects(&frames, annotators, &ego_view);
         Ok(Sample {
             pillars: clouds.iter().map(|cloud| self.voxeliser.voxelise(&cloud.xyzi)).collect(),
-            ego_from_cav,
+            facts: ego_from_cav.into_iter().enumerate().map(|(agent, pose)| ViewFacts::fresh(agent, pose)).collect(),
             labels: self.assigner.assign(&objects),
             objects,
         })

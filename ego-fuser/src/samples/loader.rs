@@ -3,12 +3,12 @@
 use agent::pillar_batch::{PillarBatch, PillarLattice};
 use agent::pillars::Pillars;
 use agent::training::{Prefetch, RunConfig};
-use protocol::Pose;
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
 
 use super::{Sample, SampleBuilder, SampleError, TickRef};
+use crate::fusion::ViewFacts;
 use crate::targets::Labels;
 
 /// Samples of one training step.
@@ -16,8 +16,8 @@ use crate::targets::Labels;
 pub struct Batch {
     /// Pillars of all views of all samples.
     pub pillars: PillarBatch,
-    /// Poses of the views of each sample, ego first.
-    pub ego_from_cav: Vec<Vec<Pose>>,
+    /// What is known of the views of each sample, ego first.
+    pub facts: Vec<Vec<ViewFacts>>,
     /// Targets of each sample.
     pub labels: Vec<Labels>,
 }
@@ -28,8 +28,8 @@ impl Batch {
     pub fn collate(samples: Vec<Sample>, lattice: &PillarLattice) -> Self {
         let views: Vec<&Pillars> = samples.iter().flat_map(|sample| &sample.pillars).collect();
         let pillars = PillarBatch::new(&views, lattice);
-        let (ego_from_cav, labels) = samples.into_iter().map(|sample| (sample.ego_from_cav, sample.labels)).unzip();
-        Self { pillars, ego_from_cav, labels }
+        let (facts, labels) = samples.into_iter().map(|sample| (sample.facts, sample.labels)).unzip();
+        Self { pillars, facts, labels }
     }
 }
 

@@ -108,7 +108,7 @@ impl<'a> Training<'a> {
         let device = self.config.run.device;
         let pillars = batch.pillars.to_device(device);
         let labels = LabelTensors::gather(&batch.labels, self.config.loss.unassigned, device);
-        let output = self.model.forward(&pillars, &batch.ego_from_cav, true)?;
+        let output = self.model.forward(&pillars, &batch.facts, true)?;
         let loss = detection_loss(&output.scores, &output.offsets, &labels, &self.config.loss)?;
         let share_done = self.share_done();
         Ok(match self.trainer.step(&loss.total(), share_done)? {

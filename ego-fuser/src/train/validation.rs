@@ -79,7 +79,7 @@ impl Validator {
             let objects: Vec<_> = sample.objects.iter().filter(inside).copied().collect();
             let batch = Batch::collate(vec![sample], model.network().lattice());
             let pillars = batch.pillars.to_device(model.device());
-            let output = no_grad(|| model.forward(&pillars, &batch.ego_from_cav, false))?;
+            let output = no_grad(|| model.forward(&pillars, &batch.facts, false))?;
             for detections in model.detections(&output, &limits)? {
                 scorer.add(&detections, &objects);
             }

@@ -1,0 +1,47 @@
+//! Which fusion a network has, and of what size.
+
+use agent::model_config::{ConfigError, DetectorConfig};
+use serde::{Deserialize, Serialize};
+use tch::nn;
+
+use super::{AttentionFusion, Fusion, MaxFusion, NoFusion};
+use crate::Method;
+
+/// Metadata key of the fusion's configuration in a weights file.
+pub const FUSION_KEY: &str = "fusion";
+
+/// What the fusion of a network is built from, stored as JSON beside its weights.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
+pub enum FusionConfig {
+    /// The ego's own map.
+    Own,
+    /// Element-wise maximum.
+    Max,
+    /// Attention without parameters.
+    Attention,
+}
+
+impl FusionConfig {
+    /// The fusion that a method has behind `detector`; methods that exchange no feature maps fuse none.
+    #[must_use]
+    pub fn for_detector(method: Method, _detector: &DetectorConfig) -> Self {
+        match method {
+            Method::None | Method::Late | Method::Early => Self::Own,
+            Method::Max => Self::Max,
+            Method::Attention => Self::Attention,
+        }
+    }
+
+    /// Builds the fusion with its variables below `path`.
+    ///
+    /// # Errors
+    /// [`ConfigError`] names the field that no fusion can be built from.
+    pub fn build(&self, _path: &nn::Path<'_>) -> Result<Box<dyn Fusion>, ConfigError> {
+        Ok(match self {
+            Self::Own => Box::new(NoFusion),
+            Self::Max => Box::new(MaxFusion),
+            Self::Attention => Box::new(AttentionFusion),
+        })
+    }
+}

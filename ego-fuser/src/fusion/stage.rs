@@ -1,0 +1,140 @@
+//! From the maps of several vehicles to one: turned, warped, fused. Training and the ego run the same lines.
+
+use agent::model_config::{ConfigError, DetectorConfig};
+use agent::weights::{Weights, WeightsError};
+use protocol::{BevGrid, Pose};
+use tch::nn::{self, VarStore};
+use tch::{Device, Tensor};
+
+use super::steering::{self, Steering};
+use super::{AlignedViews, FUSION_KEY, Fusion, FusionConfig, ViewFacts};
+use crate::method::{Exchange, Method};
+use crate::warp::{WarpError, Warped, warp_to_ego};
+
+/// Where the fusion's variables lie in a weights file.
+pub(crate) const FUSION_PREFIX: &str = "fusion.";
+
+/// Why a fusion cannot be read from a weights file.
+#[derive(Debug, thiserror::Error)]
+pub enum StageError {
+    /// Its configuration is none.
+    #[error(transparent)]
+    Config(#[from] ConfigError),
+    /// The weights do not fit.
+    #[error(transparent)]
+    Weights(#[from] WeightsError),
+}
+
+/// Steering, warp and fusion of one network.
+#[derive(Debug)]
+pub struct FusionStage {
+    config: FusionConfig,
+    fusion: Box<dyn Fusion>,
+    steering: Option<Steering>,
+    grid: BevGrid,
+}
+
+/// Maps on the ego lattice, with what they were made from.
+#[derive(Debug)]
+pub struct AlignedMaps {
+    own_frame: Tensor,
+    warped: Warped,
+}
+
+impl FusionStage {
+    /// The fusion of `method` with random parameters below `path`: `fusion.*` and, where maps are exchanged,
+    /// `steering.weight`.
+    ///
+    /// # Errors
+    /// [`ConfigError`] names the field that no fusion can be built from.
+    pub fn new(
+        path: &nn::Path<'_>,
+        config: &FusionConfig,
+        method: Method,
+        detector: &DetectorConfig,
+    ) -> Result<Self, ConfigError> {
+        let shares_maps = method.exchange() == Exchange::Features;
+        let steering = shares_maps.then(|| Steering::new(path, detector.feature_channels()));
+        let fusion = config.build(&(path / "fusion"))?;
+        Ok(Self { config: config.clone(), fusion, steering, grid: detector.feature_grid() })
+    }
+
+    /// The fusion of a weights file, or the one of `method` where it is another and has no parameters.
+    ///
+    /// # Errors
+    /// [`StageError`] names the file and the first parameter that is missing or of another shape.
+    pub fn from_weights(weights: &Weights, method: Method, detector: &DetectorConfig) -> Result<Self, StageError> {
+        let variables = VarStore::new(Device::Cpu);
+        let config = stored_config(weights, method, detector)?;
+        let mut stage = Self::new(&variables.root(), &config, method, detector)?;
+        weights.copy_some_into(&variables, |name| name != steering::WEIGHT || weights.contains(name))?;
+        if !weights.contains(steering::WEIGHT) {
+            stage.steering = None;
+        }
+        Ok(stage)
+    }
+
+    /// The fusion of `method` around a network without weights of its own: its parameters are random, channels stay as
+    /// they come.
+    ///
+    /// # Errors
+    /// [`ConfigError`] names the field that no fusion can be built from.
+    pub fn untrained(method: Method, detector: &DetectorConfig) -> Result<Self, ConfigError> {
+        let variables = VarStore::new(Device::Cpu);
+        let config = FusionConfig::for_detector(method, detector);
+        Ok(Self { steering: None, ..Self::new(&variables.root(), &config, method, detector)? })
+    }
+
+    /// What the fusion was built from.
+    #[must_use]
+    pub fn config(&self) -> &FusionConfig {
+        &self.config
+    }
+
+    /// Time steps of every agent that the fusion wants.
+    #[must_use]
+    pub fn frames(&self) -> usize {
+        self.fusion.frames()
+    }
+
+    /// Moves maps onto the ego lattice: `own_frame` is `[N, C, H, W]`, each map in the axes of its sender, `sent`
+    /// `[N, 1, H, W]` is 1 where a cell was sent (absent: everywhere), `facts` are `N`, the ego's first.
+    ///
+    /// # Errors
+    /// [`WarpError`] when the maps do not lie on the lattice or facts are missing.
+    pub fn align(&self, own_frame: &Tensor, sent: Option<&Tensor>, facts: &[ViewFacts]) -> Result<AlignedMaps, WarpError> {
+        let poses: Vec<Pose> = facts.iter().map(|facts| facts.ego_from_cav).collect();
+        let own_frame = match &self.steering {
+            Some(steering) => steering.turn(own_frame, &poses)?,
+            None => own_frame.shallow_clone(),
+        };
+        let warped = warp_to_ego(&own_frame, sent, &poses, &self.grid)?;
+        Ok(AlignedMaps { own_frame, warped })
+    }
+
+    /// Fuses aligned maps into `[C, H, W]` in the frame of the ego.
+    ///
+    /// # Errors
+    /// [`WarpError::Torch`] when the tensor library refuses.
+    pub fn fuse(&self, maps: &AlignedMaps, facts: &[ViewFacts], train: bool) -> Result<Tensor, WarpError> {
+        let AlignedMaps { own_frame, warped } = maps;
+        let views =
+            AlignedViews { features: &warped.features, mask: &warped.mask, own_frame, grid: &self.grid, facts };
+        Ok(self.fusion.fuse(&views, train)?)
+    }
+}
+
+/// The configuration that a weights file names, as long as it belongs to `method`.
+pub(crate) fn stored_config(
+    weights: &Weights,
+    method: Method,
+    detector: &DetectorConfig,
+) -> Result<FusionConfig, WeightsError> {
+    let usual = FusionConfig::for_detector(method, detector);
+    if weights.metadata(FUSION_KEY).is_none() {
+        return Ok(usual);
+    }
+    let stored: FusionConfig = weights.metadata_json(FUSION_KEY)?;
+    let is_of_method = std::mem::discriminant(&stored) == std::mem::discriminant(&usual);
+    Ok(if is_of_method { stored } else { usual })
+}
