@@ -31,7 +31,7 @@ const SAFE_GAP_M: f64 = 2.5;
 const BEHIND_M: f64 = 60.0;
 /// How long a wish without need is kept, seconds.
 const WHIM_S: f64 = 8.0;
-/// An exploring focus changes this often where both lanes are equally well known.
+/// An exploring focus changes this often where nothing speaks for either lane.
 const WHIM_SHARE: f64 = 0.25;
 /// Neighbours whose lengths differ by more than this share lie in a bend too tight for a change.
 const LENGTH_SHARE: f64 = 0.04;
@@ -46,7 +46,7 @@ pub(crate) enum Side {
 }
 
 impl Side {
-    fn of(self, lane: &Lane) -> Option<LaneId> {
+    pub(super) fn of(self, lane: &Lane) -> Option<LaneId> {
         match self {
             Self::Left => lane.left,
             Self::Right => lane.right,
@@ -130,19 +130,22 @@ impl Traffic<'_> {
         index == 0 && self.options.focus_explores
     }
 
-    /// A side to change to without need; for an exploring focus, where it has been less often.
+    /// A side to change to without need; for an exploring focus, where that leads to the unknown.
     fn whim(&mut self, index: usize) -> Option<Side> {
         let own = self.cars[index].path.lane();
         let sides = [Side::Left, Side::Right];
         let lane = self.roads.graph.lane(own);
         let sides = sides.into_iter().filter_map(|side| Some((side, side.of(lane)?)));
         let mut sides: Vec<(Side, LaneId)> = sides.collect();
-        if self.explores(index) {
-            let fewest = sides.iter().map(|&(_, lane)| self.visits[lane.0 as usize]).min()?;
-            if fewest >= self.visits[own.0 as usize] && !self.random.chance(WHIM_SHARE) {
+        if let Some(explorer) = self.explorer.as_mut().filter(|_| index == 0) {
+            let wanted = |&(_, lane): &(Side, LaneId)| explorer.prefers(lane, own);
+            let better: Vec<_> = sides.iter().copied().filter(wanted).collect();
+            if better.is_empty() && !self.random.chance(WHIM_SHARE) {
                 return None;
             }
-            sides.retain(|&(_, lane)| self.visits[lane.0 as usize] == fewest);
+            if !better.is_empty() {
+                sides = better;
+            }
         }
         Some(sides.get(self.random.below(sides.len()))?.0)
     }
@@ -245,13 +248,10 @@ impl Traffic<'_> {
         let pause_s = self.time_to_whim_s(index);
         let car = &mut self.cars[index];
         car.lane_mood = LaneMood { held_up_s: -REST_S, whim: None, whim_turns_in_s: pause_s };
-        if index == 0 {
+        if let Some(explorer) = self.explorer.as_mut().filter(|_| index == 0) {
             // Lanes that were decided but will not be driven do not count.
-            for (lane, _) in car.path.ahead(self.roads.graph).skip(1) {
-                let visits = &mut self.visits[lane.0 as usize];
-                *visits = visits.saturating_sub(1);
-            }
-            path.ahead(self.roads.graph).for_each(|(lane, _)| self.visits[lane.0 as usize] += 1);
+            car.path.ahead(self.roads.graph).skip(1).for_each(|(lane, _)| explorer.give_up(lane));
+            path.ahead(self.roads.graph).for_each(|(lane, _)| explorer.choose(lane));
         }
         let entry = (path.s_m(), index as u32);
         let occupants = &mut self.occupants[path.lane().0 as usize];

@@ -6,6 +6,7 @@
 
 mod car;
 mod driver;
+mod explorer;
 mod junction;
 mod lane_change;
 mod look_ahead;
@@ -20,6 +21,7 @@ pub(crate) use car::Car;
 pub(crate) use rectangle::{NeighbourIndex, Rectangle};
 pub(crate) use roads::Roads;
 
+use explorer::Explorer;
 use junction::RightOfWay;
 
 use super::cast::Sweep;
@@ -60,8 +62,8 @@ pub(crate) struct Traffic<'t> {
     index: NeighbourIndex,
     random: SplitMix64,
     next_id: i64,
-    /// How often the focus chose each lane.
-    visits: Vec<u32>,
+    /// What a focus that explores knows of the roads.
+    explorer: Option<Explorer>,
 }
 
 impl<'t> Traffic<'t> {
@@ -146,13 +148,13 @@ impl<'t> Traffic<'t> {
 
     fn choose_next(&mut self, index: usize) -> Option<LaneId> {
         let mut onward = self.roads.onward(self.cars[index].path.last());
-        if index == 0 && self.options.focus_explores {
-            let fewest = onward.iter().map(|lane| self.visits[lane.0 as usize]).min()?;
-            onward.retain(|lane| self.visits[lane.0 as usize] == fewest);
+        let mut explorer = self.explorer.as_mut().filter(|_| index == 0);
+        if let Some(explorer) = &mut explorer {
+            explorer.keep_best(&mut onward);
         }
         let next = *onward.get(self.random.below(onward.len()))?;
-        if index == 0 {
-            self.visits[next.0 as usize] += 1;
+        if let Some(explorer) = explorer {
+            explorer.choose(next);
         }
         Some(next)
     }

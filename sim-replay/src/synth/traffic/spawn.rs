@@ -2,12 +2,13 @@
 
 use super::car::Car;
 use super::driver::Driver;
+use super::explorer::Explorer;
 use super::junction::RightOfWay;
 use super::lane_change::LaneMood;
 use super::path::Path;
 use super::rectangle::{NeighbourIndex, Rectangle};
 use super::roads::{Roads, Spawn};
-use super::{Traffic, TrafficOptions};
+use super::{STEP_S, Traffic, TrafficOptions};
 use crate::synth::cast::Sweep;
 use crate::synth::random::SplitMix64;
 use crate::synth::vehicle::Vehicle;
@@ -18,6 +19,8 @@ const EDGE_M: f64 = 35.0;
 const SPAWN_ROOM_M: f64 = 4.0;
 /// Vehicles that stand longer than this with nobody before them are stuck in a knot, and leave, seconds.
 const STUCK_S: f64 = 45.0;
+/// While the focus is stuck, somebody near it leaves this often, seconds.
+const NEXT_LEAVES_S: f64 = 5.0;
 /// Whoever stands farther behind its leader than this has nobody before it, metres.
 const QUEUE_GAP_M: f64 = 8.0;
 /// Tries to place one vehicle in one step.
@@ -50,9 +53,8 @@ impl<'t> Traffic<'t> {
             index: NeighbourIndex::default(),
             random: SplitMix64::new(seed),
             next_id: FOCUS_ID,
-            visits: vec![0; lanes],
+            explorer: options.focus_explores.then(|| Explorer::new(roads, start.lane)),
         };
-        traffic.visits[start.lane.0 as usize] = 1;
         let focus = Vehicle::random_connected(&mut traffic.random);
         traffic.add(focus, start);
         traffic.fill(start.point_m);
@@ -153,8 +155,19 @@ impl<'t> Traffic<'t> {
         }
     }
 
-    /// The vehicle that has stood longest at the head of a queue, when that is too long; the focus stays.
+    /// The vehicle that has stood longest at the head of a queue, when that is too long; the focus stays, and those who
+    /// stand around it leave one by one.
     fn longest_stuck(&self) -> Option<usize> {
+        let over_s = self.cars[0].standing_s - STUCK_S;
+        if over_s > 0.0 && over_s % NEXT_LEAVES_S < STEP_S {
+            let center_m = self.cars[0].point_m();
+            let distance_m = |car: &Car| (car.point_m()[0] - center_m[0]).hypot(car.point_m()[1] - center_m[1]);
+            let standing = (1..self.cars.len()).filter(|&index| {
+                let car = &self.cars[index];
+                car.is_present && car.standing_s > NEXT_LEAVES_S
+            });
+            return standing.min_by(|&a, &b| distance_m(&self.cars[a]).total_cmp(&distance_m(&self.cars[b])));
+        }
         let is_first = |car: &Car| car.leader.is_none_or(|leader| leader.gap_m > QUEUE_GAP_M);
         let stuck = (1..self.cars.len()).filter(|&index| {
             let car = &self.cars[index];
