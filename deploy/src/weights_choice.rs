@@ -43,7 +43,7 @@ pub fn weights_of(path: &Path, method: Method) -> Result<PathBuf, WeightsChoiceE
     let candidates: &[Method] = match method {
         Method::Late => &[Method::None],
         Method::Early => &[Method::Early, Method::None],
-        Method::None | Method::Max | Method::Attention => &[method],
+        _ => &[method],
     };
     let mut last = (method, 0);
     for &name in candidates {

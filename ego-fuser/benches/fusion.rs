@@ -21,7 +21,7 @@ fn fuse(criterion: &mut Criterion) {
         let features = Tensor::rand([agents as i64, shape[0], shape[1], shape[2]], (Kind::Float, Device::Cpu));
         let pose = |agent: usize| Pose::from_xyz_yaw([7.0 * agent as f64, 2.0, 0.0], 0.2 * agent as f64);
         let facts: Vec<_> = (0..agents).map(|agent| ViewFacts::fresh(agent, pose(agent))).collect();
-        for method in [Method::Max, Method::Attention] {
+        for method in [Method::Max, Method::Attention, Method::Pastat] {
             let stage = FusionStage::untrained(method, &config).expect("lean is a valid configuration");
             group.bench_function(BenchmarkId::new(method.name(), agents), |bencher| {
                 bencher.iter(|| {

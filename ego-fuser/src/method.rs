@@ -19,6 +19,8 @@ pub enum Method {
     Max,
     /// Feature maps, self-attention over the agents at each cell (AttFuse, OPV2V).
     Attention,
+    /// Feature maps of several frames, aligned by pose confidence and content, transformer (PASTAT).
+    Pastat,
 }
 
 /// What has to cross the air for a method.
@@ -37,7 +39,7 @@ pub enum Exchange {
 
 impl Method {
     /// Every method, in the order of tables.
-    pub const ALL: [Self; 5] = [Self::None, Self::Late, Self::Early, Self::Max, Self::Attention];
+    pub const ALL: [Self; 6] = [Self::None, Self::Late, Self::Early, Self::Max, Self::Attention, Self::Pastat];
 
     /// The name on the command line and in result files.
     #[must_use]
@@ -48,6 +50,7 @@ impl Method {
             Self::Early => "early",
             Self::Max => "max",
             Self::Attention => "attention",
+            Self::Pastat => "pastat",
         }
     }
 
@@ -60,6 +63,7 @@ impl Method {
             Self::Early => "points, encoded together in the ego frame",
             Self::Max => "feature maps, element-wise maximum (F-Cooper)",
             Self::Attention => "feature maps, self-attention over agents at each cell (AttFuse)",
+            Self::Pastat => "feature maps with history, aligned by confidence and content, transformer (PASTAT)",
         }
     }
 
@@ -70,14 +74,14 @@ impl Method {
             Self::None => Exchange::Nothing,
             Self::Late => Exchange::Boxes,
             Self::Early => Exchange::Points,
-            Self::Max | Self::Attention => Exchange::Features,
+            Self::Max | Self::Attention | Self::Pastat => Exchange::Features,
         }
     }
 }
 
 /// A name that no method has.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-#[error("no method is called {0:?}; there are none, late, early, max and attention")]
+#[error("no method is called {0:?}; there are {names}", names = Method::ALL.map(Method::name).join(", "))]
 pub struct UnknownMethod(String);
 
 impl FromStr for Method {

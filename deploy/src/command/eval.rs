@@ -18,7 +18,7 @@ pub(crate) struct Arguments {
     /// Data set, split or scenario; the layout is found out. The first vehicle of each scenario is the ego.
     #[arg(long, value_name = "DIR")]
     dataset: PathBuf,
-    /// Fusion methods: none, late, early, max, attention; several give one table.
+    /// Fusion methods, as `ego-fuser methods` lists them; several give one table.
     #[arg(long, value_name = "NAME", value_delimiter = ',', required = true)]
     method: Vec<Method>,
     /// Weights of the detector, or a folder with a file *-METHOD.safetensors for each method.

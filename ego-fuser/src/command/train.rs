@@ -21,7 +21,7 @@ pub(crate) struct Arguments {
     /// Datasets to measure AP on; none: no validation.
     #[arg(long, num_args = 1.., value_name = "DIR")]
     validation: Vec<PathBuf>,
-    /// Method: none, early, max or attention.
+    /// Method: none, early or one that exchanges feature maps; `ego-fuser methods` lists them.
     #[arg(long, default_value = "none")]
     method: Method,
     /// Network: lean or full; --init overrides it.

@@ -4,11 +4,15 @@ use agent::model_config::{ConfigError, DetectorConfig};
 use serde::{Deserialize, Serialize};
 use tch::nn;
 
+use super::pastat::{Pastat, PastatConfig};
 use super::{AttentionFusion, Fusion, MaxFusion, NoFusion};
 use crate::Method;
 
 /// Metadata key of the fusion's configuration in a weights file.
 pub const FUSION_KEY: &str = "fusion";
+
+/// Maps with more channels are fused by modules of full size.
+const LEAN_CHANNELS: i64 = 128;
 
 /// What the fusion of a network is built from, stored as JSON beside its weights.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -20,16 +24,21 @@ pub enum FusionConfig {
     Max,
     /// Attention without parameters.
     Attention,
+    /// PASTAT.
+    Pastat(PastatConfig),
 }
 
 impl FusionConfig {
     /// The fusion that a method has behind `detector`; methods that exchange no feature maps fuse none.
     #[must_use]
-    pub fn for_detector(method: Method, _detector: &DetectorConfig) -> Self {
+    pub fn for_detector(method: Method, detector: &DetectorConfig) -> Self {
+        let channels = detector.feature_channels();
         match method {
             Method::None | Method::Late | Method::Early => Self::Own,
             Method::Max => Self::Max,
             Method::Attention => Self::Attention,
+            Method::Pastat if channels > LEAN_CHANNELS => Self::Pastat(PastatConfig::full(channels)),
+            Method::Pastat => Self::Pastat(PastatConfig::lean(channels)),
         }
     }
 
@@ -37,11 +46,12 @@ impl FusionConfig {
     ///
     /// # Errors
     /// [`ConfigError`] names the field that no fusion can be built from.
-    pub fn build(&self, _path: &nn::Path<'_>) -> Result<Box<dyn Fusion>, ConfigError> {
+    pub fn build(&self, path: &nn::Path<'_>) -> Result<Box<dyn Fusion>, ConfigError> {
         Ok(match self {
             Self::Own => Box::new(NoFusion),
             Self::Max => Box::new(MaxFusion),
             Self::Attention => Box::new(AttentionFusion),
+            Self::Pastat(config) => Box::new(Pastat::new(path, config)?),
         })
     }
 }

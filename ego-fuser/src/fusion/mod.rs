@@ -3,6 +3,7 @@
 mod attention;
 mod config;
 mod max;
+pub mod pastat;
 mod stage;
 pub(crate) mod steering;
 
@@ -14,8 +15,8 @@ use tch::{TchError, Tensor};
 pub use attention::AttentionFusion;
 pub use config::{FUSION_KEY, FusionConfig};
 pub use max::MaxFusion;
-pub(crate) use stage::{FUSION_PREFIX, stored_config};
 pub use stage::{AlignedMaps, FusionStage, StageError};
+pub(crate) use stage::{FUSION_PREFIX, stored_config};
 pub use steering::Steering;
 
 /// What is known of one map besides its values.

@@ -21,7 +21,7 @@ pub use validation::{Accuracy, Validator};
 
 use self::curve::DetectorCurve;
 use crate::loss::{LabelTensors, detection_loss};
-use crate::method::Method;
+use crate::method::{Exchange, Method};
 use crate::model::CooperativeModel;
 use crate::samples::{Batch, SampleBuilder, SampleConfig, SampleError, SampleKind, SceneSet, batches};
 
@@ -37,11 +37,11 @@ pub fn run(config: &TrainConfig, observer: &mut dyn Observer) -> Result<Summary,
 
 /// The views that a method learns from.
 fn sample_kind(method: Method) -> Result<SampleKind, TrainError> {
-    match method {
-        Method::None => Ok(SampleKind::Single),
-        Method::Early => Ok(SampleKind::Merged),
-        Method::Max | Method::Attention => Ok(SampleKind::Cooperative),
-        Method::Late => Err(TrainError::NotTrained(method)),
+    match method.exchange() {
+        Exchange::Nothing => Ok(SampleKind::Single),
+        Exchange::Points => Ok(SampleKind::Merged),
+        Exchange::Features => Ok(SampleKind::Cooperative),
+        Exchange::Boxes => Err(TrainError::NotTrained(method)),
     }
 }
 

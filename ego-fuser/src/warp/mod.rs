@@ -10,7 +10,7 @@ use protocol::{BevGrid, Pose};
 use tch::{Kind, TchError, Tensor};
 
 /// `grid_sampler` reads zeros outside of the map.
-const PADDING_ZEROS: i64 = 0;
+pub(crate) const PADDING_ZEROS: i64 = 0;
 /// `grid_sampler` weighs the four nearest cells.
 pub(crate) const BILINEAR: i64 = 0;
 /// `grid_sampler` takes the nearest cell.

@@ -1,0 +1,221 @@
+//! Attention among the tokens of one cell, over agents and time, and among the tokens of one map, within windows.
+
+use tch::nn::{self, Init, Module};
+use tch::{TchError, Tensor};
+
+/// What a masked score is set to: low enough for no weight, and finite, so that rows with nothing valid stay numbers.
+const MASKED: f64 = -1e9;
+
+/// Multi-head self-attention over agents and time at each cell (the MSA of Eq. 8).
+#[derive(Debug)]
+pub(super) struct AgentAttention {
+    query: nn::Linear,
+    key_value: nn::Linear,
+    out: nn::Linear,
+    heads: i64,
+}
+
+impl AgentAttention {
+    pub(super) fn new(path: &nn::Path<'_>, dim: i64, heads: i64) -> Self {
+        let bare = nn::LinearConfig { bias: false, ..Default::default() };
+        Self {
+            query: nn::linear(path / "query", dim, dim, bare),
+            key_value: nn::linear(path / "key_value", dim, 2 * dim, bare),
+            out: nn::linear(path / "out", dim, dim, nn::LinearConfig::default()),
+            heads,
+        }
+    }
+
+    /// What the first `rows` entries learn of all, at each cell.
+    ///
+    /// # Shapes
+    /// - `tokens`: `[N, h, w, D]`
+    /// - `valid`: `[N, h, w]`, 1 for tokens that count
+    /// - returns: `[rows, h, w, D]`
+    pub(super) fn forward(&self, tokens: &Tensor, valid: &Tensor, rows: i64) -> Result<Tensor, TchError> {
+        let (entries, height, width, dim) = tokens.size4()?;
+        let (cells, each) = (height * width, dim / self.heads);
+        let query = self.query.forward(&tokens.f_narrow(0, 0, rows)?) / (each as f64).sqrt();
+        let key_value = self.key_value.forward(tokens);
+        let key = key_value.f_narrow(3, 0, dim)?.f_reshape([entries, cells, self.heads, each])?;
+        let value = key_value.f_narrow(3, dim, dim)?.f_reshape([entries, cells, self.heads, each])?;
+        let query = query.f_view([rows, cells, self.heads, each])?;
+        let hidden = valid.f_eq(0.0)?.f_view([entries, cells, 1])?;
+        let mixed =
+            if rows == 1 { one_row(&query, &key, &value, &hidden)? } else { all_rows(&query, &key, &value, &hidden)? };
+        Ok(self.out.forward(&mixed.f_reshape([rows, height, width, dim])?))
+    }
+}
+
+/// Only the ego asks: sums over few entries, cheaper than products of small matrices.
+fn one_row(query: &Tensor, key: &Tensor, value: &Tensor, hidden: &Tensor) -> Result<Tensor, TchError> {
+    let scores = (query * key).f_sum_dim_intlist([3_i64].as_slice(), false, None)?;
+    let weights = scores.f_masked_fill(hidden, MASKED)?.f_softmax(0, None)?;
+    (weights.f_unsqueeze(3)? * value).f_sum_dim_intlist([0_i64].as_slice(), true, None)
+}
+
+fn all_rows(query: &Tensor, key: &Tensor, value: &Tensor, hidden: &Tensor) -> Result<Tensor, TchError> {
+    // [N, cells, heads, d] to [cells, heads, N, d]
+    let by_cell = |tensor: &Tensor| tensor.f_permute([1, 2, 0, 3])?.f_contiguous();
+    let scores = by_cell(query)?.f_matmul(&by_cell(key)?.f_transpose(2, 3)?)?;
+    let hidden = hidden.f_permute([1, 2, 0])?.f_unsqueeze(2)?;
+    let weights = scores.f_masked_fill(&hidden, MASKED)?.f_softmax(3, None)?;
+    weights.f_matmul(&by_cell(value)?)?.f_permute([2, 0, 1, 3])
+}
+
+/// Attention among the tokens of a window, with windows of several sizes, each with its share of the heads.
+#[derive(Debug)]
+pub(super) struct WindowAttention {
+    query_key_value: nn::Linear,
+    out: nn::Linear,
+    sizes: Vec<WindowSize>,
+    /// Heads of each size.
+    heads: i64,
+}
+
+#[derive(Debug)]
+struct WindowSize {
+    edge: i64,
+    /// `[(2 edge - 1)^2, heads]`: a learnt preference for each relative place.
+    bias: Tensor,
+    /// `[edge^4]`: the relative place of each pair.
+    places: Vec<i64>,
+}
+
+impl WindowAttention {
+    pub(super) fn new(path: &nn::Path<'_>, dim: i64, heads: i64, edges: &[i64]) -> Self {
+        let bare = nn::LinearConfig { bias: false, ..Default::default() };
+        let heads = heads / edges.len() as i64;
+        let size = |(index, &edge): (usize, &i64)| WindowSize {
+            edge,
+            bias: path.var(&format!("bias{index}"), &[(2 * edge - 1).pow(2), heads], Init::Const(0.0)),
+            places: relative_places(edge),
+        };
+        Self {
+            query_key_value: nn::linear(path / "query_key_value", dim, 3 * dim, bare),
+            out: nn::linear(path / "out", dim, dim, nn::LinearConfig::default()),
+            sizes: edges.iter().enumerate().map(size).collect(),
+            heads,
+        }
+    }
+
+    /// What each token learns of its windows.
+    ///
+    /// # Shapes
+    /// - `tokens`: `[N, h, w, D]`, `h` and `w` multiples of every window
+    /// - `valid`: `[N, h, w]`, 1 for tokens that count
+    /// - returns: `[N, h, w, D]`
+    pub(super) fn forward(&self, tokens: &Tensor, valid: &Tensor) -> Result<Tensor, TchError> {
+        let (.., dim) = tokens.size4()?;
+        let share = dim / self.sizes.len() as i64;
+        let projected = self.query_key_value.forward(tokens);
+        let mut parts = Vec::with_capacity(self.sizes.len());
+        for (index, size) in self.sizes.iter().enumerate() {
+            let of_size = |which: i64| projected.f_narrow(3, which * dim + index as i64 * share, share);
+            parts.push(self.within(size, [of_size(0)?, of_size(1)?, of_size(2)?], valid)?);
+        }
+        Ok(self.out.forward(&Tensor::f_cat(&parts, 3)?))
+    }
+
+    fn within(&self, size: &WindowSize, parts: [Tensor; 3], valid: &Tensor) -> Result<Tensor, TchError> {
+        let (entries, height, width, share) = parts[0].size4()?;
+        let (edge, each) = (size.edge, share / self.heads);
+        let (down, across) = (height / edge, width / edge);
+        let windows = |tensor: &Tensor| {
+            tensor
+                .f_reshape([entries, down, edge, across, edge, self.heads, each])?
+                .f_permute([0, 1, 3, 5, 2, 4, 6])?
+                .f_reshape([entries * down * across, self.heads, edge * edge, each])
+        };
+        let [query, key, value] = [windows(&parts[0])?, windows(&parts[1])?, windows(&parts[2])?];
+        let scores = (query / (each as f64).sqrt()).f_matmul(&key.f_transpose(2, 3)?)? + self.preference(size)?;
+        let hidden = valid.f_eq(0.0)?.f_view([entries, down, edge, across, edge])?.f_permute([0, 1, 3, 2, 4])?;
+        let hidden = hidden.f_reshape([entries * down * across, 1, 1, edge * edge])?;
+        let weights = scores.f_masked_fill(&hidden, MASKED)?.f_softmax(3, None)?;
+        weights
+            .f_matmul(&value)?
+            .f_view([entries, down, across, self.heads, edge, edge, each].as_slice())?
+            .f_permute([0, 1, 4, 2, 5, 3, 6])?
+            .f_reshape([entries, height, width, share])
+    }
+
+    /// `[heads, edge^2, edge^2]`.
+    fn preference(&self, size: &WindowSize) -> Result<Tensor, TchError> {
+        let tokens = size.edge * size.edge;
+        let places = Tensor::f_from_slice(&size.places)?.f_to_device(size.bias.device())?;
+        size.bias.f_index_select(0, &places)?.f_view([tokens, tokens, self.heads])?.f_permute([2, 0, 1])
+    }
+}
+
+/// For each pair of tokens of a window, which row of the table of preferences is theirs.
+fn relative_places(edge: i64) -> Vec<i64> {
+    let tokens = || (0..edge).flat_map(move |row| (0..edge).map(move |column| (row, column)));
+    let place = |(a_row, a_column): (i64, i64), (b_row, b_column): (i64, i64)| {
+        (a_row - b_row + edge - 1) * (2 * edge - 1) + a_column - b_column + edge - 1
+    };
+    tokens().flat_map(|a| tokens().map(move |b| place(a, b))).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use tch::nn::VarStore;
+    use tch::{Device, Kind};
+
+    use super::*;
+
+    const FLOAT: (Kind, Device) = (Kind::Float, Device::Cpu);
+
+    #[test]
+    fn one_row_is_the_first_of_all_rows() {
+        let variables = VarStore::new(Device::Cpu);
+        let attention = AgentAttention::new(&variables.root(), 8, 2);
+        let tokens = Tensor::randn([4, 3, 5, 8], FLOAT);
+        let valid = Tensor::rand([4, 3, 5], FLOAT).gt(0.4).to_kind(Kind::Float);
+        let _ = valid.get(0).fill_(1.0);
+        let all = attention.forward(&tokens, &valid, 4).unwrap();
+        let one = attention.forward(&tokens, &valid, 1).unwrap();
+        assert!(one.allclose(&all.narrow(0, 0, 1), 1e-4, 1e-5, false));
+    }
+
+    #[test]
+    fn hidden_tokens_are_not_looked_at() {
+        let variables = VarStore::new(Device::Cpu);
+        let agents = AgentAttention::new(&(variables.root() / "a"), 8, 2);
+        let windows = WindowAttention::new(&(variables.root() / "w"), 8, 2, &[2, 4]);
+        let tokens = Tensor::randn([2, 4, 8, 8], FLOAT);
+        let valid = Tensor::ones([2, 4, 8], FLOAT);
+        let _ = valid.get(1).fill_(0.0);
+        let changed = tokens.copy();
+        let _ = changed.get(1).fill_(7.0);
+        let same = |found: Tensor, again: Tensor| found.allclose(&again, 1e-5, 1e-6, false);
+        assert!(same(agents.forward(&tokens, &valid, 1).unwrap(), agents.forward(&changed, &valid, 1).unwrap()));
+        let _ = valid.get(0).get(1).get(3).fill_(0.0);
+        let _ = changed.get(0).get(1).get(3).fill_(9.0);
+        let [first, second] = [&tokens, &changed].map(|tokens| windows.forward(tokens, &valid).unwrap());
+        let difference = (first - second).abs().sum_dim_intlist([3_i64].as_slice(), false, Kind::Float);
+        let _ = difference.get(0).get(1).get(3).fill_(0.0);
+        assert!(difference.get(0).max().double_value(&[]) < 1e-5, "only the hidden token itself may change");
+        assert!(difference.isfinite().all().int64_value(&[]) == 1, "a window with nothing valid is a number too");
+    }
+
+    #[test]
+    fn tokens_of_other_windows_do_not_matter() {
+        let variables = VarStore::new(Device::Cpu);
+        let windows = WindowAttention::new(&variables.root(), 8, 2, &[2, 4]);
+        let tokens = Tensor::randn([1, 4, 8, 8], FLOAT);
+        let changed = tokens.copy();
+        let _ = changed.narrow(2, 4, 4).fill_(3.0);
+        let valid = Tensor::ones([1, 4, 8], FLOAT);
+        let left = |tokens: &Tensor| windows.forward(tokens, &valid).unwrap().narrow(2, 0, 4);
+        assert!(left(&tokens).allclose(&left(&changed), 1e-5, 1e-6, false));
+    }
+
+    #[test]
+    fn pairs_in_the_same_relation_share_a_place() {
+        let places = relative_places(3);
+        let at = |a: usize, b: usize| places[a * 9 + b];
+        assert_eq!(at(0, 1), at(4, 5));
+        assert_ne!(at(0, 1), at(1, 0));
+        assert!(places.iter().all(|place| (0..25).contains(place)));
+    }
+}

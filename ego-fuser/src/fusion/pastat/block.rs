@@ -1,0 +1,46 @@
+//! The transformer's blocks: attention, then an MLP, both pre-norm with a residual (Eq. 8 and 9).
+
+use tch::nn::{self, Module};
+use tch::{TchError, Tensor};
+
+use super::attention::{AgentAttention, WindowAttention};
+use super::config::PastatConfig;
+
+/// One block: over agents and time at each cell, across cells within windows, then cell by cell.
+#[derive(Debug)]
+pub(super) struct Block {
+    norms: [nn::LayerNorm; 3],
+    agents: AgentAttention,
+    windows: WindowAttention,
+    mlp: [nn::Linear; 2],
+}
+
+impl Block {
+    pub(super) fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Self {
+        let PastatConfig { dim, heads, mlp_ratio, .. } = *config;
+        let norm = |name: &str| nn::layer_norm(path / name, vec![dim], nn::LayerNormConfig::default());
+        let linear = |name: &str, from, to| nn::linear(path / name, from, to, nn::LinearConfig::default());
+        Self {
+            norms: [norm("norm_agents"), norm("norm_windows"), norm("norm_mlp")],
+            agents: AgentAttention::new(&(path / "agents"), dim, heads),
+            windows: WindowAttention::new(&(path / "windows"), dim, heads, &config.windows),
+            mlp: [linear("mlp0", dim, mlp_ratio * dim), linear("mlp1", mlp_ratio * dim, dim)],
+        }
+    }
+
+    /// The first `rows` entries after this block.
+    ///
+    /// # Shapes
+    /// - `tokens`: `[N, h, w, D]`
+    /// - `valid`: `[N, h, w]`
+    /// - returns: `[rows, h, w, D]`
+    pub(super) fn forward(&self, tokens: &Tensor, valid: &Tensor, rows: i64) -> Result<Tensor, TchError> {
+        let [norm_agents, norm_windows, norm_mlp] = &self.norms;
+        let own = valid.f_narrow(0, 0, rows)?;
+        let kept = tokens.f_narrow(0, 0, rows)?;
+        let kept = self.agents.forward(&norm_agents.forward(tokens), valid, rows)? + kept;
+        let kept = self.windows.forward(&norm_windows.forward(&kept), &own)? + kept;
+        let inner = self.mlp[0].forward(&norm_mlp.forward(&kept)).f_gelu("none")?;
+        Ok(self.mlp[1].forward(&inner) + kept)
+    }
+}

@@ -1,0 +1,210 @@
+//! The numbers that define a PASTAT, and its switches.
+
+use agent::model_config::ConfigError;
+use serde::{Deserialize, Serialize};
+
+/// Which tokens ask in the attention over agents and time.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Rows {
+    /// Those of the ego's newest map alone: in the end only they are kept. Maps of others stay as they came.
+    Ego,
+    /// All in every block but the last: maps of others learn of each other too.
+    All,
+}
+
+/// How the wavelengths of the temporal encoding grow with the channel.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Wavelengths {
+    /// `2k / D` for the sine (Eq. 11) and `(2k + 1) / D` for the cosine (Eq. 12), as the paper prints them.
+    Printed,
+    /// `2k / D` for both, as is usual.
+    Usual,
+}
+
+/// Feature Spatial Alignment.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FsaConfig {
+    /// Channels that maps are compared in.
+    pub matching: i64,
+    /// Tokens are compared with those of the ego up to so many tokens away, along x and along y.
+    pub radius: i64,
+    /// Channels of the convolutions.
+    pub channels: i64,
+    /// Largest shift along x or y, metres.
+    pub max_shift_m: f64,
+    /// Largest turn, radians.
+    pub max_turn_rad: f64,
+}
+
+impl Default for FsaConfig {
+    fn default() -> Self {
+        Self { matching: 8, radius: 2, channels: 16, max_shift_m: 3.0, max_turn_rad: 5.0_f64.to_radians() }
+    }
+}
+
+/// A PASTAT from its tokens to its output. `ce`, `fsa`, `te` and `frames` are the switches of the ablation.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PastatConfig {
+    /// Channels of the maps.
+    pub channels: i64,
+    /// Cells along each edge of a token.
+    pub patch: i64,
+    /// Channels of a token, the D of the paper.
+    pub dim: i64,
+    /// Heads of every attention.
+    pub heads: i64,
+    /// Blocks of attention and MLP, the L of the paper.
+    pub depth: usize,
+    /// Channels inside the MLP, in multiples of `dim`.
+    pub mlp_ratio: i64,
+    /// Edges of the attention windows, tokens; each has its equal share of the heads.
+    pub windows: Vec<i64>,
+    /// Which tokens ask.
+    pub rows: Rows,
+    /// Time steps wanted of every agent, the T of the paper.
+    pub frames: usize,
+    /// Time from one step to the next that the temporal encoding counts in, seconds.
+    pub frame_secs: f64,
+    /// Whether poses' confidences are embedded (Eq. 7).
+    pub ce: bool,
+    /// Feature Spatial Alignment; absent: maps stay where poses put them.
+    pub fsa: Option<FsaConfig>,
+    /// Temporal encoding (Eq. 10-12); absent: the age of a map is not known.
+    pub te: Option<Wavelengths>,
+}
+
+impl PastatConfig {
+    /// Sized for one core and live traffic.
+    #[must_use]
+    pub fn lean(channels: i64) -> Self {
+        Self {
+            channels,
+            patch: 2,
+            dim: 32,
+            heads: 4,
+            depth: 2,
+            mlp_ratio: 2,
+            windows: vec![4, 8],
+            rows: Rows::Ego,
+            frames: 3,
+            frame_secs: 0.1,
+            ce: true,
+            fsa: Some(FsaConfig::default()),
+            te: Some(Wavelengths::Printed),
+        }
+    }
+
+    /// Sized like the transformer that the paper builds on.
+    #[must_use]
+    pub fn full(channels: i64) -> Self {
+        Self {
+            patch: 1,
+            dim: channels,
+            heads: 8,
+            depth: 3,
+            windows: vec![4, 8],
+            rows: Rows::All,
+            fsa: Some(FsaConfig { matching: 16, radius: 3, channels: 32, ..FsaConfig::default() }),
+            ..Self::lean(channels)
+        }
+    }
+
+    /// Maps are padded to multiples of this many cells, so that tokens fill every window.
+    #[must_use]
+    pub fn padding_cells(&self) -> i64 {
+        self.patch * self.windows.iter().copied().fold(1, lcm)
+    }
+
+    /// Checks that a module can be built.
+    ///
+    /// # Errors
+    /// [`ConfigError`] names the field, its value and what it must be.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        let error = |field, value: String, must| Err(ConfigError::Value { field, value, must });
+        for (field, value, most) in [
+            ("pastat channels", self.channels, 4096),
+            ("pastat patch", self.patch, 16),
+            ("pastat dim", self.dim, 1024),
+            ("pastat heads", self.heads, 64),
+            ("pastat mlp_ratio", self.mlp_ratio, 16),
+            ("pastat depth", i64::try_from(self.depth).unwrap_or(i64::MAX), 32),
+            ("pastat frames", i64::try_from(self.frames).unwrap_or(i64::MAX), 16),
+        ] {
+            if !(1..=most).contains(&value) {
+                return error(field, value.to_string(), "above zero and of a sensible size");
+            }
+        }
+        if self.dim % (2 * self.heads) != 0 {
+            return error("pastat dim", self.dim.to_string(), "a multiple of twice the heads");
+        }
+        let sizes = i64::try_from(self.windows.len()).unwrap_or(i64::MAX);
+        let are_sizes = self.windows.iter().all(|size| (1..=32).contains(size));
+        if sizes == 0 || self.heads % sizes != 0 || !are_sizes {
+            return error("pastat windows", format!("{:?}", self.windows), "1 to 32 tokens each, sharing the heads");
+        }
+        if !(1e-3..=10.0).contains(&self.frame_secs) {
+            return error("pastat frame_secs", self.frame_secs.to_string(), "0.001 to 10 s");
+        }
+        self.fsa.as_ref().map_or(Ok(()), FsaConfig::validate)
+    }
+}
+
+impl FsaConfig {
+    fn validate(&self) -> Result<(), ConfigError> {
+        let error = |field, value: String, must| Err(ConfigError::Value { field, value, must });
+        if !(1..=256).contains(&self.matching) || !(1..=256).contains(&self.channels) {
+            return error("pastat fsa channels", format!("{}, {}", self.matching, self.channels), "1 to 256");
+        }
+        if !(0..=8).contains(&self.radius) {
+            return error("pastat fsa radius", self.radius.to_string(), "0 to 8 tokens");
+        }
+        if !(0.0..=50.0).contains(&self.max_shift_m) || !(0.0..=1.6).contains(&self.max_turn_rad) {
+            let value = format!("{} m, {} rad", self.max_shift_m, self.max_turn_rad);
+            return error("pastat fsa bounds", value, "up to 50 m and 1.6 rad");
+        }
+        Ok(())
+    }
+}
+
+fn lcm(a: i64, b: i64) -> i64 {
+    let (mut rest, mut divisor) = (a, b);
+    while rest != 0 {
+        (rest, divisor) = (divisor % rest, rest);
+    }
+    a / divisor.max(1) * b
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn presets_are_valid_and_come_back_from_json() {
+        for config in [PastatConfig::lean(64), PastatConfig::full(256)] {
+            config.validate().unwrap();
+            let text = serde_json::to_string(&config).unwrap();
+            assert_eq!(serde_json::from_str::<PastatConfig>(&text).unwrap(), config);
+        }
+        assert_eq!(PastatConfig::lean(64).padding_cells(), 16);
+        assert_eq!(PastatConfig { windows: vec![4, 6], ..PastatConfig::lean(64) }.padding_cells(), 24);
+    }
+
+    #[test]
+    fn what_cannot_be_built_is_named() {
+        for (config, part) in [
+            (PastatConfig { dim: 36, ..PastatConfig::lean(64) }, "dim is 36"),
+            (PastatConfig { windows: vec![4, 8, 16], ..PastatConfig::lean(64) }, "windows is [4, 8, 16]"),
+            (PastatConfig { frames: 0, ..PastatConfig::lean(64) }, "frames is 0"),
+            (PastatConfig { frame_secs: f64::NAN, ..PastatConfig::lean(64) }, "frame_secs is NaN"),
+        ] {
+            let message = config.validate().unwrap_err().to_string();
+            assert!(message.contains(part), "{message}");
+        }
+        let text = serde_json::to_string(&PastatConfig::lean(64)).unwrap().replace("\"ce\"", "\"cf\"");
+        assert!(serde_json::from_str::<PastatConfig>(&text).unwrap_err().to_string().contains("cf"));
+    }
+}

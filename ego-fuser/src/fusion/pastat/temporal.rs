@@ -1,0 +1,57 @@
+//! TE, Temporal Encoding (Eq. 10-12), of the true age of a map.
+
+use super::config::{PastatConfig, Wavelengths};
+
+/// Ages beyond this are no ages, seconds.
+const MAX_AGE_SECS: f64 = 10.0;
+
+/// `E_t` of a map of this age, `D` values.
+///
+/// The paper counts time steps from 1, the oldest, to T, the newest. A map between two steps lies between them: `t` is
+/// no slot but T less the age in steps, so a late message is not taken for a fresh one.
+pub(super) fn encoding(age_secs: f64, config: &PastatConfig, wavelengths: Wavelengths) -> Vec<f32> {
+    let t = config.frames as f64 - age_secs.clamp(-MAX_AGE_SECS, MAX_AGE_SECS) / config.frame_secs;
+    let dim = config.dim as f64;
+    (0..config.dim)
+        .map(|channel| {
+            let is_cosine = channel % 2 == 1;
+            let numerator = match wavelengths {
+                Wavelengths::Usual if is_cosine => channel - 1,
+                Wavelengths::Usual | Wavelengths::Printed => channel,
+            };
+            let angle = t / 10_000_f64.powf(numerator as f64 / dim);
+            (if is_cosine { angle.cos() } else { angle.sin() }) as f32
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn config() -> PastatConfig {
+        PastatConfig { frames: 3, frame_secs: 0.1, dim: 8, ..PastatConfig::lean(64) }
+    }
+
+    #[test]
+    fn the_newest_of_three_frames_is_step_three_as_printed() {
+        let found = encoding(0.0, &config(), Wavelengths::Printed);
+        for (channel, value) in found.iter().enumerate() {
+            let angle = 3.0 / 10_000_f64.powf(channel as f64 / 8.0);
+            let expected = if channel % 2 == 0 { angle.sin() } else { angle.cos() };
+            assert!((f64::from(*value) - expected).abs() < 1e-6, "channel {channel}");
+        }
+        let usual = encoding(0.0, &config(), Wavelengths::Usual);
+        assert_eq!(usual[0], found[0]);
+        assert!((f64::from(usual[1]) - 3.0_f64.cos()).abs() < 1e-6);
+    }
+
+    #[test]
+    fn the_oldest_is_step_one_and_a_late_map_lies_between_steps() {
+        let at = |age| encoding(age, &config(), Wavelengths::Printed)[0];
+        assert!((at(0.2) - 1.0_f32.sin()).abs() < 1e-6);
+        assert!((at(0.05) - 2.5_f32.sin()).abs() < 1e-6);
+        assert_ne!(encoding(0.0, &config(), Wavelengths::Printed), encoding(0.5, &config(), Wavelengths::Printed));
+        assert!(encoding(f64::INFINITY, &config(), Wavelengths::Printed).iter().all(|value| value.is_finite()));
+    }
+}

@@ -1,0 +1,187 @@
+use protocol::{BevGrid, Pose};
+use tch::nn::VarStore;
+use tch::{Device, Kind, no_grad};
+
+use super::*;
+
+const FLOAT: (Kind, Device) = (Kind::Float, Device::Cpu);
+const GRID: BevGrid = BevGrid { x_min_m: -10.0, y_min_m: -6.0, cell_m: 1.0, width: 20, height: 12 };
+
+/// Made-up entries: who made them, and when.
+struct Scene {
+    features: Tensor,
+    mask: Tensor,
+    facts: Vec<ViewFacts>,
+}
+
+impl Scene {
+    fn new(agent: &[usize], age_secs: &[f64]) -> Self {
+        tch::set_num_threads(1);
+        let entries = agent.len() as i64;
+        let fact = |(entry, (&agent, &age_secs)): (usize, (&usize, &f64))| ViewFacts {
+            agent,
+            ego_from_cav: Pose::from_xyz_yaw([entry as f64, -0.5 * entry as f64, 0.0], 0.1),
+            confidence: 0.8,
+            age_secs,
+        };
+        Self {
+            features: Tensor::rand([entries, 4, 12, 20], FLOAT),
+            mask: Tensor::ones([entries, 1, 12, 20], FLOAT),
+            facts: agent.iter().zip(age_secs).enumerate().map(fact).collect(),
+        }
+    }
+
+    fn fused(&self, pastat: &Pastat) -> Tensor {
+        let views = AlignedViews {
+            features: &self.features,
+            mask: &self.mask,
+            own_frame: &self.features,
+            grid: &GRID,
+            facts: &self.facts,
+        };
+        pastat.fuse(&views, true).unwrap()
+    }
+
+    /// The same with these entries alone, in this order.
+    fn only(&self, entries: &[usize]) -> Self {
+        let index: Vec<i64> = entries.iter().map(|&entry| entry as i64).collect();
+        let index = Tensor::from_slice(&index);
+        Self {
+            features: self.features.index_select(0, &index),
+            mask: self.mask.index_select(0, &index),
+            facts: entries.iter().map(|&entry| self.facts[entry]).collect(),
+        }
+    }
+}
+
+fn small() -> PastatConfig {
+    PastatConfig { dim: 16, windows: vec![2, 4], ..PastatConfig::lean(4) }
+}
+
+/// A module in which no weight is neutral any more, as after a training.
+fn trained(config: &PastatConfig) -> (VarStore, Pastat) {
+    tch::manual_seed(4);
+    let variables = VarStore::new(Device::Cpu);
+    let pastat = Pastat::new(&variables.root(), config).unwrap();
+    no_grad(|| {
+        for (name, mut variable) in variables.variables() {
+            if name.contains("delta") || name.contains("out") || name.contains("cells") {
+                let _ = variable.normal_(0.0, 0.2);
+            }
+        }
+    });
+    (variables, pastat)
+}
+
+fn distance(a: &Tensor, b: &Tensor) -> f64 {
+    (a - b).abs().max().double_value(&[])
+}
+
+#[test]
+fn untrained_it_is_the_maximum_of_the_newest_maps() {
+    for config in [small(), PastatConfig { rows: Rows::All, patch: 1, ..small() }] {
+        let variables = VarStore::new(Device::Cpu);
+        let pastat = Pastat::new(&variables.root(), &config).unwrap();
+        let scene = Scene::new(&[0, 1, 2, 0, 1], &[0.0, 0.1, 0.0, 0.1, 0.2]);
+        let newest = scene.features.narrow(0, 0, 3).amax([0_i64].as_slice(), false);
+        assert!(distance(&scene.fused(&pastat), &newest) < 1e-4);
+        let alone = Scene::new(&[0], &[0.0]);
+        assert!(distance(&alone.fused(&pastat), &alone.features.get(0)) < 1e-6);
+    }
+}
+
+#[test]
+fn masked_entries_change_nothing_also_after_training() {
+    for rows in [Rows::Ego, Rows::All] {
+        let (_store, pastat) = trained(&PastatConfig { rows, fsa: None, ..small() });
+        let scene = Scene::new(&[0, 1, 2, 1], &[0.0, 0.1, 0.0, 0.2]);
+        for entry in [1, 3] {
+            let _ = scene.mask.get(entry).fill_(0.0);
+        }
+        let fused = scene.fused(&pastat);
+        for entry in [1, 3] {
+            let _ = scene.features.get(entry).fill_(5.0);
+        }
+        assert!(distance(&scene.fused(&pastat), &fused) < 1e-5);
+        assert!(distance(&scene.only(&[0, 2]).fused(&pastat), &fused) < 1e-5);
+        // One that reaches some cells only counts there alone.
+        let _ = scene.mask.get(1).narrow(2, 0, 4).fill_(1.0);
+        let near = scene.fused(&pastat);
+        let _ = scene.features.get(1).narrow(2, 8, 12).fill_(-5.0);
+        assert!(distance(&scene.fused(&pastat), &near) < 1e-5);
+    }
+}
+
+#[test]
+fn the_order_of_neighbours_does_not_matter() {
+    let (_store, pastat) = trained(&small());
+    let scene = Scene::new(&[0, 1, 2, 0], &[0.0, 0.1, 0.0, 0.1]);
+    assert!(distance(&scene.only(&[0, 3, 2, 1]).fused(&pastat), &scene.fused(&pastat)) < 1e-4);
+}
+
+#[test]
+fn each_switch_decides_whether_its_input_matters() {
+    let base = || Scene::new(&[0, 1], &[0.0, 0.1]);
+    for (ce, te) in [(false, false), (true, false), (false, true)] {
+        let te = te.then_some(Wavelengths::Printed);
+        let is_timed = te.is_some();
+        let (_store, pastat) = trained(&PastatConfig { ce, te, fsa: None, ..small() });
+        let mut scene = base();
+        let fused = scene.fused(&pastat);
+        scene.facts[1].confidence = 0.1;
+        assert_eq!(distance(&scene.fused(&pastat), &fused) > 1e-5, ce, "confidence");
+        scene.facts[1].confidence = 0.8;
+        scene.facts[1].age_secs = 0.4;
+        assert_eq!(distance(&scene.fused(&pastat), &fused) > 1e-5, is_timed, "age");
+    }
+    let count = |fsa| trained(&PastatConfig { fsa, ..small() }).0.variables().len();
+    assert!(count(None) < count(Some(FsaConfig::default())));
+}
+
+#[test]
+fn every_parameter_gets_a_gradient() {
+    for rows in [Rows::Ego, Rows::All] {
+        let (store, pastat) = trained(&PastatConfig { rows, ..small() });
+        let scene = Scene::new(&[0, 1, 2, 1], &[0.0, 0.1, 0.0, 0.2]);
+        (scene.fused(&pastat) * Tensor::randn([4, 12, 20], FLOAT)).sum(Kind::Float).backward();
+        for (name, variable) in store.variables() {
+            let gradient = variable.grad();
+            assert!(gradient.defined(), "{name} has no gradient");
+            let is_finite = gradient.isfinite().all().int64_value(&[]) == 1;
+            assert!(is_finite && gradient.abs().max().double_value(&[]) > 0.0, "{name}");
+        }
+    }
+}
+
+#[test]
+fn fsa_learns_a_shift_from_the_maps_alone() {
+    tch::manual_seed(7);
+    let variables = VarStore::new(Device::Cpu);
+    let config = PastatConfig { patch: 1, ..small() };
+    let pastat = Pastat::new(&variables.root(), &config).unwrap();
+    let mut optimizer = agent::training::AdamW::new(&variables, agent::training::AdamWConfig::default());
+    // The neighbour shows what the ego shows, one or two cells beside it; what is wanted is one sharp map.
+    let error = |step: u64, train: bool| {
+        let mut scene = Scene::new(&[0, 1], &[0.0, 0.0]);
+        let cells = Tensor::rand([1, 4, 12, 20], FLOAT).gt(0.9).to_kind(Kind::Float) * 3.0;
+        let shift = if step % 2 == 0 { 1 } else { -1 };
+        scene.features = Tensor::cat(&[&cells, &cells.roll([shift], [3])], 0);
+        let entries = pastat.align(&scene.features, &scene.mask, &Told::new(&scene.facts), &GRID).unwrap();
+        let inside = |map: Tensor| map.narrow(1, 2, 8).narrow(2, 4, 12);
+        let difference = inside(entries.newest.get(1)) - inside(cells.get(0));
+        let loss = difference.square().mean(Kind::Float);
+        if train {
+            let _ = no_grad(|| optimizer.zero_grad());
+            loss.backward();
+            optimizer.step(3e-3).unwrap();
+        }
+        loss.double_value(&[])
+    };
+    let mut error = error;
+    let before: f64 = (0..10).map(|step| error(step, false)).sum();
+    (0..300).for_each(|step| {
+        error(step, true);
+    });
+    let after: f64 = (0..10).map(|step| error(step, false)).sum();
+    assert!(after < 0.5 * before, "{before} before, {after} after");
+}

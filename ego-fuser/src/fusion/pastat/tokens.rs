@@ -1,0 +1,129 @@
+//! Cells to tokens and back.
+
+use tch::nn::{self, Init, Module};
+use tch::{Kind, TchError, Tensor};
+
+use super::config::PastatConfig;
+use super::temporal::encoding;
+
+/// Maps with zero rows below and columns to the right, so that both counts are multiples of `cells`.
+pub(super) fn padded(maps: &Tensor, cells: i64) -> Result<Tensor, TchError> {
+    let (_, _, height, width) = maps.size4()?;
+    let more = |size: i64| (cells - size % cells) % cells;
+    match (more(height), more(width)) {
+        (0, 0) => Ok(maps.shallow_clone()),
+        (below, right) => maps.f_constant_pad_nd([0, right, 0, below]),
+    }
+}
+
+/// Patches of cells to tokens, with what is known of a map beside what it shows.
+#[derive(Debug)]
+pub(super) struct Tokeniser {
+    patches: nn::Conv2D,
+    /// `[D]`: the weight of Eq. 7's channel. That channel has one value all over a map, so its part of a token is this
+    /// times that value, whichever cells the token is of; the channel itself need not be built.
+    confidence: Option<Tensor>,
+    config: PastatConfig,
+}
+
+impl Tokeniser {
+    pub(super) fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Self {
+        let PastatConfig { channels, dim, patch, .. } = *config;
+        let stride = nn::ConvConfig { stride: patch, ..Default::default() };
+        let deviation = ((channels * patch * patch) as f64).sqrt().recip();
+        let random = Init::Uniform { lo: -deviation, up: deviation };
+        Self {
+            patches: nn::conv2d(path / "patches", channels, dim, patch, stride),
+            confidence: config.ce.then(|| (path / "ce").var("weight", &[dim], random)),
+            config: config.clone(),
+        }
+    }
+
+    /// Tokens `[N, h, w, D]` of maps `[N, C, H, W]` with their shares of all trust, `[N]`, and their ages.
+    pub(super) fn forward(&self, maps: &Tensor, shares: &Tensor, age_secs: &[f64]) -> Result<Tensor, TchError> {
+        let dim = self.config.dim;
+        let tokens = self.patches.forward(maps).f_permute([0, 2, 3, 1])?;
+        let per_map = |values: Tensor| values.f_view([-1, 1, 1, dim]);
+        let tokens = match &self.confidence {
+            Some(weight) => tokens + per_map(shares.f_unsqueeze(1)? * weight)?,
+            None => tokens,
+        };
+        let tokens = match self.config.te {
+            Some(wavelengths) => {
+                let values: Vec<f32> =
+                    age_secs.iter().flat_map(|&age| encoding(age, &self.config, wavelengths)).collect();
+                tokens + per_map(Tensor::f_from_slice(&values)?.f_to_device(maps.device())?)?
+            }
+            None => tokens,
+        };
+        tokens.f_contiguous()
+    }
+
+    /// `[N, h, w]`: 1 for tokens of which any cell is valid in the mask `[N, 1, H, W]`.
+    pub(super) fn valid(&self, mask: &Tensor) -> Result<Tensor, TchError> {
+        let patch = self.config.patch;
+        let none: [i64; 2] = [0, 0];
+        mask.f_max_pool2d([patch, patch], [patch, patch], none, [1, 1], false)?.f_squeeze_dim(1)
+    }
+}
+
+/// How much of a neighbour's newest map is taken, token by token: 1 before it is trained, 0 to 2 after.
+#[derive(Debug)]
+pub(super) struct TrustGate {
+    hidden: nn::Linear,
+    out: nn::Linear,
+    patch: i64,
+}
+
+impl TrustGate {
+    pub(super) fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Self {
+        let neutral = nn::LinearConfig { ws_init: Init::Const(0.0), bs_init: Some(Init::Const(0.0)), bias: true };
+        Self {
+            hidden: nn::linear(path / "hidden", 2 * config.dim, config.dim, nn::LinearConfig::default()),
+            out: nn::linear(path / "out", config.dim, 1, neutral),
+            patch: config.patch,
+        }
+    }
+
+    /// `[M, 1, H, W]` from the neighbours' tokens `[M, h, w, D]` and the ego's after the transformer `[1, h, w, D]`.
+    pub(super) fn forward(&self, others: &Tensor, ego: &Tensor) -> Result<Tensor, TchError> {
+        let pairs = Tensor::f_cat(&[others, &ego.f_expand_as(others)?], 3)?;
+        let trust = self.out.forward(&self.hidden.forward(&pairs).f_relu()?).f_sigmoid()? * 2.0;
+        let (maps, rows, columns, _) = trust.size4()?;
+        let trust = trust.f_view([maps, 1, rows, columns])?;
+        trust.f_upsample_nearest2d([rows * self.patch, columns * self.patch], None, None)
+    }
+}
+
+/// Tokens back to cells: what the transformer adds to a map; nothing before it is trained.
+#[derive(Debug)]
+pub(super) struct Decoder {
+    norm: nn::LayerNorm,
+    cells: nn::Linear,
+    channels: i64,
+    patch: i64,
+}
+
+impl Decoder {
+    pub(super) fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Self {
+        let PastatConfig { channels, dim, patch, .. } = *config;
+        let neutral = nn::LinearConfig { ws_init: Init::Const(0.0), bs_init: Some(Init::Const(0.0)), bias: true };
+        Self {
+            norm: nn::layer_norm(path / "norm", vec![dim], nn::LayerNormConfig::default()),
+            cells: nn::linear(path / "cells", dim, channels * patch * patch, neutral),
+            channels,
+            patch,
+        }
+    }
+
+    /// `[C, H, W]` of tokens `[1, h, w, D]`.
+    pub(super) fn forward(&self, ego: &Tensor) -> Result<Tensor, TchError> {
+        let (_, rows, columns, _) = ego.size4()?;
+        let cells = self.cells.forward(&self.norm.forward(ego)).f_to_kind(Kind::Float)?;
+        cells.f_view([rows, columns, self.channels, self.patch, self.patch])?.f_permute([2, 0, 3, 1, 4])?.f_reshape([
+            self.channels,
+            rows * self.patch,
+            columns * self.patch,
+        ])
+    }
+}
