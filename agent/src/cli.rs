@@ -18,6 +18,7 @@ pub(crate) struct Cli {
 enum Command {
     Run(command::run::Args),
     Eval(command::eval::Args),
+    Localize(command::localize::Args),
     Train(command::train::Args),
 }
 
@@ -31,6 +32,7 @@ pub(crate) fn run(cli: Cli) -> ExitCode {
     let outcome = match cli.command {
         Command::Run(args) => command::run::run(&args),
         Command::Eval(args) => command::eval::run(&args),
+        Command::Localize(args) => command::localize::run(&args),
         Command::Train(args) => command::train::run(&args),
     };
     match outcome {

@@ -8,6 +8,7 @@ mod icp_map;
 mod localized;
 mod noise;
 mod noisy;
+mod pose_table;
 pub mod sanity;
 
 use std::path::PathBuf;
@@ -20,6 +21,7 @@ pub use icp_map::{IcpMapPose, MapError, read_map};
 pub use localized::{EndToEndPoseConfig, LocalizedPose, PgcConfig};
 pub use noise::{PlanarError, PoseNoise};
 pub use noisy::NoisyPose;
+pub use pose_table::{CachedPose, CachedPoseConfig, PoseRow, PoseTable, PoseTableError};
 
 use crate::localizer::LocalizerError;
 
@@ -81,6 +83,8 @@ pub enum PoseSourceConfig {
     Pgc(PgcConfig),
     /// From the sweep alone, by a network that was trained end to end.
     EndToEnd(EndToEndPoseConfig),
+    /// From a table that `agent localize` wrote.
+    Cached(CachedPoseConfig),
 }
 
 /// An error on the measured pose.
@@ -156,6 +160,9 @@ pub enum PoseSourceError {
     /// The networks cannot be used.
     #[error(transparent)]
     Localizer(#[from] LocalizerError),
+    /// The table of poses is not readable.
+    #[error(transparent)]
+    PoseTable(#[from] PoseTableError),
 }
 
 impl PoseSourceConfig {
@@ -167,6 +174,18 @@ impl PoseSourceConfig {
             Self::Noisy(_) => "noisy",
             Self::Pgc(_) => "pgc",
             Self::EndToEnd(_) => "end_to_end",
+            Self::Cached(_) => "cached",
+        }
+    }
+
+    /// The same for one scenario of many: only tables of poses tell scenarios apart.
+    #[must_use]
+    pub fn for_scenario(&self, name: &str) -> Self {
+        match self {
+            Self::Cached(config) => {
+                Self::Cached(CachedPoseConfig { scenario: Some(name.to_owned()), ..config.clone() })
+            }
+            other => other.clone(),
         }
     }
 
@@ -180,6 +199,7 @@ impl PoseSourceConfig {
             Self::Noisy(config) => Box::new(NoisyPose::new(config)?),
             Self::Pgc(config) => Box::new(LocalizedPose::pgc(config)?),
             Self::EndToEnd(config) => Box::new(LocalizedPose::end_to_end(config)?),
+            Self::Cached(config) => Box::new(CachedPose::new(config)?),
         })
     }
 }
