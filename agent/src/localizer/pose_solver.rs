@@ -68,15 +68,29 @@ impl PoseSolver {
     /// # Errors
     /// As [`Self::solve`].
     pub fn search(&self, coordinates: &SceneCoordinates) -> Result<Registration, NoRegistration> {
+        self.search_wider(coordinates, 1.0)
+    }
+
+    /// The same with cells that may be off by `factor` times as much. Who agrees is counted as in [`Self::search`].
+    ///
+    /// # Errors
+    /// As [`Self::solve`].
+    pub(super) fn search_wider(
+        &self,
+        coordinates: &SceneCoordinates,
+        factor: f64,
+    ) -> Result<Registration, NoRegistration> {
         let pairs = coordinates.correspondences();
         if pairs.len() < MIN_CELLS {
             let (usable, given) = (pairs.len(), pairs.len());
             return Err(NoRegistration::TooFewCorrespondences { usable, given, required: MIN_CELLS });
         }
-        match &self.solver {
-            Solver::Ransac(config) => ransac::solve(&pairs, config),
-            Solver::Sc2Pcr(config) => sc2pcr::solve(&pairs, config),
-        }
+        let (found, threshold_m) = match &self.solver {
+            Solver::Ransac(config) => (ransac::solve(&pairs, &config.wider(factor))?, config.inlier_threshold_m),
+            Solver::Sc2Pcr(config) => (sc2pcr::solve(&pairs, &config.wider(factor))?, config.inlier_threshold_m),
+        };
+        let is_wider = factor > 1.0;
+        Ok(if is_wider { Registration::judge(&pairs, found.target_from_source, threshold_m) } else { found })
     }
 
     /// Last step: how far to trust what was found, and found again by a second look where there was one.

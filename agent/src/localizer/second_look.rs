@@ -10,6 +10,8 @@ use crate::registration::{Correspondence, Registration};
 
 /// Scales of the fits of each round, metres: the first pose may be off by two metres, the second hardly is.
 const ROUNDS_M: [&[f64]; 2] = [&[2.0, 1.2, 0.8], &[0.6, 0.4, 0.3, 0.3]];
+/// Scales of a round that goes before them where the first pose may be off by more, metres.
+const WIDE_ROUND_M: &[f64] = &[4.0, 3.0, 2.0];
 /// A cell agrees with the sharp pose when its answer is this near, metres.
 const AGREES_M: f64 = 1.0;
 /// What even the best cell does not know, metres.
@@ -38,6 +40,7 @@ pub(super) fn look_again(
     cells: &Tensor,
     sensor_m: &[[f32; 3]],
     start: &Isometry3<f64>,
+    factor: f64,
     kind: Kind,
 ) -> Result<Option<SecondLook>, TchError> {
     let Some(refiner) = head.refiner() else { return Ok(None) };
@@ -45,7 +48,8 @@ pub(super) fn look_again(
     let device = cells.device();
     let mut pose = *start;
     let mut answer = None;
-    for scales_m in ROUNDS_M {
+    let wide_rounds = if factor > 1.0 { 2 } else { 0 };
+    for scales_m in std::iter::repeat_n(WIDE_ROUND_M, wide_rounds).chain(ROUNDS_M) {
         let assumed: Vec<f32> = sensor_m
             .iter()
             .flat_map(|point| (pose * Point3::from(point.map(f64::from))).coords.map(|axis| axis as f32).data.0[0])

@@ -91,6 +91,17 @@ impl RansacConfig {
         }
     }
 
+    /// The same for correspondences that may be off by `factor` times as much.
+    #[must_use]
+    pub fn wider(&self, factor: f64) -> Self {
+        Self {
+            inlier_threshold_m: factor * self.inlier_threshold_m,
+            min_edge_m: factor * self.min_edge_m,
+            refine_scale_m: factor * self.refine_scale_m,
+            ..self.clone()
+        }
+    }
+
     fn sample_size(&self) -> i32 {
         match self.minimal {
             MinimalSolver::UprightTwoPoint => 2,

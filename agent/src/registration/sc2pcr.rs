@@ -53,6 +53,21 @@ pub struct Refinement {
     pub rounds: usize,
 }
 
+impl Sc2PcrConfig {
+    /// The same for correspondences that may be off by `factor` times as much.
+    #[must_use]
+    pub fn wider(&self, factor: f64) -> Self {
+        let refinement =
+            self.refinement.map(|refinement| Refinement { threshold_m: factor * refinement.threshold_m, ..refinement });
+        Self {
+            inlier_threshold_m: factor * self.inlier_threshold_m,
+            distance_threshold_m: factor * self.distance_threshold_m,
+            refinement,
+            ..self.clone()
+        }
+    }
+}
+
 impl Default for Sc2PcrConfig {
     /// For scene coordinates that are right to a metre or two.
     fn default() -> Self {

@@ -64,7 +64,7 @@ pub(super) fn validate(
         let mut found = solve(correspondences, &RansacConfig::default());
         if let Ok(first) = &found {
             let sensor_m: Vec<[f32; 3]> = correspondences.iter().map(|pair| pair.source_m).collect();
-            if let Some(second) = look_again(head, &cells, &sensor_m, &first.target_from_source, kind)? {
+            if let Some(second) = look_again(head, &cells, &sensor_m, &first.target_from_source, 1.0, kind)? {
                 found = Ok(second.registration);
             }
         }
