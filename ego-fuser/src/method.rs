@@ -19,6 +19,11 @@ pub enum Method {
     Max,
     /// Feature maps, self-attention over the agents at each cell (AttFuse, OPV2V).
     Attention,
+    /// Feature maps, attention over agents and within windows of several sizes (V2X-ViT).
+    #[serde(rename = "v2xvit")]
+    V2xVit,
+    /// Feature maps, attention over agents within windows and grids (CoBEVT).
+    Cobevt,
     /// Feature maps of several frames, aligned by pose confidence and content, transformer (PASTAT).
     Pastat,
 }
@@ -39,7 +44,16 @@ pub enum Exchange {
 
 impl Method {
     /// Every method, in the order of tables.
-    pub const ALL: [Self; 6] = [Self::None, Self::Late, Self::Early, Self::Max, Self::Attention, Self::Pastat];
+    pub const ALL: [Self; 8] = [
+        Self::None,
+        Self::Late,
+        Self::Early,
+        Self::Max,
+        Self::Attention,
+        Self::V2xVit,
+        Self::Cobevt,
+        Self::Pastat,
+    ];
 
     /// The name on the command line and in result files.
     #[must_use]
@@ -50,6 +64,8 @@ impl Method {
             Self::Early => "early",
             Self::Max => "max",
             Self::Attention => "attention",
+            Self::V2xVit => "v2xvit",
+            Self::Cobevt => "cobevt",
             Self::Pastat => "pastat",
         }
     }
@@ -63,6 +79,8 @@ impl Method {
             Self::Early => "points, encoded together in the ego frame",
             Self::Max => "feature maps, element-wise maximum (F-Cooper)",
             Self::Attention => "feature maps, self-attention over agents at each cell (AttFuse)",
+            Self::V2xVit => "feature maps, attention over agents and windows of several sizes (V2X-ViT)",
+            Self::Cobevt => "feature maps, attention over agents within windows and grids (CoBEVT)",
             Self::Pastat => "feature maps with history, aligned by confidence and content, transformer (PASTAT)",
         }
     }
@@ -74,7 +92,7 @@ impl Method {
             Self::None => Exchange::Nothing,
             Self::Late => Exchange::Boxes,
             Self::Early => Exchange::Points,
-            Self::Max | Self::Attention | Self::Pastat => Exchange::Features,
+            Self::Max | Self::Attention | Self::V2xVit | Self::Cobevt | Self::Pastat => Exchange::Features,
         }
     }
 }

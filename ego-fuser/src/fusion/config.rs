@@ -4,6 +4,8 @@ use agent::model_config::{ConfigError, DetectorConfig};
 use serde::{Deserialize, Serialize};
 use tch::nn;
 
+use super::cobevt::{Cobevt, CobevtConfig};
+use super::v2xvit::{V2xVit, V2xVitConfig};
 use super::pastat::{Pastat, PastatConfig};
 use super::{AttentionFusion, Fusion, MaxFusion, NoFusion};
 use crate::Method;
@@ -24,6 +26,11 @@ pub enum FusionConfig {
     Max,
     /// Attention without parameters.
     Attention,
+    /// V2X-ViT.
+    #[serde(rename = "v2xvit")]
+    V2xVit(V2xVitConfig),
+    /// CoBEVT.
+    Cobevt(CobevtConfig),
     /// PASTAT.
     Pastat(PastatConfig),
 }
@@ -33,12 +40,17 @@ impl FusionConfig {
     #[must_use]
     pub fn for_detector(method: Method, detector: &DetectorConfig) -> Self {
         let channels = detector.feature_channels();
+        let is_lean = channels <= LEAN_CHANNELS;
         match method {
             Method::None | Method::Late | Method::Early => Self::Own,
             Method::Max => Self::Max,
             Method::Attention => Self::Attention,
-            Method::Pastat if channels > LEAN_CHANNELS => Self::Pastat(PastatConfig::full(channels)),
-            Method::Pastat => Self::Pastat(PastatConfig::lean(channels)),
+            Method::V2xVit if is_lean => Self::V2xVit(V2xVitConfig::lean(channels)),
+            Method::V2xVit => Self::V2xVit(V2xVitConfig::full(channels)),
+            Method::Cobevt if is_lean => Self::Cobevt(CobevtConfig::lean(channels)),
+            Method::Cobevt => Self::Cobevt(CobevtConfig::full(channels)),
+            Method::Pastat if is_lean => Self::Pastat(PastatConfig::lean(channels)),
+            Method::Pastat => Self::Pastat(PastatConfig::full(channels)),
         }
     }
 
@@ -51,6 +63,8 @@ impl FusionConfig {
             Self::Own => Box::new(NoFusion),
             Self::Max => Box::new(MaxFusion),
             Self::Attention => Box::new(AttentionFusion),
+            Self::V2xVit(config) => Box::new(V2xVit::new(path, config)?),
+            Self::Cobevt(config) => Box::new(Cobevt::new(path, config)?),
             Self::Pastat(config) => Box::new(Pastat::new(path, config)?),
         })
     }

@@ -1,11 +1,17 @@
 //! Many feature maps on the ego lattice, one feature map out.
 
 mod attention;
+mod block_order;
+pub mod cobevt;
 mod config;
+pub mod layers;
 mod max;
+mod padding;
 pub mod pastat;
 mod stage;
 pub(crate) mod steering;
+pub mod swap_fusion;
+pub mod v2xvit;
 
 use std::fmt::Debug;
 
@@ -13,6 +19,7 @@ use protocol::{BevGrid, Pose};
 use tch::{TchError, Tensor};
 
 pub use attention::AttentionFusion;
+pub use block_order::BlockOrder;
 pub use config::{FUSION_KEY, FusionConfig};
 pub use max::MaxFusion;
 pub use stage::{AlignedMaps, FusionStage, StageError};
@@ -126,8 +133,16 @@ mod tests {
     }
 
     fn fuse(fusion: &dyn Fusion, features: &Tensor, reach: &[f32]) -> Tensor {
+        let agents: Vec<usize> = (0..reach.len()).collect();
+        fuse_of(fusion, features, reach, &agents)
+    }
+
+    /// The same for maps of these agents, each of which stands somewhere else.
+    fn fuse_of(fusion: &dyn Fusion, features: &Tensor, reach: &[f32], agents: &[usize]) -> Tensor {
         let mask = Tensor::from_slice(reach).view([-1, 1, 1, 1]).expand([-1, 1, SHAPE[1], SHAPE[2]], false);
-        let facts: Vec<_> = (0..reach.len()).map(|agent| ViewFacts::fresh(agent, Pose::IDENTITY)).collect();
+        let facts: Vec<_> = (agents.iter())
+            .map(|&agent| ViewFacts::fresh(agent, Pose::from_xyz_yaw([2.0 * agent as f64, 0.0, 0.0], 0.0)))
+            .collect();
         let (height, width) = (SHAPE[1] as u32, SHAPE[2] as u32);
         let grid = BevGrid { x_min_m: -12.0, y_min_m: -8.0, cell_m: 1.0, width, height };
         let views = AlignedViews { features, mask: &mask, own_frame: features, grid: &grid, facts: &facts };
@@ -167,8 +182,39 @@ mod tests {
         let features = random(3);
         let swapped = features.index_select(0, &Tensor::from_slice(&[0i64, 2, 1]));
         for (method, fusion) in all() {
-            let [one, other] = [&features, &swapped].map(|features| fuse(&*fusion, features, &[1.0; 3]));
+            let one = fuse_of(&*fusion, &features, &[1.0; 3], &[0, 1, 2]);
+            let other = fuse_of(&*fusion, &swapped, &[1.0; 3], &[0, 2, 1]);
             assert!(difference(&one, &other) < 1e-4, "{method}");
+        }
+    }
+
+    #[test]
+    fn every_parameter_learns() {
+        let features = random(3);
+        let shrink = Some(ShrinkConfig::Pointwise { channels: SHAPE[0] });
+        let detector = DetectorConfig { shrink, ..DetectorConfig::lean() };
+        for method in Method::ALL {
+            let variables = VarStore::new(Device::Cpu);
+            let fusion = FusionConfig::for_detector(method, &detector).build(&variables.root()).unwrap();
+            let mask = Tensor::ones([3, 1, SHAPE[1], SHAPE[2]], FLOAT);
+            let facts: Vec<_> = (0..3)
+                .map(|agent| ViewFacts { age_secs: 0.07 * agent as f64, ..ViewFacts::fresh(agent, Pose::IDENTITY) })
+                .collect();
+            let (height, width) = (SHAPE[1] as u32, SHAPE[2] as u32);
+            let grid = BevGrid { x_min_m: -12.0, y_min_m: -8.0, cell_m: 1.0, width, height };
+            let views =
+                AlignedViews { features: &features, mask: &mask, own_frame: &features, grid: &grid, facts: &facts };
+            let fused = fusion.fuse(&views, true).unwrap();
+            if variables.is_empty() {
+                continue;
+            }
+            (fused * random(1)).sum(Kind::Float).backward();
+            for (name, variable) in variables.variables() {
+                // What belongs to another type of agent has nothing to learn from vehicles.
+                let other_type = name.contains("linears.1.") || !variable.requires_grad();
+                let learns = variable.grad().defined() && variable.grad().isfinite().all().double_value(&[]) == 1.0;
+                assert!(learns || other_type, "{method}: {name}");
+            }
         }
     }
 

@@ -1,0 +1,159 @@
+//! The layers that transformers among the fusions are made of. Parameter names are those of the reference codes.
+//!
+//! Tokens lie along all dimensions but the last, which holds the channels.
+
+use tch::nn::{self, Init};
+use tch::{TchError, Tensor};
+
+/// Offset under the root in layer norms, as everywhere in the reference codes.
+const EPSILON: f64 = 1e-5;
+
+/// Spread of the weights that lead back to the residual path: small, so that an untrained transformer hands on what an
+/// encoder that is trained already has found, and yet not zero, so that everything behind them learns from the first step.
+const RESIDUAL: Init = Init::Randn { mean: 0.0, stdev: 0.02 };
+
+/// `x W^T + b` over the last dimension.
+#[derive(Debug)]
+pub struct Linear {
+    /// `[to, from]`, `weight`.
+    pub weight: Tensor,
+    /// `[to]`, `bias`; nothing where the reference has none.
+    pub bias: Option<Tensor>,
+}
+
+impl Linear {
+    /// Random at the start.
+    #[must_use]
+    pub fn new(path: &nn::Path<'_>, from: i64, to: i64, has_bias: bool) -> Self {
+        Self::with_init(path, from, to, has_bias, nn::init::DEFAULT_KAIMING_UNIFORM)
+    }
+
+    /// The last layer of a branch that is added to the residual path: almost nothing at the start.
+    #[must_use]
+    pub fn residual(path: &nn::Path<'_>, from: i64, to: i64, has_bias: bool) -> Self {
+        Self::with_init(path, from, to, has_bias, RESIDUAL)
+    }
+
+    fn with_init(path: &nn::Path<'_>, from: i64, to: i64, has_bias: bool, init: Init) -> Self {
+        let weight = path.var("weight", &[to, from], init);
+        Self { weight, bias: has_bias.then(|| path.var("bias", &[to], Init::Const(0.0))) }
+    }
+
+    /// `[..., from]` to `[..., to]`.
+    ///
+    /// # Errors
+    /// [`TchError`] when the channels are others.
+    pub fn forward(&self, x: &Tensor) -> Result<Tensor, TchError> {
+        x.f_linear(&self.weight, self.bias.as_ref())
+    }
+}
+
+/// Normalisation over the channels of each token.
+#[derive(Debug)]
+pub struct LayerNorm {
+    weight: Tensor,
+    bias: Tensor,
+}
+
+impl LayerNorm {
+    /// `weight` and `bias`, `[channels]`, below `path`.
+    #[must_use]
+    pub fn new(path: &nn::Path<'_>, channels: i64) -> Self {
+        let weight = path.var("weight", &[channels], Init::Const(1.0));
+        Self { weight, bias: path.var("bias", &[channels], Init::Const(0.0)) }
+    }
+
+    /// `[..., channels]` to the same.
+    ///
+    /// # Errors
+    /// [`TchError`] when the channels are others.
+    pub fn forward(&self, x: &Tensor) -> Result<Tensor, TchError> {
+        x.f_layer_norm(self.weight.size(), Some(&self.weight), Some(&self.bias), EPSILON, false)
+    }
+}
+
+/// Two linear layers with GELU between them: `net.0` and `net.3`.
+#[derive(Debug)]
+pub struct FeedForward {
+    wide: Linear,
+    back: Linear,
+    dropout: f64,
+}
+
+impl FeedForward {
+    /// From `channels` to `hidden` and back.
+    #[must_use]
+    pub fn new(path: &nn::Path<'_>, channels: i64, hidden: i64, dropout: f64) -> Self {
+        let net = path / "net";
+        let wide = Linear::new(&(&net / 0), channels, hidden, true);
+        Self { wide, back: Linear::residual(&(&net / 3), hidden, channels, true), dropout }
+    }
+
+    /// `[..., channels]` to the same.
+    ///
+    /// # Errors
+    /// [`TchError`] when the channels are others.
+    pub fn forward(&self, x: &Tensor, train: bool) -> Result<Tensor, TchError> {
+        let hidden = dropout(self.wide.forward(x)?.f_gelu("none")?, self.dropout, train)?;
+        dropout(self.back.forward(&hidden)?, self.dropout, train)
+    }
+}
+
+/// Leaves out values at random in training.
+///
+/// # Errors
+/// [`TchError`] when `share` is no probability.
+pub fn dropout(x: Tensor, share: f64, train: bool) -> Result<Tensor, TchError> {
+    if train && share > 0.0 { x.f_dropout(share, true) } else { Ok(x) }
+}
+
+/// Scaled dot-product attention, `softmax(q k^T / sqrt(D) + bias) v`, of `B` groups of tokens with `M` heads at once.
+///
+/// # Shapes
+/// - `query`: `[B, Q, M, D]`; `key`, `value`: `[B, K, M, D]`; the last dimension without gaps
+/// - `bias`: what can be spread over `[B, M, Q, K]`
+/// - returns: `[B, Q, M * D]`
+///
+/// # Errors
+/// [`TchError`] when shapes do not fit.
+pub fn attend(query: &Tensor, key: &Tensor, value: &Tensor, bias: Option<&Tensor>) -> Result<Tensor, TchError> {
+    let (groups, tokens, heads, channels) = query.size4()?;
+    let [query, key, value] = [query.f_transpose(1, 2)?, key.f_transpose(1, 2)?, value.f_transpose(1, 2)?];
+    let seen = Tensor::f_scaled_dot_product_attention(&query, &key, &value, bias, 0.0, false, None, false)?;
+    seen.f_transpose(1, 2)?.f_reshape([groups, tokens, heads * channels])
+}
+
+/// What is added to scores so that cells with a mask of zero are not attended to: 0 or minus infinity.
+///
+/// # Errors
+/// [`TchError`] of the tensor library.
+pub fn unseen(mask: &Tensor) -> Result<Tensor, TchError> {
+    mask.f_zeros_like()?.f_masked_fill(&mask.f_eq(0.0)?, f64::NEG_INFINITY)
+}
+
+#[cfg(test)]
+mod tests {
+    use tch::nn::VarStore;
+    use tch::{Device, Kind};
+
+    use super::*;
+
+    #[test]
+    fn attention_with_a_bias_of_its_own_picks_one_token() {
+        let float = (Kind::Float, Device::Cpu);
+        let [query, key, value] = [(); 3].map(|()| Tensor::randn([3, 4, 2, 8], float));
+        let mask = Tensor::from_slice(&[0f32, 1.0, 0.0, 0.0]);
+        let out = attend(&query, &key, &value, Some(&unseen(&mask).unwrap().view([1, 1, 1, 4]))).unwrap();
+        let expected = value.narrow(1, 1, 1).expand([3, 4, 2, 8], false).reshape([3, 4, 16]);
+        assert!((out - expected).abs().max().double_value(&[]) < 1e-6);
+    }
+
+    #[test]
+    fn other_channels_are_an_error() {
+        let variables = VarStore::new(Device::Cpu);
+        let layer = FeedForward::new(&variables.root(), 4, 8, 0.1);
+        assert!(layer.forward(&Tensor::zeros([2, 5], (Kind::Float, Device::Cpu)), false).is_err());
+        let names: Vec<_> = variables.variables().into_keys().collect();
+        assert!(names.iter().all(|name| name.starts_with("net.")), "{names:?}");
+    }
+}

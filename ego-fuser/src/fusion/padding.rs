@@ -1,0 +1,79 @@
+//! Cells around a map, so that windows of any size cover it whole.
+
+use tch::{TchError, Tensor};
+
+/// Rows below and columns right of a map.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) struct Padding {
+    height: i64,
+    width: i64,
+    below: i64,
+    right: i64,
+}
+
+impl Padding {
+    /// What a map of `[N, C, H, W]` lacks to multiples of `edge`.
+    pub(super) fn to_multiples(maps: &Tensor, edge: i64) -> Result<Self, TchError> {
+        let (_, _, height, width) = maps.size4()?;
+        let [below, right] = [height, width].map(|length| (edge - length % edge) % edge);
+        Ok(Self { height, width, below, right })
+    }
+
+    /// Whether nothing is lacking.
+    pub(super) fn is_empty(self) -> bool {
+        (self.below, self.right) == (0, 0)
+    }
+
+    /// Rows and columns with it.
+    pub(super) fn size(self) -> [i64; 2] {
+        [self.height + self.below, self.width + self.right]
+    }
+
+    /// `[N, C, H, W]` with zeros around, and `slots` maps of zeros more.
+    pub(super) fn maps(self, maps: &Tensor, slots: i64) -> Result<Tensor, TchError> {
+        if self.is_empty() && slots == 0 {
+            return Ok(maps.shallow_clone());
+        }
+        maps.f_pad([0, self.right, 0, self.below, 0, 0, 0, slots], "constant", 0.0)
+    }
+
+    /// The same for a mask `[N, 1, H, W]`: there is nothing to be seen of neighbours beyond the edge, but the ego has to
+    /// look at something, and looks at itself.
+    pub(super) fn mask(self, mask: &Tensor, slots: i64) -> Result<Tensor, TchError> {
+        if self.is_empty() && slots == 0 {
+            return Ok(mask.shallow_clone());
+        }
+        let neighbours = mask.size4()?.0 - 1;
+        let ego = mask.f_narrow(0, 0, 1)?.f_pad([0, self.right, 0, self.below], "constant", 1.0)?;
+        Tensor::f_cat(&[ego, self.maps(&mask.f_narrow(0, 1, neighbours)?, slots)?], 0)
+    }
+
+    /// `[C, H, W]` of a padded map.
+    pub(super) fn crop(self, map: &Tensor) -> Result<Tensor, TchError> {
+        if self.is_empty() {
+            return Ok(map.shallow_clone());
+        }
+        map.f_narrow(1, 0, self.height)?.f_narrow(2, 0, self.width)?.f_contiguous()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tch::{Device, Kind};
+
+    use super::*;
+
+    #[test]
+    fn what_is_added_is_seen_by_the_ego_alone_and_cut_off_again() {
+        let maps = Tensor::ones([2, 3, 5, 8], (Kind::Float, Device::Cpu));
+        let padding = Padding::to_multiples(&maps, 4).unwrap();
+        assert_eq!(padding.size(), [8, 8]);
+        let padded = padding.maps(&maps, 1).unwrap();
+        assert_eq!(padded.size(), [3, 3, 8, 8]);
+        assert_eq!(padding.crop(&padded.get(1)).unwrap(), maps.get(1));
+        let mask = padding.mask(&maps.narrow(1, 0, 1), 1).unwrap();
+        let seen: Vec<f64> = (0..3).map(|slot| mask.get(slot).sum(Kind::Float).double_value(&[])).collect();
+        assert_eq!(seen, [64.0, 40.0, 0.0]);
+        assert!(Padding::to_multiples(&maps, 1).unwrap().is_empty());
+    }
+}

@@ -1,0 +1,338 @@
+//! Swap fusion (fused axial attention), the fusion of CoBEVT: attention over all agents within windows, then within grids.
+//!
+//! A window is a square of neighbouring cells; a grid is as many cells spread evenly over the whole map. Tokens of both
+//! are those of all agents, and scores are moved by a table over the offset between agents, rows and columns.
+
+use tch::nn::{self, Init};
+use tch::{Device, Kind, TchError, Tensor};
+
+use super::cobevt::CobevtConfig;
+use super::layers::{FeedForward, LayerNorm, Linear, attend, dropout};
+
+/// Tokens that are computed at once outside of training: what lies between two steps then stays in the cache.
+const CHUNK: i64 = 1280;
+
+/// How a map is cut into groups of `window * window` cells.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Partition {
+    /// Neighbouring cells.
+    Window,
+    /// Cells spread evenly.
+    Grid,
+}
+
+impl Partition {
+    /// `[S, H, W, C]` to `[groups, S, cells of a group, C]`.
+    fn cut(self, map: &Tensor, window: i64) -> Result<Tensor, TchError> {
+        let &[slots, height, width, channels] = &map.size()[..] else { return Err(shape_error(map)) };
+        let (rows, columns) = (height / window, width / window);
+        let cut = match self {
+            Self::Window => {
+                map.f_view([slots, rows, window, columns, window, channels])?.f_permute([1, 3, 0, 2, 4, 5])?
+            }
+            Self::Grid => {
+                map.f_view([slots, window, rows, window, columns, channels])?.f_permute([2, 4, 0, 1, 3, 5])?
+            }
+        };
+        cut.f_reshape([rows * columns, slots, window * window, channels])
+    }
+
+    /// The way back of [`Self::cut`].
+    fn map(self, groups: &Tensor, [height, width]: [i64; 2], window: i64) -> Result<Tensor, TchError> {
+        let &[_, slots, _, channels] = &groups.size()[..] else { return Err(shape_error(groups)) };
+        let groups = groups.f_view([height / window, width / window, slots, window, window, channels])?;
+        let map = match self {
+            Self::Window => groups.f_permute([2, 0, 3, 1, 4, 5])?,
+            Self::Grid => groups.f_permute([2, 3, 0, 4, 1, 5])?,
+        };
+        map.f_reshape([slots, height, width, channels])
+    }
+}
+
+fn shape_error(found: &Tensor) -> TchError {
+    TchError::Shape(format!("swap fusion has no use for {:?}", found.size()))
+}
+
+/// Attention among the tokens of a group.
+#[derive(Debug)]
+struct GroupAttention {
+    heads: i64,
+    slots: i64,
+    window: i64,
+    to_qkv: Linear,
+    /// `[(2 * slots - 1) * (2 * window - 1)^2, M]`.
+    table: Tensor,
+    out: Linear,
+    dropout: f64,
+}
+
+impl GroupAttention {
+    fn new(path: &nn::Path<'_>, config: &CobevtConfig) -> Self {
+        let heads = config.channels / config.head_channels;
+        let offsets = (2 * config.slots - 1) * (2 * config.window - 1) * (2 * config.window - 1);
+        let table = path / "relative_position_bias_table";
+        Self {
+            heads,
+            slots: config.slots,
+            window: config.window,
+            to_qkv: Linear::new(&(path / "to_qkv"), config.channels, 3 * config.channels, false),
+            table: table.var("weight", &[offsets, heads], Init::Randn { mean: 0.0, stdev: 0.02 }),
+            out: Linear::residual(&(path / "to_out" / 0), config.channels, config.channels, false),
+            dropout: config.dropout,
+        }
+    }
+
+    /// `[M, asking * cells, asked * cells]` added to the scores. Agents further apart than the table knows count as its end.
+    fn bias(&self, asking: i64, asked: i64) -> Result<Tensor, TchError> {
+        let (span, last) = (2 * self.window - 1, self.slots - 1);
+        let tokens = |slots: i64| {
+            let window = self.window;
+            let cells = move |slot| (0..window * window).map(move |cell| [slot, cell / window, cell % window]);
+            (0..slots).flat_map(cells)
+        };
+        let offset = |from: [i64; 3], to: [i64; 3]| {
+            let agent = (from[0] - to[0]).clamp(-last, last) + last;
+            (agent * span + from[1] - to[1] + self.window - 1) * span + from[2] - to[2] + self.window - 1
+        };
+        let index: Vec<i64> = tokens(asking).flat_map(|from| tokens(asked).map(move |to| offset(from, to))).collect();
+        let cells = self.window * self.window;
+        let index = Tensor::f_from_slice(&index)?.f_to_device(self.table.device())?;
+        let bias = self.table.f_index_select(0, &index)?.f_view([asking * cells, asked * cells, self.heads])?;
+        bias.f_permute([2, 0, 1])?.f_contiguous()
+    }
+
+    /// `[G, S, P, C]` to the same, of which the first `asked` slots are looked at.
+    fn forward(&self, x: &Tensor, asked: i64, bias: &Tensor, train: bool) -> Result<Tensor, TchError> {
+        let &[groups, slots, cells, channels] = &x.size()[..] else { return Err(shape_error(x)) };
+        let heads = |part: &Tensor| part.f_unflatten(-1, [self.heads, channels / self.heads]);
+        let (query, key_value) = if asked == slots {
+            let qkv = self.to_qkv.forward(x)?.f_view([groups, slots * cells, 3 * channels])?;
+            (qkv.f_narrow(2, 0, channels)?, qkv.f_narrow(2, channels, 2 * channels)?)
+        } else {
+            // Slots that nobody looks at have no keys and values.
+            let weight = &self.to_qkv.weight;
+            let query = x.f_linear(&weight.f_narrow(0, 0, channels)?, None::<Tensor>)?;
+            let there = x.f_narrow(1, 0, asked)?.f_contiguous()?;
+            let key_value = there.f_linear(&weight.f_narrow(0, channels, 2 * channels)?, None::<Tensor>)?;
+            (query.f_view([groups, -1, channels])?, key_value.f_view([groups, -1, 2 * channels])?)
+        };
+        let [key, value] = [key_value.f_narrow(2, 0, channels)?, key_value.f_narrow(2, channels, channels)?];
+        let seen = attend(&heads(&query)?, &heads(&key)?, &heads(&value)?, Some(bias))?;
+        dropout(self.out.forward(&seen)?, self.dropout, train)?.f_view_as(x)
+    }
+}
+
+/// Attention and a feed-forward network over one partition, each normalised first and added to what it started from.
+#[derive(Debug)]
+struct HalfBlock {
+    partition: Partition,
+    norm: LayerNorm,
+    attention: GroupAttention,
+    feed_norm: LayerNorm,
+    feed_forward: FeedForward,
+}
+
+impl HalfBlock {
+    fn new(partition: Partition, attention: &nn::Path<'_>, feed: &nn::Path<'_>, config: &CobevtConfig) -> Self {
+        Self {
+            partition,
+            norm: LayerNorm::new(&(attention / "norm"), config.channels),
+            attention: GroupAttention::new(&(attention / "fn"), config),
+            feed_norm: LayerNorm::new(&(feed / "norm"), config.channels),
+            feed_forward: FeedForward::new(&(feed / "fn"), config.channels, config.hidden, config.dropout),
+        }
+    }
+
+    fn forward(&self, x: &Tensor, asked: i64, bias: &Tensor, train: bool) -> Result<Tensor, TchError> {
+        let x = x + self.attention.forward(&self.norm.forward(x)?, asked, bias, train)?;
+        Ok(&x + self.feed_forward.forward(&self.feed_norm.forward(&x)?, train)?)
+    }
+}
+
+/// What of the slots counts.
+#[derive(Debug, Clone, Copy)]
+pub struct Slots<'a> {
+    /// The first slots hold agents that are there; only those are looked at.
+    pub asked: i64,
+    /// `[S, H, W]` 1 where a map reaches, 0 elsewhere; nothing: all reach everywhere.
+    pub reach: Option<&'a Tensor>,
+    /// Whether slots that are empty, or do not reach a cell, count in the mean at the end, as they do in the reference.
+    pub count_missing: bool,
+}
+
+/// The encoder of swap fusion.
+#[derive(Debug)]
+pub struct SwapFusion {
+    /// Window and grid in turn.
+    halves: Vec<HalfBlock>,
+    norm: LayerNorm,
+    head: Linear,
+    window: i64,
+    slots: i64,
+}
+
+impl SwapFusion {
+    /// Variables `layers` and `mlp_head` below `path`. `config` is valid; `masked` says which of the two networks of the
+    /// reference the names are of.
+    #[must_use]
+    pub fn new(path: &nn::Path<'_>, config: &CobevtConfig, masked: bool) -> Self {
+        let mut halves = Vec::with_capacity(2 * config.depth);
+        for layer in 0..config.depth {
+            let path = path / "layers" / layer;
+            let names = if masked {
+                ["window_attention", "window_ffd", "grid_attention", "grid_ffd"].map(|name| &path / name)
+            } else {
+                [1, 2, 5, 6].map(|index| &path / "block" / index)
+            };
+            halves.push(HalfBlock::new(Partition::Window, &names[0], &names[1], config));
+            halves.push(HalfBlock::new(Partition::Grid, &names[2], &names[3], config));
+        }
+        let head = path / "mlp_head";
+        Self {
+            halves,
+            norm: LayerNorm::new(&(&head / 2), config.channels),
+            head: Linear::new(&(&head / 3), config.channels, config.channels, true),
+            window: config.window,
+            slots: config.slots,
+        }
+    }
+
+    /// Number of agents that its table of offsets was made for.
+    #[must_use]
+    pub fn slots(&self) -> i64 {
+        self.slots
+    }
+
+    /// Fuses `[S, C, H, W]` into `[C, H, W]`. H and W are multiples of the window; the first slot reaches every cell.
+    ///
+    /// # Errors
+    /// [`TchError`] when shapes do not fit.
+    pub fn forward(&self, maps: &Tensor, slots: Slots<'_>, train: bool) -> Result<Tensor, TchError> {
+        let last = self.halves.len();
+        self.head(&self.through(maps, slots, last, train)?, slots)
+    }
+
+    /// All slots `[S, C, H, W]` after the first `layers` layers.
+    ///
+    /// # Errors
+    /// [`TchError`] when shapes do not fit.
+    pub fn after_layers(&self, maps: &Tensor, slots: Slots<'_>, layers: usize) -> Result<Tensor, TchError> {
+        self.through(maps, slots, 2 * layers, false)?.f_permute([0, 3, 1, 2])?.f_contiguous()
+    }
+
+    /// All slots after the first `halves` half blocks: `[S, C, H, W]` to `[S, H, W, C]`.
+    fn through(&self, maps: &Tensor, slots: Slots<'_>, halves: usize, train: bool) -> Result<Tensor, TchError> {
+        let map = maps.f_permute([0, 2, 3, 1])?.f_contiguous()?;
+        let size = [map.size()[1], map.size()[2]];
+        let mut x = map;
+        let mut lies_in = None;
+        for half in &self.halves[..halves.min(self.halves.len())] {
+            x = if train {
+                self.whole(half, &x, lies_in, slots, size)?
+            } else {
+                self.chunked(half, &x, lies_in, slots, size)?
+            };
+            lies_in = Some(half.partition);
+        }
+        lies_in.map_or_else(|| Ok(x.shallow_clone()), |partition| partition.map(&x, size, self.window))
+    }
+
+    /// A half block on all groups at once, by moves that gradients go back through quickly.
+    fn whole(
+        &self,
+        half: &HalfBlock,
+        x: &Tensor,
+        lies_in: Option<Partition>,
+        slots: Slots<'_>,
+        size: [i64; 2],
+    ) -> Result<Tensor, TchError> {
+        let map = lies_in.map_or_else(|| Ok(x.shallow_clone()), |partition| partition.map(x, size, self.window))?;
+        let x = half.partition.cut(&map, self.window)?;
+        let bias = half.attention.bias(x.size()[1], slots.asked)?;
+        let bias = match self.unseen(half.partition, slots)? {
+            Some(unseen) => bias.f_unsqueeze(0)? + unseen,
+            None => bias.f_unsqueeze(0)?,
+        };
+        half.forward(&x, slots.asked, &bias, true)
+    }
+
+    /// The same some groups at a time, gathered from wherever they lie.
+    fn chunked(
+        &self,
+        half: &HalfBlock,
+        x: &Tensor,
+        lies_in: Option<Partition>,
+        slots: Slots<'_>,
+        size: [i64; 2],
+    ) -> Result<Tensor, TchError> {
+        let channels = x.size()[3];
+        let rows = x.f_view([-1, channels])?;
+        let total = rows.size()[0];
+        let cells = self.window * self.window;
+        let count = total / (size[0] * size[1]);
+        let order = Tensor::f_arange(total, (Kind::Int64, Device::Cpu))?.f_to_device(x.device())?;
+        let order = match lies_in {
+            Some(partition) => partition.map(&order.f_view([-1, count, cells, 1])?, size, self.window)?,
+            None => order.f_view([count, size[0], size[1], 1])?,
+        };
+        let order = half.partition.cut(&order, self.window)?.f_view([-1])?;
+        let bias = half.attention.bias(count, slots.asked)?.f_unsqueeze(0)?;
+        let unseen = self.unseen(half.partition, slots)?;
+        let step = (CHUNK / (count * cells)).max(1);
+        let mut done = Vec::new();
+        for (index, order) in order.f_split(step * count * cells, 0)?.iter().enumerate() {
+            let x = rows.f_index_select(0, order)?.f_view([-1, count, cells, channels])?;
+            let biased = match &unseen {
+                Some(unseen) => Some(&bias + unseen.f_narrow(0, index as i64 * step, x.size()[0])?),
+                None => None,
+            };
+            done.push(half.forward(&x, slots.asked, biased.as_ref().unwrap_or(&bias), false)?);
+        }
+        Tensor::f_cat(&done, 0)
+    }
+
+    /// `[G, 1, 1, asked * P]`: 0 for tokens that are there, minus infinity for those that are not.
+    fn unseen(&self, partition: Partition, slots: Slots<'_>) -> Result<Option<Tensor>, TchError> {
+        let Some(reach) = slots.reach else { return Ok(None) };
+        let unseen = super::layers::unseen(&reach.f_narrow(0, 0, slots.asked)?.f_unsqueeze(3)?)?;
+        let tokens = slots.asked * self.window * self.window;
+        Ok(Some(partition.cut(&unseen, self.window)?.f_view([-1, 1, 1, tokens])?))
+    }
+
+    /// The mean over the slots, normalised and projected: `[S, H, W, C]` to `[C, H, W]`.
+    fn head(&self, x: &Tensor, slots: Slots<'_>) -> Result<Tensor, TchError> {
+        let mean = match slots.reach {
+            Some(reach) if !slots.count_missing => {
+                let reach = reach.f_unsqueeze(3)?.f_to_kind(x.kind())?;
+                let count = reach.f_sum_dim_intlist([0i64].as_slice(), false, None::<Kind>)?;
+                (x * reach).f_sum_dim_intlist([0i64].as_slice(), false, None::<Kind>)? / count
+            }
+            _ => x.f_mean_dim([0i64].as_slice(), false, None::<Kind>)?,
+        };
+        self.head.forward(&self.norm.forward(&mean)?)?.f_permute([2, 0, 1])?.f_contiguous()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn both_partitions_lead_back() {
+        let map = Tensor::randn([2, 6, 9, 4], (Kind::Float, Device::Cpu));
+        for partition in [Partition::Window, Partition::Grid] {
+            let groups = partition.cut(&map, 3).unwrap();
+            assert_eq!(groups.size(), [6, 2, 9, 4]);
+            assert_eq!(partition.map(&groups, [6, 9], 3).unwrap(), map, "{partition:?}");
+        }
+    }
+
+    #[test]
+    fn windows_are_neighbours_and_grids_are_spread() {
+        let map = Tensor::arange(36, (Kind::Int64, Device::Cpu)).view([1, 6, 6, 1]);
+        let first =
+            |partition: Partition| Vec::<i64>::try_from(partition.cut(&map, 2).unwrap().get(0).view(-1)).unwrap();
+        assert_eq!(first(Partition::Window), [0, 1, 6, 7]);
+        assert_eq!(first(Partition::Grid), [0, 3, 18, 21]);
+    }
+}
