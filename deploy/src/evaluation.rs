@@ -25,6 +25,8 @@ pub struct EvaluationOptions {
     pub pose_source: PoseSourceConfig,
     /// How feature maps are written.
     pub codec: CodecConfig,
+    /// How long messages of neighbours are under way, nanoseconds.
+    pub delay_nanos: u64,
     /// Frames to judge at most, over all scenarios.
     pub frames: Option<usize>,
 }
@@ -72,6 +74,7 @@ pub fn evaluate(
         pose_source: options.pose_source.clone(),
         codec: options.codec,
         rule: None,
+        delay_nanos: options.delay_nanos,
     })?;
     let grid = evaluator.ego().detector().config().feature_grid();
     let channels = evaluator.ego().detector().config().feature_channels();

@@ -15,6 +15,7 @@ use protocol::{BevGrid, CavId, DecodedFeatures, Detection, DropReason, PointClou
 use tch::{Kind, TchError, Tensor, no_grad};
 
 use crate::fusion::{FusionStage, StageError, ViewFacts};
+use crate::history::{History, KeptMap};
 use crate::method::{Exchange, Method, UnknownMethod};
 use crate::model::{METHOD_KEY, SCORE_THRESHOLD};
 use crate::samples::merge_points;
@@ -27,10 +28,18 @@ pub struct View {
     pub cav: CavId,
     /// Where it believes to be.
     pub pose: PoseEstimate,
-    /// Capture time of the ego's sweep less that of this view's, nanoseconds; 0 for the ego.
-    pub age_nanos: i64,
+    /// Capture time of the sweep, nanoseconds.
+    pub capture_nanos: u64,
     /// What it sees, in its own LiDAR frame.
     pub content: Content,
+}
+
+impl View {
+    /// How much older it is than another, nanoseconds.
+    #[must_use]
+    pub fn age_nanos(&self, newer: &Self) -> i64 {
+        newer.capture_nanos as i64 - self.capture_nanos as i64
+    }
 }
 
 /// What crosses the air, by method.
@@ -129,6 +138,7 @@ pub struct Ego {
     method: Method,
     detector: Detector,
     fusion: FusionStage,
+    history: History,
     limits: PostprocessConfig,
     comm_range_m: f64,
 }
@@ -165,7 +175,8 @@ impl Ego {
     fn assembled(detector: Detector, method: Method, fusion: FusionStage) -> Self {
         let limits = PostprocessConfig::for_detector(detector.config());
         let limits = PostprocessConfig { score_threshold: SCORE_THRESHOLD, ..limits };
-        Self { method, detector, fusion, limits, comm_range_m: Self::COMM_RANGE_M }
+        let history = History::new(fusion.frames());
+        Self { method, detector, fusion, history, limits, comm_range_m: Self::COMM_RANGE_M }
     }
 
     /// The same with other limits of the clean-up.
@@ -192,6 +203,11 @@ impl Ego {
         &self.detector
     }
 
+    /// Forgets the maps of earlier frames: another scene begins.
+    pub fn forget(&mut self) {
+        self.history.clear();
+    }
+
     /// Detects around the ego. Neighbours that cannot be used are left out; with none left the ego goes on alone.
     ///
     /// # Errors
@@ -201,6 +217,7 @@ impl Ego {
         if own.content.exchange() != needed {
             return Err(EgoError::OwnContent { method: self.method, needed, found: own.content.exchange() });
         }
+        self.history.advance(own.capture_nanos);
         let mut aligned = vec![Aligned { view: own, ego_from_cav: Pose::IDENTITY }];
         let mut fused = Vec::new();
         let mut skipped = Vec::new();
@@ -255,30 +272,72 @@ impl Ego {
     }
 
     /// Intermediate fusion, and the ego alone.
-    fn merge_features(&self, aligned: &[Aligned<'_>], stages: &mut Stages) -> Result<Vec<Detection>, EgoError> {
-        let mut maps = Vec::with_capacity(aligned.len());
-        let mut sent = Vec::with_capacity(aligned.len());
+    fn merge_features(&mut self, aligned: &[Aligned<'_>], stages: &mut Stages) -> Result<Vec<Detection>, EgoError> {
+        let (mut maps, mut sent) = (Vec::with_capacity(aligned.len()), Vec::with_capacity(aligned.len()));
         for Aligned { view, .. } in aligned {
             let Content::Features(map) = &view.content else { continue };
-            if !self.is_own_shape(map) {
-                return Err(EgoError::OwnMap {
-                    channels: map.features.channels,
-                    found: map.features.grid,
-                    expected_channels: self.detector.map_shape()[0],
-                    expected: self.detector.grid(),
-                });
-            }
-            let [channels, height, width] = self.detector.map_shape();
-            maps.push(Tensor::f_from_slice(&map.features.values)?.f_view([1, channels, height, width])?);
-            sent.push(sent_cells(map, maps.len() == 1, [height, width])?);
+            let (values, cells) = self.tensors(map, maps.is_empty())?;
+            maps.push(values);
+            sent.push(cells);
         }
-        let (maps, sent) = (Tensor::f_cat(&maps, 0)?, Tensor::f_cat(&sent, 0)?);
-        let facts: Vec<ViewFacts> = aligned.iter().enumerate().map(|(agent, view)| view.facts(agent)).collect();
-        let maps = self.fusion.align(&maps, Some(&sent), &facts)?;
+        let newest = maps.len();
+        let mut facts: Vec<ViewFacts> =
+            aligned.iter().enumerate().map(|(agent, view)| view.facts(agent, aligned[0].view)).collect();
+        for (agent, kept, ego_from_cav) in self.earlier(aligned) {
+            maps.push(kept.map.shallow_clone());
+            sent.push(kept.sent.shallow_clone());
+            let age_nanos = aligned[0].view.capture_nanos as i64 - kept.capture_nanos as i64;
+            facts.push(ViewFacts {
+                agent,
+                ego_from_cav,
+                confidence: kept.confidence,
+                age_secs: age_nanos as f64 * 1e-9,
+            });
+        }
+        let moved = self.fusion.align(&Tensor::f_cat(&maps, 0)?, Some(&Tensor::f_cat(&sent, 0)?), &facts)?;
         stages.lap("align");
-        let fused = self.fusion.fuse(&maps, &facts, false)?.f_unsqueeze(0)?.f_contiguous()?;
+        let fused = self.fusion.fuse(&moved, &facts, false)?.f_unsqueeze(0)?.f_contiguous()?;
         stages.lap("fuse");
+        maps.truncate(newest);
+        self.keep(aligned, maps.into_iter().zip(sent));
         self.boxes_of(&fused, stages)
+    }
+
+    /// A map `[1, C, H, W]` and what was sent of it `[1, 1, H, W]`.
+    fn tensors(&self, map: &DecodedFeatures, is_ego: bool) -> Result<(Tensor, Tensor), EgoError> {
+        let [channels, height, width] = self.detector.map_shape();
+        if !self.is_own_shape(map) {
+            return Err(EgoError::OwnMap {
+                channels: map.features.channels,
+                found: map.features.grid,
+                expected_channels: channels,
+                expected: self.detector.grid(),
+            });
+        }
+        let values = Tensor::f_from_slice(&map.features.values)?.f_view([1, channels, height, width])?;
+        Ok((values, sent_cells(map, is_ego, [height, width])?))
+    }
+
+    /// The kept maps of the vehicles that take part, and where they belong now. An ego that does not know where it is
+    /// cannot say.
+    fn earlier(&self, aligned: &[Aligned<'_>]) -> Vec<(usize, &KeptMap, Pose)> {
+        let Some(world_from_ego) = aligned[0].view.pose.world_from_cav() else { return Vec::new() };
+        let of_agent = |(agent, Aligned { view, .. }): (usize, &Aligned<'_>)| {
+            let place = |kept: &KeptMap| world_from_ego.from_world(&kept.world_from_cav);
+            let kept = self.history.before(&view.cav, view.capture_nanos);
+            kept.map(|kept| (agent, kept, place(kept))).collect::<Vec<_>>()
+        };
+        aligned.iter().enumerate().flat_map(of_agent).collect()
+    }
+
+    /// Keeps the maps of this frame for those to come.
+    fn keep(&mut self, aligned: &[Aligned<'_>], maps: impl Iterator<Item = (Tensor, Tensor)>) {
+        for (Aligned { view, .. }, (map, sent)) in aligned.iter().zip(maps) {
+            let Some(world_from_cav) = view.pose.world_from_cav().copied() else { continue };
+            let confidence = f64::from(view.pose.confidence());
+            let kept = KeptMap { capture_nanos: view.capture_nanos, world_from_cav, confidence, map, sent };
+            self.history.keep(&view.cav, kept);
+        }
     }
 
     /// Early fusion: one cloud in the ego frame.
@@ -342,9 +401,10 @@ struct Aligned<'a> {
 }
 
 impl Aligned<'_> {
-    fn facts(&self, agent: usize) -> ViewFacts {
+    fn facts(&self, agent: usize, ego: &View) -> ViewFacts {
         let confidence = f64::from(self.view.pose.confidence());
-        ViewFacts { agent, ego_from_cav: self.ego_from_cav, confidence, age_secs: self.view.age_nanos as f64 * 1e-9 }
+        let age_secs = self.view.age_nanos(ego) as f64 * 1e-9;
+        ViewFacts { agent, ego_from_cav: self.ego_from_cav, confidence, age_secs }
     }
 }
 

@@ -1,8 +1,9 @@
 //! A method on recorded scenes, frame by frame, through the same code and the same messages as in a live run.
 //!
 //! Every vehicle runs an [`Agent`]; what it would publish is encoded, weighed and decoded again; the [`Ego`] detects.
-//! Nothing is late and nothing is lost, so a live run paced like that gives the same boxes.
+//! Nothing is lost, and nothing is late unless asked for, so a live run paced like that gives the same boxes.
 
+use std::collections::VecDeque;
 use std::ops::ControlFlow;
 use std::path::PathBuf;
 
@@ -33,6 +34,8 @@ pub struct EvaluateConfig {
     pub codec: CodecConfig,
     /// Which objects count; absent: those wholly over the area of the network, of all vehicles within 70 m.
     pub rule: Option<GroundTruthRule>,
+    /// How long messages of neighbours are under way, nanoseconds: the ego fuses the newest that are at least so old.
+    pub delay_nanos: u64,
 }
 
 /// Why an evaluation ended early.
@@ -80,6 +83,8 @@ pub struct Evaluator {
     weights: Weights,
     ego: Ego,
     rule: GroundTruthRule,
+    /// What the neighbours have sent, oldest first; the first is what has arrived last, or has not arrived yet.
+    under_way: VecDeque<Vec<Sent>>,
 }
 
 impl Evaluator {
@@ -90,7 +95,7 @@ impl Evaluator {
     pub fn new(config: EvaluateConfig) -> Result<Self, EvaluateError> {
         let ego = Ego::load(&config.weights, config.method)?;
         let rule = config.rule.unwrap_or_else(|| rule_of(ego.detector()));
-        Ok(Self { weights: Weights::load(&config.weights)?, ego, rule, config })
+        Ok(Self { weights: Weights::load(&config.weights)?, ego, rule, config, under_way: VecDeque::new() })
     }
 
     /// The ego's pipeline.
@@ -114,11 +119,14 @@ impl Evaluator {
         scenario: &Scenario,
         on_frame: &mut dyn FnMut(EvaluatedFrame) -> ControlFlow<()>,
     ) -> Result<ControlFlow<()>, EvaluateError> {
+        self.ego.forget();
+        self.under_way.clear();
+        let pose_source = self.config.pose_source.for_scenario(&scenario.name);
         let detector_config = self.weights.config()?;
         let mut agents = Vec::with_capacity(scenario.agents.len());
         for cav in &scenario.agents {
             let detector = Detector::from_weights(&self.weights, &detector_config)?;
-            agents.push(Agent::new(cav.clone(), self.config.pose_source.build()?, detector));
+            agents.push(Agent::new(cav.clone(), pose_source.build()?, detector));
         }
         for tick in 0..scenario.ticks.len() {
             let frames: Result<Vec<Frame>, _> =
@@ -145,23 +153,19 @@ impl Evaluator {
             sent.push(view(agent, frame, is_needed.then_some(exchange), &self.config.codec)?);
         }
         let poses = sent.iter().map(|sent| sent.pose).collect();
-        let own_age = |frame: &Frame| frames[0].capture_nanos as i64 - frame.capture_nanos as i64;
-        let mut views = Vec::with_capacity(sent.len());
-        let mut bytes = Vec::with_capacity(sent.len());
-        for (sent, frame) in sent.into_iter().zip(&frames) {
-            let Some(content) = sent.content else { continue };
-            bytes.push((sent.payload_bytes, sent.wire_bytes));
-            views.push(View { cav: frame.cav.clone(), pose: sent.pose, age_nanos: own_age(frame), content });
-        }
-        let (own, neighbours) = views.split_first().expect("the ego is needed by every method");
-        let output = self.ego.detect(own, neighbours)?;
+        let own = sent.remove(0);
+        let own = own.view().expect("the ego is needed by every method");
+        self.under_way.push_back(sent);
+        let (neighbours, bytes): (Vec<View>, Vec<_>) =
+            self.arrived(own.capture_nanos).iter().filter_map(Sent::heard).unzip();
+        let output = self.ego.detect(&own, &neighbours)?;
         let fused = (output.fused.iter())
             .map(|&index| FusedNeighbour {
                 cav: neighbours[index].cav.clone(),
-                age_nanos: neighbours[index].age_nanos,
+                age_nanos: neighbours[index].age_nanos(&own),
                 confidence: neighbours[index].pose.confidence(),
-                payload_bytes: bytes[index + 1].0,
-                wire_bytes: bytes[index + 1].1,
+                payload_bytes: bytes[index].0,
+                wire_bytes: bytes[index].1,
             })
             .collect();
         let skipped = output.skipped.iter().map(|&(index, reason)| SkippedNeighbour {
@@ -186,6 +190,18 @@ impl Evaluator {
         let stamp = stamp(&own.cav, frames[0].capture_nanos);
         Ok(EvaluatedFrame { stamp, result, frames, poses, objects })
     }
+
+    /// What the neighbours sent last of all that has arrived; nothing where all is still under way.
+    fn arrived(&mut self, now_nanos: u64) -> &[Sent] {
+        let delay_nanos = self.config.delay_nanos;
+        let has_arrived = |sent: &Vec<Sent>| {
+            sent.iter().all(|sent| sent.capture_nanos.saturating_add(delay_nanos) <= now_nanos) && !sent.is_empty()
+        };
+        while self.under_way.get(1).is_some_and(has_arrived) {
+            self.under_way.pop_front();
+        }
+        self.under_way.front().filter(|sent| has_arrived(sent)).map_or(&[], Vec::as_slice)
+    }
 }
 
 /// The objects of all vehicles within 70 m that lie wholly over the area of a detector.
@@ -202,11 +218,27 @@ pub fn rule_of(detector: &Detector) -> GroundTruthRule {
 }
 
 /// What a vehicle sends for one frame.
+#[derive(Debug)]
 struct Sent {
+    cav: CavId,
+    capture_nanos: u64,
     pose: PoseEstimate,
     content: Option<Content>,
     payload_bytes: u64,
     wire_bytes: u64,
+}
+
+impl Sent {
+    /// As the ego sees it; nothing where nothing was sent.
+    fn view(&self) -> Option<View> {
+        let Self { cav, capture_nanos, pose, content, .. } = self;
+        Some(View { cav: cav.clone(), pose: *pose, capture_nanos: *capture_nanos, content: content.clone()? })
+    }
+
+    /// The same, with payload and wire bytes.
+    fn heard(&self) -> Option<(View, (u64, u64))> {
+        Some((self.view()?, (self.payload_bytes, self.wire_bytes)))
+    }
 }
 
 fn view(
@@ -223,8 +255,16 @@ fn view(
     let pose = agent.estimate_pose(&input);
     let stamp = stamp(agent.cav(), frame.capture_nanos);
     let (_, pose_bytes) = through_the_wire(&stamp, pose)?;
+    let sent = |content, payload_bytes, wire_bytes| Sent {
+        cav: frame.cav.clone(),
+        capture_nanos: frame.capture_nanos,
+        pose,
+        content,
+        payload_bytes,
+        wire_bytes,
+    };
     let (content, bytes) = match exchange {
-        None => return Ok(Sent { pose, content: None, payload_bytes: 0, wire_bytes: 0 }),
+        None => return Ok(sent(None, 0, 0)),
         Some(Exchange::Points) => {
             let points = agent.detector().crop().without_own_body(&frame.points);
             let (message, bytes) = through_the_wire(&stamp, Points { pose, points })?;
@@ -242,8 +282,7 @@ fn view(
             (Content::Features(message.features.decode(&Limits::default())?), bytes)
         }
     };
-    let payload_bytes = bytes - HEADER_LEN as u64;
-    Ok(Sent { pose, content: Some(content), payload_bytes, wire_bytes: bytes + pose_bytes })
+    Ok(sent(Some(content), bytes - HEADER_LEN as u64, bytes + pose_bytes))
 }
 
 /// Encodes and decodes a message; its size on the wire.

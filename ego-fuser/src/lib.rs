@@ -13,6 +13,7 @@ pub mod average_precision;
 pub mod ego;
 pub mod evaluate;
 pub mod fusion;
+mod history;
 pub mod loss;
 pub mod method;
 pub mod model;

@@ -183,7 +183,7 @@ fn play_offline(scenario: &Scenario, method: Method) -> Vec<(u64, Vec<Detection>
                         Content::Features(DecodedFeatures { features: output.perception.features, sent: None })
                     }
                 };
-                View { cav: agent.cav().clone(), pose: output.pose, age_nanos: 0, content }
+                View { cav: agent.cav().clone(), pose: output.pose, capture_nanos: tick.capture_nanos, content }
             })
             .collect();
         let detected = ego.detect(&views[0], &views[1..]).unwrap();

@@ -85,7 +85,7 @@ fn run(config: &TrainConfig) -> (Summary, Ear) {
 fn evaluate(weights: PathBuf, scene: &Path, method: Method, dtype: Dtype) -> Vec<EvaluatedFrame> {
     let codec = CodecConfig { dtype, ..CodecConfig::default() };
     let pose_source = PoseSourceConfig::Recorded;
-    let config = EvaluateConfig { weights, method: Some(method), pose_source, codec, rule: None };
+    let config = EvaluateConfig { weights, method: Some(method), pose_source, codec, rule: None, delay_nanos: 0 };
     let mut evaluator = Evaluator::new(config).unwrap();
     let mut frames = Vec::new();
     for scenario in &dataset::open(scene).unwrap().scenarios {

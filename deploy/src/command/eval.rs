@@ -3,7 +3,9 @@
 use std::path::PathBuf;
 
 use agent::pose_source::sanity::SanityConfig;
-use agent::pose_source::{EndToEndPoseConfig, NoiseMode, NoisyPoseConfig, PgcConfig, PoseSourceConfig};
+use agent::pose_source::{
+    CachedPoseConfig, EndToEndPoseConfig, NoiseMode, NoisyPoseConfig, PgcConfig, PoseSourceConfig,
+};
 use clap::ValueEnum;
 use deploy::evaluation::{EvaluationOptions, evaluate, frame_count};
 use deploy::report;
@@ -48,6 +50,12 @@ pub(crate) struct Arguments {
     /// Weights of a network that was trained end to end (--pose-source end-to-end).
     #[arg(long, value_name = "FILE", required_if_eq("pose_source", "end-to-end"))]
     end_to_end: Option<PathBuf>,
+    /// A table of poses that `agent localize` wrote (--pose-source cached).
+    #[arg(long, value_name = "FILE", required_if_eq("pose_source", "cached"))]
+    poses: Option<PathBuf>,
+    /// How long messages of neighbours are under way, milliseconds.
+    #[arg(long, value_name = "MS", default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=10_000))]
+    delay: u64,
     /// How exactly feature values cross the air.
     #[arg(long, value_enum, default_value_t = Exactness::F32)]
     dtype: Exactness,
@@ -78,6 +86,8 @@ enum PoseFrom {
     Pgc,
     /// The same by a network that was trained end to end, to compare with.
     EndToEnd,
+    /// Found before, from a table.
+    Cached,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -135,6 +145,7 @@ impl Arguments {
                 budget_bytes: self.budget,
                 zstd_level: self.zstd,
             },
+            delay_nanos: self.delay * 1_000_000,
             frames: self.frames.map(|frames| usize::try_from(frames).unwrap_or(usize::MAX)),
         })
     }
@@ -167,6 +178,10 @@ impl Arguments {
                     sanity: SanityConfig::default(),
                 })),
                 None => Err(BadInput("--pose-source end-to-end needs --end-to-end".into())),
+            },
+            PoseFrom::Cached => match &self.poses {
+                Some(file) => Ok(PoseSourceConfig::Cached(CachedPoseConfig { file: file.clone(), scenario: None })),
+                None => Err(BadInput("--pose-source cached needs --poses".into())),
             },
         }
     }

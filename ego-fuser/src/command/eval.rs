@@ -52,6 +52,7 @@ impl Arguments {
                 pose_source: PoseSourceConfig::Recorded,
                 codec: CodecConfig::default(),
                 rule: None,
+                delay_nanos: 0,
             };
             rows.push(evaluate(config, &scenarios, self.frames.unwrap_or(usize::MAX), self.json)?);
         }

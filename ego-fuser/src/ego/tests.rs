@@ -8,6 +8,9 @@ use tch::nn::VarStore;
 
 use super::*;
 
+/// Capture time of all sweeps but those that say otherwise.
+const NOW: u64 = 5_000_000_000;
+
 const HERE: Pose = Pose { translation_m: [100.0, 50.0, 2.0], rotation_wxyz: [1.0, 0.0, 0.0, 0.0] };
 
 /// The same network every time, with a head that believes in vehicles, so that there is something to clean up.
@@ -52,7 +55,7 @@ fn view(name: &str, world_from_cav: Pose, method: Method, phase: f32) -> View {
         Exchange::Points => Content::Points(agent.detector().crop().without_own_body(&cloud)),
         _ => Content::Features(DecodedFeatures { features: output.perception.features, sent: None }),
     };
-    View { cav, pose: output.pose, age_nanos: 0, content }
+    View { cav, pose: output.pose, capture_nanos: NOW, content }
 }
 
 fn near() -> Pose {
@@ -84,7 +87,7 @@ fn late_fusion_moves_boxes_and_keeps_the_better_of_two() {
     let boxes = |name: &str, world_from_cav: Pose, found: Vec<Detection>| View {
         cav: CavId::new(name).unwrap(),
         pose: PoseEstimate::new(world_from_cav, 1.0),
-        age_nanos: 0,
+        capture_nanos: NOW,
         content: Content::Boxes(found),
     };
     // The other stands 4 m ahead: its box at 1 m is the ego's at 5 m, the one at -10 m only it has seen.
@@ -148,4 +151,37 @@ fn maps_of_another_network_are_left_out_and_named_where_they_are_the_egos_own() 
     let boxes = View { content: Content::Boxes(vec![]), ..own.clone() };
     assert!(matches!(ego.detect(&boxes, &[]), Err(EgoError::OwnContent { .. })));
     assert_eq!(ego.detect(&own, &[boxes]).unwrap().skipped, [(0, Skipped::Unusable(DropReason::Shape))]);
+}
+
+#[test]
+fn maps_of_earlier_frames_are_moved_by_the_egos_motion_and_come_in_once() {
+    let mut ego = Ego::new(detector(), Method::Pastat).unwrap();
+    assert_eq!(ego.fusion.frames(), 3);
+    let at = |frame: u64, x: f64| View {
+        capture_nanos: NOW + frame * 100_000_000,
+        pose: PoseEstimate::new(Pose::from_xyz_yaw([100.0 + x, 50.0, 2.0], 0.0), 0.9),
+        ..view("a", HERE, Method::Pastat, 0.0)
+    };
+    let other = view("b", near(), Method::Pastat, 0.15);
+    let (first, second) = (at(0, 0.0), at(1, 2.0));
+    ego.detect(&first, std::slice::from_ref(&other)).unwrap();
+    // The neighbour has nothing new to say: its message serves again, and is not its own history.
+    let aligned = |own, other| {
+        vec![Aligned { view: own, ego_from_cav: Pose::IDENTITY }, Aligned { view: other, ego_from_cav: Pose::IDENTITY }]
+    };
+    let earlier = ego.earlier(&aligned(&second, &other)).into_iter().map(|(agent, _, pose)| (agent, pose));
+    let earlier: Vec<_> = earlier.collect();
+    assert_eq!(earlier.len(), 1);
+    let (agent, place) = earlier[0];
+    assert_eq!(agent, 0);
+    assert!((place.translation_m[0] + 2.0).abs() < 1e-9, "what was here lies 2 m behind now");
+    ego.detect(&second, std::slice::from_ref(&other)).unwrap();
+    let later = View { capture_nanos: NOW + 150_000_000, ..view("b", near(), Method::Pastat, 0.15) };
+    let third = at(2, 4.0);
+    let agents: Vec<usize> = ego.earlier(&aligned(&third, &later)).into_iter().map(|found| found.0).collect();
+    assert_eq!(agents, [0, 0, 1]);
+    let lost = View { pose: PoseEstimate::NoPose { reason: NoPoseReason::NoSource, inlier_count: 0 }, ..third.clone() };
+    assert!(ego.earlier(&aligned(&lost, &later)).is_empty());
+    ego.forget();
+    assert!(ego.earlier(&aligned(&third, &later)).is_empty());
 }

@@ -25,7 +25,7 @@ impl Node<'_> {
         let transport = unix_nanos().saturating_sub(arrival.header.stamp.publish_nanos);
         self.bus.books().timed(&format!("{} transport", self.stream), Duration::from_nanos(transport));
         let capture_nanos = arrival.header.stamp.capture_nanos;
-        let view = View { cav: cav.clone(), pose, age_nanos: 0, content };
+        let view = View { cav: cav.clone(), pose, capture_nanos, content };
         if *cav == self.cav {
             let frame_index = arrival.header.stamp.sequence;
             self.frames.push_back(OwnFrame { frame_index, capture_nanos, begun: arrival.at, view });

@@ -62,7 +62,7 @@ impl Node<'_> {
             Ok(EgoOutput { detections, fused, skipped, stages }) => {
                 self.bus.books().received(&own_topic);
                 self.leave_out(&skipped, &mut choice);
-                let fused = self.take_in(&fused, &choice);
+                let fused = self.take_in(&own, &fused, &choice);
                 let stages = std::iter::once(StageTiming::new("wait", waited)).chain(stages).collect();
                 let result = Detections {
                     ego: self.cav.clone(),
@@ -81,7 +81,7 @@ impl Node<'_> {
                 self.report.failed += 1;
                 self.bus.books().dropped(&own_topic, DropReason::Shape);
                 // Nothing is wrong with the neighbours' messages.
-                self.take_in(&(0..choice.views.len()).collect::<Vec<_>>(), &choice);
+                self.take_in(&own, &(0..choice.views.len()).collect::<Vec<_>>(), &choice);
             }
         }
     }
@@ -90,9 +90,9 @@ impl Node<'_> {
     fn choose(&mut self, capture_nanos: u64) -> Choice {
         let (paired, dropped) = self.pairing.pair(capture_nanos);
         let mut choice = Choice::default();
-        for Paired { age_nanos, is_first_use, message, .. } in paired {
+        for Paired { is_first_use, message, .. } in paired {
             // A copy, as the message may serve the next frame too.
-            choice.views.push(View { age_nanos, ..message.view.clone() });
+            choice.views.push(message.view.clone());
             let (payload_bytes, wire_bytes) = (message.payload_bytes, message.wire_bytes);
             choice.books.push(Booking { is_first_use, payload_bytes, wire_bytes });
         }
@@ -112,13 +112,14 @@ impl Node<'_> {
     }
 
     /// Books the views that are in the result, and describes them.
-    fn take_in(&mut self, fused: &[usize], choice: &Choice) -> Vec<FusedNeighbour> {
+    fn take_in(&mut self, own: &View, fused: &[usize], choice: &Choice) -> Vec<FusedNeighbour> {
         self.report.fused += fused.len() as u64;
         let describe = |&index: &usize| {
-            let View { cav, pose, age_nanos, .. } = &choice.views[index];
+            let view = &choice.views[index];
+            let View { cav, pose, .. } = view;
             let Booking { is_first_use, payload_bytes, wire_bytes } = choice.books[index];
             self.settle(cav, is_first_use, None);
-            let (cav, age_nanos, confidence) = (cav.clone(), *age_nanos, pose.confidence());
+            let (cav, age_nanos, confidence) = (cav.clone(), view.age_nanos(own), pose.confidence());
             FusedNeighbour { cav, age_nanos, confidence, payload_bytes, wire_bytes }
         };
         fused.iter().map(describe).collect()
