@@ -12,12 +12,12 @@ use super::options::{Subset, SynthOptions};
 use super::positioning::{Fix, Positioning};
 use super::protocol_file::protocol_yaml;
 use super::radar::Radar;
-use super::random::derive_seed;
 use super::recording::{RecordedFrame, Recording, SceneSpec, record};
 use super::traffic::STEP_S;
 use super::vehicle::Vehicle;
 use super::world::World;
 use super::writer::{AgentFolder, Annotation, FrameFacts, make_folder, write_file};
+use crate::random::derive_seed;
 use crate::town::{self, Town, TownSource};
 
 /// The farthest that any sensor looks, metres.

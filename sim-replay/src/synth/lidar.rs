@@ -5,8 +5,8 @@ use std::f32::consts::{PI, TAU};
 use nalgebra::Vector3;
 
 use super::cast::{Body, Caster, GROUND, MISS, RayPattern, Surface, Sweep};
-use super::random::SplitMix64;
 use super::weather::{Echo, Weather};
+use crate::random::SplitMix64;
 
 /// Where the LiDAR sits on its vehicle: x forward, y left, z up from the ground under the middle, metres.
 pub const LIDAR_MOUNT_M: [f64; 3] = [-0.5, 0.0, 1.95];

@@ -25,7 +25,6 @@ mod parking;
 mod positioning;
 mod protocol_file;
 pub mod radar;
-pub mod random;
 mod recording;
 mod terrain;
 mod traffic;

@@ -1,9 +1,9 @@
 //! Parked vehicles: which spots are taken, and by what.
 
 use super::cast::{Placement, wrapped};
-use super::random::SplitMix64;
 use super::traffic::Rectangle;
 use super::vehicle::Vehicle;
+use crate::random::SplitMix64;
 use crate::town::{LaneIndex, ParkingSpot, Town};
 
 /// Ids of parked vehicles begin here; the number of the spot is added.

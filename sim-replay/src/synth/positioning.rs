@@ -1,7 +1,7 @@
 //! GNSS and IMU of an agent, and the filter that estimates its pose from them.
 
 use super::cast::{Placement, wrapped};
-use super::random::SplitMix64;
+use crate::random::SplitMix64;
 
 /// Deviation of GNSS latitude and longitude, degrees (OpenCDA's set-up of the paper's recordings).
 const LATITUDE_DEG: f64 = 1e-6;

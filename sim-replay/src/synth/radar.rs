@@ -3,7 +3,7 @@
 use nalgebra::Vector3;
 
 use super::cast::{Body, Caster, GROUND, MISS, RayPattern, Surface, Sweep};
-use super::random::SplitMix64;
+use crate::random::SplitMix64;
 
 /// Radial velocities between plus and minus this fill the red channel, metres per second.
 ///

@@ -3,10 +3,10 @@
 use super::cast::{Placement, Sweep};
 use super::error::SynthError;
 use super::parking::{ParkedVehicle, park};
-use super::random::{SplitMix64, derive_seed};
 use super::traffic::{Rectangle, STEP_S, Traffic, TrafficOptions};
 use super::vehicle::{Vehicle, VehicleKind};
 use super::world::World;
+use crate::random::{SplitMix64, derive_seed};
 
 /// Agents farther than this from the ego do not hear it, metres.
 pub(crate) const COMM_RANGE_M: f64 = 70.0;

@@ -278,8 +278,8 @@ pub(crate) fn deck_shape(triangle: &Triangle) -> Option<(BodyShape, [f64; 3])> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::random::SplitMix64;
     use crate::synth::cast::{Body, Caster, Placement, Plane, RayPattern, Sweep};
-    use crate::synth::random::SplitMix64;
 
     fn hills(seed: u64) -> HeightGrid {
         let mut random = SplitMix64::new(seed);

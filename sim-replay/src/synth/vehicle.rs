@@ -3,7 +3,7 @@
 use std::f32::consts::PI;
 
 use super::cast::{BodyShape, Bounds, Part};
-use super::random::SplitMix64;
+use crate::random::SplitMix64;
 
 /// Kinds of vehicles on the roads of a town.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]

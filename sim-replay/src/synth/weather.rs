@@ -13,7 +13,7 @@
 
 use clap::ValueEnum;
 
-use super::random::SplitMix64;
+use crate::random::SplitMix64;
 
 /// Share of light that a target must throw back to be seen in clear air at [`CLEAR_RANGE_M`].
 const WEAKEST_REFLECTIVITY: f32 = 0.1;

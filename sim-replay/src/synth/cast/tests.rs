@@ -5,7 +5,7 @@ use std::f64::consts::PI;
 use nalgebra::{Point3, Vector3};
 
 use super::*;
-use crate::synth::random::SplitMix64;
+use crate::random::SplitMix64;
 
 fn spinning() -> RayPattern {
     RayPattern {

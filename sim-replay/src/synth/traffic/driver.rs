@@ -1,6 +1,6 @@
 //! How a driver chooses speed: the Intelligent Driver Model (Treiber, Hennecke and Helbing 2000) and bends.
 
-use crate::synth::random::SplitMix64;
+use crate::random::SplitMix64;
 use crate::town::Lane;
 
 /// Sideways acceleration that drivers accept in bends, metres per second squared.

@@ -6,7 +6,7 @@ use super::path::{Beside, Path};
 use super::rectangle::Rectangle;
 use super::roads::Roads;
 use super::{STEP_S, Traffic};
-use crate::synth::random::SplitMix64;
+use crate::random::SplitMix64;
 use crate::town::{Lane, LaneId};
 
 /// Duration of a change at an even speed, seconds.

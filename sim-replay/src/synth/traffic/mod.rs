@@ -25,7 +25,7 @@ use explorer::Explorer;
 use junction::RightOfWay;
 
 use super::cast::Sweep;
-use super::random::SplitMix64;
+use crate::random::SplitMix64;
 use crate::town::LaneId;
 
 /// Simulated time of one step, seconds: one turn of the LiDAR.

@@ -9,8 +9,8 @@ use super::path::Path;
 use super::rectangle::{NeighbourIndex, Rectangle};
 use super::roads::{Roads, Spawn};
 use super::{STEP_S, Traffic, TrafficOptions};
+use crate::random::SplitMix64;
 use crate::synth::cast::Sweep;
-use crate::synth::random::SplitMix64;
 use crate::synth::vehicle::Vehicle;
 
 /// New vehicles come in at most this far inside the edge, metres.

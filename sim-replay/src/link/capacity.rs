@@ -1,0 +1,136 @@
+//! How much could have crossed by when, in whole numbers, so that no rounding adds up.
+
+use super::config::CapacityConfig;
+use super::trace::{OPPORTUNITY_BYTES, Step, Trace};
+
+/// Work of one byte: 8 bits, times the nanoseconds of a second, so that bits per second times nanoseconds are work.
+const WORK_PER_BYTE: u128 = 8_000_000_000;
+
+/// What a link could do.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) enum Capacity {
+    /// Everything at once.
+    Unlimited,
+    /// A rate that stays, bit/s.
+    Constant(u64),
+    /// A rate that changes, with the work that is done before each step.
+    Steps(Vec<(Step, u128)>),
+    /// Moments, nanoseconds, repeated from the last one on.
+    Opportunities(Vec<u64>),
+}
+
+/// Work of so many bytes.
+pub(super) fn work(bytes: u64) -> u128 {
+    u128::from(bytes) * WORK_PER_BYTE
+}
+
+impl Capacity {
+    pub(super) fn new(config: &CapacityConfig, trace: Option<&Trace>) -> Self {
+        match (config, trace) {
+            (CapacityConfig::TokenBucket { rate_mbps, .. }, _) => Self::Constant((rate_mbps * 1e6).round() as u64),
+            (_, Some(Trace::Steps(steps))) => {
+                let mut done = 0;
+                let mut last: Option<&Step> = None;
+                let steps = steps.iter().map(|step| {
+                    if let Some(last) = last {
+                        done += u128::from(last.bits_per_s) * u128::from(step.from_nanos - last.from_nanos);
+                    }
+                    last = Some(step);
+                    (*step, done)
+                });
+                Self::Steps(steps.collect())
+            }
+            (_, Some(Trace::Opportunities(times))) => Self::Opportunities(times.clone()),
+            _ => Self::Unlimited,
+        }
+    }
+
+    /// Work that could be done from time 0 to `nanos`.
+    pub(super) fn done_by(&self, nanos: u64) -> u128 {
+        match self {
+            Self::Unlimited => 0,
+            Self::Constant(rate) => u128::from(*rate) * u128::from(nanos),
+            Self::Steps(steps) => {
+                let index = steps.partition_point(|(step, _)| step.from_nanos <= nanos).saturating_sub(1);
+                let (step, before) = &steps[index];
+                before + u128::from(step.bits_per_s) * u128::from(nanos - step.from_nanos)
+            }
+            Self::Opportunities(times) => {
+                let period = times[times.len() - 1];
+                let (rounds, rest) = (nanos / period, nanos % period);
+                let passed = times.partition_point(|&time| time <= rest) as u128;
+                (u128::from(rounds) * times.len() as u128 + passed) * work(OPPORTUNITY_BYTES)
+            }
+        }
+    }
+
+    /// When `work` will have been done; never where the rate stays 0.
+    pub(super) fn time_of(&self, wanted: u128) -> Option<u64> {
+        match self {
+            Self::Unlimited => Some(0),
+            Self::Constant(rate) => u64::try_from(wanted.div_ceil(u128::from(*rate))).ok(),
+            Self::Steps(steps) => {
+                let index = steps.partition_point(|(_, before)| *before < wanted).saturating_sub(1);
+                let (step, before) = &steps[index];
+                let left = wanted.saturating_sub(*before);
+                if left == 0 {
+                    return Some(step.from_nanos);
+                }
+                let nanos = left.checked_div(u128::from(step.bits_per_s))?;
+                let whole = nanos * u128::from(step.bits_per_s) == left;
+                step.from_nanos.checked_add(u64::try_from(nanos + u128::from(!whole)).ok()?)
+            }
+            Self::Opportunities(times) => {
+                let count = wanted.div_ceil(work(OPPORTUNITY_BYTES)).max(1) - 1;
+                let (rounds, place) = (count / times.len() as u128, (count % times.len() as u128) as usize);
+                let period = times[times.len() - 1];
+                u64::try_from(rounds).ok()?.checked_mul(period)?.checked_add(times[place])
+            }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn steps(rates: &[u64]) -> Capacity {
+        let step = |(index, &bits_per_s): (usize, &u64)| Step {
+            from_nanos: index as u64 * 700_000_000,
+            bits_per_s,
+            delay_ms: 0.0,
+            loss: 0.0,
+        };
+        let trace = Trace::Steps(rates.iter().enumerate().map(step).collect());
+        Capacity::new(&CapacityConfig::Trace("trace.csv".into()), Some(&trace))
+    }
+
+    proptest! {
+        #[test]
+        fn work_is_done_exactly_when_it_is_said_to_be(
+            rates in prop::collection::vec(0_u64..50_000_000, 1..6), bytes in 1_u64..10_000_000, constant in 1_u64..1_000_000_000,
+            mut times in prop::collection::vec(0_u64..5_000, 1..30),
+        ) {
+            times.sort_unstable();
+            times.push(5_001);
+            let times = times.iter().map(|ms| ms * 1_000_000).collect();
+            for capacity in [steps(&rates), Capacity::Constant(constant), Capacity::Opportunities(times)] {
+                let Some(nanos) = capacity.time_of(work(bytes)) else {
+                    prop_assert_eq!(rates.last(), Some(&0));
+                    continue;
+                };
+                prop_assert!(capacity.done_by(nanos) >= work(bytes), "{:?}", capacity);
+                prop_assert!(nanos == 0 || capacity.done_by(nanos - 1) < work(bytes), "{:?}", capacity);
+            }
+        }
+    }
+
+    #[test]
+    fn an_opportunity_is_repeated_after_the_last() {
+        let capacity = Capacity::Opportunities(vec![2, 2, 5]);
+        let times: Vec<_> = (1..=7).map(|packet| capacity.time_of(work(packet * 1500)).unwrap()).collect();
+        assert_eq!(times, [2, 2, 5, 7, 7, 10, 12]);
+    }
+}

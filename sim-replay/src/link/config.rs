@@ -1,0 +1,369 @@
+//! The numbers that define a link.
+
+use std::path::{Path, PathBuf};
+
+use serde::{Deserialize, Serialize};
+
+use super::trace::{Trace, TraceError};
+
+/// Payload of one fragment where loss is drawn per fragment, bytes: what fits an 802.11p frame with its headers.
+pub(super) const FRAGMENT_BYTES: u64 = 1400;
+
+/// Why no link can be made.
+#[derive(Debug, thiserror::Error)]
+pub enum LinkError {
+    /// A number is out of bounds.
+    #[error("link: {field} is {value}, must be {must}")]
+    Value {
+        /// Name of the field.
+        field: &'static str,
+        /// What stood there.
+        value: f64,
+        /// What would be right.
+        must: &'static str,
+    },
+    /// No preset has this name.
+    #[error("link: no preset is called {name:?}; there are {known}")]
+    Preset {
+        /// What was asked for.
+        name: String,
+        /// What there is.
+        known: String,
+    },
+    /// The delay or the loss is to come from a trace, but the capacity is not one of those.
+    #[error("link: {field} is trace, but capacity names no trace with such a column")]
+    NoTrace {
+        /// Name of the field.
+        field: &'static str,
+    },
+    /// The trace is not readable.
+    #[error(transparent)]
+    Trace(#[from] TraceError),
+}
+
+/// Who shares what.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Medium {
+    /// Every ordered pair of vehicles has a link of its own.
+    #[default]
+    PerPair,
+    /// All messages share one queue and one rate, as on one radio channel.
+    Shared,
+}
+
+/// How many bytes cross in how much time.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case", deny_unknown_fields)]
+pub enum CapacityConfig {
+    /// All at once.
+    #[default]
+    Unlimited,
+    /// A token bucket.
+    TokenBucket {
+        /// Long-run rate, Mbit/s.
+        rate_mbps: f64,
+        /// Bytes that may cross at once after a pause.
+        #[serde(default)]
+        burst_bytes: u64,
+    },
+    /// Rates over time from a CSV file: `time_s,rate_mbps,delay_ms,loss`.
+    Trace(PathBuf),
+    /// Delivery opportunities of 1,500 bytes each, as mahimahi records them: one line a packet, milliseconds; repeated.
+    Mahimahi(PathBuf),
+}
+
+/// What happens to those who have to wait.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct QueueConfig {
+    /// Bytes that may wait, without the message that is on its way.
+    pub bytes: u64,
+    /// Who goes when there is no room.
+    pub drop: QueueDrop,
+    /// Whether a newer message of the same stream takes the place of one that waits.
+    pub keep_newest: bool,
+    /// Messages of at most so many bytes do not wait behind larger ones.
+    pub urgent_bytes: u64,
+}
+
+impl Default for QueueConfig {
+    fn default() -> Self {
+        Self { bytes: 16 << 20, drop: QueueDrop::Tail, keep_newest: false, urgent_bytes: FRAGMENT_BYTES }
+    }
+}
+
+/// Who goes when there is no room.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum QueueDrop {
+    /// The newcomer.
+    #[default]
+    Tail,
+    /// Those who have waited longest.
+    Head,
+}
+
+/// The law of the propagation delay, after the last bit was sent.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case", deny_unknown_fields)]
+pub enum DelayLaw {
+    /// None.
+    #[default]
+    None,
+    /// Always the same, milliseconds.
+    ConstantMs(f64),
+    /// Between two bounds, milliseconds.
+    UniformMs([f64; 2]),
+    /// Normal, cut off at 0.
+    Normal {
+        /// Mean before it is cut off, milliseconds.
+        mean_ms: f64,
+        /// Standard deviation, milliseconds.
+        std_ms: f64,
+    },
+    /// Lognormal.
+    Lognormal {
+        /// Median, milliseconds.
+        median_ms: f64,
+        /// Standard deviation of the logarithm.
+        sigma: f64,
+    },
+    /// What OpenCOOD computes in its mode `real`, without any queue: uniform overhead, time by size, a fixed time.
+    BySize {
+        /// Largest overhead, milliseconds.
+        overhead_ms: f64,
+        /// Rate that the size is divided by, Mbit/s.
+        rate_mbps: f64,
+        /// What is added in any case, milliseconds.
+        fixed_ms: f64,
+    },
+    /// The column of the capacity's trace.
+    Trace,
+}
+
+/// The law of loss.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case", deny_unknown_fields)]
+pub enum LossLaw {
+    /// Nothing is lost.
+    #[default]
+    None,
+    /// Each alike.
+    Bernoulli(f64),
+    /// A chain of two states (Gilbert 1960, Elliott 1963), one step a message or fragment.
+    GilbertElliott {
+        /// Probability of going from good to bad.
+        to_bad: f64,
+        /// Probability of going from bad to good.
+        to_good: f64,
+        /// Loss in the good state.
+        #[serde(default)]
+        loss_good: f64,
+        /// Loss in the bad state.
+        #[serde(default = "one")]
+        loss_bad: f64,
+    },
+    /// By the distance between sender and receiver: points of metres and probability, straight lines between them.
+    Distance(Vec<[f64; 2]>),
+    /// The column of the capacity's trace.
+    Trace,
+}
+
+fn one() -> f64 {
+    1.0
+}
+
+/// What is lost at a time.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum LossUnit {
+    /// A message.
+    #[default]
+    Message,
+    /// A fragment of 1,400 bytes; a message is lost with any of its fragments.
+    Fragment,
+}
+
+/// Messages that others overtake.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ReorderConfig {
+    /// Share of the messages.
+    pub probability: f64,
+    /// How much later they come, milliseconds.
+    pub extra_ms: f64,
+}
+
+/// A time in which nothing crosses, from the beginning of the scene, seconds. What was on its way is lost.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Outage {
+    /// First second.
+    pub from_s: f64,
+    /// Last second.
+    pub to_s: f64,
+}
+
+/// A link, or all links of a shared medium.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct LinkConfig {
+    /// Who shares what.
+    pub medium: Medium,
+    /// How fast bytes cross.
+    pub capacity: CapacityConfig,
+    /// Who waits, and who does not get to.
+    pub queue: QueueConfig,
+    /// How long a message is under way after its last bit was sent.
+    pub delay: DelayLaw,
+    /// The time from publication to arrival is cut down to a multiple of this, milliseconds; 0 for none. OpenCOOD's
+    /// evaluation knows only whole frames of 100 ms.
+    pub floor_ms: f64,
+    /// Whether jitter may not change the order of a sender's messages.
+    pub keep_order: bool,
+    /// What gets lost.
+    pub loss: LossLaw,
+    /// At a time.
+    pub loss_unit: LossUnit,
+    /// Messages that others overtake.
+    pub reorder: Option<ReorderConfig>,
+    /// Share of the messages that arrive twice.
+    pub duplicate: f64,
+    /// When nothing crosses.
+    pub outages: Vec<Outage>,
+}
+
+impl LinkConfig {
+    /// Checks every number; files are not looked at.
+    ///
+    /// # Errors
+    /// [`LinkError`] names the first field that is wrong.
+    pub fn validate(&self) -> Result<(), LinkError> {
+        if let CapacityConfig::TokenBucket { rate_mbps, .. } = self.capacity {
+            bounded("capacity.rate_mbps", rate_mbps, 1e-6, 1e6, "1e-6 to 1e6")?;
+        }
+        match self.delay {
+            DelayLaw::None | DelayLaw::Trace => {}
+            DelayLaw::ConstantMs(ms) => time("delay", ms)?,
+            DelayLaw::UniformMs([low, high]) => {
+                time("delay", low)?;
+                bounded("delay", high, low, MAX_MS, "from the lower bound to 600,000 ms")?;
+            }
+            DelayLaw::Normal { mean_ms, std_ms } => {
+                time("delay.mean_ms", mean_ms)?;
+                time("delay.std_ms", std_ms)?;
+            }
+            DelayLaw::BySize { overhead_ms, rate_mbps, fixed_ms } => {
+                time("delay.overhead_ms", overhead_ms)?;
+                bounded("delay.rate_mbps", rate_mbps, 1e-6, 1e6, "1e-6 to 1e6")?;
+                time("delay.fixed_ms", fixed_ms)?;
+            }
+            DelayLaw::Lognormal { median_ms, sigma } => {
+                time("delay.median_ms", median_ms)?;
+                bounded("delay.sigma", sigma, 0.0, 5.0, "0 to 5")?;
+            }
+        }
+        time("floor_ms", self.floor_ms)?;
+        match &self.loss {
+            LossLaw::None | LossLaw::Trace => {}
+            LossLaw::Bernoulli(share) => probability("loss", *share)?,
+            LossLaw::GilbertElliott { to_bad, to_good, loss_good, loss_bad } => {
+                probability("loss.to_bad", *to_bad)?;
+                probability("loss.to_good", *to_good)?;
+                probability("loss.loss_good", *loss_good)?;
+                probability("loss.loss_bad", *loss_bad)?;
+            }
+            LossLaw::Distance(points) => {
+                let mut last_m = 0.0;
+                for &[distance_m, share] in points {
+                    bounded("loss.distance", distance_m, last_m, 1e6, "rising metres")?;
+                    probability("loss.distance", share)?;
+                    last_m = distance_m;
+                }
+            }
+        }
+        if let Some(ReorderConfig { probability: share, extra_ms }) = self.reorder {
+            probability("reorder.probability", share)?;
+            time("reorder.extra_ms", extra_ms)?;
+        }
+        probability("duplicate", self.duplicate)?;
+        for Outage { from_s, to_s } in &self.outages {
+            bounded("outages.from_s", *from_s, 0.0, 1e9, "0 to 1e9 s")?;
+            bounded("outages.to_s", *to_s, *from_s, 1e9, "after from_s")?;
+        }
+        Ok(())
+    }
+
+    /// The trace that the capacity names; relative paths start at `folder`.
+    ///
+    /// # Errors
+    /// [`LinkError`] when it is not readable, or has to say what it does not.
+    pub(super) fn read_trace(&self, folder: &Path) -> Result<Option<Trace>, LinkError> {
+        let trace = match &self.capacity {
+            CapacityConfig::Unlimited | CapacityConfig::TokenBucket { .. } => None,
+            CapacityConfig::Trace(path) => Some(Trace::read_csv(&folder.join(path))?),
+            CapacityConfig::Mahimahi(path) => Some(Trace::read_mahimahi(&folder.join(path))?),
+        };
+        let has_steps = matches!(trace, Some(Trace::Steps(_)));
+        if self.delay == DelayLaw::Trace && !has_steps {
+            return Err(LinkError::NoTrace { field: "delay" });
+        }
+        if self.loss == LossLaw::Trace && !has_steps {
+            return Err(LinkError::NoTrace { field: "loss" });
+        }
+        Ok(trace)
+    }
+}
+
+/// Longest delay that is no mistake, milliseconds.
+const MAX_MS: f64 = 600_000.0;
+
+fn time(field: &'static str, ms: f64) -> Result<(), LinkError> {
+    bounded(field, ms, 0.0, MAX_MS, "0 to 600,000 ms")
+}
+
+fn probability(field: &'static str, share: f64) -> Result<(), LinkError> {
+    bounded(field, share, 0.0, 1.0, "0 to 1")
+}
+
+fn bounded(field: &'static str, value: f64, low: f64, high: f64, must: &'static str) -> Result<(), LinkError> {
+    if (low..=high).contains(&value) { Ok(()) } else { Err(LinkError::Value { field, value, must }) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_file_names_every_stage() {
+        let text = "medium: shared\ncapacity: {token_bucket: {rate_mbps: 27, burst_bytes: 3000}}\n\
+            queue: {bytes: 100000, drop: head, keep_newest: true}\ndelay: {normal: {mean_ms: 10, std_ms: 3}}\n\
+            loss: {gilbert_elliott: {to_bad: 0.01, to_good: 0.2}}\nloss_unit: fragment\n\
+            reorder: {probability: 0.01, extra_ms: 30}\nduplicate: 0.001\noutages: [{from_s: 3, to_s: 13}]\n";
+        let config: LinkConfig = serde_saphyr::from_str(text).unwrap();
+        config.validate().unwrap();
+        assert_eq!(config.medium, Medium::Shared);
+        assert_eq!(config.queue.urgent_bytes, FRAGMENT_BYTES);
+        assert_eq!(config.loss, LossLaw::GilbertElliott { to_bad: 0.01, to_good: 0.2, loss_good: 0.0, loss_bad: 1.0 });
+        let written = serde_json::to_string(&config).unwrap();
+        assert_eq!(serde_json::from_str::<LinkConfig>(&written).unwrap(), config);
+        assert!(serde_saphyr::from_str::<LinkConfig>("dely: none\n").is_err());
+    }
+
+    #[test]
+    fn wrong_numbers_are_named() {
+        let message = |config: LinkConfig| config.validate().unwrap_err().to_string();
+        let rate = CapacityConfig::TokenBucket { rate_mbps: 0.0, burst_bytes: 0 };
+        assert!(message(LinkConfig { capacity: rate, ..LinkConfig::default() }).contains("rate_mbps is 0"));
+        let delay = DelayLaw::UniformMs([5.0, 2.0]);
+        assert!(message(LinkConfig { delay, ..LinkConfig::default() }).contains("delay is 2"));
+        let loss = LossLaw::Bernoulli(f64::NAN);
+        assert!(message(LinkConfig { loss, ..LinkConfig::default() }).contains("loss is NaN"));
+        let loss = LossLaw::Distance(vec![[50.0, 0.1], [20.0, 0.2]]);
+        assert!(message(LinkConfig { loss, ..LinkConfig::default() }).contains("rising"));
+        let config = LinkConfig { delay: DelayLaw::Trace, ..LinkConfig::default() };
+        let message = config.read_trace(Path::new(".")).unwrap_err().to_string();
+        assert!(message.contains("delay is trace"), "{message}");
+    }
+}

@@ -1,0 +1,188 @@
+//! Links that somebody has measured.
+
+use std::fs;
+use std::io;
+use std::path::{Path, PathBuf};
+
+/// First line of a CSV trace.
+const HEADER: &str = "time_s,rate_mbps,delay_ms,loss";
+/// Bytes of a mahimahi delivery opportunity.
+pub(super) const OPPORTUNITY_BYTES: u64 = 1500;
+/// Longer files are no traces, bytes.
+const MAX_FILE_BYTES: u64 = 256 << 20;
+
+/// Why a trace cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum TraceError {
+    /// The file is missing or not readable.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// A line is not what it must be.
+    #[error("{}:{line}: {found:?} must be {must}", path.display())]
+    Line {
+        /// The file.
+        path: PathBuf,
+        /// Line number, from 1.
+        line: usize,
+        /// What stood there.
+        found: String,
+        /// What would be right.
+        must: &'static str,
+    },
+    /// There is nothing in it.
+    #[error("{}: no line with numbers", path.display())]
+    Empty {
+        /// The file.
+        path: PathBuf,
+    },
+}
+
+/// The state of a link from one moment on.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Step {
+    /// From here on, nanoseconds since the beginning.
+    pub from_nanos: u64,
+    /// Rate, bit/s.
+    pub bits_per_s: u64,
+    /// Propagation delay, milliseconds.
+    pub delay_ms: f64,
+    /// Probability of loss.
+    pub loss: f64,
+}
+
+/// A link over time.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Trace {
+    /// Rates, delays and losses; the last step lasts for ever.
+    Steps(Vec<Step>),
+    /// Moments at which 1,500 bytes may cross, nanoseconds, in order; repeated from the last one on.
+    Opportunities(Vec<u64>),
+}
+
+impl Trace {
+    /// Reads `time_s,rate_mbps,delay_ms,loss`: one line for every change, times rising from 0.
+    ///
+    /// # Errors
+    /// [`TraceError`] names the file and the line.
+    pub fn read_csv(path: &Path) -> Result<Self, TraceError> {
+        let text = read(path)?;
+        let mut lines = text.lines().enumerate();
+        let header = lines.next().map_or("", |(_, line)| line.trim());
+        if header != HEADER {
+            return Err(wrong(path, 0, header, "the header time_s,rate_mbps,delay_ms,loss"));
+        }
+        let mut steps: Vec<Step> = Vec::new();
+        for (index, line) in lines.filter(|(_, line)| !line.trim().is_empty()) {
+            let numbers: Option<Vec<f64>> = line.split(',').map(|field| field.trim().parse().ok()).collect();
+            let numbers = numbers.and_then(|numbers| <[f64; 4]>::try_from(numbers).ok());
+            let Some([time_s, rate_mbps, delay_ms, loss]) = numbers else {
+                return Err(wrong(path, index, line, "four numbers"));
+            };
+            let sound = (0.0..=1e9).contains(&time_s)
+                && (0.0..=1e6).contains(&rate_mbps)
+                && (0.0..=600_000.0).contains(&delay_ms)
+                && (0.0..=1.0).contains(&loss);
+            if !sound {
+                return Err(wrong(
+                    path,
+                    index,
+                    line,
+                    "a time, a rate up to 1e6, a delay up to 600,000, a loss up to 1",
+                ));
+            }
+            let from_nanos = (time_s * 1e9).round() as u64;
+            let rises = steps.last().map_or(from_nanos == 0, |last| from_nanos > last.from_nanos);
+            if !rises {
+                return Err(wrong(path, index, line, "later than the line before, the first at 0"));
+            }
+            steps.push(Step { from_nanos, bits_per_s: (rate_mbps * 1e6).round() as u64, delay_ms, loss });
+        }
+        if steps.is_empty() { Err(TraceError::Empty { path: path.to_owned() }) } else { Ok(Self::Steps(steps)) }
+    }
+
+    /// Reads delivery opportunities as mahimahi writes them: one line a packet, whole milliseconds that never fall.
+    ///
+    /// # Errors
+    /// [`TraceError`] names the file and the line.
+    pub fn read_mahimahi(path: &Path) -> Result<Self, TraceError> {
+        let mut times = Vec::new();
+        for (index, line) in read(path)?.lines().enumerate().filter(|(_, line)| !line.trim().is_empty()) {
+            let time = line.trim().parse::<u64>().ok().and_then(|ms| ms.checked_mul(1_000_000));
+            match time {
+                Some(time) if times.last().is_none_or(|&last| time >= last) => times.push(time),
+                _ => return Err(wrong(path, index, line, "whole milliseconds, not before the line above")),
+            }
+        }
+        match times.last() {
+            None => Err(TraceError::Empty { path: path.to_owned() }),
+            // A trace lasts as long as its last line says: one that ends at 0 would deliver everything at once.
+            Some(0) => Err(wrong(path, times.len() - 1, "0", "a last line above 0")),
+            Some(_) => Ok(Self::Opportunities(times)),
+        }
+    }
+
+    /// The step at a time; none for opportunities.
+    pub(super) fn at(&self, nanos: u64) -> Option<&Step> {
+        match self {
+            Self::Steps(steps) => steps.get(steps.partition_point(|step| step.from_nanos <= nanos).saturating_sub(1)),
+            Self::Opportunities(_) => None,
+        }
+    }
+}
+
+fn read(path: &Path) -> Result<String, TraceError> {
+    let io = |source| TraceError::Io { path: path.to_owned(), source };
+    let bytes = fs::metadata(path).map_err(io)?.len();
+    if bytes > MAX_FILE_BYTES {
+        return Err(io(io::Error::new(io::ErrorKind::FileTooLarge, format!("{bytes} bytes are too many for a trace"))));
+    }
+    fs::read_to_string(path).map_err(io)
+}
+
+fn wrong(path: &Path, index: usize, found: &str, must: &'static str) -> TraceError {
+    TraceError::Line { path: path.to_owned(), line: index + 1, found: found.chars().take(80).collect(), must }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn file(text: &str) -> (tempfile::TempDir, PathBuf) {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("trace.txt");
+        fs::write(&path, text).unwrap();
+        (folder, path)
+    }
+
+    #[test]
+    fn steps_hold_until_the_next() {
+        let (_folder, path) = file("time_s,rate_mbps,delay_ms,loss\n0,27,10,0\n2.5,1.5,40,0.1\n\n");
+        let trace = Trace::read_csv(&path).unwrap();
+        let rate = |seconds: f64| trace.at((seconds * 1e9) as u64).unwrap().bits_per_s;
+        assert_eq!([rate(0.0), rate(2.499), rate(2.5), rate(900.0)], [27_000_000, 27_000_000, 1_500_000, 1_500_000]);
+    }
+
+    #[test]
+    fn what_is_wrong_is_named_with_its_line() {
+        let header = "time_s,rate_mbps,delay_ms,loss\n";
+        for (text, line) in
+            [("1,2,3,0\n", 2), ("0,2,3,0\n0,2,3,0\n", 3), ("0,2,3\n", 2), ("0,-1,0,0\n", 2), ("0,1,0,nan\n", 2)]
+        {
+            let (_folder, path) = file(&format!("{header}{text}"));
+            let message = Trace::read_csv(&path).unwrap_err().to_string();
+            assert!(message.contains(&format!("trace.txt:{line}:")), "{message}");
+        }
+        assert!(matches!(Trace::read_csv(Path::new("no/such/trace.csv")), Err(TraceError::Io { .. })));
+        let (_folder, path) = file("time,rate\n");
+        assert!(Trace::read_csv(&path).unwrap_err().to_string().contains("header"));
+        for text in ["5\n3\n", "x\n", "-1\n", "0\n0\n", ""] {
+            let (_folder, path) = file(text);
+            assert!(Trace::read_mahimahi(&path).is_err(), "{text:?}");
+        }
+    }
+}
