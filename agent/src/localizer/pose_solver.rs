@@ -149,6 +149,24 @@ mod tests {
     }
 
     #[test]
+    fn cells_that_are_metres_off_are_found_by_a_wider_search() {
+        let town = SyntheticTown { noise_m: 2.5, outliers: 0.3, ..SyntheticTown::default() };
+        let solver = PoseSolver::default();
+        let off_m = |factor| {
+            let errors = (0..6).map(|seed| match solver.search_wider(&town.coordinates(seed), factor) {
+                Ok(found) => {
+                    let truth = town.world_from_sensor(seed).translation.vector
+                        - Vector3::from(town.coordinates(seed).origin_m);
+                    (found.target_from_source.translation.vector - truth).norm()
+                }
+                Err(_) => f64::INFINITY,
+            });
+            errors.fold(0.0, f64::max)
+        };
+        assert!(off_m(4.0) < 1.5 && off_m(4.0) < off_m(1.0), "{} {}", off_m(4.0), off_m(1.0));
+    }
+
+    #[test]
     fn what_is_thin_is_no_pose_and_says_why() {
         let reason = |town: &SyntheticTown| match estimate(&PoseSolver::default().solve(&town.coordinates(3))) {
             PoseEstimate::NoPose { reason, .. } => Some(reason),
