@@ -11,24 +11,19 @@ use super::confidence::{CONFIDENCE_KEY, Confidence};
 use super::error::LocalizerError;
 use super::head_config::SceneHeadConfig;
 use super::pose_evidence::PoseEvidence;
+use super::pose_search::{PoseSearch, SearchTimes};
 use super::pose_solver::{self, FoundPose, PoseSolver, Solved};
 use super::scene_encoder::SceneEncoder;
 use super::scene_head::SceneHead;
-use super::second_look::look_again;
 use super::sweep_voxels::{Cell, SweepVoxels};
 use super::voxel_batch::VoxelBatch;
-use crate::registration::{Correspondence, NoRegistration};
+use crate::registration::Correspondence;
 use crate::weights::Weights;
 
 /// Cells that are regressed at most, where the head allows for more: poses hardly gain from more, and they take time.
 pub(super) const CELLS: usize = 256;
 /// Share of the regressed cells that may be flat ground, which looks the same everywhere.
 const FLAT_SHARE: f64 = 0.25;
-
-/// How much farther off than usual cells may be in one search after the other.
-const WIDENING: [f64; 3] = [1.0, 2.0, 4.0];
-/// Where so large a share of the cells agrees with a pose, nothing else is tried.
-const SURE: f64 = 0.5;
 
 /// Where each cell of a sweep lies in the world, as far as the network knows.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -208,50 +203,11 @@ impl Localizer {
             Some(regressed) => regressed,
             None => return Ok(Localization::new(&self.solver.solve(&SceneCoordinates::default()), times)),
         };
-        let mut best = self.attempt(&coordinates, &cells, WIDENING[0], &mut times)?;
-        for &factor in &WIDENING[1..] {
-            if best.as_ref().is_ok_and(|best| best.agreement >= SURE) {
-                break;
-            }
-            let next = self.attempt(&coordinates, &cells, factor, &mut times)?;
-            let agreement = |attempt: &Result<Attempt, _>| attempt.as_ref().map_or(-1.0, |found| found.agreement);
-            if agreement(&next) > agreement(&best) {
-                best = next;
-            }
-        }
-        Ok(Localization::new(&best.map(|best| best.found), times))
+        let search = PoseSearch { head: &self.head, solver: &self.solver, kind: Kind::Float };
+        let mut spent = SearchTimes::default();
+        let solved = search.run(&coordinates, &cells, &mut spent)?;
+        Ok(Localization::new(&solved, LocalizerTimes { solve: spent.solve, refine: spent.refine, ..times }))
     }
-
-    /// One search, for cells that may be off by `factor` times the usual, and the second look from where it led.
-    fn attempt(
-        &self,
-        coordinates: &SceneCoordinates,
-        cells: &Tensor,
-        factor: f64,
-        times: &mut LocalizerTimes,
-    ) -> Result<Result<Attempt, NoRegistration>, LocalizerError> {
-        let start = Instant::now();
-        let rough = self.solver.search_wider(coordinates, factor);
-        times.solve += start.elapsed();
-        let rough = match rough {
-            Ok(rough) => rough,
-            Err(none) => return Ok(Err(none)),
-        };
-        let start = Instant::now();
-        let pose = rough.target_from_source;
-        let second = look_again(&self.head, cells, &coordinates.sensor_m, &pose, factor, Kind::Float)?;
-        let found = self.solver.judge(coordinates, &rough, second.as_ref());
-        let agreement = second.map_or(rough.inlier_ratio, |second| second.registration.inlier_ratio);
-        times.refine += start.elapsed();
-        Ok(Ok(Attempt { found, agreement }))
-    }
-}
-
-/// What came of one search.
-struct Attempt {
-    found: FoundPose,
-    /// Share of the cells that agree with it in the end.
-    agreement: f64,
 }
 
 impl Localize for Localizer {

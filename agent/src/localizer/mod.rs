@@ -14,6 +14,7 @@ mod feature_norm;
 mod head_config;
 mod localize;
 mod pose_evidence;
+mod pose_search;
 pub mod pose_solver;
 mod pose_std;
 mod refiner;

@@ -31,7 +31,8 @@ pub(super) struct SecondLook {
 /// Asks the refiner where cells are that `start` puts somewhere.
 ///
 /// `cells` are features `[N, cell_channels]`, `sensor_m` `[N]` places in the sensor frame; poses are relative to the head's
-/// origin. Nothing comes back where the head has no refiner or its answers fix no pose.
+/// origin. `is_wide` says that `start` may be off by more than usual. Nothing comes back where the head has no refiner or
+/// its answers fix no pose.
 ///
 /// # Errors
 /// The tensor library's.
@@ -40,7 +41,7 @@ pub(super) fn look_again(
     cells: &Tensor,
     sensor_m: &[[f32; 3]],
     start: &Isometry3<f64>,
-    factor: f64,
+    is_wide: bool,
     kind: Kind,
 ) -> Result<Option<SecondLook>, TchError> {
     let Some(refiner) = head.refiner() else { return Ok(None) };
@@ -48,7 +49,7 @@ pub(super) fn look_again(
     let device = cells.device();
     let mut pose = *start;
     let mut answer = None;
-    let wide_rounds = if factor > 1.0 { 2 } else { 0 };
+    let wide_rounds = if is_wide { 2 } else { 0 };
     for scales_m in std::iter::repeat_n(WIDE_ROUND_M, wide_rounds).chain(ROUNDS_M) {
         let assumed: Vec<f32> = sensor_m
             .iter()

@@ -5,10 +5,11 @@ use tch::{Kind, Tensor, no_grad};
 
 use super::error::LocalizerTrainError;
 use super::feature_cache::FeatureCache;
+use crate::localizer::localize::SceneCoordinates;
+use crate::localizer::pose_search::{PoseSearch, SearchTimes};
+use crate::localizer::pose_solver::PoseSolver;
 use crate::localizer::scene_head::SceneHead;
-use crate::localizer::second_look::look_again;
-use crate::registration::Correspondence;
-use crate::registration::ransac::{RansacConfig, solve};
+use crate::pose_error::PoseError;
 
 /// Errors on sweeps that were not trained on.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
@@ -48,30 +49,26 @@ pub(super) fn validate(
     let sensor: Vec<f32> = Vec::try_from(&cache.sensor_m.f_reshape([-1])?)?;
     let epsilon: Vec<f32> = Vec::try_from(&regression.epsilon_m)?;
     let sweeps: Vec<i64> = Vec::try_from(&cache.sweep_of_cell)?;
-    let mut by_sweep = vec![Vec::new(); cache.sweep_count()];
-    for (row, &sweep) in sweeps.iter().enumerate() {
-        let point = |values: &[f32]| [values[3 * row], values[3 * row + 1], values[3 * row + 2]];
-        let weight = 1.0 / (1.0 + epsilon[row] * epsilon[row]);
-        by_sweep[sweep as usize].push(Correspondence { source_m: point(&sensor), target_m: point(&world), weight });
-    }
+    let solver = PoseSolver::default();
+    let search = PoseSearch { head, solver: &solver, kind };
     let mut translations = Vec::new();
     let mut rotations = Vec::new();
-    let mut first_row = 0;
-    for (correspondences, truth) in by_sweep.iter().zip(&cache.world_from_sensor) {
-        let rows = correspondences.len() as i64;
-        let cells = cache.cells.f_narrow(0, first_row, rows)?;
-        first_row += rows;
-        let mut found = solve(correspondences, &RansacConfig::default());
-        if let Ok(first) = &found {
-            let sensor_m: Vec<[f32; 3]> = correspondences.iter().map(|pair| pair.source_m).collect();
-            if let Some(second) = look_again(head, &cells, &sensor_m, &first.target_from_source, 1.0, kind)? {
-                found = Ok(second.registration);
-            }
-        }
+    let mut first = 0;
+    for (sweep, truth) in cache.world_from_sensor.iter().enumerate() {
+        let count = sweeps[first..].iter().take_while(|&&of| of == sweep as i64).count();
+        let rows = first..first + count;
+        let cells = cache.cells.f_narrow(0, first as i64, count as i64)?;
+        first += count;
+        let coordinates = SceneCoordinates {
+            sensor_m: sensor.as_chunks().0[rows.clone()].to_vec(),
+            world_m: world.as_chunks().0[rows.clone()].to_vec(),
+            epsilon_m: epsilon[rows].to_vec(),
+            origin_m: head.config().origin_m,
+        };
+        let found = search.run(&coordinates, &cells, &mut SearchTimes::default())?;
         let (metres, degrees) = found.map_or((f64::INFINITY, 180.0), |found| {
-            let offset = nalgebra::Vector3::from(origin);
-            let error = found.target_from_source.translation.vector + offset - truth.translation.vector;
-            (error.norm(), found.target_from_source.rotation.angle_to(&truth.rotation).to_degrees())
+            let error = PoseError::between(&found.world_from_sensor.into(), &(*truth).into());
+            (error.distance_m, error.angle_deg)
         });
         translations.push(metres);
         rotations.push(degrees);
