@@ -36,7 +36,7 @@ fn stamp() -> Stamp {
 /// Name and configuration of every codec; a budget is a quarter of the map in that dtype.
 fn codecs(kib: usize) -> Vec<(&'static str, CodecConfig)> {
     let quarter = Some(kib as u64 * 1024 / 4);
-    let codec = |dtype, budget_bytes, zstd_level| CodecConfig { dtype, budget_bytes, zstd_level };
+    let codec = |dtype, budget_bytes, zstd_level| CodecConfig { dtype, budget_bytes, zstd_level, gate: None };
     vec![
         ("f32", codec(Dtype::F32, None, None)),
         ("f16", codec(Dtype::F16, None, None)),

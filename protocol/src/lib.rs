@@ -13,7 +13,7 @@
 //! // An agent: half precision, at most 2,000 bytes, the most confident cells first.
 //! let grid = BevGrid { x_min_m: -51.2, y_min_m: -38.4, cell_m: 0.8, width: 32, height: 24 };
 //! let features = BevFeatures { grid, channels: 4, values: vec![0.5; 4 * 24 * 32] };
-//! let config = CodecConfig { dtype: Dtype::F16, budget_bytes: Some(2_000), zstd_level: None };
+//! let config = CodecConfig { dtype: Dtype::F16, budget_bytes: Some(2_000), ..CodecConfig::default() };
 //! let confidence: Vec<f32> = (0..24 * 32).map(|cell| cell as f32 / 768.0).collect();
 //! let message = Bev {
 //!     pose: PoseEstimate::new(Pose::from_xyz_yaw([12.0, -3.5, 1.9], 0.3), 0.8),
@@ -101,7 +101,10 @@ pub use balance::{Balance, Difference, Unheard};
 pub use bev::{BevFeatures, BevGrid};
 pub use body::{Body, BodyShape};
 pub use box3d::{Box3d, Detection};
-pub use codec::{Codec, CodecConfig, DecodedFeatures, Dtype, EncodedFeatures, Packing, Selection, encode_features};
+pub use codec::{
+    Codec, CodecConfig, ConfidenceGate, DecodedFeatures, Dtype, EncodedFeatures, Packing, Selection, Smoothing,
+    encode_features,
+};
 pub use drop_reason::DropReason;
 pub use error::WireError;
 pub use header::{HEADER_LEN, Header, Kind, Stamp, WIRE_VERSION};

@@ -114,7 +114,9 @@ proptest! {
         let sent = sent.unwrap_or_else(|| vec![true; cells]);
         let least_sent = (0..cells).filter(|cell| sent[*cell]).map(|cell| confidence[cell]).fold(1.0, f32::min);
         let most_kept = (0..cells).filter(|cell| !sent[*cell]).map(|cell| confidence[cell]).fold(0.0, f32::max);
-        prop_assert!(most_kept <= least_sent);
+        // A window judges cells by what is around them.
+        let is_smoothed = config.gate.is_some_and(|gate| gate.smoothing.is_some());
+        prop_assert!(is_smoothed || most_kept <= least_sent);
         for (before, after) in values.chunks(cells).zip(back.values.chunks(cells)) {
             check_channel(config.dtype, before, after, &sent)?;
         }

@@ -5,7 +5,7 @@
 //! | part | bytes | where |
 //! | --- | --- | --- |
 //! | scales, `f32` per channel | `4 C` | dtype `i8` |
-//! | mask, one bit per cell, row-major, lowest bit first | `ceil(H W / 8)` | selection top-k |
+//! | mask, one bit per cell, row-major, lowest bit first | `ceil(H W / 8)` | selection top-k (by gate, budget or both) |
 //! | values `[C, K]`, `K` selected cells in row-major order | `C K` times 4, 2 or 1 | always; dense: `K = H W` |
 //!
 //! A mask of bits rather than a list of indices: it has one spelling for a set (no order, no duplicate, no index out of
@@ -14,6 +14,7 @@
 
 mod compression;
 mod dtype;
+mod gate;
 mod layout;
 mod selection;
 
@@ -25,13 +26,16 @@ use crate::{BevFeatures, BevGrid, Body, BodyShape, Limits, WireError};
 use layout::Layout;
 
 pub use dtype::Dtype;
+pub use gate::{ConfidenceGate, Smoothing};
 
 /// How an agent encodes its maps.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct CodecConfig {
     /// How exactly values are written.
     pub dtype: Dtype,
+    /// Which cells are worth sending at all. `None`: all. A budget chooses among those.
+    pub gate: Option<ConfidenceGate>,
     /// Most bytes of a body: the cells with the highest confidence that fit are sent. `None`, or enough for all: all.
     pub budget_bytes: Option<u64>,
     /// zstd level, 1..=22; `None`: not packed. The budget holds for what is there before packing.
@@ -44,7 +48,7 @@ pub struct CodecConfig {
 pub enum Selection {
     /// All.
     Dense,
-    /// Those with the highest confidence.
+    /// Those with the highest confidence: above a threshold, as many as fit, or both.
     TopK {
         /// How many.
         cells: u32,
@@ -101,11 +105,12 @@ pub struct DecodedFeatures {
 ///
 /// # Shapes
 /// - `features`: `[C, H, W]`
-/// - `confidence`: `[H, W]`, needed where `config` has a budget that not all cells fit in; ties go to the first cell
+/// - `confidence`: `[H, W]`, needed where `config` has a gate, or a budget that not all cells fit in; ties go to the first
+///   cell
 ///
 /// # Errors
-/// [`WireError`] when values and lattice disagree, a value is not finite (or too large for its dtype), a budget has no
-/// confidence map or cannot hold even an empty selection.
+/// [`WireError`] when values and lattice disagree, a value is not finite (or too large for its dtype), a gate or budget
+/// has no confidence map, or a budget cannot hold even an empty selection.
 pub fn encode_features(
     features: BevFeatures,
     config: &CodecConfig,
@@ -118,11 +123,20 @@ pub fn encode_features(
     if values.len() != expected {
         return Err(WireError::Shape { what: "features", expected: expected as u64, found: values.len() as u64 });
     }
-    let Some(budget) = config.budget_bytes.filter(|budget| *budget < layout.len() as u64) else {
+    let budget = config.budget_bytes.filter(|budget| *budget < layout.len() as u64);
+    if config.gate.is_none() && budget.is_none() {
         return encode_selected(grid, channels, dense, values, None, config.zstd_level);
-    };
+    }
     let confidence = confidence.ok_or(WireError::NoConfidence { cells: layout.cells as u64 })?;
-    let selected = selection::within_budget(confidence, layout.cells, channels, config.dtype, budget)?;
+    selection::check_confidence(confidence, layout.cells)?;
+    let gated = config.gate.map(|gate| gate.cells(confidence, &grid)).transpose()?;
+    let selected = match (gated, budget) {
+        (gated, Some(budget)) => {
+            selection::within_budget(confidence, gated.as_deref(), channels, config.dtype, budget)?
+        }
+        (Some(gated), None) if gated.len() < layout.cells => gated,
+        _ => return encode_selected(grid, channels, dense, values, None, config.zstd_level),
+    };
     let codec = Codec { selection: Selection::TopK { cells: selected.len() as u32 }, ..dense };
     let values = selection::gather(&values, layout.cells, &selected);
     encode_selected(grid, channels, codec, values, Some(&selected), config.zstd_level)
@@ -286,7 +300,7 @@ mod tests {
         for dtype in [Dtype::F32, Dtype::F16, Dtype::I8] {
             for (budget_bytes, zstd_level) in [(None, Some(1)), (Some(100), None), (Some(100), Some(1))] {
                 for bad in [f32::NAN, f32::INFINITY, 1e30] {
-                    let config = CodecConfig { dtype, budget_bytes, zstd_level };
+                    let config = CodecConfig { dtype, budget_bytes, zstd_level, gate: None };
                     let error = encode_features(map(vec![bad; 80]), &config, Some(&[1.0; 8])).unwrap_err();
                     assert!(matches!(error, WireError::Value { what: "feature", .. }), "{error}");
                 }
@@ -296,7 +310,7 @@ mod tests {
 
     #[test]
     fn a_budget_that_fits_all_needs_no_confidence() {
-        let config = CodecConfig { dtype: Dtype::F16, budget_bytes: Some(16), zstd_level: None };
+        let config = CodecConfig { dtype: Dtype::F16, budget_bytes: Some(16), ..CodecConfig::default() };
         assert_eq!(encode_features(map(vec![1.0; 8]), &config, None).unwrap().codec.selection, Selection::Dense);
         let smaller = CodecConfig { budget_bytes: Some(15), ..config };
         let error = encode_features(map(vec![1.0; 8]), &smaller, None).unwrap_err();
@@ -304,6 +318,50 @@ mod tests {
         let sparse = encode_features(map(vec![1.0; 8]), &smaller, Some(&[0.5; 8])).unwrap();
         // One byte of mask, two a cell.
         assert_eq!((sparse.codec.selection, sparse.body.len()), (Selection::TopK { cells: 7 }, 15));
+    }
+
+    #[test]
+    fn a_gate_sends_what_passes_and_a_budget_the_best_of_it() {
+        let confidence = [0.9, 0.1, 0.8, 0.1, 0.7, 0.1, 0.1, 0.1];
+        let gate = Some(ConfidenceGate { threshold: 0.5, smoothing: None });
+        let config = CodecConfig { dtype: Dtype::F16, gate, ..CodecConfig::default() };
+        let values: Vec<f32> = (0..8u8).map(f32::from).collect();
+        let encoded = encode_features(map(values.clone()), &config, Some(&confidence)).unwrap();
+        assert_eq!((encoded.codec.selection, encoded.body.len()), (Selection::TopK { cells: 3 }, 1 + 3 * 2));
+        let decoded = encoded.decode(&Limits::DEFAULT).unwrap();
+        assert_eq!(decoded.features.values, [0.0, 0.0, 2.0, 0.0, 4.0, 0.0, 0.0, 0.0]);
+        assert_eq!(decoded.sent.unwrap().iter().filter(|sent| **sent).count(), 3);
+        let tight = CodecConfig { budget_bytes: Some(1 + 2 * 2), ..config };
+        let encoded = encode_features(map(values.clone()), &tight, Some(&confidence)).unwrap();
+        assert_eq!(encoded.decode(&Limits::DEFAULT).unwrap().features.values[4], 0.0, "the least sure is left out");
+        // What passes fits: the budget takes nothing more.
+        let wide = CodecConfig { budget_bytes: Some(15), ..config };
+        let encoded = encode_features(map(values.clone()), &wide, Some(&confidence)).unwrap();
+        assert_eq!(encoded.codec.selection, Selection::TopK { cells: 3 });
+        let error = encode_features(map(values), &config, None).unwrap_err();
+        assert_eq!(error, WireError::NoConfidence { cells: 8 });
+    }
+
+    #[test]
+    fn nothing_worth_sending_is_an_answer_in_every_dtype() {
+        let gate = Some(ConfidenceGate { threshold: 1.0, smoothing: None });
+        for dtype in [Dtype::F32, Dtype::F16, Dtype::I8] {
+            for zstd_level in [None, Some(1)] {
+                let config = CodecConfig { dtype, gate, zstd_level, budget_bytes: None };
+                let encoded = encode_features(map(vec![1.0; 16]), &config, Some(&[0.5; 8])).unwrap();
+                let decoded = encoded.decode(&Limits::DEFAULT).unwrap();
+                assert_eq!(decoded.features.values, [0.0; 16]);
+                assert_eq!(decoded.sent, Some(vec![false; 8]));
+            }
+        }
+    }
+
+    #[test]
+    fn a_gate_that_everything_passes_leaves_the_tensor_alone() {
+        let gate = Some(ConfidenceGate { threshold: -1.0, smoothing: None });
+        let config = CodecConfig { gate, ..CodecConfig::default() };
+        let encoded = encode_features(map(vec![1.0; 8]), &config, Some(&[0.0; 8])).unwrap();
+        assert_eq!(encoded.codec.selection, Selection::Dense);
     }
 
     #[test]

@@ -3,17 +3,11 @@
 use super::Dtype;
 use crate::WireError;
 
-/// The cells with the highest confidence that fit into `budget` bytes, in row-major order.
+/// Checks that there is one finite confidence for each cell.
 ///
 /// # Errors
-/// [`WireError`] when `confidence` has not one finite value per cell or the budget cannot hold scales and mask.
-pub(super) fn within_budget(
-    confidence: &[f32],
-    cells: usize,
-    channels: u32,
-    dtype: Dtype,
-    budget: u64,
-) -> Result<Vec<u32>, WireError> {
+/// [`WireError`] names the first that is none, or both counts.
+pub(super) fn check_confidence(confidence: &[f32], cells: usize) -> Result<(), WireError> {
     if confidence.len() != cells {
         let (expected, found) = (cells as u64, confidence.len() as u64);
         return Err(WireError::Shape { what: "confidence map", expected, found });
@@ -22,17 +16,32 @@ pub(super) fn within_budget(
         let (value, min, max) = (confidence[index].into(), f32::MIN.into(), f32::MAX.into());
         return Err(WireError::Value { what: "confidence", index, value, min, max });
     }
-    let scale_bytes = if dtype == Dtype::I8 { 4 * u64::from(channels) } else { 0 };
-    let needed = scale_bytes + cells.div_ceil(8) as u64;
-    let for_cells = budget.checked_sub(needed).ok_or(WireError::Budget { budget, needed })?;
-    let fitting = for_cells / (u64::from(channels) * dtype.size());
-    Ok(most_confident(confidence, usize::try_from(fitting).unwrap_or(cells).min(cells)))
+    Ok(())
 }
 
-/// The `count` most confident cells in row-major order; of equals, the first.
-fn most_confident(confidence: &[f32], count: usize) -> Vec<u32> {
+/// Of the `candidates` (`None`: of all cells) those with the highest confidence that fit into `budget` bytes, in
+/// row-major order.
+///
+/// # Errors
+/// [`WireError::Budget`] when the budget cannot hold scales and mask.
+pub(super) fn within_budget(
+    confidence: &[f32],
+    candidates: Option<&[u32]>,
+    channels: u32,
+    dtype: Dtype,
+    budget: u64,
+) -> Result<Vec<u32>, WireError> {
+    let scale_bytes = if dtype == Dtype::I8 { 4 * u64::from(channels) } else { 0 };
+    let needed = scale_bytes + confidence.len().div_ceil(8) as u64;
+    let for_cells = budget.checked_sub(needed).ok_or(WireError::Budget { budget, needed })?;
+    let fitting = usize::try_from(for_cells / (u64::from(channels) * dtype.size())).unwrap_or(usize::MAX);
     // A lattice has at most 2^32 - 1 cells.
-    let mut cells: Vec<u32> = (0..confidence.len() as u32).collect();
+    let candidates = candidates.map_or_else(|| (0..confidence.len() as u32).collect(), <[u32]>::to_vec);
+    Ok(most_confident(confidence, candidates, fitting))
+}
+
+/// The `count` most confident of some cells in row-major order; of equals, the first.
+fn most_confident(confidence: &[f32], mut cells: Vec<u32>, count: usize) -> Vec<u32> {
     if count < cells.len() {
         let descending = |a: &u32, b: &u32| confidence[*b as usize].total_cmp(&confidence[*a as usize]).then(a.cmp(b));
         cells.select_nth_unstable_by(count, descending);
@@ -105,22 +114,25 @@ mod tests {
     #[test]
     fn the_most_confident_win_and_ties_go_to_the_first() {
         let confidence = [0.1, 0.9, 0.5, 0.5, 0.5, 0.0, -0.0];
-        assert!(most_confident(&confidence, 0).is_empty());
-        assert_eq!(most_confident(&confidence, 1), [1]);
-        assert_eq!(most_confident(&confidence, 3), [1, 2, 3]);
-        assert_eq!(most_confident(&confidence, 7), [0, 1, 2, 3, 4, 5, 6]);
+        let of_all = |count| most_confident(&confidence, (0..7).collect(), count);
+        assert!(of_all(0).is_empty());
+        assert_eq!(of_all(1), [1]);
+        assert_eq!(of_all(3), [1, 2, 3]);
+        assert_eq!(of_all(7), [0, 1, 2, 3, 4, 5, 6]);
+        assert_eq!(most_confident(&confidence, vec![0, 3, 4], 2), [3, 4]);
     }
 
     #[test]
     fn the_budget_is_filled_and_kept() {
         let confidence: Vec<f32> = (0..100u8).map(f32::from).collect();
         // Scales 4 * 3, mask 13, then 3 bytes a cell.
-        let selected = within_budget(&confidence, 100, 3, Dtype::I8, 12 + 13 + 3 * 5 + 2).unwrap();
+        let selected = within_budget(&confidence, None, 3, Dtype::I8, 12 + 13 + 3 * 5 + 2).unwrap();
         assert_eq!(selected, [95, 96, 97, 98, 99]);
-        let error = within_budget(&confidence, 100, 3, Dtype::I8, 24).unwrap_err();
+        let error = within_budget(&confidence, None, 3, Dtype::I8, 24).unwrap_err();
         assert_eq!(error, WireError::Budget { budget: 24, needed: 25 });
-        assert!(within_budget(&confidence[1..], 100, 3, Dtype::F16, 1000).is_err());
-        assert!(within_budget(&[f32::NAN; 100], 100, 3, Dtype::F16, 1000).is_err());
+        assert!(check_confidence(&confidence, 100).is_ok());
+        assert!(check_confidence(&confidence[1..], 100).is_err());
+        assert!(check_confidence(&[f32::NAN; 100], 100).is_err());
     }
 
     #[test]

@@ -81,14 +81,20 @@ fn any_detection() -> impl Strategy<Value = Detection> {
 pub(crate) fn any_map() -> impl Strategy<Value = (BevFeatures, Vec<f32>, CodecConfig)> {
     let grid = (-100.0..100.0f64, -100.0..100.0f64, 0.1..2.0f64, 1..20u32, 1..20u32)
         .prop_map(|(x_min_m, y_min_m, cell_m, width, height)| BevGrid { x_min_m, y_min_m, cell_m, width, height });
-    (grid, 1..6u32, select(vec![Dtype::F32, Dtype::F16, Dtype::I8]), option::of(80..3000u64), option::of(1..4i32))
-        .prop_flat_map(|(grid, channels, dtype, budget_bytes, zstd_level)| {
+    let gate = (0f32..1.0, option::of((0..4u32, 0.2f32..3.0))).prop_map(|(threshold, smoothing)| {
+        let smoothing = smoothing.map(|(half, sigma)| Smoothing { kernel: 2 * half + 1, sigma });
+        ConfidenceGate { threshold, smoothing }
+    });
+    let dtype = select(vec![Dtype::F32, Dtype::F16, Dtype::I8]);
+    (grid, 1..6u32, dtype, option::of(80..3000u64), option::of(1..4i32), option::of(gate)).prop_flat_map(
+        |(grid, channels, dtype, budget_bytes, zstd_level, gate)| {
             let cells = grid.cells();
             let values = vec(prop_oneof![Just(0f32), -100f32..100.0], cells * channels as usize);
-            let config = CodecConfig { dtype, budget_bytes, zstd_level };
+            let config = CodecConfig { dtype, gate, budget_bytes, zstd_level };
             (values, vec(0f32..1.0, cells))
                 .prop_map(move |(values, confidence)| (BevFeatures { grid, channels, values }, confidence, config))
-        })
+        },
+    )
 }
 
 fn any_bev() -> impl Strategy<Value = Bev> {

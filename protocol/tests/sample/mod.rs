@@ -53,7 +53,7 @@ pub(crate) fn every_codec() -> Vec<CodecConfig> {
     for dtype in [Dtype::F32, Dtype::F16, Dtype::I8] {
         for budget_bytes in [None, Some(400)] {
             for zstd_level in [None, Some(3)] {
-                configs.push(CodecConfig { dtype, budget_bytes, zstd_level });
+                configs.push(CodecConfig { dtype, budget_bytes, zstd_level, gate: None });
             }
         }
     }

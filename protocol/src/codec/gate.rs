@@ -1,0 +1,154 @@
+//! Which cells are worth sending: those around which a vehicle is likely (Where2comm, Hu et al., NeurIPS 2022).
+
+use serde::{Deserialize, Serialize};
+
+use crate::{BevGrid, WireError};
+
+/// Widest kernel of the smoothing, cells.
+const MAX_KERNEL: u32 = 63;
+
+/// Sends the cells whose smoothed confidence is above a threshold.
+///
+/// The decision is the sender's alone, before anything is on the air: where it sees nothing, nothing is sent.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ConfidenceGate {
+    /// Smoothed confidence that a cell must exceed. Below zero: every cell passes.
+    pub threshold: f32,
+    /// How the confidence is spread to the surroundings of a vehicle first; `None`: not at all.
+    pub smoothing: Option<Smoothing>,
+}
+
+/// A Gaussian window over the lattice, zeros outside of it.
+///
+/// As in the published code its weights are `exp(-(x^2 + y^2) / (2 sigma^2)) / (2 pi sigma)`: they add up to about `sigma`,
+/// not to one, so thresholds belong to a sigma.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Smoothing {
+    /// Edge of the window, cells; odd.
+    pub kernel: u32,
+    /// Standard deviation, cells.
+    pub sigma: f32,
+}
+
+impl Default for ConfidenceGate {
+    /// The published threshold and smoothing: 0.01 after 5 x 5 cells with a sigma of one.
+    fn default() -> Self {
+        Self { threshold: 0.01, smoothing: Some(Smoothing { kernel: 5, sigma: 1.0 }) }
+    }
+}
+
+impl ConfidenceGate {
+    /// The cells that pass, in row-major order; `confidence` is `[H, W]` on `grid`, one finite value per cell.
+    ///
+    /// # Errors
+    /// [`WireError::Value`] when the window has no middle, is too wide, or its sigma is not positive.
+    pub(super) fn cells(&self, confidence: &[f32], grid: &BevGrid) -> Result<Vec<u32>, WireError> {
+        let threshold = self.threshold;
+        let pass = |values: &[f32]| -> Vec<u32> {
+            (0u32..).zip(values).filter(|(_, value)| **value > threshold).map(|(cell, _)| cell).collect()
+        };
+        Ok(match self.smoothing {
+            Some(smoothing) => pass(&smoothing.smooth(confidence, grid)?),
+            None => pass(confidence),
+        })
+    }
+}
+
+impl Smoothing {
+    fn smooth(&self, values: &[f32], grid: &BevGrid) -> Result<Vec<f32>, WireError> {
+        let weights = self.weights()?;
+        let width = grid.width as usize;
+        let mut along_rows = vec![0f32; values.len()];
+        for (row, smoothed) in values.chunks_exact(width).zip(along_rows.chunks_exact_mut(width)) {
+            convolve(row, &weights, smoothed);
+        }
+        let mut smoothed = vec![0f32; values.len()];
+        let half = weights.len() / 2;
+        let height = values.len() / width;
+        for (row, target) in smoothed.chunks_exact_mut(width).enumerate() {
+            let first = row.saturating_sub(half);
+            for source in first..(row + half + 1).min(height) {
+                let weight = weights[source + half - row];
+                let values = &along_rows[source * width..][..width];
+                target.iter_mut().zip(values).for_each(|(target, value)| *target += weight * value);
+            }
+        }
+        Ok(smoothed)
+    }
+
+    /// One dimension of the window, whose weights are products of two.
+    fn weights(&self) -> Result<Vec<f32>, WireError> {
+        let Self { kernel, sigma } = *self;
+        let refuse = |what, value, max| Err(WireError::Value { what, index: 0, value, min: 1e-3, max });
+        if kernel % 2 == 0 || kernel > MAX_KERNEL {
+            return refuse("odd kernel of the confidence gate", f64::from(kernel), f64::from(MAX_KERNEL));
+        }
+        if !(1e-3..=1e3).contains(&sigma) {
+            return refuse("sigma of the confidence gate", f64::from(sigma), 1e3);
+        }
+        let (half, sigma) = (f64::from(kernel / 2), f64::from(sigma));
+        let scale = 1.0 / (std::f64::consts::TAU * sigma).sqrt();
+        let weight = |cell: u32| scale * (-(f64::from(cell) - half).powi(2) / (2.0 * sigma * sigma)).exp();
+        Ok((0..kernel).map(|cell| weight(cell) as f32).collect())
+    }
+}
+
+/// `weights` moved over `values`, zeros outside.
+fn convolve(values: &[f32], weights: &[f32], smoothed: &mut [f32]) {
+    let half = weights.len() / 2;
+    for (cell, smoothed) in smoothed.iter_mut().enumerate() {
+        let first = cell.saturating_sub(half);
+        let window = &values[first..(cell + half + 1).min(values.len())];
+        *smoothed = window.iter().zip(&weights[first + half - cell..]).map(|(value, weight)| value * weight).sum();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const GRID: BevGrid = BevGrid { x_min_m: 0.0, y_min_m: 0.0, cell_m: 1.0, width: 6, height: 5 };
+
+    #[test]
+    fn smoothing_is_the_convolution_by_definition() {
+        let values: Vec<f32> = (0..30u8).map(|cell| f32::from(cell * 37 % 30) / 30.0).collect();
+        let smoothing = Smoothing { kernel: 5, sigma: 1.3 };
+        let smoothed = smoothing.smooth(&values, &GRID).unwrap();
+        for (row, column) in (0..5i32).flat_map(|row| (0..6i32).map(move |column| (row, column))) {
+            let mut expected = 0.0;
+            for (dy, dx) in (-2..=2).flat_map(|dy| (-2..=2).map(move |dx| (dy, dx))) {
+                if (0..5).contains(&(row + dy)) && (0..6).contains(&(column + dx)) {
+                    let weight = (-f64::from(dx * dx + dy * dy) / (2.0 * 1.69)).exp() / (std::f64::consts::TAU * 1.3);
+                    expected += weight * f64::from(values[((row + dy) * 6 + column + dx) as usize]);
+                }
+            }
+            let found = f64::from(smoothed[(row * 6 + column) as usize]);
+            assert!((found - expected).abs() < 1e-6, "{row} {column}: {found} {expected}");
+        }
+    }
+
+    #[test]
+    fn a_sure_cell_brings_its_surroundings() {
+        let mut confidence = [0f32; 30];
+        confidence[14] = 0.9;
+        let alone = ConfidenceGate { threshold: 0.01, smoothing: None };
+        assert_eq!(alone.cells(&confidence, &GRID).unwrap(), [14]);
+        let published = ConfidenceGate::default().cells(&confidence, &GRID).unwrap();
+        assert!(published.contains(&13) && published.contains(&8) && published.len() > 9, "{published:?}");
+        let nothing = ConfidenceGate { threshold: 1.0, ..alone };
+        assert!(nothing.cells(&confidence, &GRID).unwrap().is_empty());
+        let everything = ConfidenceGate { threshold: -1.0, ..alone };
+        assert_eq!(everything.cells(&confidence, &GRID).unwrap().len(), 30);
+    }
+
+    #[test]
+    fn windows_without_a_middle_are_refused() {
+        for smoothing in [(4, 1.0), (0, 1.0), (65, 1.0), (5, 0.0), (5, f32::NAN)] {
+            let smoothing = Smoothing { kernel: smoothing.0, sigma: smoothing.1 };
+            let gate = ConfidenceGate { threshold: 0.1, smoothing: Some(smoothing) };
+            assert!(matches!(gate.cells(&[0.0; 30], &GRID), Err(WireError::Value { .. })), "{smoothing:?}");
+        }
+    }
+}
