@@ -4,24 +4,39 @@ use tch::{TchError, Tensor, nn};
 
 use crate::agent_attention::attend_samples;
 use crate::convolution::ConvLayer;
-use crate::model_config::DetectorConfig;
+use crate::model_config::{BlockKind, DetectorConfig};
+use crate::residual::ResidualBlock;
 
 /// Blocks of 3x3 convolutions and their up-sampling branches.
 #[derive(Debug)]
 pub struct BevBackbone {
-    blocks: Vec<Vec<ConvLayer>>,
+    blocks: Vec<Block>,
     deblocks: Vec<ConvLayer>,
 }
 
+/// The layers of one level.
+#[derive(Debug)]
+enum Block {
+    Plain(Vec<ConvLayer>),
+    Residual(Vec<ResidualBlock>),
+}
+
 impl BevBackbone {
-    /// Parameters `blocks.<level>.<position>.*` and `deblocks.<level>.<0|1>.*` under `path`.
+    /// Parameters `blocks.<level>.<position>.*` (with residual blocks `resnet.layer<level>.<position>.*`) and
+    /// `deblocks.<level>.<0|1>.*` under `path`.
     #[must_use]
     pub fn new(path: &nn::Path<'_>, config: &DetectorConfig) -> Self {
         let mut input = config.pillar_channels;
         let mut backbone = Self { blocks: Vec::new(), deblocks: Vec::new() };
         for (level, &filters) in config.num_filters.iter().enumerate() {
-            let stride = config.layer_strides[level];
-            backbone.blocks.push(block(&(path / "blocks" / level), [input, filters], config.layer_nums[level], stride));
+            let (layers, stride) = (config.layer_nums[level], config.layer_strides[level]);
+            backbone.blocks.push(match config.blocks {
+                BlockKind::Plain => Block::Plain(block(&(path / "blocks" / level), [input, filters], layers, stride)),
+                BlockKind::Residual => {
+                    let path = path / "resnet" / format!("layer{level}");
+                    Block::Residual(ResidualBlock::chain(&path, [input, filters], layers, stride))
+                }
+            });
             let deblock = path / "deblocks" / level;
             let io = [filters, config.num_upsample_filters[level]];
             let layer = ConvLayer::upsampling(&(&deblock / 0), &(&deblock / 1), io, config.upsample_strides[level]);
@@ -50,11 +65,41 @@ impl BevBackbone {
         self.run(x, train, |level| attend_samples(level, record_len))
     }
 
+    /// Number of levels.
+    #[must_use]
+    pub fn levels(&self) -> usize {
+        self.blocks.len()
+    }
+
+    /// What one level makes of the output of the level above it, or of the canvas.
+    ///
+    /// # Panics
+    /// When there is no such level.
+    pub fn level(&self, level: usize, x: &Tensor, train: bool) -> Tensor {
+        match &self.blocks[level] {
+            Block::Plain(layers) => layers.iter().fold(x.shallow_clone(), |x, layer| layer.forward(&x, train)),
+            Block::Residual(blocks) => blocks.iter().fold(x.shallow_clone(), |x, block| block.forward(&x, train)),
+        }
+    }
+
+    /// Brings the outputs of all levels, own or fused, to one lattice: `[N, sum of C_up, H', W']`.
+    pub fn upsampled(&self, levels: &[Tensor], train: bool) -> Tensor {
+        let mut levels: Vec<Tensor> =
+            self.deblocks.iter().zip(levels).map(|(deblock, level)| deblock.forward(level, train)).collect();
+        if levels.len() == 1 { levels.remove(0) } else { Tensor::cat(&levels, 1) }
+    }
+
     /// The same backbone for inference, norms folded into the convolutions.
     #[must_use]
     pub fn folded(&self) -> Self {
-        let fold = |layers: &Vec<ConvLayer>| layers.iter().map(ConvLayer::folded).collect();
-        Self { blocks: self.blocks.iter().map(fold).collect(), deblocks: fold(&self.deblocks) }
+        let fold = |block: &Block| match block {
+            Block::Plain(layers) => Block::Plain(layers.iter().map(ConvLayer::folded).collect()),
+            Block::Residual(blocks) => Block::Residual(blocks.iter().map(ResidualBlock::folded).collect()),
+        };
+        Self {
+            blocks: self.blocks.iter().map(fold).collect(),
+            deblocks: self.deblocks.iter().map(ConvLayer::folded).collect(),
+        }
     }
 
     fn run(
@@ -65,13 +110,11 @@ impl BevBackbone {
     ) -> Result<Tensor, TchError> {
         let mut x = x.shallow_clone();
         let mut levels = Vec::with_capacity(self.blocks.len());
-        for (block, deblock) in self.blocks.iter().zip(&self.deblocks) {
-            for layer in block {
-                x = layer.forward(&x, train);
-            }
-            levels.push(deblock.forward(&fuse(&x)?, train));
+        for level in 0..self.blocks.len() {
+            x = self.level(level, &x, train);
+            levels.push(fuse(&x)?);
         }
-        Ok(if levels.len() == 1 { levels.remove(0) } else { Tensor::cat(&levels, 1) })
+        Ok(self.upsampled(&levels, train))
     }
 }
 

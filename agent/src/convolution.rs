@@ -105,6 +105,12 @@ impl ConvLayer {
         Self::down(conv, io, kernel, nn::ConvConfig { stride, padding: kernel / 2, ..Default::default() })
     }
 
+    /// `kernel x kernel` convolution without bias and with nothing after it.
+    #[must_use]
+    pub fn unbiased(conv: &nn::Path<'_>, io: [i64; 2], kernel: i64, stride: i64) -> Self {
+        Self::down(conv, io, kernel, nn::ConvConfig { stride, padding: kernel / 2, bias: false, ..Default::default() })
+    }
+
     /// Transposed convolution whose kernel is its stride, so that outputs do not overlap; batch norm, ReLU.
     #[must_use]
     pub fn upsampling(conv: &nn::Path<'_>, norm: &nn::Path<'_>, io: [i64; 2], stride: i64) -> Self {
@@ -123,6 +129,12 @@ impl ConvLayer {
     #[must_use]
     pub fn with_norm(self, norm: &nn::Path<'_>, channels: i64) -> Self {
         Self { norm: Some(Norm::new(norm, channels)), ..self }
+    }
+
+    /// The same with a batch norm of another epsilon and momentum.
+    #[must_use]
+    pub fn with_norm_of(self, norm: &nn::Path<'_>, channels: i64, (eps, momentum): (f64, f64)) -> Self {
+        Self { norm: Some(Norm::with_eps(norm, channels, eps, momentum)), ..self }
     }
 
     /// The same with a ReLU at the end.

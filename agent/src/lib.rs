@@ -24,6 +24,7 @@ pub mod pose_error;
 pub mod pose_source;
 pub mod postprocess;
 pub mod registration;
+pub mod residual;
 pub mod rotated_iou;
 pub mod shrink;
 pub mod sparse;

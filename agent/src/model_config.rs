@@ -46,6 +46,29 @@ pub enum ShrinkConfig {
     },
 }
 
+/// What the blocks of the backbone are made of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum BlockKind {
+    /// PointPillars: a strided convolution and `layer_nums` more.
+    #[default]
+    Plain,
+    /// CoAlign: `layer_nums` residual blocks, the first strided.
+    Residual,
+}
+
+/// Towards which side y grows in the world that a network was trained in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum YAxis {
+    /// Left, as everywhere in this program.
+    #[default]
+    Left,
+    /// Right, as in CARLA and the public reference codes: weights from there see a mirrored world. Clouds are mirrored
+    /// before such a network and boxes behind it; its maps lie mirrored on the air, among others of the same network.
+    Right,
+}
+
 /// The prior boxes at every cell of the head.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -82,7 +105,13 @@ pub struct DetectorConfig {
     pub max_pillars: usize,
     /// Channels of the pillar encoder.
     pub pillar_channels: i64,
-    /// Layers of each block after its strided one.
+    /// What blocks are made of.
+    #[serde(default)]
+    pub blocks: BlockKind,
+    /// Towards which side its world grows; a network that is mirrored has an area as wide to the left as to the right.
+    #[serde(default)]
+    pub y_axis: YAxis,
+    /// Layers of each block after its strided one; of residual ones: their number.
     pub layer_nums: Vec<usize>,
     /// Stride of each block.
     pub layer_strides: Vec<i64>,
@@ -113,6 +142,8 @@ impl DetectorConfig {
             max_points_per_pillar: 32,
             max_pillars: 70_000,
             pillar_channels: 64,
+            blocks: BlockKind::Plain,
+            y_axis: YAxis::Left,
             layer_nums: vec![3, 5, 8],
             layer_strides: vec![2, 2, 2],
             num_filters: vec![64, 128, 256],
@@ -239,6 +270,13 @@ impl DetectorConfig {
         if (self.voxel_size_m[0] - self.voxel_size_m[1]).abs() > 1e-9 {
             return Err(value_error("voxel_size_m", self.voxel_size_m, "equal along x and y"));
         }
+        if self.y_axis == YAxis::Right && (range[1] + range[4]).abs() > 1e-9 {
+            return Err(value_error(
+                "lidar_range_m",
+                range,
+                "as wide to the left as to the right where y_axis is right",
+            ));
+        }
         let [x, y, z] = self.pillar_grid();
         if z != 1 {
             return Err(value_error("pillar layers along z", z, "1"));
@@ -268,8 +306,9 @@ impl DetectorConfig {
                 return Err(value_error(field, list, "1 to 4096 each"));
             }
         }
-        if self.layer_nums.iter().any(|layers| *layers > 64) {
-            return Err(value_error("layer_nums", &self.layer_nums, "at most 64 each"));
+        let fewest = if self.blocks == BlockKind::Residual { 1 } else { 0 };
+        if self.layer_nums.iter().any(|layers| !(fewest..=64).contains(layers)) {
+            return Err(value_error("layer_nums", &self.layer_nums, "at most 64 each, residual blocks at least 1"));
         }
         self.check_strides()
     }

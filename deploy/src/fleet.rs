@@ -7,7 +7,7 @@ use agent::localizer::{EndToEndLocalizer, Localizer, LocalizerError};
 use agent::model_config::DetectorConfig;
 use agent::weights::{Weights, WeightsError};
 use ego_fuser::Exchange;
-use protocol::{CavId, Dtype, ProcessId, Role, RunId, Stream, Topic};
+use protocol::{CavId, Dtype, ProcessId, Role, RunId, Smoothing, Stream, Topic};
 use sim_replay::bus::{Route, process_id};
 use sim_replay::dataset::{self, ReadError};
 use sim_replay::ground_truth::GroundTruthRule;
@@ -230,6 +230,10 @@ impl Fleet {
             args.option("--end-to-end", weights);
         }
         args.option("--dtype", dtype(settings.codec.dtype));
+        if let Some(gate) = settings.codec.gate.or(self.scenario.method.gate()) {
+            args.option("--gate", &gate.threshold.to_string());
+            args.option("--gate-smoothing", &smoothing(gate.smoothing));
+        }
         if let Some(bytes) = settings.codec.budget_bytes {
             args.option("--budget", &bytes.to_string());
         }
@@ -359,6 +363,10 @@ fn dtype(dtype: Dtype) -> &'static str {
         Dtype::F16 => "f16",
         Dtype::I8 => "i8",
     }
+}
+
+fn smoothing(smoothing: Option<Smoothing>) -> String {
+    smoothing.map_or_else(|| "none".to_owned(), |Smoothing { kernel, sigma }| format!("{kernel},{sigma}"))
 }
 
 fn noise_mode(mode: NoiseMode) -> &'static str {

@@ -1,6 +1,7 @@
 //! `agent run`: one vehicle of a live fleet.
 
 use std::path::PathBuf;
+use std::str::FromStr;
 
 use agent::agent::Agent;
 use agent::detector::Detector;
@@ -9,7 +10,7 @@ use agent::pose_source::sanity::SanityConfig;
 use agent::pose_source::{EndToEndPoseConfig, NoiseMode, NoisyPoseConfig, PgcConfig, PoseSource, PoseSourceConfig};
 use anyhow::Context;
 use clap::ValueEnum;
-use protocol::{CavId, CodecConfig, Dtype, Role, Stream};
+use protocol::{CavId, CodecConfig, ConfidenceGate, Dtype, Role, Smoothing, Stream};
 use sim_replay::bus::{BusArgs, STOP_LIMIT, log_to_stderr};
 
 use crate::cli::BadInput;
@@ -40,6 +41,12 @@ pub(crate) struct Args {
     /// How exactly feature values are written.
     #[arg(long, value_enum, default_value_t = Exactness::F32)]
     dtype: Exactness,
+    /// Confidence that a cell must exceed to be sent [default: all cells are sent].
+    #[arg(long, value_name = "CONFIDENCE", allow_negative_numbers = true)]
+    gate: Option<f32>,
+    /// Window that the confidence is smoothed with first: edge in cells, sigma in cells; or none.
+    #[arg(long, value_name = "CELLS,SIGMA", default_value = "5,1", requires = "gate")]
+    gate_smoothing: SmoothingArg,
     /// Most bytes of a feature map, before packing: the cells with the highest confidence that fit are sent
     /// [default: all].
     #[arg(long, value_name = "BYTES", visible_alias = "budget-bytes")]
@@ -145,6 +152,24 @@ enum Exactness {
     I8,
 }
 
+/// `5,1`: a window of 5 x 5 cells with a sigma of one cell; `none`: no smoothing.
+#[derive(Debug, Clone, Copy, PartialEq)]
+struct SmoothingArg(Option<Smoothing>);
+
+impl FromStr for SmoothingArg {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        if text == "none" {
+            return Ok(Self(None));
+        }
+        let (kernel, sigma) = text.split_once(',').ok_or_else(|| format!("{text:?} is not CELLS,SIGMA or none"))?;
+        let kernel = kernel.trim().parse().map_err(|error| format!("window {kernel:?}: {error}"))?;
+        let sigma = sigma.trim().parse().map_err(|error| format!("sigma {sigma:?}: {error}"))?;
+        Ok(Self(Some(Smoothing { kernel, sigma })))
+    }
+}
+
 /// Loads the models, joins the run and works until the replay ends.
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     log_to_stderr();
@@ -192,9 +217,10 @@ impl Args {
             Exactness::F16 => Dtype::F16,
             Exactness::I8 => Dtype::I8,
         };
+        let gate = self.gate.map(|threshold| ConfidenceGate { threshold, smoothing: self.gate_smoothing.0 });
         NodeOptions {
             publish: self.publish.iter().map(stream).collect(),
-            codec: CodecConfig { dtype, budget_bytes: self.budget, zstd_level: self.zstd },
+            codec: CodecConfig { dtype, gate, budget_bytes: self.budget, zstd_level: self.zstd },
             keeps_running: self.keep_running || self.bus.supervised,
             ..NodeOptions::default()
         }

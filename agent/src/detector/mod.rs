@@ -22,7 +22,7 @@ use crate::backbone::BevBackbone;
 use crate::crop::Crop;
 use crate::decode::{Decoded, decode};
 use crate::head::DetectionHead;
-use crate::model_config::DetectorConfig;
+use crate::model_config::{DetectorConfig, YAxis};
 use crate::pillar_batch::PillarLattice;
 use crate::pillar_projection::PillarProjection;
 use crate::pillars::Voxeliser;
@@ -159,6 +159,9 @@ impl Detector {
         let mut clock = StageClock::start();
         self.cropped.clear();
         crop.keep(&cloud.xyzi, &mut self.cropped);
+        if self.config.y_axis == YAxis::Right {
+            self.cropped.iter_mut().for_each(|point| point[1] = -point[1]);
+        }
         let pillars = self.voxeliser.voxelise(&self.cropped);
         let voxelise = clock.lap();
         self.canvas.fill(0.0);
@@ -201,12 +204,19 @@ impl Detector {
         })
     }
 
-    /// Boxes above a score, in the frame of the map, not yet suppressed.
+    /// Boxes above a score, in the frame of the vehicle whose map it is, not yet suppressed.
     ///
     /// # Errors
     /// [`DetectorError::Decode`] when the heads are of another detector.
     pub fn boxes(&self, heads: &Heads, score_threshold: f32) -> Result<Vec<Decoded>, DetectorError> {
-        Ok(decode(&heads.scores, &heads.offsets, &self.anchors, score_threshold)?)
+        let mut boxes = decode(&heads.scores, &heads.offsets, &self.anchors, score_threshold)?;
+        if self.config.y_axis == YAxis::Right {
+            for Decoded { box3d, .. } in &mut boxes {
+                box3d.center_m[1] = -box3d.center_m[1];
+                box3d.heading_rad = -box3d.heading_rad;
+            }
+        }
+        Ok(boxes)
     }
 
     /// The map as it is sent.
@@ -311,6 +321,31 @@ mod tests {
         let [channels, height, width] = detector.map_shape();
         let back = Tensor::from_slice(&message.values).view([channels, height, width]);
         assert_eq!(detector.heads(&back).unwrap(), detector.heads(&first).unwrap());
+    }
+
+    #[test]
+    fn a_network_of_a_mirrored_world_sees_the_mirrored_cloud() {
+        let (store, pillars) = network();
+        let _ = tch::no_grad(|| store.variables()["cls_head.bias"].shallow_clone().fill_(0.5));
+        let mut plain = Detector::from_network(pillars);
+        let (mirrored_store, mut pillars) = network();
+        for (name, mut variable) in mirrored_store.variables() {
+            tch::no_grad(|| variable.copy_(&store.variables()[&name]));
+        }
+        pillars.config.y_axis = YAxis::Right;
+        let mut mirrored = Detector::from_network(pillars);
+        let flip =
+            |cloud: PointCloud| PointCloud { xyzi: cloud.xyzi.iter().map(|&[x, y, z, i]| [x, -y, z, i]).collect() };
+        let (there, here) = (plain.encode(&cloud()).unwrap(), mirrored.encode(&flip(cloud())).unwrap());
+        assert!(there.features.equal(&here.features));
+        let boxes = |detector: &Detector, features| detector.boxes(&detector.heads(features).unwrap(), 0.3).unwrap();
+        let (theirs, ours) = (boxes(&plain, &there.features), boxes(&mirrored, &here.features));
+        assert!(!theirs.is_empty() && theirs.len() == ours.len());
+        for (theirs, ours) in theirs.iter().zip(&ours) {
+            assert_eq!(theirs.box3d.center_m[1], -ours.box3d.center_m[1]);
+            assert_eq!(theirs.box3d.heading_rad, -ours.box3d.heading_rad);
+            assert_eq!(theirs.box3d.center_m[0], ours.box3d.center_m[0]);
+        }
     }
 
     #[test]

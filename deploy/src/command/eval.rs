@@ -11,7 +11,7 @@ use deploy::evaluation::{EvaluationOptions, evaluate, frame_count};
 use deploy::report;
 use ego_fuser::Method;
 use indicatif::{ProgressBar, ProgressStyle};
-use protocol::{CodecConfig, Dtype};
+use protocol::{CodecConfig, ConfidenceGate, Dtype};
 
 use super::{BadInput, Outcome};
 
@@ -59,6 +59,9 @@ pub(crate) struct Arguments {
     /// How exactly feature values cross the air.
     #[arg(long, value_enum, default_value_t = Exactness::F32)]
     dtype: Exactness,
+    /// Confidence that a cell must exceed to be sent, smoothed as Where2comm does [default: what the method says].
+    #[arg(long, value_name = "CONFIDENCE", allow_negative_numbers = true)]
+    gate: Option<f32>,
     /// Most bytes of a feature map, before packing [default: all cells].
     #[arg(long, value_name = "BYTES")]
     budget: Option<u64>,
@@ -142,6 +145,7 @@ impl Arguments {
                     Exactness::F16 => Dtype::F16,
                     Exactness::I8 => Dtype::I8,
                 },
+                gate: self.gate.map(|threshold| ConfidenceGate { threshold, ..ConfidenceGate::default() }),
                 budget_bytes: self.budget,
                 zstd_level: self.zstd,
             },
