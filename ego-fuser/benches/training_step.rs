@@ -50,8 +50,7 @@ fn training_step(criterion: &mut Criterion) {
     let mut rng = ChaCha8Rng::seed_from_u64(1);
     let mut voxeliser = Voxeliser::for_detector(&config);
     let pillars: Vec<Pillars> = (0..AGENTS * SAMPLES).map(|_| voxeliser.voxelise(&sweep(&mut rng))).collect();
-    let poses =
-        [Pose::IDENTITY, Pose::from_xyz_yaw([12.0, 3.0, 0.0], 0.4), Pose::from_xyz_yaw([-20.0, 5.0, 0.0], 3.0)];
+    let poses = [Pose::IDENTITY, Pose::from_xyz_yaw([12.0, 3.0, 0.0], 0.4), Pose::from_xyz_yaw([-20.0, 5.0, 0.0], 3.0)];
     let facts: Vec<_> = poses.into_iter().enumerate().map(|(agent, pose)| ViewFacts::fresh(agent, pose)).collect();
     let facts = vec![facts; SAMPLES];
     let mut group = criterion.benchmark_group("training_step/lean/2x3");

@@ -3,6 +3,8 @@
 //! Synchronous and without any network: live process, offline evaluation, tests and benches run the same lines, and the
 //! same views give the same bits.
 
+mod box_correction;
+
 use std::path::Path;
 use std::time::Instant;
 
@@ -45,7 +47,7 @@ impl View {
 /// What crosses the air, by method.
 #[derive(Debug, Clone, PartialEq)]
 pub enum Content {
-    /// A feature map: `none`, `max`, `attention`.
+    /// A feature map: `none`, and all methods of intermediate fusion.
     Features(DecodedFeatures),
     /// Detections: `late`.
     Boxes(Vec<Detection>),
@@ -283,6 +285,10 @@ impl Ego {
         let newest = maps.len();
         let mut facts: Vec<ViewFacts> =
             aligned.iter().enumerate().map(|(agent, view)| view.facts(agent, aligned[0].view)).collect();
+        if let Some(pose_graph) = self.fusion.config().pose_graph() {
+            box_correction::correct_by_boxes(&mut facts, &maps, &self.detector, pose_graph)?;
+            stages.lap("correct");
+        }
         for (agent, kept, ego_from_cav) in self.earlier(aligned) {
             maps.push(kept.map.shallow_clone());
             sent.push(kept.sent.shallow_clone());

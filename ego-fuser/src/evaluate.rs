@@ -30,7 +30,7 @@ pub struct EvaluateConfig {
     pub method: Option<Method>,
     /// Where the vehicles' poses come from.
     pub pose_source: PoseSourceConfig,
-    /// How maps are encoded.
+    /// How maps are encoded; without a gate the method's own holds.
     pub codec: CodecConfig,
     /// Which objects count; absent: those wholly over the area of the network, of all vehicles within 70 m.
     pub rule: Option<GroundTruthRule>,
@@ -95,6 +95,8 @@ impl Evaluator {
     pub fn new(config: EvaluateConfig) -> Result<Self, EvaluateError> {
         let ego = Ego::load(&config.weights, config.method)?;
         let rule = config.rule.unwrap_or_else(|| rule_of(ego.detector()));
+        let codec = CodecConfig { gate: config.codec.gate.or(ego.method().gate()), ..config.codec };
+        let config = EvaluateConfig { codec, ..config };
         Ok(Self { weights: Weights::load(&config.weights)?, ego, rule, config, under_way: VecDeque::new() })
     }
 

@@ -17,6 +17,7 @@ mod history;
 pub mod loss;
 pub mod method;
 pub mod model;
+pub mod multi_scale;
 mod neighbourhood;
 pub mod node;
 pub mod pairing;

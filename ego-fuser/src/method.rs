@@ -3,6 +3,7 @@
 use std::fmt;
 use std::str::FromStr;
 
+use protocol::ConfidenceGate;
 use serde::{Deserialize, Serialize};
 
 /// How the views of several CAVs become one set of boxes.
@@ -19,6 +20,17 @@ pub enum Method {
     Max,
     /// Feature maps, self-attention over the agents at each cell (AttFuse, OPV2V).
     Attention,
+    /// Feature maps, only the cells around which a vehicle is likely (Where2comm).
+    Where2comm,
+    /// Feature maps, their poses corrected by the boxes in common (CoAlign).
+    #[serde(rename = "coalign")]
+    CoAlign,
+    /// Feature maps, messages between the vehicles (V2VNet).
+    #[serde(rename = "v2vnet")]
+    V2vNet,
+    /// Feature maps, a learnt weight for each agent and cell (DiscoNet).
+    #[serde(rename = "disconet")]
+    DiscoNet,
     /// Feature maps, attention over agents and within windows of several sizes (V2X-ViT).
     #[serde(rename = "v2xvit")]
     V2xVit,
@@ -44,12 +56,16 @@ pub enum Exchange {
 
 impl Method {
     /// Every method, in the order of tables.
-    pub const ALL: [Self; 8] = [
+    pub const ALL: [Self; 12] = [
         Self::None,
         Self::Late,
         Self::Early,
         Self::Max,
         Self::Attention,
+        Self::Where2comm,
+        Self::CoAlign,
+        Self::V2vNet,
+        Self::DiscoNet,
         Self::V2xVit,
         Self::Cobevt,
         Self::Pastat,
@@ -64,6 +80,10 @@ impl Method {
             Self::Early => "early",
             Self::Max => "max",
             Self::Attention => "attention",
+            Self::Where2comm => "where2comm",
+            Self::CoAlign => "coalign",
+            Self::V2vNet => "v2vnet",
+            Self::DiscoNet => "disconet",
             Self::V2xVit => "v2xvit",
             Self::Cobevt => "cobevt",
             Self::Pastat => "pastat",
@@ -79,6 +99,10 @@ impl Method {
             Self::Early => "points, encoded together in the ego frame",
             Self::Max => "feature maps, element-wise maximum (F-Cooper)",
             Self::Attention => "feature maps, self-attention over agents at each cell (AttFuse)",
+            Self::Where2comm => "feature maps, only the cells around which a vehicle is likely (Where2comm)",
+            Self::CoAlign => "feature maps, poses corrected by the boxes in common, attention (CoAlign)",
+            Self::V2vNet => "feature maps, messages between the vehicles (V2VNet)",
+            Self::DiscoNet => "feature maps, a learnt weight per agent and cell (DiscoNet)",
             Self::V2xVit => "feature maps, attention over agents and windows of several sizes (V2X-ViT)",
             Self::Cobevt => "feature maps, attention over agents within windows and grids (CoBEVT)",
             Self::Pastat => "feature maps with history, aligned by confidence and content, transformer (PASTAT)",
@@ -92,8 +116,14 @@ impl Method {
             Self::None => Exchange::Nothing,
             Self::Late => Exchange::Boxes,
             Self::Early => Exchange::Points,
-            Self::Max | Self::Attention | Self::V2xVit | Self::Cobevt | Self::Pastat => Exchange::Features,
+            _ => Exchange::Features,
         }
+    }
+
+    /// Which cells of their maps agents send, where nothing else is said; absent: all.
+    #[must_use]
+    pub fn gate(self) -> Option<ConfidenceGate> {
+        (self == Self::Where2comm).then(ConfidenceGate::default)
     }
 }
 

@@ -6,7 +6,7 @@ use std::path::Path;
 use agent::anchors::Anchors;
 use agent::decode::{DecodeError, decode};
 use agent::head::HeadOutput;
-use agent::model_config::{ConfigError, DetectorConfig};
+use agent::model_config::{ConfigError, DetectorConfig, YAxis};
 use agent::pillar_batch::PillarBatch;
 use agent::point_pillars::PointPillars;
 use agent::postprocess::{AgentBoxes, PostprocessConfig, postprocess};
@@ -17,6 +17,7 @@ use protocol::{Box3d, Detection};
 use tch::nn::VarStore;
 use tch::{Device, Kind, TchError, Tensor};
 
+use crate::fusion::where2comm::most_confident;
 use crate::fusion::{FUSION_KEY, FUSION_PREFIX, FusionConfig, FusionStage, ViewFacts, steering, stored_config};
 use crate::method::{Method, UnknownMethod};
 use crate::targets::{LatticeError, TargetAssigner, TargetRule};
@@ -90,6 +91,11 @@ impl CooperativeModel {
         fusion: &FusionConfig,
         device: Device,
     ) -> Result<Self, ModelError> {
+        if config.y_axis == YAxis::Right {
+            // Samples and targets are of this world.
+            let (field, value) = ("y_axis", "right".to_owned());
+            return Err(ConfigError::Value { field, value, must: "left to train" }.into());
+        }
         let variables = VarStore::new(device);
         let network = PointPillars::new(&variables.root(), config)?;
         let fusion = FusionStage::new(&variables.root(), fusion, method, config)?;
@@ -122,7 +128,9 @@ impl CooperativeModel {
         let config = serde_json::to_string(&self.network.config).expect("a configuration is JSON");
         let fusion = serde_json::to_string(self.fusion.config()).expect("a configuration is JSON");
         let method = self.method.name().to_owned();
-        [(CONFIG_KEY, config), (METHOD_KEY, method), (FUSION_KEY, fusion)].map(|(key, value)| (key.to_owned(), value)).into()
+        [(CONFIG_KEY, config), (METHOD_KEY, method), (FUSION_KEY, fusion)]
+            .map(|(key, value)| (key.to_owned(), value))
+            .into()
     }
 
     /// The numbers it was built from.
@@ -193,9 +201,26 @@ impl CooperativeModel {
         for facts in facts {
             let views = features.f_narrow(0, first, facts.len() as i64)?;
             first += facts.len() as i64;
-            fused.push(self.fusion.fuse(&self.fusion.align(&views, None, facts)?, facts, train)?);
+            let sent = if train { self.sent_in_training(&views)? } else { None };
+            fused.push(self.fusion.fuse(&self.fusion.align(&views, sent.as_ref(), facts)?, facts, train)?);
         }
         Ok(self.network.heads(&Tensor::f_stack(&fused, 0)?)?)
+    }
+
+    /// What agents would have sent of their maps `[N, C, H, W]`, for a method in which they choose: in training a random
+    /// share of the cells that they are surest of, so that every threshold is learnt for. The ego has all of its own.
+    fn sent_in_training(&self, features: &Tensor) -> Result<Option<Tensor>, TchError> {
+        let agents = features.size4()?.0;
+        if !matches!(self.fusion.config(), FusionConfig::Where2comm(_)) || agents < 2 {
+            return Ok(None);
+        }
+        tch::no_grad(|| {
+            let confidence = self.network.heads(features)?.confidence().f_unsqueeze(1)?;
+            let share = Tensor::f_rand([1], (Kind::Float, Device::Cpu))?.double_value(&[0]);
+            let sent = most_confident(&confidence, share)?;
+            let _ = sent.f_get(0)?.f_fill_(1.0)?;
+            Ok(Some(sent))
+        })
     }
 
     /// Boxes of every sample of a head's output, cleaned up by `limits`.

@@ -16,6 +16,7 @@ pub mod box_icp;
 pub mod clouds;
 pub mod compare;
 pub mod free_align;
+pub mod pose_graph;
 pub mod poses;
 pub mod table;
 

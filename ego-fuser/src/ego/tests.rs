@@ -2,7 +2,7 @@ use agent::agent::{Agent, AgentInput};
 use agent::model_config::DetectorConfig;
 use agent::point_pillars::PointPillars;
 use agent::pose_source::RecordedPose;
-use protocol::NoPoseReason;
+use protocol::{CodecConfig, ConfidenceGate, Limits, NoPoseReason, encode_features};
 use tch::Device;
 use tch::nn::VarStore;
 
@@ -64,7 +64,7 @@ fn near() -> Pose {
 
 #[test]
 fn a_neighbour_changes_what_is_seen_and_the_same_views_give_the_same_bits() {
-    for method in [Method::Early, Method::Max, Method::Attention] {
+    for method in [Method::Early, Method::Max, Method::Attention, Method::Where2comm, Method::CoAlign] {
         let (own, other) = (view("a", HERE, method, 0.0), view("b", near(), method, 0.15));
         let mut ego = Ego::new(detector(), method).unwrap();
         let alone = ego.detect(&own, &[]).unwrap();
@@ -108,7 +108,7 @@ fn with_none_left_the_maps_of_every_method_are_those_of_the_ego_alone() {
     assert!(!alone.is_empty());
     let far = view("b", Pose::from_xyz_yaw([200.0, 50.0, 2.0], 0.0), Method::Max, 0.0);
     let lost = View { pose: PoseEstimate::NoPose { reason: NoPoseReason::NoSource, inlier_count: 0 }, ..far.clone() };
-    for method in [Method::Max, Method::Attention] {
+    for method in [Method::Max, Method::Attention, Method::Where2comm, Method::CoAlign, Method::DiscoNet] {
         let output = Ego::new(detector(), method).unwrap().detect(&own, &[far.clone(), lost.clone()]).unwrap();
         assert_eq!(output.detections, alone, "{method}");
         let reasons = [(0, Skipped::Unusable(DropReason::OutOfRange)), (1, Skipped::Unusable(DropReason::NoPose))];
@@ -136,6 +136,37 @@ fn cells_that_were_not_sent_have_no_part() {
     let output = ego.detect(&own, &[other]).unwrap();
     assert_eq!(output.fused, [0]);
     assert_eq!(output.detections, ego.detect(&own, &[]).unwrap().detections);
+}
+
+#[test]
+fn what_is_not_worth_sending_is_not_on_the_air_and_the_rest_is_fused_as_it_is() {
+    let own = view("a", HERE, Method::Where2comm, 0.0);
+    let mut other = view("b", near(), Method::Where2comm, 0.1);
+    let Content::Features(map) = &mut other.content else { panic!("maps are exchanged") };
+    let detector = detector();
+    let [channels, height, width] = detector.map_shape();
+    let whole = Tensor::from_slice(&map.features.values).view([1, channels, height, width]);
+    let confidence = detector.heads(&whole).unwrap().confidence;
+    let mut distinct = confidence.clone();
+    distinct.sort_by(f32::total_cmp);
+    distinct.dedup();
+    let gate = ConfidenceGate { threshold: distinct[distinct.len() * 3 / 4], smoothing: None };
+    let encode = |gate| {
+        let codec = CodecConfig { gate, ..CodecConfig::default() };
+        encode_features(map.features.clone(), &codec, Some(&confidence)).unwrap()
+    };
+    let (dense, sparse) = (encode(None), encode(Some(gate)));
+    let (dense_bytes, sparse_bytes) = (dense.body.len(), sparse.body.len());
+    let received = sparse.decode(&Limits::DEFAULT).unwrap();
+    let sent = received.sent.clone().unwrap().iter().filter(|sent| **sent).count();
+    assert_eq!(sent, confidence.iter().filter(|confidence| **confidence > gate.threshold).count());
+    assert!((1..confidence.len()).contains(&sent), "{sent} of {}", confidence.len());
+    assert_eq!(sparse_bytes, confidence.len() / 8 + dense_bytes / confidence.len() * sent);
+    *map = received;
+    let mut ego = Ego::new(detector, Method::Where2comm).unwrap();
+    let output = ego.detect(&own, std::slice::from_ref(&other)).unwrap();
+    assert_eq!(output.fused, [0]);
+    assert!(output.detections != ego.detect(&own, &[]).unwrap().detections);
 }
 
 #[test]

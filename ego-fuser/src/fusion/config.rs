@@ -1,14 +1,21 @@
 //! Which fusion a network has, and of what size.
 
+use std::ops::RangeInclusive;
+
 use agent::model_config::{ConfigError, DetectorConfig};
 use serde::{Deserialize, Serialize};
 use tch::nn;
 
+use super::coalign::CoAlignConfig;
 use super::cobevt::{Cobevt, CobevtConfig};
-use super::v2xvit::{V2xVit, V2xVitConfig};
+use super::disconet::{DiscoNet, DiscoNetConfig};
 use super::pastat::{Pastat, PastatConfig};
+use super::v2vnet::{V2vNet, V2vNetConfig};
+use super::v2xvit::{V2xVit, V2xVitConfig};
+use super::where2comm::{Where2comm, Where2commConfig};
 use super::{AttentionFusion, Fusion, MaxFusion, NoFusion};
 use crate::Method;
+use crate::alignment::pose_graph::PoseGraphConfig;
 
 /// Metadata key of the fusion's configuration in a weights file.
 pub const FUSION_KEY: &str = "fusion";
@@ -26,6 +33,17 @@ pub enum FusionConfig {
     Max,
     /// Attention without parameters.
     Attention,
+    /// Attention or maximum over the cells worth sending.
+    Where2comm(Where2commConfig),
+    /// Attention or maximum after a correction of the poses.
+    #[serde(rename = "coalign")]
+    CoAlign(CoAlignConfig),
+    /// Messages between vehicles.
+    #[serde(rename = "v2vnet")]
+    V2vNet(V2vNetConfig),
+    /// A weight per agent and cell.
+    #[serde(rename = "disconet")]
+    DiscoNet(DiscoNetConfig),
     /// V2X-ViT.
     #[serde(rename = "v2xvit")]
     V2xVit(V2xVitConfig),
@@ -45,12 +63,27 @@ impl FusionConfig {
             Method::None | Method::Late | Method::Early => Self::Own,
             Method::Max => Self::Max,
             Method::Attention => Self::Attention,
+            Method::Where2comm => Self::Where2comm(Where2commConfig::default()),
+            Method::CoAlign => Self::CoAlign(CoAlignConfig::default()),
+            Method::V2vNet if is_lean => Self::V2vNet(V2vNetConfig::lean(channels)),
+            Method::V2vNet => Self::V2vNet(V2vNetConfig::full(channels)),
+            Method::DiscoNet if is_lean => Self::DiscoNet(DiscoNetConfig::lean(channels)),
+            Method::DiscoNet => Self::DiscoNet(DiscoNetConfig::full(channels)),
             Method::V2xVit if is_lean => Self::V2xVit(V2xVitConfig::lean(channels)),
             Method::V2xVit => Self::V2xVit(V2xVitConfig::full(channels)),
             Method::Cobevt if is_lean => Self::Cobevt(CobevtConfig::lean(channels)),
             Method::Cobevt => Self::Cobevt(CobevtConfig::full(channels)),
             Method::Pastat if is_lean => Self::Pastat(PastatConfig::lean(channels)),
             Method::Pastat => Self::Pastat(PastatConfig::full(channels)),
+        }
+    }
+
+    /// How poses are corrected by boxes before maps are moved, for a fusion that asks for it.
+    #[must_use]
+    pub fn pose_graph(&self) -> Option<&PoseGraphConfig> {
+        match self {
+            Self::CoAlign(config) => config.pose_graph.as_ref(),
+            _ => None,
         }
     }
 
@@ -63,9 +96,21 @@ impl FusionConfig {
             Self::Own => Box::new(NoFusion),
             Self::Max => Box::new(MaxFusion),
             Self::Attention => Box::new(AttentionFusion),
+            Self::Where2comm(config) => Box::new(Where2comm::new(config)),
+            Self::CoAlign(config) => Box::new(config.fusion()),
+            Self::V2vNet(config) => Box::new(V2vNet::new(path, config)?),
+            Self::DiscoNet(config) => Box::new(DiscoNet::new(path, config)?),
             Self::V2xVit(config) => Box::new(V2xVit::new(path, config)?),
             Self::Cobevt(config) => Box::new(Cobevt::new(path, config)?),
             Self::Pastat(config) => Box::new(Pastat::new(path, config)?),
         })
     }
+}
+
+/// Checks a number of a fusion's configuration.
+pub(super) fn within(field: &'static str, value: i64, allowed: RangeInclusive<i64>) -> Result<(), ConfigError> {
+    if allowed.contains(&value) {
+        return Ok(());
+    }
+    Err(ConfigError::Value { field, value: value.to_string(), must: "positive and of a size that a network can have" })
 }

@@ -2,8 +2,11 @@
 
 mod attention;
 mod block_order;
+pub mod coalign;
 pub mod cobevt;
 mod config;
+mod conv_gru;
+pub mod disconet;
 pub mod layers;
 mod max;
 mod padding;
@@ -11,7 +14,9 @@ pub mod pastat;
 mod stage;
 pub(crate) mod steering;
 pub mod swap_fusion;
+pub mod v2vnet;
 pub mod v2xvit;
+pub mod where2comm;
 
 use std::fmt::Debug;
 
@@ -86,6 +91,13 @@ impl Fusion for NoFusion {
     fn fuse(&self, views: &AlignedViews<'_>, _train: bool) -> Result<Tensor, TchError> {
         views.features.f_get(0)
     }
+}
+
+/// The entries of `mask` `[N, 1, H, W]` that have something to say anywhere, the ego first.
+pub(crate) fn present(mask: &Tensor) -> Result<Vec<i64>, TchError> {
+    let most = mask.f_amax([1i64, 2, 3].as_slice(), false)?.f_to_kind(tch::Kind::Float)?;
+    let most = Vec::<f32>::try_from(most.f_to_device(tch::Device::Cpu)?)?;
+    Ok((0i64..).zip(most).filter(|(entry, most)| *entry == 0 || *most > 0.0).map(|(entry, _)| entry).collect())
 }
 
 /// Splits agents of all samples into padded samples: `[sum(agents), ...]` to `[B, longest, ...]` and a mask `[B, longest]`.

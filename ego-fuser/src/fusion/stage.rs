@@ -1,6 +1,8 @@
 //! From the maps of several vehicles to one: turned, warped, fused. Training and the ego run the same lines.
 
-use agent::model_config::{ConfigError, DetectorConfig};
+use std::borrow::Cow;
+
+use agent::model_config::{ConfigError, DetectorConfig, YAxis};
 use agent::weights::{Weights, WeightsError};
 use protocol::{BevGrid, Pose};
 use tch::nn::{self, VarStore};
@@ -32,6 +34,8 @@ pub struct FusionStage {
     fusion: Box<dyn Fusion>,
     steering: Option<Steering>,
     grid: BevGrid,
+    /// In which world the maps are.
+    y_axis: YAxis,
 }
 
 /// Maps on the ego lattice, with what they were made from.
@@ -56,7 +60,7 @@ impl FusionStage {
         let shares_maps = method.exchange() == Exchange::Features;
         let steering = shares_maps.then(|| Steering::new(path, detector.feature_channels()));
         let fusion = config.build(&(path / "fusion"))?;
-        Ok(Self { config: config.clone(), fusion, steering, grid: detector.feature_grid() })
+        Ok(Self { config: config.clone(), fusion, steering, grid: detector.feature_grid(), y_axis: detector.y_axis })
     }
 
     /// The fusion of a weights file, or the one of `method` where it is another and has no parameters.
@@ -102,8 +106,13 @@ impl FusionStage {
     ///
     /// # Errors
     /// [`WarpError`] when the maps do not lie on the lattice or facts are missing.
-    pub fn align(&self, own_frame: &Tensor, sent: Option<&Tensor>, facts: &[ViewFacts]) -> Result<AlignedMaps, WarpError> {
-        let poses: Vec<Pose> = facts.iter().map(|facts| facts.ego_from_cav).collect();
+    pub fn align(
+        &self,
+        own_frame: &Tensor,
+        sent: Option<&Tensor>,
+        facts: &[ViewFacts],
+    ) -> Result<AlignedMaps, WarpError> {
+        let poses: Vec<Pose> = self.of_network(facts).iter().map(|facts| facts.ego_from_cav).collect();
         let own_frame = match &self.steering {
             Some(steering) => steering.turn(own_frame, &poses)?,
             None => own_frame.shallow_clone(),
@@ -118,9 +127,24 @@ impl FusionStage {
     /// [`WarpError::Torch`] when the tensor library refuses.
     pub fn fuse(&self, maps: &AlignedMaps, facts: &[ViewFacts], train: bool) -> Result<Tensor, WarpError> {
         let AlignedMaps { own_frame, warped } = maps;
-        let views =
-            AlignedViews { features: &warped.features, mask: &warped.mask, own_frame, grid: &self.grid, facts };
+        let facts = &*self.of_network(facts);
+        let views = AlignedViews { features: &warped.features, mask: &warped.mask, own_frame, grid: &self.grid, facts };
         Ok(self.fusion.fuse(&views, train)?)
+    }
+}
+
+impl FusionStage {
+    /// The facts in the world of the network: a mirrored one has mirrored poses.
+    fn of_network<'a>(&self, facts: &'a [ViewFacts]) -> Cow<'a, [ViewFacts]> {
+        if self.y_axis == YAxis::Left {
+            return Cow::Borrowed(facts);
+        }
+        let mirrored = |facts: &ViewFacts| {
+            let Pose { translation_m: [x, y, z], rotation_wxyz: [qw, qx, qy, qz] } = facts.ego_from_cav;
+            let ego_from_cav = Pose { translation_m: [x, -y, z], rotation_wxyz: [qw, -qx, qy, -qz] };
+            ViewFacts { ego_from_cav, ..*facts }
+        };
+        Cow::Owned(facts.iter().map(mirrored).collect())
     }
 }
 
@@ -137,4 +161,32 @@ pub(crate) fn stored_config(
     let stored: FusionConfig = weights.metadata_json(FUSION_KEY)?;
     let is_of_method = std::mem::discriminant(&stored) == std::mem::discriminant(&usual);
     Ok(if is_of_method { stored } else { usual })
+}
+
+#[cfg(test)]
+mod tests {
+    use tch::Kind;
+
+    use super::*;
+
+    /// A network of a mirrored world gets mirrored maps and answers with a mirrored one.
+    #[test]
+    fn a_mirrored_world_is_fused_like_this_one() {
+        tch::set_num_threads(1);
+        let plain = DetectorConfig::lean();
+        let mirrored = DetectorConfig { y_axis: YAxis::Right, ..DetectorConfig::lean() };
+        let grid = plain.feature_grid();
+        let size = [3, plain.feature_channels(), i64::from(grid.height), i64::from(grid.width)];
+        let maps = Tensor::rand(size, (Kind::Float, Device::Cpu));
+        let poses =
+            [Pose::IDENTITY, Pose::from_xyz_yaw([8.0, 3.0, 0.0], 0.4), Pose::from_xyz_yaw([-5.0, 9.0, 0.0], -2.0)];
+        let facts: Vec<ViewFacts> = (0..3).map(|agent| ViewFacts::fresh(agent, poses[agent])).collect();
+        let fused = |detector: &DetectorConfig, maps: &Tensor| {
+            let stage = FusionStage::untrained(Method::Attention, detector).unwrap();
+            stage.fuse(&stage.align(maps, None, &facts).unwrap(), &facts, false).unwrap()
+        };
+        let here = fused(&plain, &maps);
+        let there = fused(&mirrored, &maps.flip([2])).flip([1]);
+        assert!(here.allclose(&there, 1e-3, 1e-3, false));
+    }
 }

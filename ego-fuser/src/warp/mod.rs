@@ -120,7 +120,7 @@ const UNMOVED: [f32; 6] = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0];
 
 /// Rows of the affine map from normalised ego coordinates (-1..1 over the whole extent of the lattice, edges of the outer
 /// cells included) to normalised CAV coordinates: `[xx, xy, x0, yx, yy, y0]`.
-fn cav_from_ego_normalized(ego_from_cav: &Pose, grid: &BevGrid) -> [f32; 6] {
+pub(crate) fn cav_from_ego_normalized(ego_from_cav: &Pose, grid: &BevGrid) -> [f32; 6] {
     let (sin, cos) = ego_from_cav.yaw_rad().sin_cos();
     let [ego_x, ego_y, _] = ego_from_cav.translation_m;
     let half_x = grid.cell_m * f64::from(grid.width) / 2.0;

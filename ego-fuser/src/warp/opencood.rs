@@ -47,16 +47,25 @@ pub fn about_centre(matrix: &Tensor, height: i64, width: i64) -> Result<Tensor, 
 /// [`TchError`] when shapes do not fit or a transform cannot be inverted.
 pub fn warp_affine(source: &Tensor, matrix: &Tensor, interpolation: Interpolation) -> Result<Tensor, TchError> {
     let (batch, channels, height, width) = source.size4()?;
-    let homography = homogeneous(matrix)?;
-    let normal = pixel_to_normal(height, width, matrix)?;
-    let destination_from_source = normal.f_matmul(&homography.f_matmul(&normal.f_inverse()?)?)?;
-    let theta = destination_from_source.f_inverse()?.f_narrow(-2, 0, 2)?;
+    let theta = normalized(matrix, height, width)?;
     let lattice = Tensor::f_affine_grid_generator(&theta, [batch, channels, height, width], true)?;
     let mode = match interpolation {
         Interpolation::Bilinear => BILINEAR,
         Interpolation::Nearest => NEAREST,
     };
     source.f_grid_sampler(&lattice.f_to_kind(source.kind())?, mode, PADDING_ZEROS, true)
+}
+
+/// Destination-to-source matrices `[N, 2, 3]` on coordinates -1..1 with aligned corners, from source-to-destination pixel
+/// transforms `[N, 2, 3]`.
+///
+/// # Errors
+/// [`TchError`] when shapes do not fit or a transform cannot be inverted.
+pub fn normalized(matrix: &Tensor, height: i64, width: i64) -> Result<Tensor, TchError> {
+    let homography = homogeneous(matrix)?;
+    let normal = pixel_to_normal(height, width, matrix)?;
+    let destination_from_source = normal.f_matmul(&homography.f_matmul(&normal.f_inverse()?)?)?;
+    destination_from_source.f_inverse()?.f_narrow(-2, 0, 2)
 }
 
 /// Which cells of the ego see something of each agent: `[B, L, H, W]`, 1 inside the warped extent of a present agent.

@@ -1,0 +1,235 @@
+//! Poses corrected by what vehicles see in common: the agent-object pose graph of CoAlign (Lu et al., ICRA 2023).
+//!
+//! Agents and objects are nodes, every box is an edge between the agent that sees it and the object it is of, weighed by
+//! how exact the box is. The ego stands still; agents and objects move until the boxes fit best.
+//!
+//! What differs from the published code: boxes are one object there when they lie within 1.5 m of each other, which an
+//! error of 2 m and a degree at 60 m defeats; here the matching may move an agent by as much as its pose may be wrong, and
+//! takes the motion that most boxes agree on ([`consensus`](self)). Its detector predicts the uncertainty of every box;
+//! ours does not, and it is taken from score and distance. Agents stay near their own poses by a weak prior, so that one
+//! with few boxes in common is not turned about by them.
+
+mod consensus;
+mod optimise;
+
+use nalgebra::{Isometry3, UnitQuaternion, Vector3};
+use protocol::{Detection, Pose};
+use serde::{Deserialize, Serialize};
+
+use consensus::consensus;
+use optimise::{Graph, Node, Observation};
+
+/// Settings of the correction.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct PoseGraphConfig {
+    /// At most so many boxes of each agent, the surest.
+    pub max_boxes: usize,
+    /// Boxes below this score are not looked at.
+    pub min_score: f32,
+    /// Fewest objects that an agent must share with those that are aligned already; below, its pose stays.
+    pub min_shared: usize,
+    /// How far apart two boxes of one object may lie by the poses as they came, metres.
+    pub search_m: f64,
+    /// How much an agent may have to be turned, degrees.
+    pub max_turn_deg: f64,
+    /// How far apart two boxes of one object may lie after the agent was moved, metres.
+    pub fit_tolerance_m: f64,
+    /// Standard deviation of the centre of a sure box nearby, metres.
+    pub box_std_m: f64,
+    /// The same of its heading, degrees.
+    pub box_std_deg: f64,
+    /// Standard deviation of the poses as they came, metres.
+    pub pose_std_m: f64,
+    /// The same of their heading, degrees.
+    pub pose_std_deg: f64,
+}
+
+impl Default for PoseGraphConfig {
+    fn default() -> Self {
+        Self {
+            max_boxes: 40,
+            min_score: 0.25,
+            min_shared: 3,
+            search_m: 6.0,
+            max_turn_deg: 6.0,
+            fit_tolerance_m: 1.0,
+            box_std_m: 0.3,
+            box_std_deg: 4.0,
+            pose_std_m: 3.0,
+            pose_std_deg: 3.0,
+        }
+    }
+}
+
+/// An agent with what it sees.
+#[derive(Debug, Clone, Copy)]
+pub struct Observer<'a> {
+    /// Its pose as it came, LiDAR frames.
+    pub ego_from_agent: Pose,
+    /// Its boxes in the frame of its own LiDAR.
+    pub boxes: &'a [Detection],
+}
+
+/// What became of an agent.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Corrected {
+    /// Its pose now; as it came where too little is shared.
+    pub ego_from_agent: Pose,
+    /// Objects that it shares with others; 0 where it was left alone.
+    pub shared: usize,
+}
+
+/// Distance at which a box is half as exact as nearby, metres.
+const HALF_EXACT_M: f64 = 60.0;
+
+/// A box of an agent, seen from above.
+struct Seen {
+    /// In the frame of the agent, height left out.
+    center: Vector3<f64>,
+    heading_rad: f64,
+    std_m: f64,
+    std_rad: f64,
+}
+
+impl Seen {
+    fn new(found: &Detection, config: &PoseGraphConfig) -> Option<Self> {
+        let [x, y, _] = found.box3d.center_m;
+        let center = Vector3::new(x, y, 0.0);
+        let heading_rad = found.box3d.heading_rad;
+        let is_sound = center.norm() < 1e4 && heading_rad.is_finite() && found.score >= config.min_score;
+        let doubt = (1.0 + center.norm() / HALF_EXACT_M) / f64::from(found.score.clamp(0.1, 1.0)).sqrt();
+        let (std_m, std_rad) = (config.box_std_m * doubt, config.box_std_deg.to_radians() * doubt);
+        is_sound.then_some(Self { center, heading_rad, std_m, std_rad })
+    }
+}
+
+/// Corrects the poses of all agents relative to the first, the ego, whose pose stays.
+///
+/// Agents join one after another, those first that share most with whoever has joined: an agent that shares nothing with
+/// the ego may still be placed by a third.
+#[must_use]
+pub fn correct(agents: &[Observer<'_>], config: &PoseGraphConfig) -> Vec<Corrected> {
+    let seen: Vec<Vec<Seen>> = agents.iter().map(|agent| sound_boxes(agent.boxes, config)).collect();
+    let priors: Vec<Isometry3<f64>> = agents.iter().map(|agent| flattened(&agent.ego_from_agent)).collect();
+    let unmoved = || agents.iter().map(|agent| Corrected { ego_from_agent: agent.ego_from_agent, shared: 0 }).collect();
+    let Some(own) = seen.first() else { return Vec::new() };
+    let mut graph = Assembly { objects: Vec::new(), observations: Vec::new(), joined: Vec::new() };
+    graph.join(0, &Isometry3::identity(), own, &[]);
+    let mut waiting: Vec<usize> = (1..agents.len()).collect();
+    while let Some((place, found)) = graph.next(&waiting, &seen, &priors, config) {
+        let agent = waiting.remove(place);
+        graph.join(agent, &found.motion, &seen[agent], &found.matches);
+    }
+    if graph.joined.len() < 2 {
+        return unmoved();
+    }
+    let mut corrected: Vec<Corrected> = unmoved();
+    for (agent, solved, shared) in graph.solve(&priors, config) {
+        let moved = solved * priors[agent].inverse();
+        corrected[agent].ego_from_agent = (moved * agents[agent].ego_from_agent.isometry()).into();
+        corrected[agent].shared = shared;
+    }
+    corrected
+}
+
+fn sound_boxes(boxes: &[Detection], config: &PoseGraphConfig) -> Vec<Seen> {
+    let mut sorted: Vec<&Detection> = boxes.iter().collect();
+    sorted.sort_by(|a, b| b.score.total_cmp(&a.score));
+    sorted.into_iter().filter_map(|found| Seen::new(found, config)).take(config.max_boxes).collect()
+}
+
+/// Place and heading alone.
+fn flattened(pose: &Pose) -> Isometry3<f64> {
+    let [x, y, _] = pose.translation_m;
+    planar(&Node { x_m: x, y_m: y, heading_rad: pose.yaw_rad() })
+}
+
+fn planar(node: &Node) -> Isometry3<f64> {
+    let turn = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), node.heading_rad);
+    Isometry3::from_parts(Vector3::new(node.x_m, node.y_m, 0.0).into(), turn)
+}
+
+/// The graph while agents join it.
+struct Assembly {
+    /// In the frame of the ego.
+    objects: Vec<Node>,
+    /// Agents here are places in `joined`.
+    observations: Vec<Observation>,
+    joined: Vec<(usize, Isometry3<f64>)>,
+}
+
+impl Assembly {
+    /// Of those waiting, the place of the one that shares most with the objects so far, and how.
+    fn next(
+        &self,
+        waiting: &[usize],
+        seen: &[Vec<Seen>],
+        priors: &[Isometry3<f64>],
+        config: &PoseGraphConfig,
+    ) -> Option<(usize, consensus::Consensus)> {
+        let objects: Vec<Vector3<f64>> =
+            self.objects.iter().map(|node| Vector3::new(node.x_m, node.y_m, 0.0)).collect();
+        let found = waiting.iter().enumerate().filter_map(|(place, &agent)| {
+            let centers: Vec<Vector3<f64>> = seen[agent].iter().map(|seen| seen.center).collect();
+            Some((place, consensus(&objects, &centers, &priors[agent], config)?))
+        });
+        found.max_by(|(_, one), (_, other)| one.score.total_cmp(&other.score))
+    }
+
+    /// `matches` are pairs of object and box; boxes without an object become one.
+    fn join(&mut self, agent: usize, ego_from_agent: &Isometry3<f64>, seen: &[Seen], matches: &[(usize, usize)]) {
+        let node = self.joined.len();
+        let heading = ego_from_agent.rotation.euler_angles().2;
+        for (index, seen) in seen.iter().enumerate() {
+            let known = matches.iter().find(|(_, matched)| *matched == index).map(|(object, _)| *object);
+            let object = known.unwrap_or_else(|| {
+                let place = ego_from_agent.rotation * seen.center + ego_from_agent.translation.vector;
+                self.objects.push(Node { x_m: place.x, y_m: place.y, heading_rad: heading + seen.heading_rad });
+                self.objects.len() - 1
+            });
+            self.observations.push(Observation {
+                agent: node,
+                object,
+                seen: Node { x_m: seen.center.x, y_m: seen.center.y, heading_rad: seen.heading_rad },
+                information: [seen.std_m.powi(-2), seen.std_m.powi(-2), seen.std_rad.powi(-2)],
+            });
+        }
+        self.joined.push((agent, *ego_from_agent));
+    }
+
+    /// Agent, pose and number of shared objects of all who joined but the ego.
+    fn solve(
+        self,
+        priors: &[Isometry3<f64>],
+        config: &PoseGraphConfig,
+    ) -> impl Iterator<Item = (usize, Isometry3<f64>, usize)> {
+        let mut viewers = vec![0usize; self.objects.len()];
+        self.observations.iter().for_each(|observation| viewers[observation.object] += 1);
+        // An object that one agent alone sees says nothing of poses.
+        let shared: Vec<Observation> =
+            self.observations.into_iter().filter(|observation| viewers[observation.object] > 1).collect();
+        let node = |motion: &Isometry3<f64>| Node {
+            x_m: motion.translation.x,
+            y_m: motion.translation.y,
+            heading_rad: motion.rotation.euler_angles().2,
+        };
+        let (std_m, std_rad) = (config.pose_std_m, config.pose_std_deg.to_radians());
+        let mut graph = Graph {
+            agents: self.joined.iter().map(|(_, motion)| node(motion)).collect(),
+            priors: self.joined.iter().map(|(agent, _)| node(&priors[*agent])).collect(),
+            prior_information: [std_m.powi(-2), std_m.powi(-2), std_rad.powi(-2)],
+            objects: self.objects,
+            observations: shared,
+        };
+        graph.optimise();
+        let Graph { agents, observations, .. } = graph;
+        self.joined.into_iter().zip(agents).enumerate().skip(1).map(move |(place, ((agent, _), solved))| {
+            let shared = observations.iter().filter(|observation| observation.agent == place).count();
+            (agent, planar(&solved), shared)
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests;

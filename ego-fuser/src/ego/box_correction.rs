@@ -1,0 +1,41 @@
+//! Poses of neighbours corrected by the boxes that are in their maps.
+//!
+//! What a vehicle detects alone is its map under the head, and the ego has both: it finds in a neighbour's map what the
+//! neighbour itself would have sent as boxes, without another message to wait for.
+
+use agent::detector::{Detector, DetectorError};
+use agent::postprocess::{AgentBoxes, PostprocessConfig, postprocess};
+use nalgebra::Isometry3;
+use protocol::Detection;
+use tch::Tensor;
+
+use crate::alignment::pose_graph::{Observer, PoseGraphConfig, correct};
+use crate::fusion::ViewFacts;
+
+/// Corrects the poses in `facts` by what each map `[1, C, H, W]` shows; the ego's stays.
+pub(super) fn correct_by_boxes(
+    facts: &mut [ViewFacts],
+    maps: &[Tensor],
+    detector: &Detector,
+    config: &PoseGraphConfig,
+) -> Result<(), DetectorError> {
+    if facts.len() < 2 {
+        return Ok(());
+    }
+    let boxes = maps.iter().map(|map| boxes_in(map, detector)).collect::<Result<Vec<_>, _>>()?;
+    let observers: Vec<Observer<'_>> = (facts.iter().zip(&boxes))
+        .map(|(facts, boxes)| Observer { ego_from_agent: facts.ego_from_cav, boxes })
+        .collect();
+    for (facts, corrected) in facts.iter_mut().zip(correct(&observers, config)) {
+        facts.ego_from_cav = corrected.ego_from_agent;
+    }
+    Ok(())
+}
+
+/// What a vehicle detects alone, in its own frame.
+fn boxes_in(map: &Tensor, detector: &Detector) -> Result<Vec<Detection>, DetectorError> {
+    let limits = PostprocessConfig::for_late_fusion(detector.config());
+    let boxes = detector.boxes(&detector.heads(map)?, limits.score_threshold)?;
+    let own = AgentBoxes { boxes: &boxes, output_from_agent: Isometry3::identity() };
+    Ok(postprocess(&[own], &limits).iter().map(|candidate| candidate.detection(None)).collect())
+}

@@ -1,0 +1,100 @@
+//! Convolutions whose input channels are taken in parts, and a GRU made of them.
+
+use tch::nn::{self, Init};
+use tch::{TchError, Tensor};
+
+/// A convolution with bias that keeps the size of the map.
+#[derive(Debug)]
+pub(super) struct Conv {
+    /// `[out, in, k, k]`, or `[out, in]` for a layer that a reference applies to the last dimension.
+    weight: Tensor,
+    /// `[out]`.
+    bias: Tensor,
+}
+
+impl Conv {
+    /// `weight` `[out, in, kernel, kernel]` and `bias` `[out]` below `path`.
+    pub(super) fn new(path: &nn::Path<'_>, [input, output]: [i64; 2], kernel: i64) -> Self {
+        Self::of_shape(path, &[output, input, kernel, kernel])
+    }
+
+    /// The same per cell, its weight stored as `[out, in]`.
+    pub(super) fn linear(path: &nn::Path<'_>, [input, output]: [i64; 2]) -> Self {
+        Self::of_shape(path, &[output, input])
+    }
+
+    fn of_shape(path: &nn::Path<'_>, shape: &[i64]) -> Self {
+        let weight = path.var("weight", shape, nn::init::DEFAULT_KAIMING_UNIFORM);
+        let bound = 1.0 / (shape[1..].iter().product::<i64>() as f64).sqrt();
+        Self { weight, bias: path.var("bias", &shape[..1], Init::Uniform { lo: -bound, up: bound }) }
+    }
+
+    /// `[out, in, k, k]`.
+    fn kernel(&self) -> Result<Tensor, TchError> {
+        if self.weight.dim() == 4 {
+            return Ok(self.weight.shallow_clone());
+        }
+        self.weight.f_unsqueeze(-1)?.f_unsqueeze(-1)
+    }
+
+    /// `[N, in, H, W]` to `[N, out, H, W]`.
+    pub(super) fn apply(&self, x: &Tensor) -> Result<Tensor, TchError> {
+        convolve(x, &self.kernel()?, Some(&self.bias))
+    }
+
+    /// What the input channels from `first` on contribute, where `x` holds just those.
+    pub(super) fn part(&self, x: &Tensor, first: i64, with_bias: bool) -> Result<Tensor, TchError> {
+        let channels = x.size4()?.1;
+        convolve(x, &self.kernel()?.f_narrow(1, first, channels)?, with_bias.then_some(&self.bias))
+    }
+}
+
+fn convolve(x: &Tensor, kernel: &Tensor, bias: Option<&Tensor>) -> Result<Tensor, TchError> {
+    let padding = kernel.size()[2] / 2;
+    let (kernel, bias) = (kernel.f_to_kind(x.kind())?, bias.map(|bias| bias.f_to_kind(x.kind())).transpose()?);
+    x.f_conv2d(&kernel, bias, [1, 1], [padding; 2], [1, 1], 1)
+}
+
+/// A convolutional GRU that is only ever asked for its first step.
+#[derive(Debug)]
+pub(super) struct ConvGru {
+    cells: Vec<Cell>,
+    hidden: i64,
+}
+
+#[derive(Debug)]
+struct Cell {
+    /// Reset gate, then update gate, of input and state.
+    gates: Conv,
+    /// New state, of input and state.
+    candidate: Conv,
+}
+
+impl ConvGru {
+    /// Parameters `cell_list.<layer>.{conv_gates,conv_can}.*` below `path`.
+    pub(super) fn new(path: &nn::Path<'_>, [input, hidden]: [i64; 2], kernel: i64, layers: usize) -> Self {
+        let cell = |layer: usize| {
+            let path = path / "cell_list" / layer;
+            let input = if layer == 0 { input } else { hidden } + hidden;
+            Cell {
+                gates: Conv::new(&(&path / "conv_gates"), [input, 2 * hidden], kernel),
+                candidate: Conv::new(&(&path / "conv_can"), [input, hidden], kernel),
+            }
+        };
+        Self { cells: (0..layers).map(cell).collect(), hidden }
+    }
+
+    /// The state `[N, hidden, H, W]` after `x` `[N, in, H, W]` has come to an empty one: `update * candidate`.
+    pub(super) fn from_empty_state(&self, x: &Tensor) -> Result<Tensor, TchError> {
+        let hidden = self.hidden;
+        self.cells.iter().try_fold(x.shallow_clone(), |x, Cell { gates, candidate }| {
+            let input = x.size4()?.1;
+            // Update gate and candidate in one convolution over the input alone.
+            let kernels = [gates.weight.f_narrow(0, hidden, hidden)?, candidate.weight.shallow_clone()];
+            let kernel = Tensor::f_cat(&kernels, 0)?.f_narrow(1, 0, input)?;
+            let bias = Tensor::f_cat(&[gates.bias.f_narrow(0, hidden, hidden)?, candidate.bias.shallow_clone()], 0)?;
+            let both = convolve(&x, &kernel, Some(&bias))?;
+            Ok(both.f_narrow(1, 0, hidden)?.f_sigmoid()? * both.f_narrow(1, hidden, hidden)?.f_tanh()?)
+        })
+    }
+}

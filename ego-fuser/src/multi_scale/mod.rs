@@ -1,0 +1,13 @@
+//! Networks that fuse at every level of the backbone, as Where2comm and CoAlign were published: imported weights run
+//! here, offline.
+//!
+//! Every level's maps are fused on their way to the up-sampling branch, while each agent's own go on down; so an agent
+//! would have to send the maps of all levels, or the ego to run the rest of the backbone for everyone. A live agent sends
+//! one map. What runs live of these methods is the same fusion at a single scale ([`crate::fusion::where2comm`],
+//! [`crate::fusion::coalign`]), with weights that were trained for it.
+
+mod fuse;
+mod network;
+
+pub use fuse::{Levels, Placement, fuse_levels};
+pub use network::{MULTI_SCALE_KIND, MultiScaleConfig, MultiScaleNetwork, Senders};
