@@ -6,3 +6,4 @@ pub mod fleet;
 pub mod localizer;
 pub mod scene;
 pub mod sequences;
+pub mod tensors;

@@ -134,7 +134,8 @@ fn play_in_lockstep(dir: &Path, method: Method) -> (Vec<(u64, Detections)>, Ledg
         let ego = scope.spawn(|| {
             let bus = router.join("ego-10", "10");
             let options = ego_node::NodeOptions { deadline: PATIENCE, ..ego_node::NodeOptions::default() };
-            let report = ego_node::run(&bus, &cav("10"), Ego::new(detector(), method).unwrap(), &options, &stop).unwrap();
+            let report =
+                ego_node::run(&bus, &cav("10"), Ego::new(detector(), method).unwrap(), &options, &stop).unwrap();
             assert_eq!((report.frames, report.at_deadline, report.failed), (TICKS as u64, 0, 0));
             leave(bus)
         });
@@ -379,7 +380,8 @@ fn maps_of_a_network_that_a_neighbour_names_as_another_are_left_out() {
             let bus = router.join("ego-10", "10");
             // A frame that waited for what is left out would take for ever.
             let options = ego_node::NodeOptions { deadline: PATIENCE, keeps_running: true, ..Default::default() };
-            let report = ego_node::run(&bus, &cav("10"), Ego::new(detector(), Method::Max).unwrap(), &options, &stop).unwrap();
+            let report =
+                ego_node::run(&bus, &cav("10"), Ego::new(detector(), Method::Max).unwrap(), &options, &stop).unwrap();
             assert_eq!((report.frames, report.at_deadline), (4, 0));
             leave(bus)
         });

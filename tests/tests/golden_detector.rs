@@ -1,7 +1,5 @@
 //! The detector against the reference implementation: encoder and voxelisation.
 
-use std::collections::BTreeMap;
-
 use agent::backbone::BevBackbone;
 use agent::head::DetectionHead;
 use agent::model_config::{DetectorConfig, ShrinkConfig};
@@ -10,10 +8,10 @@ use agent::pillar_encoder::PillarEncoder;
 use agent::pillar_projection::PillarProjection;
 use agent::pillars::{Pillars, Voxeliser};
 use agent::shrink::{Compressor, Shrink};
-use serde_json::Value;
 use tch::nn::VarStore;
 use tch::{Device, Tensor};
 use tests::fixtures::{Golden, assert_close, golden};
+use tests::tensors::{array, integer, integers, load, pillars, tensor, values};
 
 /// Tolerances of the encoder cases.
 const ATOL: f64 = 2e-4;
@@ -71,8 +69,8 @@ fn golden_c1_shrink_compress() {
     let network = VarStore::new(Device::Cpu);
     let shrink = Shrink::new(&(network.root() / "shrink"), input, &shrink_config);
     let compressor = Compressor::new(&(network.root() / "compress"), channels, integer(&config["compress_ratio"]));
-    load(&network, &golden);
-    let x = tensor(golden.f32("in.x"));
+    load(&network, &golden, "");
+    let x = tensor(&golden, "in.x");
     for (shrink, compressor) in [(&shrink, &compressor), (&shrink.folded(), &compressor.folded())] {
         let (reduced, code, decoded) = tch::no_grad(|| {
             let reduced = shrink.forward(&x, false);
@@ -132,7 +130,7 @@ impl EncoderCase {
         let backbone = BevBackbone::new(&(&root / "backbone"), &config);
         let anchors = golden.f32("w.cls_head.bias").1.len() as i64;
         let head = DetectionHead::new(&root, config.backbone_channels(), anchors);
-        load(&network, golden);
+        load(&network, golden, "");
         let lattice = PillarLattice::new(&config);
         let (sweeps, row_of_pillar) = pillars(golden);
         let batch = PillarBatch::new(&sweeps.iter().collect::<Vec<_>>(), &lattice);
@@ -154,7 +152,7 @@ impl EncoderCase {
 /// The sizes of the network, from the configuration and the shapes of the weights.
 fn encoder_config(golden: &Golden) -> DetectorConfig {
     let config = golden.config();
-    let layer_nums: Vec<usize> = list(&config["layer_nums"]).iter().map(|&count| count as usize).collect();
+    let layer_nums: Vec<usize> = integers(&config["layer_nums"]).iter().map(|&count| count as usize).collect();
     let levels = layer_nums.len();
     let deblock = |level: usize| golden.f32(&format!("w.backbone.deblocks.{level}.0.weight")).0;
     DetectorConfig {
@@ -165,68 +163,10 @@ fn encoder_config(golden: &Golden) -> DetectorConfig {
         pillar_channels: golden.f32("w.pillar_vfe.pfn_layers.0.linear.weight").0[0] as i64,
         layer_nums,
         layer_strides: vec![2; levels],
-        num_filters: list(&config["num_filters"]),
+        num_filters: integers(&config["num_filters"]),
         upsample_strides: (0..levels).map(|level| deblock(level)[2] as i64).collect(),
         num_upsample_filters: (0..levels).map(|level| deblock(level)[1] as i64).collect(),
         shrink: None,
         ..DetectorConfig::full()
     }
-}
-
-/// The pillars of each sweep of an encoder case, and where each pillar of the file went.
-fn pillars(golden: &Golden) -> (Vec<Pillars>, Vec<usize>) {
-    let (shape, features) = golden.f32("in.voxel_features");
-    let (_, coords) = golden.i32("in.voxel_coords");
-    let (_, counts) = golden.i32("in.voxel_num_points");
-    let coords = coords.as_chunks::<4>().0;
-    let sweeps = coords.iter().map(|coord| coord[0]).max().map_or(0, |last| last as usize + 1);
-    let mut pillars = vec![Pillars::default(); sweeps];
-    for (index, &[sweep, z, y, x]) in coords.iter().enumerate() {
-        let pillar = &mut pillars[sweep as usize];
-        let points = features[index * shape[1] * 4..].as_chunks::<4>().0;
-        pillar.points.extend(&points[..counts[index] as usize]);
-        pillar.counts.push(counts[index] as u32);
-        pillar.coords.push([z, y, x]);
-    }
-    let firsts: Vec<usize> = (0..sweeps).map(|sweep| pillars[..sweep].iter().map(Pillars::len).sum()).collect();
-    let mut next = firsts;
-    let rows = coords.iter().map(|coord| {
-        let row = &mut next[coord[0] as usize];
-        *row += 1;
-        *row - 1
-    });
-    let rows = rows.collect();
-    (pillars, rows)
-}
-
-/// Copies the `w.*` tensors of a case into the network; each parameter must be there.
-fn load(network: &VarStore, golden: &Golden) {
-    let variables: BTreeMap<String, Tensor> = network.variables().into_iter().collect();
-    assert!(!variables.is_empty());
-    for (name, mut variable) in variables {
-        let source = tensor(golden.f32(&format!("w.{name}")));
-        assert_eq!(source.size(), variable.size(), "{name}");
-        tch::no_grad(|| variable.copy_(&source));
-    }
-}
-
-fn tensor((shape, values): (Vec<usize>, Vec<f32>)) -> Tensor {
-    Tensor::from_slice(&values).reshape(shape.iter().map(|&size| size as i64).collect::<Vec<_>>())
-}
-
-fn values(tensor: &Tensor) -> Vec<f32> {
-    Vec::try_from(&tensor.contiguous().view([-1])).expect("f32 values")
-}
-
-fn integer(value: &Value) -> i64 {
-    value.as_i64().unwrap_or_else(|| panic!("{value} is not an integer"))
-}
-
-fn list(value: &Value) -> Vec<i64> {
-    value.as_array().expect("a list").iter().map(integer).collect()
-}
-
-fn array<const N: usize>(value: &Value) -> [f64; N] {
-    let values: Vec<f64> = value.as_array().expect("a list").iter().filter_map(Value::as_f64).collect();
-    values.try_into().unwrap_or_else(|_| panic!("{value} has not {N} numbers"))
 }

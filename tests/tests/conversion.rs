@@ -1,0 +1,213 @@
+//! Checkpoints of the public code bases through the converter, on python3 alone.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+use agent::model_config::{BlockKind, DetectorConfig, ShrinkConfig, YAxis};
+use agent::pillar_batch::PillarBatch;
+use agent::weights::{self, Precision, Weights};
+use ego_fuser::Method;
+use ego_fuser::ego::Ego;
+use ego_fuser::fusion::FusionConfig;
+use ego_fuser::fusion::disconet::DiscoNetConfig;
+use ego_fuser::fusion::v2vnet::{Aggregation, V2vNetConfig};
+use ego_fuser::fusion::where2comm::{self, Missing, Where2commConfig};
+use ego_fuser::model::CooperativeModel;
+use ego_fuser::multi_scale::{MultiScaleNetwork, Placement};
+use ego_fuser::warp::coalign;
+use serde_json::{Value, json};
+use tch::nn::VarStore;
+use tch::{Device, Tensor, no_grad};
+use tests::fixtures::{assert_close, golden};
+use tests::tensors::{integer, number, pillars, tensor, values};
+
+const ATOL: f64 = 2e-4;
+const RTOL: f64 = 1e-4;
+
+/// Runs the converter; `None` (with the reason on stderr) where there is no python3.
+fn convert(state: &Path, arguments: &[&str]) -> Option<Result<(PathBuf, String), String>> {
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/tools/convert_opencood.py");
+    let out = state.with_extension("converted.safetensors");
+    let run = Command::new("python3").arg(script).arg(state).args(arguments).arg("--out").arg(&out).output();
+    let output = match run {
+        Ok(output) => output,
+        Err(error) => {
+            eprintln!("skipped: python3 does not run: {error}");
+            return None;
+        }
+    };
+    let text = |bytes: &[u8]| String::from_utf8_lossy(bytes).into_owned();
+    Some(match output.status.code() {
+        Some(0) => Ok((out, text(&output.stdout))),
+        _ => Err(text(&output.stderr)),
+    })
+}
+
+/// A copy of a golden archive, beside which files may be written.
+fn copied(name: &str, folder: &Path) -> Option<PathBuf> {
+    let golden = golden(name)?;
+    let path = folder.join(format!("{name}.safetensors"));
+    std::fs::write(&path, golden.bytes()).unwrap();
+    Some(path)
+}
+
+#[test]
+fn golden_converted_multi_scale_networks_answer_as_the_reference() {
+    tch::set_num_threads(1);
+    let folder = tempfile::tempdir().unwrap();
+    for (name, model) in
+        [("c6_e2e_coalign", "point_pillar_coalign"), ("c6_e2e_where2comm_multi", "point_pillar_where2comm")]
+    {
+        let Some(state) = copied(name, folder.path()) else { continue };
+        let golden = golden(name).expect("it was there a moment ago");
+        let slots = golden.f32("in.voxel_features").0[1].to_string();
+        let Some(converted) = convert(&state, &["--model", model, "--max-points", &slots]) else { return };
+        let (path, _) = converted.unwrap();
+        let network = MultiScaleNetwork::load(&path, Device::Cpu).unwrap();
+        let (sweeps, _) = pillars(&golden);
+        let batch = PillarBatch::new(&sweeps.iter().collect::<Vec<_>>(), network.network().lattice());
+        let [width, height, _] = network.network().config.pillar_grid().map(|count| count as i64);
+        let cell_m = number(&golden.config()["voxel_size"][0]);
+        let normalized = coalign::normalized(&tensor(&golden, "in.pairwise"), height, width, cell_m).unwrap();
+        let samples: Vec<Placement> = (0..)
+            .zip(golden.i64("in.record_len").1)
+            .map(|(sample, agents)| {
+                let theta = normalized.get(sample).get(0).narrow(0, 0, agents);
+                Placement { agents, theta: (!network.config().one_frame).then_some(theta) }
+            })
+            .collect();
+        let heads = no_grad(|| network.forward(&batch, &samples)).unwrap().heads;
+        assert_close(name, &values(&heads.scores), &golden.f32("out.psm").1, ATOL, RTOL);
+        assert_close(name, &values(&heads.offsets), &golden.f32("out.rm").1, ATOL, RTOL);
+    }
+}
+
+#[test]
+fn golden_converted_where2comm_of_one_scale_runs_live() {
+    tch::set_num_threads(1);
+    let folder = tempfile::tempdir().unwrap();
+    let Some(state) = copied("c6_e2e_where2comm_single", folder.path()) else { return };
+    let golden = golden("c6_e2e_where2comm_single").expect("it was there a moment ago");
+    let Some(converted) = convert(&state, &["--model", "point_pillar_where2comm"]) else { return };
+    let (path, said) = converted.unwrap();
+    let communication = &golden.config()["where2comm_fusion"]["communication"];
+    let threshold = number(&communication["threshold"]);
+    assert!(said.contains(&format!("--gate {threshold}")), "{said}");
+    let weights = Weights::load(&path).unwrap();
+    let config: DetectorConfig = weights.config().unwrap();
+    assert_eq!((config.y_axis, config.blocks), (YAxis::Right, BlockKind::Plain));
+    assert_eq!(config.num_filters, tests::tensors::integers(&golden.config()["base_bev_backbone"]["num_filters"]));
+    let shrink = &golden.config()["shrink_header"];
+    let (channels, stride) = (integer(&shrink["dim"][0]), integer(&shrink["stride"][0]));
+    assert_eq!(config.shrink, Some(ShrinkConfig::DoubleConv { channels, stride }));
+    let fusion: FusionConfig = weights.metadata_json("fusion").unwrap();
+    let expected = Where2commConfig { aggregation: where2comm::Aggregation::Attention, missing: Missing::Zero };
+    assert_eq!(fusion, FusionConfig::Where2comm(expected));
+    assert_eq!(Ego::load(&path, None).unwrap().method(), Method::Where2comm);
+}
+
+/// A state dictionary with the names of the reference around a fusion of ours, as nobody has published small ones.
+fn state_of(folder: &Path, method: Method, fusion: &FusionConfig) -> (PathBuf, BTreeMap<String, Tensor>) {
+    let detector = DetectorConfig {
+        lidar_range_m: [-12.8, -6.4, -3.0, 12.8, 6.4, 1.0],
+        layer_nums: vec![1, 1, 1],
+        num_filters: vec![8, 12, 16],
+        num_upsample_filters: vec![8; 3],
+        shrink: Some(ShrinkConfig::DoubleConv { channels: 16, stride: 2 }),
+        ..DetectorConfig::full()
+    };
+    let model = CooperativeModel::with_fusion(&detector, method, fusion, Device::Cpu).unwrap();
+    let variables: BTreeMap<String, Tensor> = model.variables.variables().into_iter().collect();
+    let renamed = VarStore::new(Device::Cpu);
+    for (name, tensor) in &variables {
+        if name == "steering.weight" {
+            continue;
+        }
+        let name = name.replacen("fusion.", "fusion_net.", 1);
+        let parts: Vec<&str> = name.split('.').collect();
+        let (last, path) = parts.split_last().unwrap();
+        let path = path.iter().fold(renamed.root(), |path, part| path / *part);
+        let mut copy = path.zeros_no_train(last, &tensor.size());
+        no_grad(|| copy.copy_(tensor));
+    }
+    let path = folder.join(format!("{method}.safetensors"));
+    weights::save(&path, &renamed, &BTreeMap::new(), Precision::Single).unwrap();
+    (path, variables)
+}
+
+fn hypes(model: &str, more: Value) -> Value {
+    let mut args = json!({
+        "voxel_size": [0.4, 0.4, 4],
+        "lidar_range": [-12.8, -6.4, -3, 12.8, 6.4, 1],
+        "anchor_number": 2,
+        "compression": 0,
+        "pillar_vfe": {"use_norm": true, "num_filters": [64]},
+        "base_bev_backbone": {
+            "layer_nums": [1, 1, 1], "layer_strides": [2, 2, 2], "num_filters": [8, 12, 16],
+            "upsample_strides": [1, 2, 4], "num_upsample_filter": [8, 8, 8]
+        },
+        "shrink_header": {"kernal_size": [3], "stride": [2], "padding": [1], "dim": [16], "input_dim": 24},
+    });
+    for (key, value) in more.as_object().unwrap() {
+        args[key] = value.clone();
+    }
+    let preprocess = json!({"args": {"max_points_per_voxel": 20, "max_voxel_test": 5000}});
+    let postprocess = json!({"anchor_args": {"l": 4.5, "w": 2, "h": 1.6, "r": [0, 90]}});
+    json!({"model": {"core_method": model, "args": args}, "preprocess": preprocess, "postprocess": postprocess})
+}
+
+#[test]
+fn fusions_with_parameters_come_back_with_every_one() {
+    tch::set_num_threads(1);
+    let folder = tempfile::tempdir().unwrap();
+    let v2vnet = V2vNetConfig { aggregation: Aggregation::Max, ..V2vNetConfig::full(16) };
+    let v2vnet_args = json!({"v2vfusion": {
+        "num_iteration": 2, "in_channels": 16, "gru_flag": true, "agg_operator": "max",
+        "conv_gru": {"H": 16, "W": 32, "num_layers": 1, "kernel_size": [[3, 3]]}
+    }});
+    let disconet = DiscoNetConfig { channels: 16, hidden: [24, 12, 6] };
+    for (method, fusion, hypes) in [
+        (Method::V2vNet, FusionConfig::V2vNet(v2vnet), hypes("point_pillar_v2vnet", v2vnet_args)),
+        (Method::DiscoNet, FusionConfig::DiscoNet(disconet), hypes("point_pillar_disconet", json!({}))),
+    ] {
+        let (state, variables) = state_of(folder.path(), method, &fusion);
+        let config = folder.path().join("config.json");
+        std::fs::write(&config, hypes.to_string()).unwrap();
+        let arguments = ["--config", config.to_str().unwrap(), "--y-axis", "left"];
+        let Some(converted) = convert(&state, &arguments) else { return };
+        let (path, _) = converted.unwrap();
+        let weights = Weights::load(&path).unwrap();
+        assert_eq!(weights.metadata_json::<FusionConfig>("fusion").unwrap(), fusion, "{method}");
+        let detector: DetectorConfig = weights.config().unwrap();
+        assert_eq!((detector.max_points_per_pillar, detector.max_pillars), (20, 5000));
+        assert_eq!(detector.anchors.size_lwh_m, [4.5, 2.0, 1.6]);
+        let model = CooperativeModel::load(&path, None, Device::Cpu).unwrap();
+        assert_eq!(model.method, method);
+        for (name, found) in model.variables.variables() {
+            assert!(name == "steering.weight" || found.equal(&variables[&name]), "{method}: {name}");
+        }
+        assert_eq!(Ego::load(&path, None).unwrap().method(), method);
+    }
+}
+
+#[test]
+fn what_is_not_understood_is_refused_with_its_name() {
+    let folder = tempfile::tempdir().unwrap();
+    let state = folder.path().join("broken.safetensors");
+    let config = folder.path().join("config.json");
+    let with = |hypes: &Value, bytes: &[u8]| {
+        std::fs::write(&state, bytes).unwrap();
+        std::fs::write(&config, hypes.to_string()).unwrap();
+        Some(convert(&state, &["--config", config.to_str().unwrap()])?.unwrap_err())
+    };
+    let empty = b"\x02\0\0\0\0\0\0\0{}";
+    let Some(message) = with(&hypes("point_pillar_fpvrcnn", json!({})), empty) else { return };
+    assert!(message.contains("broken.safetensors") && message.contains("point_pillar_fpvrcnn"), "{message}");
+    let message = with(&hypes("point_pillar", json!({})), empty).unwrap();
+    assert!(message.contains("pillar encoder"), "{message}");
+    let message = with(&hypes("point_pillar", json!({})), &[255; 12]).unwrap();
+    assert!(message.contains("claims"), "{message}");
+    let message = with(&json!({"model": {"core_method": "x"}}), empty).unwrap();
+    assert!(message.contains("args"), "{message}");
+}
