@@ -230,7 +230,9 @@ impl Fleet {
             args.option("--end-to-end", weights);
         }
         args.option("--dtype", dtype(settings.codec.dtype));
-        if let Some(gate) = settings.codec.gate.or(self.scenario.method.gate()) {
+        // The vehicle of the ego sends to its own ego, which is to have all of its map.
+        let gate = settings.codec.gate.or(self.scenario.method.gate()).filter(|_| *cav != self.ego);
+        if let Some(gate) = gate {
             args.option("--gate", &gate.threshold.to_string());
             args.option("--gate-smoothing", &smoothing(gate.smoothing));
         }

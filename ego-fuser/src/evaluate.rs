@@ -9,6 +9,7 @@ use std::path::PathBuf;
 
 use agent::agent::{Agent, AgentInput, Perception};
 use agent::detector::{Detector, DetectorError};
+use agent::model_config::DetectorConfig;
 use agent::pose_source::{PoseSourceConfig, PoseSourceError};
 use agent::weights::{Weights, WeightsError};
 use protocol::codec::encode_features;
@@ -152,7 +153,10 @@ impl Evaluator {
         for (index, (agent, frame)) in agents.iter_mut().zip(&frames).enumerate() {
             // Without an exchange, neighbours have nothing to encode; where they are is still asked.
             let is_needed = index == 0 || self.ego.method() != Method::None;
-            sent.push(view(agent, frame, is_needed.then_some(exchange), &self.config.codec)?);
+            // What the ego leaves out for others it has itself.
+            let gate = self.config.codec.gate.filter(|_| index > 0);
+            let codec = CodecConfig { gate, ..self.config.codec };
+            sent.push(view(agent, frame, is_needed.then_some(exchange), &codec)?);
         }
         let poses = sent.iter().map(|sent| sent.pose).collect();
         let own = sent.remove(0);
@@ -209,7 +213,13 @@ impl Evaluator {
 /// The objects of all vehicles within 70 m that lie wholly over the area of a detector.
 #[must_use]
 pub fn rule_of(detector: &Detector) -> GroundTruthRule {
-    let [x_low, y_low, z_low, x_high, y_high, z_high] = detector.config().lidar_range_m;
+    rule_for(detector.config())
+}
+
+/// The same by its numbers.
+#[must_use]
+pub fn rule_for(config: &DetectorConfig) -> GroundTruthRule {
+    let [x_low, y_low, z_low, x_high, y_high, z_high] = config.lidar_range_m;
     GroundTruthRule {
         x_m: [x_low, x_high],
         y_m: [y_low, y_high],

@@ -265,6 +265,6 @@ impl CooperativeModel {
 }
 
 /// The values of one sample of a map, row-major.
-fn flat(map: &Tensor, sample: i64) -> Result<Vec<f32>, TchError> {
+pub(crate) fn flat(map: &Tensor, sample: i64) -> Result<Vec<f32>, TchError> {
     Vec::try_from(map.f_get(sample)?.f_to_device(Device::Cpu)?.f_to_kind(Kind::Float)?.f_reshape([-1])?)
 }

@@ -32,6 +32,13 @@ impl Box3d {
         })
     }
 
+    /// The same box in a world whose y axis points the other way.
+    #[must_use]
+    pub fn mirrored_y(&self) -> Self {
+        let [x, y, z] = self.center_m;
+        Self { center_m: [x, -y, z], heading_rad: -self.heading_rad, ..*self }
+    }
+
     /// The box in another frame. Roll and pitch that the transform adds are dropped, as boxes stay upright.
     #[must_use]
     pub fn transformed(&self, target_from_source: &Isometry3<f64>) -> Self {

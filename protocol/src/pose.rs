@@ -105,6 +105,13 @@ impl Pose {
         Isometry3::from_parts(Translation3::new(tx, ty, tz), UnitQuaternion::new_normalize(Quaternion::new(w, x, y, z)))
     }
 
+    /// The same motion in a world whose y axis points the other way.
+    #[must_use]
+    pub fn mirrored_y(&self) -> Self {
+        let ([x, y, z], [qw, qx, qy, qz]) = (self.translation_m, self.rotation_wxyz);
+        Self { translation_m: [x, -y, z], rotation_wxyz: [qw, -qx, qy, -qz] }
+    }
+
     /// `target_from_source` from two poses in one world: `self` is `world_from_target`.
     #[must_use]
     pub fn from_world(&self, world_from_source: &Self) -> Self {
@@ -149,6 +156,16 @@ mod tests {
         fn from_world_of_itself_is_identity(pose in any_pose()) {
             let identity = pose.from_world(&pose).isometry();
             prop_assert!(identity.translation.vector.norm() < 1e-8 && identity.rotation.angle() < 1e-7);
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn a_mirrored_pose_moves_mirrored_points(pose in any_pose(), point in prop::array::uniform3(-50.0..50.0f64)) {
+            let [x, y, z] = point;
+            let here = pose.isometry() * nalgebra::Point3::new(x, y, z);
+            let there = pose.mirrored_y().isometry() * nalgebra::Point3::new(x, -y, z);
+            prop_assert!((here - nalgebra::Point3::new(there.x, -there.y, there.z)).norm() < 1e-6);
         }
     }
 

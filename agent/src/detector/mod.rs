@@ -211,9 +211,8 @@ impl Detector {
     pub fn boxes(&self, heads: &Heads, score_threshold: f32) -> Result<Vec<Decoded>, DetectorError> {
         let mut boxes = decode(&heads.scores, &heads.offsets, &self.anchors, score_threshold)?;
         if self.config.y_axis == YAxis::Right {
-            for Decoded { box3d, .. } in &mut boxes {
-                box3d.center_m[1] = -box3d.center_m[1];
-                box3d.heading_rad = -box3d.heading_rad;
+            for found in &mut boxes {
+                found.box3d = found.box3d.mirrored_y();
             }
         }
         Ok(boxes)

@@ -4,15 +4,19 @@ use std::ops::ControlFlow;
 use std::path::PathBuf;
 
 use agent::pose_source::PoseSourceConfig;
+use agent::weights::{KIND_KEY, Weights};
 use anyhow::Result;
 use ego_fuser::Method;
 use ego_fuser::average_precision::{Ordering, Scorer, THRESHOLDS};
 use ego_fuser::evaluate::{EvaluateConfig, EvaluatedFrame, Evaluator};
+use ego_fuser::multi_scale::{MULTI_SCALE_KIND, OfflineDetector};
 use protocol::CodecConfig;
 use serde_json::json;
-use sim_replay::dataset::Scenario;
+use sim_replay::dataset::{LoadOptions, Scenario};
+use sim_replay::frame::Frame;
+use sim_replay::ground_truth;
 
-use super::{progress, scenarios};
+use super::{BadInput, progress, scenarios};
 
 /// Measures AP on datasets, with true poses, nothing late and nothing lost.
 #[derive(Debug, clap::Args)]
@@ -42,6 +46,10 @@ impl Arguments {
     pub(crate) fn run(self) -> Result<()> {
         tch::set_num_threads(i32::from(self.threads.max(1)));
         let scenarios = scenarios(&self.data)?;
+        let kind = Weights::load(&self.weights)?.metadata(KIND_KEY).map(ToOwned::to_owned);
+        if kind.as_deref() == Some(MULTI_SCALE_KIND) {
+            return self.run_multi_scale(&scenarios);
+        }
         let methods =
             if self.method.is_empty() { vec![None] } else { self.method.iter().map(|method| Some(*method)).collect() };
         let mut rows = Vec::new();
@@ -63,6 +71,38 @@ impl Arguments {
     }
 }
 
+impl Arguments {
+    /// A network that fuses at every level is one method of its own.
+    fn run_multi_scale(&self, scenarios: &[Scenario]) -> Result<()> {
+        if !self.method.is_empty() {
+            return Err(BadInput("a multi-scale network has one method: leave --method out".to_owned()).into());
+        }
+        let mut detector = OfflineDetector::load(&self.weights)?;
+        let rule = detector.rule();
+        let frames = self.frames.unwrap_or(usize::MAX);
+        let mut tally = Tally::default();
+        for scenario in scenarios {
+            for tick in 0..scenario.ticks.len().min(frames) {
+                let agents = 0..scenario.agents.len();
+                let frames: Vec<Frame> = agents
+                    .map(|agent| scenario.load(agent, tick, &LoadOptions::default()))
+                    .collect::<Result<_, _>>()?;
+                let objects = ground_truth::merge(&frames.iter().collect::<Vec<_>>(), 0, &rule);
+                let objects: Vec<_> = objects.into_iter().map(|(_, object)| object).collect();
+                tally.frames += 1;
+                tally.scorer.add(&detector.detect(&frames)?.0, &objects);
+            }
+        }
+        let row = tally.row("multi_scale");
+        if self.json {
+            println!("{}", serde_json::to_string_pretty(&[row])?);
+        } else {
+            print_row(&row);
+        }
+        Ok(())
+    }
+}
+
 fn evaluate(config: EvaluateConfig, scenarios: &[Scenario], frames: usize, json: bool) -> Result<serde_json::Value> {
     let mut evaluator = Evaluator::new(config)?;
     let ticks: usize = scenarios.iter().map(|scenario| scenario.ticks.len().min(frames)).sum();
@@ -79,17 +119,22 @@ fn evaluate(config: EvaluateConfig, scenarios: &[Scenario], frames: usize, json:
         })?;
     }
     bar.finish_and_clear();
-    let row = tally.row(method);
+    let row = tally.row(method.name());
     if !json {
-        let ap =
-            |name: &str| THRESHOLDS.map(|iou| format!("{:.4}", row[name][format!("{iou}")].as_f64().unwrap_or(0.0)));
-        let (global, frame) = (ap("ap_global").join(" "), ap("ap_frame_order").join(" "));
-        println!(
-            "{method:<10} AP@0.3/0.5/0.7 global {global}, frame order {frame}, {} frames, {} bytes a neighbour",
-            row["frames"], row["payload_bytes_mean"]
-        );
+        print_row(&row);
     }
     Ok(row)
+}
+
+fn print_row(row: &serde_json::Value) {
+    let ap = |name: &str| THRESHOLDS.map(|iou| format!("{:.4}", row[name][format!("{iou}")].as_f64().unwrap_or(0.0)));
+    let (global, frame) = (ap("ap_global").join(" "), ap("ap_frame_order").join(" "));
+    println!(
+        "{:<10} AP@0.3/0.5/0.7 global {global}, frame order {frame}, {} frames, {} bytes a neighbour",
+        row["method"].as_str().unwrap_or_default(),
+        row["frames"],
+        row["payload_bytes_mean"]
+    );
 }
 
 /// What the frames of one method add up to.
@@ -107,7 +152,7 @@ impl Tally {
         self.payload_bytes.extend(frame.result.fused.iter().map(|neighbour| neighbour.payload_bytes));
     }
 
-    fn row(&self, method: Method) -> serde_json::Value {
+    fn row(&self, method: &str) -> serde_json::Value {
         let by_iou = |ordering| {
             let found = self.scorer.average_precisions(ordering);
             THRESHOLDS

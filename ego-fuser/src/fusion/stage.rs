@@ -139,12 +139,8 @@ impl FusionStage {
         if self.y_axis == YAxis::Left {
             return Cow::Borrowed(facts);
         }
-        let mirrored = |facts: &ViewFacts| {
-            let Pose { translation_m: [x, y, z], rotation_wxyz: [qw, qx, qy, qz] } = facts.ego_from_cav;
-            let ego_from_cav = Pose { translation_m: [x, -y, z], rotation_wxyz: [qw, -qx, qy, -qz] };
-            ViewFacts { ego_from_cav, ..*facts }
-        };
-        Cow::Owned(facts.iter().map(mirrored).collect())
+        let mirrored = facts.iter().map(|facts| ViewFacts { ego_from_cav: facts.ego_from_cav.mirrored_y(), ..*facts });
+        Cow::Owned(mirrored.collect())
     }
 }
 

@@ -8,6 +8,8 @@
 
 mod fuse;
 mod network;
+mod offline;
 
 pub use fuse::{Levels, Placement, fuse_levels};
-pub use network::{MULTI_SCALE_KIND, MultiScaleConfig, MultiScaleNetwork, Senders};
+pub use network::{MULTI_SCALE_KIND, MultiScaleConfig, MultiScaleNetwork, MultiScaleOutput, Senders};
+pub use offline::OfflineDetector;
