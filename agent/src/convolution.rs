@@ -111,6 +111,13 @@ impl ConvLayer {
         Self::down(conv, io, kernel, nn::ConvConfig { stride, padding: kernel / 2, bias: false, ..Default::default() })
     }
 
+    /// Convolution whose kernel is its stride, so that every input counts once; batch norm, ReLU.
+    #[must_use]
+    pub fn patches(conv: &nn::Path<'_>, norm: &nn::Path<'_>, io: [i64; 2], patch: i64) -> Self {
+        let config = nn::ConvConfig { stride: patch, padding: 0, bias: false, ..Default::default() };
+        Self::down(conv, io, patch, config).with_norm(norm, io[1]).with_relu()
+    }
+
     /// Transposed convolution whose kernel is its stride, so that outputs do not overlap; batch norm, ReLU.
     #[must_use]
     pub fn upsampling(conv: &nn::Path<'_>, norm: &nn::Path<'_>, io: [i64; 2], stride: i64) -> Self {

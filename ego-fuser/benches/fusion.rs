@@ -6,8 +6,8 @@ use std::hint::black_box;
 
 use agent::model_config::DetectorConfig;
 use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
-use ego_fuser::Method;
 use ego_fuser::fusion::{FusionStage, ViewFacts};
+use ego_fuser::{Exchange, Method};
 use protocol::Pose;
 use tch::{Device, Kind, Tensor, no_grad};
 
@@ -21,7 +21,7 @@ fn fuse(criterion: &mut Criterion) {
         let features = Tensor::rand([agents as i64, shape[0], shape[1], shape[2]], (Kind::Float, Device::Cpu));
         let pose = |agent: usize| Pose::from_xyz_yaw([7.0 * agent as f64, 2.0, 0.0], 0.2 * agent as f64);
         let facts: Vec<_> = (0..agents).map(|agent| ViewFacts::fresh(agent, pose(agent))).collect();
-        for method in [Method::Max, Method::Attention, Method::Pastat] {
+        for method in Method::ALL.into_iter().filter(|method| method.exchange() == Exchange::Features) {
             let stage = FusionStage::untrained(method, &config).expect("lean is a valid configuration");
             group.bench_function(BenchmarkId::new(method.name(), agents), |bencher| {
                 bencher.iter(|| {

@@ -10,6 +10,7 @@ use super::coalign::CoAlignConfig;
 use super::cobevt::{Cobevt, CobevtConfig};
 use super::disconet::{DiscoNet, DiscoNetConfig};
 use super::pastat::{Pastat, PastatConfig};
+use super::traf_align::{TrafAlign, TrafAlignConfig};
 use super::v2vnet::{V2vNet, V2vNetConfig};
 use super::v2xvit::{V2xVit, V2xVitConfig};
 use super::where2comm::{Where2comm, Where2commConfig};
@@ -49,6 +50,8 @@ pub enum FusionConfig {
     V2xVit(V2xVitConfig),
     /// CoBEVT.
     Cobevt(CobevtConfig),
+    /// Attention along trajectories.
+    TrafAlign(TrafAlignConfig),
     /// PASTAT.
     Pastat(PastatConfig),
 }
@@ -73,6 +76,8 @@ impl FusionConfig {
             Method::V2xVit => Self::V2xVit(V2xVitConfig::full(channels)),
             Method::Cobevt if is_lean => Self::Cobevt(CobevtConfig::lean(channels)),
             Method::Cobevt => Self::Cobevt(CobevtConfig::full(channels)),
+            Method::TrafAlign if is_lean => Self::TrafAlign(TrafAlignConfig::lean(channels)),
+            Method::TrafAlign => Self::TrafAlign(TrafAlignConfig::full(channels)),
             Method::Pastat if is_lean => Self::Pastat(PastatConfig::lean(channels)),
             Method::Pastat => Self::Pastat(PastatConfig::full(channels)),
         }
@@ -102,6 +107,7 @@ impl FusionConfig {
             Self::DiscoNet(config) => Box::new(DiscoNet::new(path, config)?),
             Self::V2xVit(config) => Box::new(V2xVit::new(path, config)?),
             Self::Cobevt(config) => Box::new(Cobevt::new(path, config)?),
+            Self::TrafAlign(config) => Box::new(TrafAlign::new(path, config)?),
             Self::Pastat(config) => Box::new(Pastat::new(path, config)?),
         })
     }

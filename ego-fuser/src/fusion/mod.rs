@@ -14,6 +14,7 @@ pub mod pastat;
 mod stage;
 pub(crate) mod steering;
 pub mod swap_fusion;
+pub mod traf_align;
 pub mod v2vnet;
 pub mod v2xvit;
 pub mod where2comm;
