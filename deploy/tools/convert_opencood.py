@@ -11,6 +11,8 @@ Models that are understood, by `model.core_method`:
 
     point_pillar                          method none
     point_pillar_v2vnet                   method v2vnet
+    point_pillar_transformer              method v2xvit
+    point_pillar_cobevt                   method cobevt
     point_pillar_disconet                 method disconet
     point_pillar_baseline                 methods max, attention, v2vnet and disconet, by `fusion_method`
     point_pillar_where2comm               method where2comm; with multi_scale: a multi-scale network
@@ -56,6 +58,11 @@ def main():
         name, model, preprocess = model_section(hypes, arguments.model)
         detector = detector_config(name, model, preprocess, state, arguments)
         header, renamed = fusion_part(name, model, state, detector)
+        if "kind" in header and detector["compress_ratio"] is not None:
+            if name != "point_pillar_where2comm":
+                raise Refused(f"compression {detector['compress_ratio']} before the fusion of levels is not understood")
+            # It computes the squeezed map and then goes on with others.
+            detector["compress_ratio"] = None
         weights = select(state, renamed)
         header["config"] = detector
         header["source"] = f"{name}, {arguments.checkpoint.name}"
@@ -206,6 +213,10 @@ def fusion_part(name, model, state, detector):
         return {"method": "none", "fusion": {"kind": "own"}}, {}
     if name == "point_pillar_v2vnet":
         return single_scale("v2vnet", v2vnet(model["v2vfusion"], channels))
+    if name == "point_pillar_transformer":
+        return single_scale("v2xvit", v2xvit(model["transformer"]["encoder"], channels))
+    if name == "point_pillar_cobevt":
+        return single_scale("cobevt", cobevt(model["fax_fusion"], channels))
     if name == "point_pillar_disconet" or (name == "point_pillar_baseline" and fusion_method == "disconet"):
         return single_scale("disconet", disconet(state, channels))
     if name == "point_pillar_baseline":
@@ -251,6 +262,43 @@ def v2vnet(settings, channels):
         "aggregation": {"avg": "mean", "max": "max"}[settings["agg_operator"]],
         "gru_layers": gru["num_layers"] if settings["gru_flag"] else 0,
         "kernel": kernel[0],
+    }
+
+
+def v2xvit(encoder, channels):
+    agents, windows = encoder["cav_att_config"], encoder["pwindow_att_config"]
+    if not agents["use_hetero"] or not windows["relative_pos_embedding"]:
+        raise Refused("V2X-ViT without use_hetero or relative_pos_embedding is not understood")
+    sizes = zip(windows["window_size"], windows["heads"], windows["dim_head"])
+    return {
+        "kind": "v2xvit",
+        "channels": channels,
+        "depth": encoder["depth"],
+        "blocks": encoder["num_blocks"],
+        "agent_heads": agents["heads"],
+        "agent_head_channels": agents["dim_head"],
+        "windows": [{"edge": edge, "heads": heads, "head_channels": width} for edge, heads, width in sizes],
+        "merge": {"naive": "naive", "split_attn": "split_attention"}[windows["fusion_method"]],
+        "hidden": encoder["feed_forward"]["mlp_dim"],
+        "temporal_encoding": bool(agents["use_RTE"]),
+        "dropout": float(agents["dropout"]),
+    }
+
+
+def cobevt(settings, channels):
+    if not settings["mask"]:
+        raise Refused("CoBEVT without a mask is not understood")
+    return {
+        "kind": "cobevt",
+        "channels": channels,
+        "depth": settings["depth"],
+        "slots": settings["agent_size"],
+        "window": settings["window_size"],
+        "head_channels": settings["dim_head"],
+        "hidden": settings["mlp_dim"],
+        # Its mean at the end counts empty slots too.
+        "count_missing": True,
+        "dropout": float(settings["drop_out"]),
     }
 
 

@@ -10,13 +10,17 @@ use agent::weights::{self, Precision, Weights};
 use ego_fuser::Method;
 use ego_fuser::ego::Ego;
 use ego_fuser::fusion::FusionConfig;
+use ego_fuser::fusion::cobevt::CobevtConfig;
 use ego_fuser::fusion::disconet::DiscoNetConfig;
 use ego_fuser::fusion::v2vnet::{Aggregation, V2vNetConfig};
+use ego_fuser::fusion::v2xvit::V2xVitConfig;
 use ego_fuser::fusion::where2comm::{self, Missing, Where2commConfig};
 use ego_fuser::model::CooperativeModel;
-use ego_fuser::multi_scale::{MultiScaleNetwork, Placement};
+use ego_fuser::multi_scale::{MultiScaleNetwork, OfflineDetector, Placement};
 use ego_fuser::warp::coalign;
+use protocol::{CavId, Handedness, PointCloud, Pose};
 use serde_json::{Value, json};
+use sim_replay::frame::Frame;
 use tch::nn::VarStore;
 use tch::{Device, Tensor, no_grad};
 use tests::fixtures::{assert_close, golden};
@@ -107,6 +111,53 @@ fn golden_converted_where2comm_of_one_scale_runs_live() {
     assert_eq!(Ego::load(&path, None).unwrap().method(), Method::Where2comm);
 }
 
+/// Two vehicles that see something of the same street.
+fn frames(mirrored: bool) -> [Frame; 2] {
+    [0, 1].map(|place| {
+        let mut frame = Frame::empty(CavId::new(&format!("{place}")).unwrap(), 0, Handedness::Right);
+        let pose = Pose::from_xyz_yaw([100.0 + 6.0 * f64::from(place), 50.0 - 2.0 * f64::from(place), 1.9], 0.5);
+        let turned = Pose::from_xyz_yaw([0.0; 3], 0.3 * f64::from(place));
+        let pose: Pose = (pose.isometry() * turned.isometry()).into();
+        frame.world_from_lidar = Some(if mirrored { pose.mirrored_y() } else { pose });
+        let point = |k: i32| {
+            let y = (k % 31) as f32 * 0.4 - 6.1;
+            [(k % 57) as f32 * 0.43 - 12.0, if mirrored { -y } else { y }, (k % 7) as f32 * 0.3 - 1.8, 0.3]
+        };
+        frame.points = PointCloud { xyzi: (40 * place..1800 + 90 * place).map(point).collect() };
+        frame
+    })
+}
+
+#[test]
+fn golden_converted_networks_detect_offline_in_either_world() {
+    tch::set_num_threads(1);
+    let folder = tempfile::tempdir().unwrap();
+    for (name, model) in
+        [("c6_e2e_coalign", "point_pillar_coalign"), ("c6_e2e_where2comm_multi", "point_pillar_where2comm")]
+    {
+        let Some(state) = copied(name, folder.path()) else { continue };
+        let mut found = Vec::new();
+        for (y_axis, mirrored) in [("left", false), ("right", true)] {
+            let Some(converted) = convert(&state, &["--model", model, "--y-axis", y_axis]) else { return };
+            let mut detector = OfflineDetector::load(&converted.unwrap().0).unwrap();
+            let frames = frames(mirrored);
+            let (together, others) = detector.detect(&frames).unwrap();
+            assert_eq!(others, 1, "{name}");
+            let (alone, others) = detector.detect(&frames[..1]).unwrap();
+            assert_eq!(others, 0, "{name}");
+            assert!(!together.is_empty() && together != alone, "{name}: {} boxes", together.len());
+            found.push(together);
+        }
+        // What a network of the mirrored world sees of the mirrored street is the mirror image.
+        assert_eq!(found[0].len(), found[1].len(), "{name}");
+        for (here, there) in found[0].iter().zip(&found[1]) {
+            let there = there.box3d.mirrored_y();
+            let off = (0..3).map(|axis| (here.box3d.center_m[axis] - there.center_m[axis]).abs());
+            assert!(off.fold(0.0, f64::max) < 1e-3, "{name}: {:?} {there:?}", here.box3d);
+        }
+    }
+}
+
 /// A state dictionary with the names of the reference around a fusion of ours, as nobody has published small ones.
 fn state_of(folder: &Path, method: Method, fusion: &FusionConfig) -> (PathBuf, BTreeMap<String, Tensor>) {
     let detector = DetectorConfig {
@@ -167,7 +218,29 @@ fn fusions_with_parameters_come_back_with_every_one() {
         "conv_gru": {"H": 16, "W": 32, "num_layers": 1, "kernel_size": [[3, 3]]}
     }});
     let disconet = DiscoNetConfig { channels: 16, hidden: [24, 12, 6] };
+    let v2xvit = V2xVitConfig { blocks: 2, hidden: 24, ..V2xVitConfig::lean(16) };
+    let v2xvit_args = json!({"transformer": {"encoder": {
+        "num_blocks": 2, "depth": v2xvit.depth,
+        "cav_att_config": {
+            "use_hetero": true, "use_RTE": true, "heads": v2xvit.agent_heads,
+            "dim_head": v2xvit.agent_head_channels, "dropout": v2xvit.dropout
+        },
+        "pwindow_att_config": {
+            "window_size": v2xvit.windows.iter().map(|window| window.edge).collect::<Vec<_>>(),
+            "heads": v2xvit.windows.iter().map(|window| window.heads).collect::<Vec<_>>(),
+            "dim_head": v2xvit.windows.iter().map(|window| window.head_channels).collect::<Vec<_>>(),
+            "relative_pos_embedding": true, "fusion_method": "split_attn"
+        },
+        "feed_forward": {"mlp_dim": 24}
+    }}});
+    let cobevt = CobevtConfig { count_missing: true, hidden: 20, ..CobevtConfig::lean(16) };
+    let cobevt_args = json!({"fax_fusion": {
+        "mask": true, "depth": cobevt.depth, "agent_size": cobevt.slots, "window_size": cobevt.window,
+        "dim_head": cobevt.head_channels, "mlp_dim": 20, "drop_out": cobevt.dropout
+    }});
     for (method, fusion, hypes) in [
+        (Method::V2xVit, FusionConfig::V2xVit(v2xvit), hypes("point_pillar_transformer", v2xvit_args)),
+        (Method::Cobevt, FusionConfig::Cobevt(cobevt), hypes("point_pillar_cobevt", cobevt_args)),
         (Method::V2vNet, FusionConfig::V2vNet(v2vnet), hypes("point_pillar_v2vnet", v2vnet_args)),
         (Method::DiscoNet, FusionConfig::DiscoNet(disconet), hypes("point_pillar_disconet", json!({}))),
     ] {
