@@ -17,6 +17,7 @@ pub(crate) struct Cli {
 #[derive(Debug, Subcommand)]
 enum Command {
     Inspect(command::inspect::Args),
+    Link(command::link::Args),
     Stream(command::stream::Args),
     Synth(command::synth::Args),
 }
@@ -36,6 +37,7 @@ pub(crate) enum Outcome {
 pub(crate) fn run(cli: Cli) -> ExitCode {
     let outcome = match cli.command {
         Command::Inspect(args) => command::inspect::run(&args),
+        Command::Link(args) => command::link::run(&args),
         Command::Stream(args) => command::stream::run(&args),
         Command::Synth(args) => command::synth::run(args),
     };

@@ -11,7 +11,7 @@ use zenoh::bytes::{Encoding, ZBytes};
 use zenoh::qos::{CongestionControl, Priority};
 
 use super::mailbox::{Mailbox, Pushed, Taken};
-use super::{Books, BusError};
+use super::{Arrival, Books, BusError};
 
 /// Between two probes of a publisher that has sent nothing yet.
 const PROBE_PERIOD: Duration = Duration::from_millis(50);
@@ -59,7 +59,7 @@ impl PublisherOptions {
     }
 }
 
-type Encode = Box<dyn FnOnce(&Stamp) -> Result<Encoded, WireError> + Send>;
+type Encode = Box<dyn FnOnce(&Stamp) -> Result<ZBytes, WireError> + Send>;
 
 struct Offer {
     capture_nanos: u64,
@@ -138,8 +138,17 @@ impl Publisher {
         capture_nanos: u64,
         encode: impl FnOnce(&Stamp) -> Result<Encoded, WireError> + Send + 'static,
     ) {
+        self.push(Offer { capture_nanos, encode: Box::new(|stamp| encode(stamp).map(payload)) });
+    }
+
+    /// Passes on a message as it came, under the stamp of its sender; nothing is copied.
+    pub fn relay(&self, arrival: &Arrival) {
+        let bytes = arrival.payload().clone();
+        self.push(Offer { capture_nanos: arrival.header.stamp.capture_nanos, encode: Box::new(|_| Ok(bytes)) });
+    }
+
+    fn push(&self, offer: Offer) {
         self.books.offered(&self.topic);
-        let offer = Offer { capture_nanos, encode: Box::new(encode) };
         let pushed = match self.overflow {
             Overflow::KeepNewest(_) => self.queue.push((), offer),
             Overflow::Wait(_) => self.queue.push_waiting((), offer),
@@ -204,10 +213,10 @@ impl Sender {
     fn send(&mut self, Offer { capture_nanos, encode }: Offer) {
         let began = Instant::now();
         match encode(&self.stamp(capture_nanos)) {
-            Ok(encoded) => {
+            Ok(bytes) => {
                 self.books.timed("encode", began.elapsed());
                 self.sequence += 1;
-                if self.put(encoded) {
+                if self.put(bytes) {
                     self.books.handed_over(&self.topic);
                 }
             }
@@ -222,14 +231,14 @@ impl Sender {
     fn notify(&self, control: Control) {
         match wire::encode(&self.stamp(0), control) {
             Ok(encoded) => {
-                self.put(encoded);
+                self.put(payload(encoded));
             }
             Err(error) => tracing::error!(topic = %self.topic, "notice cannot be sent: {error}"),
         }
     }
 
-    fn put(&self, encoded: Encoded) -> bool {
-        let sent = self.publisher.put(payload(encoded)).wait();
+    fn put(&self, bytes: ZBytes) -> bool {
+        let sent = self.publisher.put(bytes).wait();
         if let Err(cause) = &sent {
             tracing::error!(topic = %self.topic, "zenoh refuses a message: {cause}");
         }

@@ -49,6 +49,16 @@ pub struct Arrival {
 }
 
 impl Arrival {
+    /// Bytes on the wire, without what the transport adds.
+    #[must_use]
+    pub fn wire_bytes(&self) -> u64 {
+        self.payload.len() as u64
+    }
+
+    pub(super) fn payload(&self) -> &ZBytes {
+        &self.payload
+    }
+
     /// Decodes the message from the pieces it arrived in, copying its tensor once.
     ///
     /// # Errors

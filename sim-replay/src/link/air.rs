@@ -18,6 +18,8 @@ use crate::random::derive_seed;
 /// A message as the air sees it.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Parcel {
+    /// The caller's name for it; the air does not look at it.
+    pub id: u64,
     /// Who sends.
     pub from: CavId,
     /// Who shall receive.
@@ -41,6 +43,8 @@ pub enum Fate {
     Arrived {
         /// Whether it had arrived before.
         is_copy: bool,
+        /// Whether it will arrive once more.
+        is_repeated: bool,
     },
     /// It did not.
     Dropped(DropReason),
@@ -231,11 +235,11 @@ impl Air {
         if config.duplicate > 0.0 && twice.chance(config.duplicate) {
             let again_nanos = config.delay.draw(&mut twice, trace.as_ref(), &message);
             let copy_nanos = arrival_nanos.saturating_add(again_nanos);
-            self.schedule(arrival_nanos, parcel.clone(), Fate::Arrived { is_copy: false });
-            self.schedule(copy_nanos, parcel, Fate::Arrived { is_copy: true });
+            self.schedule(arrival_nanos, parcel.clone(), Fate::Arrived { is_copy: false, is_repeated: true });
+            self.schedule(copy_nanos, parcel, Fate::Arrived { is_copy: true, is_repeated: false });
             return;
         }
-        self.schedule(arrival_nanos, parcel, Fate::Arrived { is_copy: false });
+        self.schedule(arrival_nanos, parcel, Fate::Arrived { is_copy: false, is_repeated: false });
     }
 
     fn schedule(&mut self, nanos: u64, parcel: Parcel, fate: Fate) {

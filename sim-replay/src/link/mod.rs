@@ -6,6 +6,7 @@
 //!
 //! - [`LinkConfig`]: the stages, with [`LinkConfig::preset`] for links that others have described.
 //! - [`Air`]: takes [`Parcel`]s and says when and whether they arrive.
+//! - [`node`]: the same between the agents and an ego of a live run.
 //! - [`DeviceClock`]: offset and drift of a vehicle's own clock.
 
 mod air;
@@ -16,6 +17,7 @@ mod delay;
 mod device_clock;
 mod line;
 mod loss;
+pub mod node;
 mod preset;
 mod trace;
 

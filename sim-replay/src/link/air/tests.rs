@@ -9,7 +9,16 @@ const MS: u64 = 1_000_000;
 
 fn parcel(from: &str, sequence: u64, bytes: u64, offered_nanos: u64) -> Parcel {
     let cav = |name: &str| CavId::new(name).unwrap();
-    Parcel { from: cav(from), to: cav("ego"), stream: Stream::Bev, sequence, bytes, offered_nanos, distance_m: 30.0 }
+    Parcel {
+        id: sequence,
+        from: cav(from),
+        to: cav("ego"),
+        stream: Stream::Bev,
+        sequence,
+        bytes,
+        offered_nanos,
+        distance_m: 30.0,
+    }
 }
 
 fn shaped(rate_mbps: f64) -> LinkConfig {
@@ -30,7 +39,7 @@ fn times_ms(outcomes: &[Outcome]) -> Vec<(u64, u64, Fate)> {
     outcomes.iter().map(|outcome| (outcome.parcel.sequence, outcome.nanos / MS, outcome.fate)).collect()
 }
 
-const ARRIVED: Fate = Fate::Arrived { is_copy: false };
+const ARRIVED: Fate = Fate::Arrived { is_copy: false, is_repeated: false };
 
 #[test]
 fn an_ideal_link_delivers_at_once_and_in_order() {
@@ -185,7 +194,7 @@ proptest! {
         let outcomes = all(&config, parcels.clone());
         prop_assert!(outcomes.is_sorted_by_key(|outcome| outcome.nanos));
         prop_assert!(outcomes.iter().all(|outcome| outcome.nanos >= outcome.parcel.offered_nanos));
-        let first = outcomes.iter().filter(|outcome| outcome.fate != Fate::Arrived { is_copy: true });
+        let first = outcomes.iter().filter(|outcome| !matches!(outcome.fate, Fate::Arrived { is_copy: true, .. }));
         let first: Vec<u64> = first.map(|outcome| outcome.parcel.sequence).collect();
         let unique: BTreeSet<u64> = first.iter().copied().collect();
         prop_assert_eq!((first.len(), unique.len()), (parcels.len(), parcels.len()));

@@ -1,0 +1,90 @@
+//! `sim-replay link`: the emulated air between the agents of a run and an ego.
+
+use std::path::{Path, PathBuf};
+
+use anyhow::Context;
+use protocol::{CavId, Role, Stream};
+use sim_replay::bus::{BusArgs, STOP_LIMIT, log_to_stderr};
+use sim_replay::link::node::{self, LinkReport, NodeOptions};
+use sim_replay::link::{Air, LinkConfig, PRESETS};
+
+use crate::cli::Outcome;
+
+/// Carry what agents send to an ego, as a wireless link would: late, in a queue, or not at all.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    #[command(flatten)]
+    bus: BusArgs,
+    /// The vehicle that receives.
+    #[arg(long)]
+    ego: CavId,
+    /// A preset or a file that describes the link.
+    #[arg(long, value_name = "PRESET|FILE", default_value = "ideal", long_help = link_help())]
+    link: String,
+    /// Same seed, same losses and delays.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// What crosses the link.
+    #[arg(long, value_delimiter = ',', default_value = "pose,bev,descriptor")]
+    streams: Vec<Stream>,
+    /// Go on when all agents have ended.
+    #[arg(long)]
+    keep_running: bool,
+    /// Print a JSON summary.
+    #[arg(long)]
+    json: bool,
+}
+
+fn link_help() -> String {
+    let presets = PRESETS.map(|(name, about)| format!("\n  {name}: {about}")).concat();
+    format!("A YAML file with the stages of the link, or a preset:{presets}")
+}
+
+/// Carries messages and prints a summary to standard output.
+pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
+    log_to_stderr();
+    let air = match args.air() {
+        Ok(air) => air,
+        Err(error) => {
+            eprintln!("error: {error:#}");
+            return Ok(Outcome::BadInput);
+        }
+    };
+    let stop = args.bus.stop().context("installing signal handlers")?;
+    let bus = args.bus.join(Role::Link, &args.ego)?;
+    let options =
+        NodeOptions { ego: args.ego.clone(), streams: args.streams.clone(), keeps_running: args.keep_running };
+    let report = node::run(&bus, air, &options, &stop)?;
+    print(&report, args.json)?;
+    if let Err(overdue) = bus.leave(STOP_LIMIT) {
+        tracing::warn!("{overdue}");
+    }
+    Ok(Outcome::Done)
+}
+
+impl Args {
+    fn air(&self) -> anyhow::Result<Air> {
+        if PRESETS.iter().any(|(name, _)| *name == self.link) {
+            return Ok(Air::new(LinkConfig::preset(&self.link)?, Path::new("."), self.seed)?);
+        }
+        let path = PathBuf::from(&self.link);
+        let text = std::fs::read_to_string(&path)
+            .with_context(|| format!("{}: neither a preset nor a file that can be read", path.display()))?;
+        let config = serde_saphyr::from_str(&text).with_context(|| path.display().to_string())?;
+        let folder = path.parent().unwrap_or(Path::new("."));
+        Air::new(config, folder, self.seed).with_context(|| path.display().to_string())
+    }
+}
+
+fn print(report: &LinkReport, as_json: bool) -> anyhow::Result<()> {
+    if as_json {
+        println!("{}", serde_json::to_string(report)?);
+        return Ok(());
+    }
+    let LinkReport { offered, arrived, copies, under_way, dropped } = report;
+    println!("{offered} messages: {arrived} arrived, {copies} of them twice, {under_way} still under way");
+    for (reason, count) in dropped {
+        println!("{count} dropped: {reason}");
+    }
+    Ok(())
+}

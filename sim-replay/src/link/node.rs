@@ -1,0 +1,268 @@
+//! The air between the agents of a live run and one ego.
+//!
+//! What agents publish is taken in as it comes, kept for as long as the [`Air`] says, and published under
+//! `rx/<ego>/<cav>/<stream>` as it was, stamp and all. One thread receives and decides; sending has threads of its own.
+
+use std::collections::{BTreeMap, BTreeSet};
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use protocol::{CavId, DropReason, Gnss, Limits, Role, Stream, Topic};
+use serde::Serialize;
+
+use super::air::{Air, Fate, Outcome, Parcel};
+use crate::bus::mailbox::{Mailbox, Pushed, Taken};
+use crate::bus::shutdown::Stop;
+use crate::bus::{Arrival, Bus, BusError, Event, Inbox, Publisher, PublisherOptions, Sighting, Subscription, Watch};
+
+/// Messages of one topic that may wait to be looked at, and that may wait to be passed on.
+const PLACES: usize = 64;
+/// Vehicles that a link carries at most.
+const MAX_VEHICLES: usize = 64;
+/// How often the node looks for newcomers though nothing happens.
+const LOOK_ROUND: Duration = Duration::from_millis(20);
+
+/// What a link carries.
+#[derive(Debug, Clone)]
+pub struct NodeOptions {
+    /// Who receives.
+    pub ego: CavId,
+    /// What agents send.
+    pub streams: Vec<Stream>,
+    /// Whether to go on when all agents have ended, for the next ones.
+    pub keeps_running: bool,
+}
+
+/// What became of the messages.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
+pub struct LinkReport {
+    /// Messages that agents sent.
+    pub offered: u64,
+    /// Of these, passed on.
+    pub arrived: u64,
+    /// Passed on a second time.
+    pub copies: u64,
+    /// Not passed on.
+    pub dropped: BTreeMap<DropReason, u64>,
+    /// Still under way at the end.
+    pub under_way: u64,
+}
+
+/// Carries messages until all agents have ended and everything has arrived, or `stop` is requested.
+///
+/// # Errors
+/// [`BusError`] when the bus refuses. What is wrong with single messages is counted and logged.
+pub fn run(bus: &Bus, air: Air, options: &NodeOptions, stop: &Stop) -> Result<LinkReport, BusError> {
+    let mut node = Node::open(bus, air, options, stop)?;
+    let presence = bus.announce(Role::Link)?;
+    node.carry(stop)?;
+    let Node { vehicles, kept, mut report, .. } = node;
+    report.under_way = kept.len() as u64;
+    for topic in kept.values().map(|arrival| &arrival.topic) {
+        bus.books().dropped(topic, DropReason::Stale);
+    }
+    vehicles.into_values().flat_map(|vehicle| vehicle.publishers.into_values()).for_each(Publisher::finish);
+    presence.withdraw()?;
+    Ok(report)
+}
+
+/// One agent, or the ego, of whom only the place is of interest.
+struct Vehicle {
+    publishers: BTreeMap<Stream, Publisher>,
+    /// Streams that have ended.
+    ended: BTreeSet<Stream>,
+    position_m: Option<[f64; 3]>,
+    _subscriptions: Vec<Subscription>,
+}
+
+struct Node<'a> {
+    bus: &'a Bus,
+    air: Air,
+    options: &'a NodeOptions,
+    inbox: Arc<Inbox>,
+    sightings: Arc<Mailbox<CavId, bool>>,
+    vehicles: BTreeMap<CavId, Vehicle>,
+    /// Messages that are under way.
+    kept: BTreeMap<u64, Arrival>,
+    next_id: u64,
+    /// When the first message came: time 0 of the air.
+    began: Option<Instant>,
+    report: LinkReport,
+    _watch: Watch,
+}
+
+impl<'a> Node<'a> {
+    fn open(bus: &'a Bus, air: Air, options: &'a NodeOptions, stop: &Stop) -> Result<Self, BusError> {
+        let inbox = bus.inbox(PLACES, MAX_VEHICLES * (options.streams.len() + 1));
+        stop.on_request({
+            let inbox = Arc::clone(&inbox);
+            move || inbox.close()
+        });
+        let sightings = Arc::new(Mailbox::new(1, 2 * MAX_VEHICLES));
+        let watch = bus.watch(Role::Agent, {
+            let sightings = Arc::clone(&sightings);
+            move |sighting| {
+                let (cav, is_there) = match sighting {
+                    Sighting::Appeared { cav, .. } => (cav, true),
+                    Sighting::Vanished { cav, .. } => (cav, false),
+                };
+                if let Pushed::NoLane(_) = sightings.push(cav.clone(), is_there) {
+                    tracing::warn!(%cav, "more agents come and go than a link carries");
+                }
+            }
+        })?;
+        Ok(Self {
+            bus,
+            air,
+            options,
+            inbox,
+            sightings,
+            vehicles: BTreeMap::new(),
+            kept: BTreeMap::new(),
+            next_id: 0,
+            began: None,
+            report: LinkReport::default(),
+            _watch: watch,
+        })
+    }
+
+    fn carry(&mut self, stop: &Stop) -> Result<(), BusError> {
+        while !stop.requested() {
+            self.look_round()?;
+            match self.inbox.take(Some(self.next_moment())) {
+                Taken::Item(Topic::Stream { cav, stream: Stream::Gnss }, Event::Message(arrival)) => {
+                    self.locate(&cav, &arrival);
+                }
+                Taken::Item(Topic::Stream { cav, stream }, Event::Message(arrival)) => self.admit(cav, stream, arrival),
+                Taken::Item(Topic::Stream { cav, stream }, Event::End { .. }) => {
+                    if let Some(vehicle) = self.vehicles.get_mut(&cav) {
+                        vehicle.ended.insert(stream);
+                    }
+                }
+                Taken::Item(..) | Taken::TimedOut => {}
+                Taken::Closed => break,
+            }
+            self.settle();
+            if self.is_over() {
+                break;
+            }
+        }
+        Ok(())
+    }
+
+    fn is_over(&self) -> bool {
+        let mut senders = self.vehicles.iter().filter(|(cav, _)| **cav != self.options.ego).peekable();
+        !self.options.keeps_running
+            && senders.peek().is_some()
+            && senders.all(|(_, vehicle)| self.options.streams.iter().all(|stream| vehicle.ended.contains(stream)))
+            && self.kept.is_empty()
+    }
+
+    /// Follows up on who came and went.
+    fn look_round(&mut self) -> Result<(), BusError> {
+        while let Taken::Item(cav, is_there) = self.sightings.take(Some(Instant::now())) {
+            if is_there && !self.vehicles.contains_key(&cav) && self.vehicles.len() < MAX_VEHICLES {
+                let vehicle = self.attach(&cav)?;
+                tracing::info!(%cav, "its messages cross the link");
+                self.vehicles.insert(cav, vehicle);
+            } else if !is_there && let Some(vehicle) = self.vehicles.get_mut(&cav) {
+                // What it sent before may still be under way.
+                vehicle.ended.extend(self.options.streams.iter().copied());
+            }
+        }
+        Ok(())
+    }
+
+    fn attach(&self, cav: &CavId) -> Result<Vehicle, BusError> {
+        let subscribe = |stream| self.bus.subscribe(Topic::Stream { cav: cav.clone(), stream }, &self.inbox);
+        let mut subscriptions = vec![subscribe(Stream::Gnss)?];
+        let mut publishers = BTreeMap::new();
+        // An ego hears its own agent without any air between.
+        let streams = if *cav == self.options.ego { &[][..] } else { &self.options.streams };
+        for &stream in streams {
+            subscriptions.push(subscribe(stream)?);
+            let topic = Topic::Received { ego: self.options.ego.clone(), cav: cav.clone(), stream };
+            let how = if stream == Stream::Pose { PublisherOptions::POSE } else { PublisherOptions::FEATURES };
+            // The air has decided what is lost; after it nothing is.
+            publishers.insert(stream, self.bus.publisher(topic, how.lossless(PLACES))?);
+        }
+        Ok(Vehicle { publishers, ended: BTreeSet::new(), position_m: None, _subscriptions: subscriptions })
+    }
+
+    /// Takes note of where a vehicle is: loss may depend on distance.
+    fn locate(&mut self, cav: &CavId, arrival: &Arrival) {
+        let Some(Gnss { world_from_lidar, .. }) = self.inbox.decode(arrival, &Limits::DEFAULT) else { return };
+        self.bus.books().received(&arrival.topic);
+        if let Some(vehicle) = self.vehicles.get_mut(cav) {
+            vehicle.position_m = Some(world_from_lidar.translation_m);
+        }
+    }
+
+    fn admit(&mut self, from: CavId, stream: Stream, arrival: Arrival) {
+        let began = *self.began.get_or_insert(arrival.at);
+        let distance_m = self.distance_m(&from);
+        self.report.offered += 1;
+        self.air.offer(Parcel {
+            id: self.next_id,
+            from,
+            to: self.options.ego.clone(),
+            stream,
+            sequence: arrival.header.stamp.sequence,
+            bytes: arrival.wire_bytes(),
+            offered_nanos: nanos_since(began, arrival.at),
+            distance_m,
+        });
+        self.kept.insert(self.next_id, arrival);
+        self.next_id += 1;
+    }
+
+    /// Between a sender and the ego; 0 while either's place is not known.
+    fn distance_m(&self, from: &CavId) -> f64 {
+        let position = |cav: &CavId| self.vehicles.get(cav).and_then(|vehicle| vehicle.position_m);
+        match (position(from), position(&self.options.ego)) {
+            (Some(from), Some(to)) => (from[0] - to[0]).hypot(from[1] - to[1]),
+            _ => 0.0,
+        }
+    }
+
+    /// Passes on what has arrived by now.
+    fn settle(&mut self) {
+        let Some(began) = self.began else { return };
+        for Outcome { parcel, fate, .. } in self.air.advance(nanos_since(began, Instant::now())) {
+            match fate {
+                Fate::Dropped(reason) => {
+                    *self.report.dropped.entry(reason).or_default() += 1;
+                    if let Some(lost) = self.kept.remove(&parcel.id) {
+                        self.bus.books().dropped(&lost.topic, reason);
+                    }
+                }
+                Fate::Arrived { is_copy, is_repeated } => self.pass_on(&parcel, is_copy, is_repeated),
+            }
+        }
+    }
+
+    fn pass_on(&mut self, parcel: &Parcel, is_copy: bool, is_repeated: bool) {
+        let publisher = self.vehicles.get(&parcel.from).and_then(|vehicle| vehicle.publishers.get(&parcel.stream));
+        let (Some(publisher), Some(arrival)) = (publisher, self.kept.get(&parcel.id)) else { return };
+        publisher.relay(arrival);
+        if is_copy {
+            self.report.copies += 1;
+        } else {
+            self.report.arrived += 1;
+            self.bus.books().received(&arrival.topic);
+        }
+        if !is_repeated {
+            self.kept.remove(&parcel.id);
+        }
+    }
+
+    fn next_moment(&self) -> Instant {
+        let soon = Instant::now() + LOOK_ROUND;
+        let next = self.began.zip(self.air.next_nanos()).map(|(began, nanos)| began + Duration::from_nanos(nanos));
+        next.map_or(soon, |next| next.min(soon))
+    }
+}
+
+fn nanos_since(began: Instant, at: Instant) -> u64 {
+    u64::try_from(at.saturating_duration_since(began).as_nanos()).unwrap_or(u64::MAX)
+}
