@@ -3,7 +3,7 @@
 //! Tokens lie along all dimensions but the last, which holds the channels.
 
 use tch::nn::{self, Init};
-use tch::{TchError, Tensor};
+use tch::{Kind, TchError, Tensor};
 
 /// Offset under the root in layer norms, as everywhere in the reference codes.
 const EPSILON: f64 = 1e-5;
@@ -119,8 +119,29 @@ pub fn dropout(x: Tensor, share: f64, train: bool) -> Result<Tensor, TchError> {
 pub fn attend(query: &Tensor, key: &Tensor, value: &Tensor, bias: Option<&Tensor>) -> Result<Tensor, TchError> {
     let (groups, tokens, heads, channels) = query.size4()?;
     let [query, key, value] = [query.f_transpose(1, 2)?, key.f_transpose(1, 2)?, value.f_transpose(1, 2)?];
-    let seen = Tensor::f_scaled_dot_product_attention(&query, &key, &value, bias, 0.0, false, None, false)?;
+    let seen = match bias {
+        Some(bias) if bias.requires_grad() => attend_and_learn_bias(&query, &key, &value, bias)?,
+        _ => Tensor::f_scaled_dot_product_attention(&query, &key, &value, bias, 0.0, false, None, false)?,
+    };
     seen.f_transpose(1, 2)?.f_reshape([groups, tokens, heads * channels])
+}
+
+/// The same step by step, on `[B, M, tokens, D]`: the fused kernels have no gradient for the bias, and what the library
+/// falls back to scales queries and keys in passes of their own.
+fn attend_and_learn_bias(query: &Tensor, key: &Tensor, value: &Tensor, bias: &Tensor) -> Result<Tensor, TchError> {
+    let (groups, heads, asking, channels) = query.size4()?;
+    let asked = key.size()[2];
+    let flat = |x: &Tensor, tokens: i64| x.f_reshape([groups * heads, tokens, channels]);
+    let (query, key) = (flat(query, asking)?, flat(key, asked)?.f_transpose(1, 2)?);
+    let scale = (channels as f64).powf(-0.5);
+    let scores = if bias.dim() == 2 {
+        bias.f_baddbmm(&query, &key, 1.0, scale)?
+    } else {
+        let scores = (query * scale).f_bmm(&key)?.f_view([groups, heads, asking, asked])?;
+        (scores + bias).f_view([groups * heads, asking, asked])?
+    };
+    let weights = scores.f_softmax(-1, None::<Kind>)?;
+    weights.f_bmm(&flat(value, asked)?)?.f_view([groups, heads, asking, channels])
 }
 
 /// What is added to scores so that cells with a mask of zero are not attended to: 0 or minus infinity.
@@ -134,7 +155,7 @@ pub fn unseen(mask: &Tensor) -> Result<Tensor, TchError> {
 #[cfg(test)]
 mod tests {
     use tch::nn::VarStore;
-    use tch::{Device, Kind};
+    use tch::Device;
 
     use super::*;
 
@@ -146,6 +167,21 @@ mod tests {
         let out = attend(&query, &key, &value, Some(&unseen(&mask).unwrap().view([1, 1, 1, 4]))).unwrap();
         let expected = value.narrow(1, 1, 1).expand([3, 4, 2, 8], false).reshape([3, 4, 16]);
         assert!((out - expected).abs().max().double_value(&[]) < 1e-6);
+    }
+
+    #[test]
+    fn a_bias_that_learns_changes_the_way_and_not_the_result() {
+        let float = (Kind::Float, Device::Cpu);
+        let [query, key, value] = [6, 4, 4].map(|tokens| Tensor::randn([3, tokens, 2, 8], float));
+        for shape in [vec![6, 4], vec![1, 2, 6, 4], vec![3, 2, 6, 4]] {
+            let bias = Tensor::randn(shape.as_slice(), float);
+            let fused = attend(&query, &key, &value, Some(&bias)).unwrap();
+            let bias = bias.set_requires_grad(true);
+            let learnt = attend(&query, &key, &value, Some(&bias)).unwrap();
+            assert!((fused - &learnt).abs().max().double_value(&[]) < 1e-5, "{shape:?}");
+            learnt.square().sum(Kind::Float).backward();
+            assert_eq!(bias.grad().size(), shape);
+        }
     }
 
     #[test]

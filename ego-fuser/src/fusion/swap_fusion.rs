@@ -103,21 +103,20 @@ impl GroupAttention {
 
     /// `[G, S, P, C]` to the same, of which the first `asked` slots are looked at.
     fn forward(&self, x: &Tensor, asked: i64, bias: &Tensor, train: bool) -> Result<Tensor, TchError> {
-        let &[groups, slots, cells, channels] = &x.size()[..] else { return Err(shape_error(x)) };
+        let &[groups, slots, _, channels] = &x.size()[..] else { return Err(shape_error(x)) };
         let heads = |part: &Tensor| part.f_unflatten(-1, [self.heads, channels / self.heads]);
-        let (query, key_value) = if asked == slots {
-            let qkv = self.to_qkv.forward(x)?.f_view([groups, slots * cells, 3 * channels])?;
-            (qkv.f_narrow(2, 0, channels)?, qkv.f_narrow(2, channels, 2 * channels)?)
+        let flat = |x: &Tensor| x.f_view([groups, -1, x.size()[3]]);
+        let parts = if asked == slots {
+            flat(&self.to_qkv.forward(x)?)?.f_split(channels, 2)?
         } else {
             // Slots that nobody looks at have no keys and values.
             let weight = &self.to_qkv.weight;
-            let query = x.f_linear(&weight.f_narrow(0, 0, channels)?, None::<Tensor>)?;
+            let query = flat(&x.f_linear(&weight.f_narrow(0, 0, channels)?, None::<Tensor>)?)?;
             let there = x.f_narrow(1, 0, asked)?.f_contiguous()?;
             let key_value = there.f_linear(&weight.f_narrow(0, channels, 2 * channels)?, None::<Tensor>)?;
-            (query.f_view([groups, -1, channels])?, key_value.f_view([groups, -1, 2 * channels])?)
+            std::iter::once(query).chain(flat(&key_value)?.f_split(channels, 2)?).collect()
         };
-        let [key, value] = [key_value.f_narrow(2, 0, channels)?, key_value.f_narrow(2, channels, channels)?];
-        let seen = attend(&heads(&query)?, &heads(&key)?, &heads(&value)?, Some(bias))?;
+        let seen = attend(&heads(&parts[0])?, &heads(&parts[1])?, &heads(&parts[2])?, Some(bias))?;
         dropout(self.out.forward(&seen)?, self.dropout, train)?.f_view_as(x)
     }
 }

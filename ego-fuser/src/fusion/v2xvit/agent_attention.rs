@@ -142,8 +142,15 @@ impl AgentAttention {
         asked: &Asked,
         bias: Option<&Tensor>,
     ) -> Result<Tensor, TchError> {
-        let query = query.f_linear(&asked.query.0, Some(&asked.query.1))?;
+        let inner = asked.query.1.size()[0];
         let first = types[0];
+        if types.len() == 1 {
+            // Who is alone has nothing to weigh.
+            let (weight, offset) = &asked.key_value[first];
+            let (weight, offset) = (weight.f_narrow(0, inner, inner)?, offset.f_narrow(0, inner, inner)?);
+            return x.f_linear(&weight, Some(&offset))?.f_transpose(0, 1);
+        }
+        let query = query.f_linear(&asked.query.0, Some(&asked.query.1))?;
         let key_value = if types.iter().all(|&kind| kind == first) {
             let (weight, offset) = &asked.key_value[first];
             x.f_linear(weight, Some(offset))?
@@ -154,11 +161,10 @@ impl AgentAttention {
             });
             Tensor::f_stack(&each.collect::<Result<Vec<_>, TchError>>()?, 0)?
         };
-        let inner = query.size()[2];
         // Cells are the groups, agents the tokens.
         let cut = |x: &Tensor| x.f_unflatten(2, [self.heads, inner / self.heads])?.f_transpose(0, 1);
-        let [key, value] = [key_value.f_narrow(2, 0, inner)?, key_value.f_narrow(2, inner, inner)?];
-        attend(&cut(&query)?, &cut(&key)?, &cut(&value)?, bias)
+        let parts = key_value.f_split(inner, 2)?;
+        attend(&cut(&query)?, &cut(&parts[0])?, &cut(&parts[1])?, bias)
     }
 
     fn asked(&self, kind: usize) -> Result<Asked, TchError> {

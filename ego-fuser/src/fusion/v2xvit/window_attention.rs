@@ -52,8 +52,8 @@ impl WindowBranch {
         let qkv = self.to_qkv.forward(x)?;
         let head_channels = qkv.size()[1] / (3 * self.heads);
         let qkv = qkv.f_view([-1, self.tokens, 3, self.heads, head_channels])?;
-        let [query, key, value] = [qkv.f_select(2, 0)?, qkv.f_select(2, 1)?, qkv.f_select(2, 2)?];
-        attend(&query, &key, &value, Some(bias))?.f_view([-1, self.heads * head_channels])
+        let parts = qkv.f_unbind(2)?;
+        attend(&parts[0], &parts[1], &parts[2], Some(bias))?.f_view([-1, self.heads * head_channels])
     }
 
     /// What this branch gives alone: the tokens of one agent, `[T, C]` to the same.
