@@ -36,6 +36,8 @@ pub enum Method {
     V2xVit,
     /// Feature maps, attention over agents within windows and grids (CoBEVT).
     Cobevt,
+    /// Feature maps, the cells worth sending, corrected by what vehicles agree on (ERMVP).
+    Ermvp,
     /// Feature maps of several frames, attention along the ways of objects (TraF-Align).
     TrafAlign,
     /// Feature maps of several frames, aligned by pose confidence and content, transformer (PASTAT).
@@ -58,7 +60,7 @@ pub enum Exchange {
 
 impl Method {
     /// Every method, in the order of tables.
-    pub const ALL: [Self; 13] = [
+    pub const ALL: [Self; 14] = [
         Self::None,
         Self::Late,
         Self::Early,
@@ -70,6 +72,7 @@ impl Method {
         Self::DiscoNet,
         Self::V2xVit,
         Self::Cobevt,
+        Self::Ermvp,
         Self::TrafAlign,
         Self::Pastat,
     ];
@@ -89,6 +92,7 @@ impl Method {
             Self::DiscoNet => "disconet",
             Self::V2xVit => "v2xvit",
             Self::Cobevt => "cobevt",
+            Self::Ermvp => "ermvp",
             Self::TrafAlign => "traf_align",
             Self::Pastat => "pastat",
         }
@@ -109,6 +113,7 @@ impl Method {
             Self::DiscoNet => "feature maps, a learnt weight per agent and cell (DiscoNet)",
             Self::V2xVit => "feature maps, attention over agents and windows of several sizes (V2X-ViT)",
             Self::Cobevt => "feature maps, attention over agents within windows and grids (CoBEVT)",
+            Self::Ermvp => "feature maps, the cells worth sending, poses corrected by agreement about them (ERMVP)",
             Self::TrafAlign => "feature maps with history, attention along trajectories (TraF-Align)",
             Self::Pastat => "feature maps with history, aligned by confidence and content, transformer (PASTAT)",
         }

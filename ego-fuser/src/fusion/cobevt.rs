@@ -129,7 +129,7 @@ impl Fusion for Cobevt {
 }
 
 /// The numbers of the maps, the ego first and then by distance.
-fn nearest_first(views: &AlignedViews<'_>) -> Tensor {
+pub(super) fn nearest_first(views: &AlignedViews<'_>) -> Tensor {
     let distance = |index: &i64| {
         let [x, y, _] = views.facts[*index as usize].ego_from_cav.translation_m;
         if *index == 0 { -1.0 } else { x.hypot(y) }

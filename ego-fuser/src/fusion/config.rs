@@ -9,6 +9,7 @@ use tch::nn;
 use super::coalign::CoAlignConfig;
 use super::cobevt::{Cobevt, CobevtConfig};
 use super::disconet::{DiscoNet, DiscoNetConfig};
+use super::ermvp::{Ermvp, ErmvpConfig};
 use super::pastat::{Pastat, PastatConfig};
 use super::traf_align::{TrafAlign, TrafAlignConfig};
 use super::v2vnet::{V2vNet, V2vNetConfig};
@@ -50,6 +51,8 @@ pub enum FusionConfig {
     V2xVit(V2xVitConfig),
     /// CoBEVT.
     Cobevt(CobevtConfig),
+    /// ERMVP.
+    Ermvp(ErmvpConfig),
     /// Attention along trajectories.
     TrafAlign(TrafAlignConfig),
     /// PASTAT.
@@ -76,6 +79,8 @@ impl FusionConfig {
             Method::V2xVit => Self::V2xVit(V2xVitConfig::full(channels)),
             Method::Cobevt if is_lean => Self::Cobevt(CobevtConfig::lean(channels)),
             Method::Cobevt => Self::Cobevt(CobevtConfig::full(channels)),
+            Method::Ermvp if is_lean => Self::Ermvp(ErmvpConfig::lean(channels)),
+            Method::Ermvp => Self::Ermvp(ErmvpConfig::full(channels)),
             Method::TrafAlign if is_lean => Self::TrafAlign(TrafAlignConfig::lean(channels)),
             Method::TrafAlign => Self::TrafAlign(TrafAlignConfig::full(channels)),
             Method::Pastat if is_lean => Self::Pastat(PastatConfig::lean(channels)),
@@ -107,6 +112,7 @@ impl FusionConfig {
             Self::DiscoNet(config) => Box::new(DiscoNet::new(path, config)?),
             Self::V2xVit(config) => Box::new(V2xVit::new(path, config)?),
             Self::Cobevt(config) => Box::new(Cobevt::new(path, config)?),
+            Self::Ermvp(config) => Box::new(Ermvp::new(path, config)?),
             Self::TrafAlign(config) => Box::new(TrafAlign::new(path, config)?),
             Self::Pastat(config) => Box::new(Pastat::new(path, config)?),
         })

@@ -34,6 +34,14 @@ impl Linear {
         Self::with_init(path, from, to, has_bias, RESIDUAL)
     }
 
+    /// Hands on what comes in at the start; as many channels leave as enter.
+    #[must_use]
+    pub fn identity(path: &nn::Path<'_>, channels: i64) -> Self {
+        let linear = Self::with_init(path, channels, channels, true, Init::Const(0.0));
+        let _ = tch::no_grad(|| linear.weight.shallow_clone().fill_diagonal_(1.0, false));
+        linear
+    }
+
     fn with_init(path: &nn::Path<'_>, from: i64, to: i64, has_bias: bool, init: Init) -> Self {
         let weight = path.var("weight", &[to, from], init);
         Self { weight, bias: has_bias.then(|| path.var("bias", &[to], Init::Const(0.0))) }
@@ -154,8 +162,8 @@ pub fn unseen(mask: &Tensor) -> Result<Tensor, TchError> {
 
 #[cfg(test)]
 mod tests {
-    use tch::nn::VarStore;
     use tch::Device;
+    use tch::nn::VarStore;
 
     use super::*;
 

@@ -7,83 +7,37 @@ use tch::nn::{self, Init};
 use tch::{Device, Kind, TchError, Tensor};
 
 use super::cobevt::CobevtConfig;
-use super::layers::{FeedForward, LayerNorm, Linear, attend, dropout};
+use super::layers::{FeedForward, LayerNorm, Linear, attend, dropout, unseen};
+use super::partition::{Partition, shape_error};
 
 /// Tokens that are computed at once outside of training: what lies between two steps then stays in the cache.
 const CHUNK: i64 = 1280;
 
-/// How a map is cut into groups of `window * window` cells.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Partition {
-    /// Neighbouring cells.
-    Window,
-    /// Cells spread evenly.
-    Grid,
-}
-
-impl Partition {
-    /// `[S, H, W, C]` to `[groups, S, cells of a group, C]`.
-    fn cut(self, map: &Tensor, window: i64) -> Result<Tensor, TchError> {
-        let &[slots, height, width, channels] = &map.size()[..] else { return Err(shape_error(map)) };
-        let (rows, columns) = (height / window, width / window);
-        let cut = match self {
-            Self::Window => {
-                map.f_view([slots, rows, window, columns, window, channels])?.f_permute([1, 3, 0, 2, 4, 5])?
-            }
-            Self::Grid => {
-                map.f_view([slots, window, rows, window, columns, channels])?.f_permute([2, 4, 0, 1, 3, 5])?
-            }
-        };
-        cut.f_reshape([rows * columns, slots, window * window, channels])
-    }
-
-    /// The way back of [`Self::cut`].
-    fn map(self, groups: &Tensor, [height, width]: [i64; 2], window: i64) -> Result<Tensor, TchError> {
-        let &[_, slots, _, channels] = &groups.size()[..] else { return Err(shape_error(groups)) };
-        let groups = groups.f_view([height / window, width / window, slots, window, window, channels])?;
-        let map = match self {
-            Self::Window => groups.f_permute([2, 0, 3, 1, 4, 5])?,
-            Self::Grid => groups.f_permute([2, 3, 0, 4, 1, 5])?,
-        };
-        map.f_reshape([slots, height, width, channels])
-    }
-}
-
-fn shape_error(found: &Tensor) -> TchError {
-    TchError::Shape(format!("swap fusion has no use for {:?}", found.size()))
-}
-
-/// Attention among the tokens of a group.
+/// What is added to scores for the offset between two tokens of a group: agents, rows and columns.
 #[derive(Debug)]
-struct GroupAttention {
-    heads: i64,
+pub(super) struct OffsetTable {
     slots: i64,
     window: i64,
-    to_qkv: Linear,
+    heads: i64,
     /// `[(2 * slots - 1) * (2 * window - 1)^2, M]`.
     table: Tensor,
-    out: Linear,
-    dropout: f64,
 }
 
-impl GroupAttention {
-    fn new(path: &nn::Path<'_>, config: &CobevtConfig) -> Self {
+impl OffsetTable {
+    pub(super) fn new(path: &nn::Path<'_>, config: &CobevtConfig) -> Self {
         let heads = config.channels / config.head_channels;
         let offsets = (2 * config.slots - 1) * (2 * config.window - 1) * (2 * config.window - 1);
         let table = path / "relative_position_bias_table";
         Self {
-            heads,
             slots: config.slots,
             window: config.window,
-            to_qkv: Linear::new(&(path / "to_qkv"), config.channels, 3 * config.channels, false),
+            heads,
             table: table.var("weight", &[offsets, heads], Init::Randn { mean: 0.0, stdev: 0.02 }),
-            out: Linear::residual(&(path / "to_out" / 0), config.channels, config.channels, false),
-            dropout: config.dropout,
         }
     }
 
     /// `[M, asking * cells, asked * cells]` added to the scores. Agents further apart than the table knows count as its end.
-    fn bias(&self, asking: i64, asked: i64) -> Result<Tensor, TchError> {
+    pub(super) fn bias(&self, asking: i64, asked: i64) -> Result<Tensor, TchError> {
         let (span, last) = (2 * self.window - 1, self.slots - 1);
         let tokens = |slots: i64| {
             let window = self.window;
@@ -99,6 +53,28 @@ impl GroupAttention {
         let index = Tensor::f_from_slice(&index)?.f_to_device(self.table.device())?;
         let bias = self.table.f_index_select(0, &index)?.f_view([asking * cells, asked * cells, self.heads])?;
         bias.f_permute([2, 0, 1])?.f_contiguous()
+    }
+}
+
+/// Attention among the tokens of a group.
+#[derive(Debug)]
+struct GroupAttention {
+    heads: i64,
+    to_qkv: Linear,
+    offsets: OffsetTable,
+    out: Linear,
+    dropout: f64,
+}
+
+impl GroupAttention {
+    fn new(path: &nn::Path<'_>, config: &CobevtConfig) -> Self {
+        Self {
+            heads: config.channels / config.head_channels,
+            to_qkv: Linear::new(&(path / "to_qkv"), config.channels, 3 * config.channels, false),
+            offsets: OffsetTable::new(path, config),
+            out: Linear::residual(&(path / "to_out" / 0), config.channels, config.channels, false),
+            dropout: config.dropout,
+        }
     }
 
     /// `[G, S, P, C]` to the same, of which the first `asked` slots are looked at.
@@ -123,7 +99,7 @@ impl GroupAttention {
 
 /// Attention and a feed-forward network over one partition, each normalised first and added to what it started from.
 #[derive(Debug)]
-struct HalfBlock {
+pub(super) struct HalfBlock {
     partition: Partition,
     norm: LayerNorm,
     attention: GroupAttention,
@@ -132,7 +108,12 @@ struct HalfBlock {
 }
 
 impl HalfBlock {
-    fn new(partition: Partition, attention: &nn::Path<'_>, feed: &nn::Path<'_>, config: &CobevtConfig) -> Self {
+    pub(super) fn new(
+        partition: Partition,
+        attention: &nn::Path<'_>,
+        feed: &nn::Path<'_>,
+        config: &CobevtConfig,
+    ) -> Self {
         Self {
             partition,
             norm: LayerNorm::new(&(attention / "norm"), config.channels),
@@ -145,6 +126,17 @@ impl HalfBlock {
     fn forward(&self, x: &Tensor, asked: i64, bias: &Tensor, train: bool) -> Result<Tensor, TchError> {
         let x = x + self.attention.forward(&self.norm.forward(x)?, asked, bias, train)?;
         Ok(&x + self.feed_forward.forward(&self.feed_norm.forward(&x)?, train)?)
+    }
+
+    /// On all groups of a map `[S, H, W, C]` at once, by moves that gradients go back through quickly: the groups.
+    pub(super) fn whole(&self, map: &Tensor, slots: Slots<'_>, window: i64, train: bool) -> Result<Tensor, TchError> {
+        let x = self.partition.cut(map, window)?;
+        let bias = self.attention.offsets.bias(x.size()[1], slots.asked)?.f_unsqueeze(0)?;
+        let bias = match slots.unseen(self.partition, window)? {
+            Some(unseen) => bias + unseen,
+            None => bias,
+        };
+        self.forward(&x, slots.asked, &bias, train)
     }
 }
 
@@ -159,13 +151,51 @@ pub struct Slots<'a> {
     pub count_missing: bool,
 }
 
+impl Slots<'_> {
+    /// `[G, 1, 1, asked * P]`: 0 for tokens that are there, minus infinity for those that are not.
+    pub(super) fn unseen(&self, partition: Partition, window: i64) -> Result<Option<Tensor>, TchError> {
+        let Some(reach) = self.reach else { return Ok(None) };
+        let unseen = unseen(&reach.f_narrow(0, 0, self.asked)?.f_unsqueeze(3)?)?;
+        Ok(Some(partition.cut(&unseen, window)?.f_view([-1, 1, 1, self.asked * window * window])?))
+    }
+}
+
+/// The mean over the slots, normalised and projected.
+#[derive(Debug)]
+pub(super) struct MeanHead {
+    norm: LayerNorm,
+    linear: Linear,
+}
+
+impl MeanHead {
+    pub(super) fn new(path: &nn::Path<'_>, channels: i64) -> Self {
+        Self {
+            norm: LayerNorm::new(&(path / 2), channels),
+            // What the encoder has found is worth more than a random mixture of it.
+            linear: Linear::identity(&(path / 3), channels),
+        }
+    }
+
+    /// `[S, H, W, C]` to `[C, H, W]`.
+    pub(super) fn forward(&self, x: &Tensor, slots: Slots<'_>) -> Result<Tensor, TchError> {
+        let mean = match slots.reach {
+            Some(reach) if !slots.count_missing => {
+                let reach = reach.f_unsqueeze(3)?.f_to_kind(x.kind())?;
+                let count = reach.f_sum_dim_intlist([0i64].as_slice(), false, None::<Kind>)?;
+                (x * reach).f_sum_dim_intlist([0i64].as_slice(), false, None::<Kind>)? / count
+            }
+            _ => x.f_mean_dim([0i64].as_slice(), false, None::<Kind>)?,
+        };
+        self.linear.forward(&self.norm.forward(&mean)?)?.f_permute([2, 0, 1])?.f_contiguous()
+    }
+}
+
 /// The encoder of swap fusion.
 #[derive(Debug)]
 pub struct SwapFusion {
     /// Window and grid in turn.
     halves: Vec<HalfBlock>,
-    norm: LayerNorm,
-    head: Linear,
+    head: MeanHead,
     window: i64,
     slots: i64,
 }
@@ -186,11 +216,9 @@ impl SwapFusion {
             halves.push(HalfBlock::new(Partition::Window, &names[0], &names[1], config));
             halves.push(HalfBlock::new(Partition::Grid, &names[2], &names[3], config));
         }
-        let head = path / "mlp_head";
         Self {
             halves,
-            norm: LayerNorm::new(&(&head / 2), config.channels),
-            head: Linear::new(&(&head / 3), config.channels, config.channels, true),
+            head: MeanHead::new(&(path / "mlp_head"), config.channels),
             window: config.window,
             slots: config.slots,
         }
@@ -208,7 +236,7 @@ impl SwapFusion {
     /// [`TchError`] when shapes do not fit.
     pub fn forward(&self, maps: &Tensor, slots: Slots<'_>, train: bool) -> Result<Tensor, TchError> {
         let last = self.halves.len();
-        self.head(&self.through(maps, slots, last, train)?, slots)
+        self.head.forward(&self.through(maps, slots, last, train)?, slots)
     }
 
     /// All slots `[S, C, H, W]` after the first `layers` layers.
@@ -227,32 +255,14 @@ impl SwapFusion {
         let mut lies_in = None;
         for half in &self.halves[..halves.min(self.halves.len())] {
             x = if train {
-                self.whole(half, &x, lies_in, slots, size)?
+                let map = lies_in.map_or_else(|| Ok(x.shallow_clone()), |p: Partition| p.map(&x, size, self.window))?;
+                half.whole(&map, slots, self.window, true)?
             } else {
                 self.chunked(half, &x, lies_in, slots, size)?
             };
             lies_in = Some(half.partition);
         }
         lies_in.map_or_else(|| Ok(x.shallow_clone()), |partition| partition.map(&x, size, self.window))
-    }
-
-    /// A half block on all groups at once, by moves that gradients go back through quickly.
-    fn whole(
-        &self,
-        half: &HalfBlock,
-        x: &Tensor,
-        lies_in: Option<Partition>,
-        slots: Slots<'_>,
-        size: [i64; 2],
-    ) -> Result<Tensor, TchError> {
-        let map = lies_in.map_or_else(|| Ok(x.shallow_clone()), |partition| partition.map(x, size, self.window))?;
-        let x = half.partition.cut(&map, self.window)?;
-        let bias = half.attention.bias(x.size()[1], slots.asked)?;
-        let bias = match self.unseen(half.partition, slots)? {
-            Some(unseen) => bias.f_unsqueeze(0)? + unseen,
-            None => bias.f_unsqueeze(0)?,
-        };
-        half.forward(&x, slots.asked, &bias, true)
     }
 
     /// The same some groups at a time, gathered from wherever they lie.
@@ -275,8 +285,8 @@ impl SwapFusion {
             None => order.f_view([count, size[0], size[1], 1])?,
         };
         let order = half.partition.cut(&order, self.window)?.f_view([-1])?;
-        let bias = half.attention.bias(count, slots.asked)?.f_unsqueeze(0)?;
-        let unseen = self.unseen(half.partition, slots)?;
+        let bias = half.attention.offsets.bias(count, slots.asked)?.f_unsqueeze(0)?;
+        let unseen = slots.unseen(half.partition, self.window)?;
         let step = (CHUNK / (count * cells)).max(1);
         let mut done = Vec::new();
         for (index, order) in order.f_split(step * count * cells, 0)?.iter().enumerate() {
@@ -288,50 +298,5 @@ impl SwapFusion {
             done.push(half.forward(&x, slots.asked, biased.as_ref().unwrap_or(&bias), false)?);
         }
         Tensor::f_cat(&done, 0)
-    }
-
-    /// `[G, 1, 1, asked * P]`: 0 for tokens that are there, minus infinity for those that are not.
-    fn unseen(&self, partition: Partition, slots: Slots<'_>) -> Result<Option<Tensor>, TchError> {
-        let Some(reach) = slots.reach else { return Ok(None) };
-        let unseen = super::layers::unseen(&reach.f_narrow(0, 0, slots.asked)?.f_unsqueeze(3)?)?;
-        let tokens = slots.asked * self.window * self.window;
-        Ok(Some(partition.cut(&unseen, self.window)?.f_view([-1, 1, 1, tokens])?))
-    }
-
-    /// The mean over the slots, normalised and projected: `[S, H, W, C]` to `[C, H, W]`.
-    fn head(&self, x: &Tensor, slots: Slots<'_>) -> Result<Tensor, TchError> {
-        let mean = match slots.reach {
-            Some(reach) if !slots.count_missing => {
-                let reach = reach.f_unsqueeze(3)?.f_to_kind(x.kind())?;
-                let count = reach.f_sum_dim_intlist([0i64].as_slice(), false, None::<Kind>)?;
-                (x * reach).f_sum_dim_intlist([0i64].as_slice(), false, None::<Kind>)? / count
-            }
-            _ => x.f_mean_dim([0i64].as_slice(), false, None::<Kind>)?,
-        };
-        self.head.forward(&self.norm.forward(&mean)?)?.f_permute([2, 0, 1])?.f_contiguous()
-    }
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn both_partitions_lead_back() {
-        let map = Tensor::randn([2, 6, 9, 4], (Kind::Float, Device::Cpu));
-        for partition in [Partition::Window, Partition::Grid] {
-            let groups = partition.cut(&map, 3).unwrap();
-            assert_eq!(groups.size(), [6, 2, 9, 4]);
-            assert_eq!(partition.map(&groups, [6, 9], 3).unwrap(), map, "{partition:?}");
-        }
-    }
-
-    #[test]
-    fn windows_are_neighbours_and_grids_are_spread() {
-        let map = Tensor::arange(36, (Kind::Int64, Device::Cpu)).view([1, 6, 6, 1]);
-        let first =
-            |partition: Partition| Vec::<i64>::try_from(partition.cut(&map, 2).unwrap().get(0).view(-1)).unwrap();
-        assert_eq!(first(Partition::Window), [0, 1, 6, 7]);
-        assert_eq!(first(Partition::Grid), [0, 3, 18, 21]);
     }
 }
