@@ -1,4 +1,4 @@
-//! V2X-ViT and CoBEVT at their published sizes on two threads: time, and how much of the machine they use.
+//! V2X-ViT and CoBEVT at their published sizes on two threads, and lean on one: time, and how much of the machine they use.
 //!
 //! `cargo bench -p ego-fuser --bench transformers -- v2xvit/5`
 //!
@@ -11,6 +11,7 @@ use std::time::Instant;
 
 use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
 use ego_fuser::fusion::cobevt::{Cobevt, CobevtConfig};
+use ego_fuser::fusion::ermvp::{Ermvp, ErmvpConfig};
 use ego_fuser::fusion::v2xvit::{V2xVit, V2xVitConfig};
 use ego_fuser::fusion::{AlignedViews, AttentionFusion, Fusion, ViewFacts};
 use protocol::{BevGrid, Pose};
@@ -71,10 +72,20 @@ fn fuse(criterion: &mut Criterion) {
     let [channels, height, width] = LEAN;
     let (vit, cobevt) = (V2xVitConfig::lean(channels), CobevtConfig::lean(channels));
     let lean = VarStore::new(Device::Cpu);
+    let ermvp = ErmvpConfig::lean(channels);
+    let ermvp_fusion = Ermvp::new(&(lean.root() / "ermvp"), &ermvp).expect("the lean sizes are valid");
     let v2xvit_fusion = V2xVit::new(&(lean.root() / "v2xvit"), &vit).expect("the lean sizes are valid");
     let cobevt_fusion = Cobevt::new(&(lean.root() / "cobevt"), &cobevt).expect("the lean sizes are valid");
     measure(criterion, "lean-v2xvit", &v2xvit_fusion, 4, LEAN, v2xvit_gflop(&vit, 4, height * width));
     measure(criterion, "lean-cobevt", &cobevt_fusion, 4, LEAN, cobevt_gflop(&cobevt, 4, height * width));
+    measure(criterion, "lean-ermvp", &ermvp_fusion, 4, LEAN, ermvp_gflop(&ermvp, 4, height * width));
+}
+
+/// The queries of ERMVP come from a map of a sixteenth of the cells: what they cost is left out.
+fn ermvp_gflop(config: &ErmvpConfig, agents: i64, cells: i64) -> f64 {
+    let channels = config.layers.channels;
+    let query = config.layers.depth as i64 * agents * channels * channels;
+    cobevt_gflop(&config.layers, agents, cells) - 2e-9 * (cells * (query - agents * channels * channels)) as f64
 }
 
 fn measure(criterion: &mut Criterion, name: &str, fusion: &dyn Fusion, agents: i64, shape: [i64; 3], gflop: f64) {

@@ -9,6 +9,7 @@ use serde_json::Value;
 use tch::nn::VarStore;
 use tch::{Device, Kind, Tensor, no_grad};
 use tests::fixtures::{Golden, assert_close, golden};
+use tests::tensors::{integer, integers, number, tensor, values};
 
 /// Tolerance of the V2X-ViT fixtures.
 const ATOL: f64 = 2e-4;
@@ -168,7 +169,7 @@ fn check_swap_fusion(name: &str) {
     load(&variables, &golden, "");
     let (x, mask) = (tensor(&golden, "in.x"), tensor(&golden, "in.mask"));
     let (mut first, mut fused, mut trained) = (Vec::new(), Vec::new(), Vec::new());
-    for (sample, agents) in list(&config["agents"]).into_iter().enumerate() {
+    for (sample, agents) in integers(&config["agents"]).into_iter().enumerate() {
         let maps = x.get(sample as i64);
         let reach = mask.get(sample as i64).squeeze_dim(2).permute([2, 0, 1]);
         // Without the mask, slots without an agent are agents that see nothing.
@@ -225,8 +226,8 @@ impl<'a> EncoderCase<'a> {
             config,
             order,
             encoder: built,
-            pixel_m: sttf["voxel_size"][0].as_f64().unwrap() * sttf["downsample_rate"].as_f64().unwrap(),
-            rows_per_step: agents["RTE_ratio"].as_f64().unwrap(),
+            pixel_m: number(&sttf["voxel_size"][0]) * number(&sttf["downsample_rate"]),
+            rows_per_step: number(&agents["RTE_ratio"]),
             use_roi_mask: encoder["use_roi_mask"].as_bool().unwrap(),
         }
     }
@@ -246,7 +247,7 @@ impl<'a> EncoderCase<'a> {
 }
 
 fn windows(heads: &Value, head_channels: &Value, edges: &Value) -> Vec<WindowConfig> {
-    let sizes = list(edges).into_iter().zip(list(heads)).zip(list(head_channels));
+    let sizes = integers(edges).into_iter().zip(integers(heads)).zip(integers(head_channels));
     sizes.map(|((edge, heads), head_channels)| WindowConfig { edge, heads, head_channels }).collect()
 }
 
@@ -271,22 +272,4 @@ fn load(variables: &VarStore, golden: &Golden, prefix: &str) {
 fn close(golden: &Golden, name: &str, found: &Tensor, atol: f64, rtol: f64) {
     assert_eq!(found.size(), tensor(golden, name).size(), "shape of {name}");
     assert_close(name, &values(found), &golden.f32(name).1, atol, rtol);
-}
-
-fn tensor(golden: &Golden, name: &str) -> Tensor {
-    let (shape, values) = golden.f32(name);
-    let shape: Vec<i64> = shape.into_iter().map(|size| size as i64).collect();
-    Tensor::from_slice(&values).view(shape.as_slice())
-}
-
-fn values(tensor: &Tensor) -> Vec<f32> {
-    Vec::try_from(tensor.detach().contiguous().view(-1)).expect("f32 values")
-}
-
-fn integer(value: &Value) -> i64 {
-    value.as_i64().unwrap_or_else(|| panic!("{value} is not an integer"))
-}
-
-fn list(value: &Value) -> Vec<i64> {
-    value.as_array().expect("a list").iter().map(integer).collect()
 }
