@@ -2,11 +2,9 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 use std::sync::Arc;
-use std::time::Instant;
 
 use protocol::{CavId, Role, Stream, Topic};
-use sim_replay::bus::mailbox::{Mailbox, Pushed, Taken};
-use sim_replay::bus::{Bus, BusError, Inbox, Sighting, Subscription, Watch};
+use sim_replay::bus::{Bus, BusError, Inbox, RollCall, Subscription};
 
 /// Neighbours that an ego listens to at most: a flood of tokens must not become a flood of subscriptions.
 const MAX_NEIGHBOURS: usize = 64;
@@ -18,9 +16,8 @@ pub(crate) struct Neighbourhood {
     ego: CavId,
     streams: Vec<Stream>,
     allowed: Option<BTreeSet<CavId>>,
-    sightings: Arc<Mailbox<CavId, bool>>,
+    roll_call: RollCall,
     members: BTreeMap<CavId, Member>,
-    _watch: Watch,
 }
 
 struct Member {
@@ -36,26 +33,14 @@ impl Neighbourhood {
         streams: Vec<Stream>,
         allowed: Option<BTreeSet<CavId>>,
     ) -> Result<Self, BusError> {
-        let sightings = Arc::new(Mailbox::new(1, 2 * MAX_NEIGHBOURS));
-        let watch = bus.watch(Role::Agent, {
-            let sightings = Arc::clone(&sightings);
-            move |sighting| {
-                let (cav, is_there) = match sighting {
-                    Sighting::Appeared { cav, .. } => (cav, true),
-                    Sighting::Vanished { cav, .. } => (cav, false),
-                };
-                if let Pushed::NoLane(_) = sightings.push(cav.clone(), is_there) {
-                    tracing::warn!(%cav, "more agents come and go than can be followed");
-                }
-            }
-        })?;
-        Ok(Self { ego: ego.clone(), streams, allowed, sightings, members: BTreeMap::new(), _watch: watch })
+        let roll_call = RollCall::begin(bus, Role::Agent, 2 * MAX_NEIGHBOURS)?;
+        Ok(Self { ego: ego.clone(), streams, allowed, roll_call, members: BTreeMap::new() })
     }
 
     /// Follows up on who came and went; those who went are returned.
     pub(crate) fn update(&mut self, bus: &Bus, inbox: &Arc<Inbox>) -> Result<Vec<CavId>, BusError> {
         let mut gone = Vec::new();
-        while let Taken::Item(cav, is_there) = self.sightings.take(Some(Instant::now())) {
+        while let Some((cav, is_there)) = self.roll_call.next() {
             if !is_there {
                 if self.members.remove(&cav).is_some() {
                     tracing::info!(%cav, "a neighbour has left");

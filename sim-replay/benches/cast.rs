@@ -6,9 +6,9 @@
 use std::hint::black_box;
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
+use sim_replay::random::SplitMix64;
 use sim_replay::synth::cast::{Body, BodyShape, Placement, Sweep};
 use sim_replay::synth::lidar::{LIDAR_MOUNT_M, Lidar};
-use sim_replay::random::SplitMix64;
 use sim_replay::synth::vehicle::Vehicle;
 use sim_replay::synth::{Weather, ground_surface};
 use sim_replay::town::{Town, TownSource, build};

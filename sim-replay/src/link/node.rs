@@ -11,9 +11,9 @@ use protocol::{CavId, DropReason, Gnss, Limits, Role, Stream, Topic};
 use serde::Serialize;
 
 use super::air::{Air, Fate, Outcome, Parcel};
-use crate::bus::mailbox::{Mailbox, Pushed, Taken};
+use crate::bus::mailbox::Taken;
 use crate::bus::shutdown::Stop;
-use crate::bus::{Arrival, Bus, BusError, Event, Inbox, Publisher, PublisherOptions, Sighting, Subscription, Watch};
+use crate::bus::{Arrival, Bus, BusError, Event, Inbox, Publisher, PublisherOptions, RollCall, Subscription};
 
 /// Messages of one topic that may wait to be looked at, and that may wait to be passed on.
 const PLACES: usize = 64;
@@ -80,7 +80,7 @@ struct Node<'a> {
     air: Air,
     options: &'a NodeOptions,
     inbox: Arc<Inbox>,
-    sightings: Arc<Mailbox<CavId, bool>>,
+    roll_call: RollCall,
     vehicles: BTreeMap<CavId, Vehicle>,
     /// Messages that are under way.
     kept: BTreeMap<u64, Arrival>,
@@ -88,7 +88,6 @@ struct Node<'a> {
     /// When the first message came: time 0 of the air.
     began: Option<Instant>,
     report: LinkReport,
-    _watch: Watch,
 }
 
 impl<'a> Node<'a> {
@@ -98,31 +97,18 @@ impl<'a> Node<'a> {
             let inbox = Arc::clone(&inbox);
             move || inbox.close()
         });
-        let sightings = Arc::new(Mailbox::new(1, 2 * MAX_VEHICLES));
-        let watch = bus.watch(Role::Agent, {
-            let sightings = Arc::clone(&sightings);
-            move |sighting| {
-                let (cav, is_there) = match sighting {
-                    Sighting::Appeared { cav, .. } => (cav, true),
-                    Sighting::Vanished { cav, .. } => (cav, false),
-                };
-                if let Pushed::NoLane(_) = sightings.push(cav.clone(), is_there) {
-                    tracing::warn!(%cav, "more agents come and go than a link carries");
-                }
-            }
-        })?;
+        let roll_call = RollCall::begin(bus, Role::Agent, 2 * MAX_VEHICLES)?;
         Ok(Self {
             bus,
             air,
             options,
             inbox,
-            sightings,
+            roll_call,
             vehicles: BTreeMap::new(),
             kept: BTreeMap::new(),
             next_id: 0,
             began: None,
             report: LinkReport::default(),
-            _watch: watch,
         })
     }
 
@@ -160,7 +146,7 @@ impl<'a> Node<'a> {
 
     /// Follows up on who came and went.
     fn look_round(&mut self) -> Result<(), BusError> {
-        while let Taken::Item(cav, is_there) = self.sightings.take(Some(Instant::now())) {
+        while let Some((cav, is_there)) = self.roll_call.next() {
             if is_there && !self.vehicles.contains_key(&cav) && self.vehicles.len() < MAX_VEHICLES {
                 let vehicle = self.attach(&cav)?;
                 tracing::info!(%cav, "its messages cross the link");
