@@ -7,7 +7,7 @@
 //! error of 2 m and a degree at 60 m defeats; here the matching may move an agent by as much as its pose may be wrong, and
 //! takes the motion that most boxes agree on ([`consensus`](self)). Its detector predicts the uncertainty of every box;
 //! ours does not, and it is taken from score and distance. Agents stay near their own poses by a weak prior, so that one
-//! with few boxes in common is not turned about by them.
+//! with few boxes in common is not turned about by them; and corrections smaller than boxes are exact are left undone.
 
 mod consensus;
 mod optimise;
@@ -39,6 +39,9 @@ pub struct PoseGraphConfig {
     pub box_std_m: f64,
     /// The same of its heading, degrees.
     pub box_std_deg: f64,
+    /// An agent whose boxes would be moved by less than this on average stays where it was, metres: boxes are not as exact
+    /// as a good pose.
+    pub dead_zone_m: f64,
     /// Standard deviation of the poses as they came, metres.
     pub pose_std_m: f64,
     /// The same of their heading, degrees.
@@ -56,6 +59,7 @@ impl Default for PoseGraphConfig {
             fit_tolerance_m: 1.0,
             box_std_m: 0.3,
             box_std_deg: 4.0,
+            dead_zone_m: 0.4,
             pose_std_m: 3.0,
             pose_std_deg: 3.0,
         }
@@ -76,7 +80,7 @@ pub struct Observer<'a> {
 pub struct Corrected {
     /// Its pose now; as it came where too little is shared.
     pub ego_from_agent: Pose,
-    /// Objects that it shares with others; 0 where it was left alone.
+    /// Objects that it shares with others; 0 where its pose was left as it was.
     pub shared: usize,
 }
 
@@ -126,11 +130,23 @@ pub fn correct(agents: &[Observer<'_>], config: &PoseGraphConfig) -> Vec<Correct
     }
     let mut corrected: Vec<Corrected> = unmoved();
     for (agent, solved, shared) in graph.solve(&priors, config) {
+        if moved_by(&seen[agent], &priors[agent], &solved) < config.dead_zone_m {
+            continue;
+        }
         let moved = solved * priors[agent].inverse();
         corrected[agent].ego_from_agent = (moved * agents[agent].ego_from_agent.isometry()).into();
         corrected[agent].shared = shared;
     }
     corrected
+}
+
+/// How far boxes lie from where they were, on average.
+fn moved_by(seen: &[Seen], before: &Isometry3<f64>, after: &Isometry3<f64>) -> f64 {
+    let moved = |seen: &Seen| {
+        let [old, new] = [before, after].map(|pose| pose.rotation * seen.center + pose.translation.vector);
+        (new - old).norm()
+    };
+    seen.iter().map(moved).sum::<f64>() / seen.len().max(1) as f64
 }
 
 fn sound_boxes(boxes: &[Detection], config: &PoseGraphConfig) -> Vec<Seen> {

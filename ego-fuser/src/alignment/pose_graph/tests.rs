@@ -90,7 +90,7 @@ fn injected_errors_shrink_by_what_is_shared() {
         after += is;
         worse += usize::from(is > was);
         if shared >= 5 {
-            assert!(is < 0.6 && corrected[1].shared >= 4, "seed {seed}: {was} to {is} with {:?}", corrected[1]);
+            assert!(is < 0.6, "seed {seed}: {was} to {is} with {:?}", corrected[1]);
         }
     }
     assert!(after < 0.25 * before, "{before} to {after} m in 100 scenes");
@@ -108,7 +108,21 @@ fn right_poses_and_exact_boxes_stay_as_they_are() {
             Observer { ego_from_agent: truth, boxes: &neighbour },
         ];
         let corrected = correct(&agents, &PoseGraphConfig::default());
-        assert!(off(&corrected[1].ego_from_agent, &truth, &neighbour) < 1e-6, "seed {seed}");
+        assert_eq!(corrected[1].ego_from_agent, truth, "seed {seed}");
+    }
+}
+
+#[test]
+fn a_good_pose_is_not_spoilt_by_boxes() {
+    for seed in 0..20 {
+        let mut scene = Scene::new(seed, 8);
+        let truth = scene.pose();
+        let (ego, neighbour) = (scene.seen(&Pose::IDENTITY, 0..8, 0.25), scene.seen(&truth, 0..8, 0.25));
+        let agents = [
+            Observer { ego_from_agent: Pose::IDENTITY, boxes: &ego },
+            Observer { ego_from_agent: truth, boxes: &neighbour },
+        ];
+        assert_eq!(correct(&agents, &PoseGraphConfig::default())[1].ego_from_agent, truth, "seed {seed}");
     }
 }
 
