@@ -5,6 +5,7 @@
 use std::time::{Duration, Instant};
 
 use protocol::{BevFeatures, CavId, Detection, PointCloud, Pose, PoseEstimate, StageTiming};
+use tch::Tensor;
 
 use crate::detector::{Detector, DetectorError, EncodeTimes};
 use crate::pose_source::{PoseInput, PoseSource};
@@ -139,15 +140,24 @@ impl Agent {
     /// [`DetectorError`] when the tensor library refuses.
     pub fn perceive(&mut self, cloud: &PointCloud) -> Result<Perception, DetectorError> {
         let encoded = self.detector.encode(cloud)?;
-        let (features, message) = timed(|| self.detector.to_message(&encoded.features))?;
-        let (heads, head) = timed(|| self.detector.heads(&encoded.features))?;
+        let perception = self.perceive_map(&encoded.features)?;
+        Ok(Perception { times: PerceptionTimes { encode: encoded.times, ..perception.times }, ..perception })
+    }
+
+    /// The same from a map `[1, C, H, W]` that the encoder made before.
+    ///
+    /// # Errors
+    /// [`DetectorError::Shape`] when it is not one of this detector's maps.
+    pub fn perceive_map(&self, map: &Tensor) -> Result<Perception, DetectorError> {
+        let (features, message) = timed(|| self.detector.to_message(map))?;
+        let (heads, head) = timed(|| self.detector.heads(map))?;
         let (detections, boxes) = timed(|| {
             let boxes = self.detector.boxes(&heads, self.postprocess.score_threshold)?;
             let own = AgentBoxes { boxes: &boxes, output_from_agent: nalgebra::Isometry3::identity() };
             let found = postprocess(&[own], &self.postprocess);
             Ok(found.iter().map(|candidate| candidate.detection(Some(self.cav.clone()))).collect())
         })?;
-        let times = PerceptionTimes { encode: encoded.times, message, head, boxes };
+        let times = PerceptionTimes { encode: EncodeTimes::default(), message, head, boxes };
         Ok(Perception { features, confidence: heads.confidence, detections, times })
     }
 

@@ -1,14 +1,18 @@
 //! A method on recorded scenes without a network: the numbers of a run in which nothing is late.
 
 use std::ops::ControlFlow;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Instant;
 
 use agent::pose_source::PoseSourceConfig;
-use ego_fuser::Method;
+use agent::weights::Weights;
 use ego_fuser::evaluate::{EvaluateConfig, EvaluateError, EvaluatedFrame, Evaluator};
+use ego_fuser::feature_store::{FeatureStore, MapSource};
+use ego_fuser::train::KeptMaps;
+use ego_fuser::{Exchange, Method};
 use protocol::{CavId, CodecConfig};
-use sim_replay::dataset::{self, ReadError};
+use sim_replay::dataset::{self, ReadError, Scenario};
 
 use crate::metrics::{Messages, Metrics};
 use crate::score::Board;
@@ -27,6 +31,8 @@ pub struct EvaluationOptions {
     pub codec: CodecConfig,
     /// How long messages of neighbours are under way, nanoseconds.
     pub delay_nanos: u64,
+    /// Where maps of encoders are kept, in half precision, so that each is computed once for many evaluations.
+    pub maps: Option<KeptMaps>,
     /// Frames to judge at most, over all scenarios.
     pub frames: Option<usize>,
 }
@@ -68,14 +74,18 @@ pub fn evaluate(
 ) -> Result<Metrics, EvaluationError> {
     let began = Instant::now();
     let dataset = dataset::open(&options.dataset)?;
+    let weights = weights_of(&options.weights, method)?;
     let mut evaluator = Evaluator::new(EvaluateConfig {
-        weights: weights_of(&options.weights, method)?,
+        weights: weights.clone(),
         method: Some(method),
         pose_source: options.pose_source.clone(),
         codec: options.codec,
         rule: None,
         delay_nanos: options.delay_nanos,
     })?;
+    if let Some(kept) = options.maps.as_ref().filter(|_| method.exchange() != Exchange::Points) {
+        evaluator = evaluator.with_maps(maps(kept, &weights, &dataset.scenarios)?);
+    }
     let grid = evaluator.ego().detector().config().feature_grid();
     let channels = evaluator.ego().detector().config().feature_channels();
     let map_values = u64::from(grid.width) * u64::from(grid.height) * u64::try_from(channels).unwrap_or(0);
@@ -97,6 +107,13 @@ pub fn evaluate(
     let board =
         board.filter(|board| !board.records().is_empty()).ok_or(EvaluationError::Empty(options.dataset.clone()))?;
     Ok(metrics(&board, method, &options.pose_source, began))
+}
+
+/// The maps of all sweeps, encoded now where they have not been before.
+fn maps(kept: &KeptMaps, weights: &Path, scenarios: &[Scenario]) -> Result<MapSource, EvaluationError> {
+    let weights = Arc::new(Weights::load(weights).map_err(EvaluateError::from)?);
+    let store = FeatureStore::open(&kept.folder, &weights, scenarios, kept.limit_bytes, &mut |_, _| {});
+    Ok(MapSource::new(Arc::new(store.map_err(EvaluateError::from)?), weights))
 }
 
 fn judge(board: &mut Board, frame: EvaluatedFrame) {

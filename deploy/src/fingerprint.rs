@@ -90,7 +90,7 @@ fn hash_all(root: &Path, files: &[PathBuf]) -> io::Result<String> {
 }
 
 /// Length and hash of a file, as `sha256sum` prints it.
-fn hash_file(path: &Path) -> io::Result<(u64, String)> {
+pub(crate) fn hash_file(path: &Path) -> io::Result<(u64, String)> {
     let mut file = File::open(path).map_err(|error| named(error, path))?;
     let mut hash = Sha256::new();
     let mut buffer = vec![0; 1 << 20];

@@ -3,7 +3,7 @@
 //!
 //! - [`scenario`]: what is asked for; [`fleet`]: which processes that takes.
 //! - [`up`]: one run, with its [`network`], [`supervise`]d processes and [`score`].
-//! - [`evaluation`]: the same numbers without a network.
+//! - [`evaluation`]: the same numbers without a network; [`table`]: many of them.
 //! - [`run_folder`], [`metrics`], [`ledger_report`], [`picture`]: what is kept of it.
 
 pub mod evaluation;
@@ -20,5 +20,6 @@ pub mod scenario;
 pub mod score;
 pub mod showcase;
 pub mod supervise;
+pub mod table;
 pub mod up;
 pub mod weights_choice;

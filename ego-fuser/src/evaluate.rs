@@ -18,8 +18,10 @@ use protocol::{Box3d, CavId, CodecConfig, HEADER_LEN, Header, Limits, PoseEstima
 use sim_replay::dataset::{LoadOptions, ReadError, Scenario};
 use sim_replay::frame::Frame;
 use sim_replay::ground_truth::{self, GroundTruthRule};
+use tch::{Kind, TchError, Tensor};
 
 use crate::ego::{Content, Ego, EgoError, Skipped, View, own_content};
+use crate::feature_store::{FeatureStoreError, MapSource};
 use crate::method::{Exchange, Method};
 
 /// What to evaluate.
@@ -60,6 +62,12 @@ pub enum EvaluateError {
     /// A message cannot be encoded or decoded.
     #[error(transparent)]
     Wire(#[from] WireError),
+    /// Kept maps cannot be read.
+    #[error(transparent)]
+    Maps(#[from] FeatureStoreError),
+    /// The tensor library refused.
+    #[error("evaluation: {0}")]
+    Torch(#[from] TchError),
 }
 
 /// One frame of the ego with everything it can be judged by.
@@ -86,6 +94,7 @@ pub struct Evaluator {
     rule: GroundTruthRule,
     /// What the neighbours have sent, oldest first; the first is what has arrived last, or has not arrived yet.
     under_way: VecDeque<Vec<Sent>>,
+    maps: Option<MapSource>,
 }
 
 impl Evaluator {
@@ -98,7 +107,14 @@ impl Evaluator {
         let rule = config.rule.unwrap_or_else(|| rule_of(ego.detector()));
         let codec = CodecConfig { gate: config.codec.gate.or(ego.method().gate()), ..config.codec };
         let config = EvaluateConfig { codec, ..config };
-        Ok(Self { weights: Weights::load(&config.weights)?, ego, rule, config, under_way: VecDeque::new() })
+        Ok(Self { weights: Weights::load(&config.weights)?, ego, rule, config, under_way: VecDeque::new(), maps: None })
+    }
+
+    /// The same with maps that its encoder made before, kept in half precision: what a message of half precision says is
+    /// the same then.
+    #[must_use]
+    pub fn with_maps(self, maps: MapSource) -> Self {
+        Self { maps: Some(maps), ..self }
     }
 
     /// The ego's pipeline.
@@ -125,6 +141,8 @@ impl Evaluator {
         self.ego.forget();
         self.under_way.clear();
         let pose_source = self.config.pose_source.for_scenario(&scenario.name);
+        let points = self.needs_points();
+        let load = LoadOptions { points, ..LoadOptions::default() };
         let detector_config = self.weights.config()?;
         let mut agents = Vec::with_capacity(scenario.agents.len());
         for cav in &scenario.agents {
@@ -133,8 +151,9 @@ impl Evaluator {
         }
         for tick in 0..scenario.ticks.len() {
             let frames: Result<Vec<Frame>, _> =
-                (0..agents.len()).map(|agent| scenario.load(agent, tick, &LoadOptions::default())).collect();
-            let frame = self.frame(&mut agents, frames?, tick)?;
+                (0..agents.len()).map(|agent| scenario.load(agent, tick, &load)).collect();
+            let maps = self.maps_at(scenario, tick)?;
+            let frame = self.frame(&mut agents, frames?, &maps, tick)?;
             if on_frame(frame).is_break() {
                 return Ok(ControlFlow::Break(()));
             }
@@ -142,10 +161,25 @@ impl Evaluator {
         Ok(ControlFlow::Continue(()))
     }
 
+    /// Whether sweeps have to be read at all.
+    fn needs_points(&self) -> bool {
+        let shares_points = own_content(self.ego.method()) == Exchange::Points;
+        self.maps.is_none() || shares_points || self.config.pose_source.looks_at_sweeps()
+    }
+
+    /// The kept maps of all vehicles at a tick, in the order of the scenario's agents; none where none are kept.
+    fn maps_at(&mut self, scenario: &Scenario, tick: usize) -> Result<Vec<Tensor>, EvaluateError> {
+        let Some(maps) = &mut self.maps else { return Ok(Vec::new()) };
+        let Some(index) = maps.index_of(&scenario.name) else { return Ok(Vec::new()) };
+        let map = |agent| Ok(maps.map(index, scenario, agent, tick)?.f_to_kind(Kind::Float)?);
+        (0..scenario.agents.len()).map(map).collect()
+    }
+
     fn frame(
         &mut self,
         agents: &mut [Agent],
         frames: Vec<Frame>,
+        maps: &[Tensor],
         tick: usize,
     ) -> Result<EvaluatedFrame, EvaluateError> {
         let exchange = own_content(self.ego.method());
@@ -156,7 +190,7 @@ impl Evaluator {
             // What the ego leaves out for others it has itself.
             let gate = self.config.codec.gate.filter(|_| index > 0);
             let codec = CodecConfig { gate, ..self.config.codec };
-            sent.push(view(agent, frame, is_needed.then_some(exchange), &codec)?);
+            sent.push(view(agent, frame, maps.get(index), is_needed.then_some(exchange), &codec)?);
         }
         let poses = sent.iter().map(|sent| sent.pose).collect();
         let own = sent.remove(0);
@@ -256,6 +290,7 @@ impl Sent {
 fn view(
     agent: &mut Agent,
     frame: &Frame,
+    map: Option<&Tensor>,
     exchange: Option<Exchange>,
     codec: &CodecConfig,
 ) -> Result<Sent, EvaluateError> {
@@ -283,18 +318,25 @@ fn view(
             (Content::Points(message.points), bytes)
         }
         Some(Exchange::Boxes) => {
-            let detections = agent.perceive(&frame.points)?.detections;
+            let detections = perceive(agent, frame, map)?.detections;
             let (message, bytes) = through_the_wire(&stamp, Boxes { pose, detections })?;
             (Content::Boxes(message.detections), bytes)
         }
         Some(Exchange::Features | Exchange::Nothing) => {
-            let Perception { features, confidence, .. } = agent.perceive(&frame.points)?;
+            let Perception { features, confidence, .. } = perceive(agent, frame, map)?;
             let features = encode_features(features, codec, Some(&confidence))?;
             let (message, bytes) = through_the_wire(&stamp, Bev { pose, features })?;
             (Content::Features(message.features.decode(&Limits::default())?), bytes)
         }
     };
     Ok(sent(Some(content), bytes - HEADER_LEN as u64, bytes + pose_bytes))
+}
+
+fn perceive(agent: &mut Agent, frame: &Frame, map: Option<&Tensor>) -> Result<Perception, DetectorError> {
+    match map {
+        Some(map) => agent.perceive_map(map),
+        None => agent.perceive(&frame.points),
+    }
 }
 
 /// Encodes and decodes a message; its size on the wire.

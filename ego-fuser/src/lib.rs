@@ -12,6 +12,7 @@ pub mod alignment;
 pub mod average_precision;
 pub mod ego;
 pub mod evaluate;
+pub mod feature_store;
 pub mod fusion;
 mod history;
 pub mod loss;

@@ -108,14 +108,30 @@ impl CooperativeModel {
     /// # Errors
     /// [`ModelError`] when the file is missing, names no known method or does not fit its own configuration.
     pub fn load(path: &Path, method: Option<Method>, device: Device) -> Result<Self, ModelError> {
-        let weights = Weights::load(path)?;
+        Self::from_weights(&Weights::load(path)?, method, None, device)
+    }
+
+    /// The same from a file already read, with another fusion than it names.
+    ///
+    /// # Errors
+    /// As [`Self::load`].
+    pub fn from_weights(
+        weights: &Weights,
+        method: Option<Method>,
+        fusion: Option<&FusionConfig>,
+        device: Device,
+    ) -> Result<Self, ModelError> {
         let method = match (method, weights.metadata(METHOD_KEY)) {
             (Some(method), _) => method,
             (None, Some(name)) => name.parse()?,
             (None, None) => Method::None,
         };
         let config = weights.config()?;
-        let model = Self::with_fusion(&config, method, &stored_config(&weights, method, &config)?, device)?;
+        let fusion = match fusion {
+            Some(fusion) => fusion.clone(),
+            None => stored_config(weights, method, &config)?,
+        };
+        let model = Self::with_fusion(&config, method, &fusion, device)?;
         // A network that was trained alone becomes a cooperative one whose fusion has everything to learn.
         let is_fusion = |name: &str| name == steering::WEIGHT || name.starts_with(FUSION_PREFIX);
         weights.copy_some_into(&model.variables, |name| !is_fusion(name) || weights.contains(name))?;

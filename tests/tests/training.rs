@@ -63,6 +63,8 @@ fn config(scene: &Path, out: &Path, method: Method, steps: u64) -> TrainConfig {
         method,
         detector: small(),
         init: None,
+        fusion: None,
+        frozen_encoder: None,
         run: RunConfig {
             learning_rate: 2e-3,
             seed: 3,

@@ -189,6 +189,12 @@ impl PoseSourceConfig {
         }
     }
 
+    /// Whether poses are found in the sweep: without its points there are none.
+    #[must_use]
+    pub fn looks_at_sweeps(&self) -> bool {
+        matches!(self, Self::Pgc(_) | Self::EndToEnd(_))
+    }
+
     /// Sets the source up, files read.
     ///
     /// # Errors

@@ -72,6 +72,17 @@ impl Weights {
         &self.sha256
     }
 
+    /// SHA-256 over the tensors whose name is `wanted`: the same for files that share these and differ in others.
+    #[must_use]
+    pub fn sha256_of(&self, wanted: impl Fn(&str) -> bool) -> String {
+        let mut hash = Sha256::new();
+        for (name, Values { shape, values }) in self.tensors.iter().filter(|(name, _)| wanted(name)) {
+            hash.update(format!("{name} {shape:?}\n"));
+            values.iter().for_each(|value| hash.update(value.to_le_bytes()));
+        }
+        hex(&hash.finalize())
+    }
+
     /// The file.
     #[must_use]
     pub fn path(&self) -> &Path {
@@ -254,6 +265,8 @@ mod tests {
         let weights = Weights::load(&path).unwrap();
         assert_eq!(weights.sha256(), sha256);
         assert_eq!(weights.config::<DetectorConfig>().unwrap(), config);
+        let is_head = |name: &str| name.starts_with("cls_head");
+        assert_ne!(weights.sha256_of(is_head), weights.sha256_of(|name| !is_head(name)));
         let second = network(&config);
         weights.copy_into(&second).unwrap();
         let copies = second.variables();

@@ -1,6 +1,6 @@
 //! `v2vloc eval`.
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use agent::pose_source::sanity::SanityConfig;
 use agent::pose_source::{
@@ -9,6 +9,7 @@ use agent::pose_source::{
 use clap::ValueEnum;
 use deploy::evaluation::{EvaluationOptions, evaluate, frame_count};
 use deploy::report;
+use deploy::table::{self, TableObserver, TableSpec};
 use ego_fuser::Method;
 use indicatif::{ProgressBar, ProgressStyle};
 use protocol::{CodecConfig, ConfidenceGate, Dtype};
@@ -18,14 +19,20 @@ use super::{BadInput, Outcome};
 #[derive(Debug, clap::Args)]
 pub(crate) struct Arguments {
     /// Data set, split or scenario; the layout is found out. The first vehicle of each scenario is the ego.
-    #[arg(long, value_name = "DIR")]
-    dataset: PathBuf,
+    #[arg(long, value_name = "DIR", required_unless_present = "table")]
+    dataset: Option<PathBuf>,
     /// Fusion methods, as `ego-fuser methods` lists them; several give one table.
-    #[arg(long, value_name = "NAME", value_delimiter = ',', required = true)]
+    #[arg(long, value_name = "NAME", value_delimiter = ',', required_unless_present = "table")]
     method: Vec<Method>,
     /// Weights of the detector, or a folder with a file *-METHOD.safetensors for each method.
-    #[arg(long, value_name = "FILE")]
-    weights: PathBuf,
+    #[arg(long, value_name = "FILE", required_unless_present = "table")]
+    weights: Option<PathBuf>,
+    /// Instead: a file of tables, rows of methods and columns of conditions; cells that are done are kept in --out.
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["dataset", "method", "weights"], requires = "out")]
+    table: Option<PathBuf>,
+    /// Where tables are written (--table).
+    #[arg(long, value_name = "DIR", requires = "table")]
+    out: Option<PathBuf>,
     /// Where the vehicles' poses come from.
     #[arg(long, value_enum, default_value_t = PoseFrom::Recorded)]
     pose_source: PoseFrom,
@@ -117,6 +124,9 @@ impl Arguments {
     /// Evaluates every method and prints the numbers.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
         tch::set_num_threads(i32::from(self.threads));
+        if let (Some(spec), Some(out)) = (&self.table, &self.out) {
+            return tables(spec, out);
+        }
         let options = self.options()?;
         let bar = ProgressBar::new((self.method.len() * frame_count(&options)?) as u64)
             .with_style(ProgressStyle::with_template("{bar:30} {pos}/{len} frames  {msg}  {eta} left")?);
@@ -136,8 +146,9 @@ impl Arguments {
 
     fn options(&self) -> Result<EvaluationOptions, BadInput> {
         Ok(EvaluationOptions {
-            dataset: self.dataset.clone(),
-            weights: self.weights.clone(),
+            // Required where there is no table.
+            dataset: self.dataset.clone().unwrap_or_default(),
+            weights: self.weights.clone().unwrap_or_default(),
             pose_source: self.pose_source()?,
             codec: CodecConfig {
                 dtype: match self.dtype {
@@ -150,6 +161,7 @@ impl Arguments {
                 zstd_level: self.zstd,
             },
             delay_nanos: self.delay * 1_000_000,
+            maps: None,
             frames: self.frames.map(|frames| usize::try_from(frames).unwrap_or(usize::MAX)),
         })
     }
@@ -188,5 +200,31 @@ impl Arguments {
                 None => Err(BadInput("--pose-source cached needs --poses".into())),
             },
         }
+    }
+}
+
+/// Fills tables and prints them.
+fn tables(spec: &Path, out: &Path) -> anyhow::Result<Outcome> {
+    let mut progress = TableProgress(ProgressBar::new_spinner());
+    let filled = table::run(&TableSpec::read(spec)?, out, &mut progress)?;
+    progress.0.finish_and_clear();
+    filled.iter().for_each(|table| println!("{}", table::markdown(table)));
+    Ok(Outcome::Done)
+}
+
+/// Shows on standard error which cell is computed.
+struct TableProgress(ProgressBar);
+
+impl TableObserver for TableProgress {
+    fn cell(&mut self, table: &str, row: &str, column: &str, known: bool) {
+        let text = format!("{table}: {row}, {column}{}", if known { ", known" } else { "" });
+        if self.0.is_hidden() {
+            eprintln!("{text}");
+        }
+        self.0.set_message(text);
+    }
+
+    fn frame(&mut self) {
+        self.0.tick();
     }
 }

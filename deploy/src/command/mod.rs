@@ -11,6 +11,7 @@ use anyhow::Context;
 use deploy::evaluation::EvaluationError;
 use deploy::fleet::FleetError;
 use deploy::scenario::ScenarioError;
+use deploy::table::TableError;
 use deploy::up::UpError;
 
 /// What `v2vloc` can be asked to do.
@@ -71,6 +72,7 @@ pub(crate) fn exit_code(error: &anyhow::Error) -> ExitCode {
             || cause.is::<ScenarioError>()
             || cause.is::<FleetError>()
             || cause.is::<EvaluationError>()
+            || cause.is::<TableError>()
             || cause.downcast_ref::<UpError>().is_some_and(UpError::is_bad_input)
     });
     if is_bad_input { ExitCode::from(2) } else { ExitCode::FAILURE }

@@ -1,14 +1,19 @@
 //! `ego-fuser train`: arguments, and a progress bar or plain lines.
 
 use std::path::PathBuf;
+use std::sync::Arc;
 
 use agent::model_config::DetectorConfig;
+use agent::pose_source::{NoiseMode, NoisyPoseConfig, PoseTable};
 use agent::training::{AdamWConfig, DataListing, RunConfig, TrainingBar, TrainingOptions};
+use agent::weights::Weights;
 use anyhow::{Context, Result};
 use ego_fuser::Method;
+use ego_fuser::fusion::FusionConfig;
+use ego_fuser::fusion::pastat::Part;
 use ego_fuser::loss::{LossConfig, Unassigned};
-use ego_fuser::samples::{Augmentation, PoseNoise, SampleConfig, SampleKind};
-use ego_fuser::train::{self, Accuracy, Observer, StepReport, TrainConfig};
+use ego_fuser::samples::{Augmentation, Moments, SampleConfig, SampleKind, SamplePoses};
+use ego_fuser::train::{self, Accuracy, KeptMaps, Observer, StepReport, TrainConfig};
 
 use super::BadInput;
 
@@ -45,12 +50,42 @@ pub(crate) struct Arguments {
     /// Probability that a neighbour is missing from a sample.
     #[arg(long, default_value_t = 0.1)]
     drop_neighbour: f64,
-    /// Standard deviation of the neighbours' positions in training, metres.
+    /// Poses to align maps by, as `agent localize` wrote them [default: true poses].
+    #[arg(long, value_name = "FILE")]
+    poses: Option<PathBuf>,
+    /// Standard deviation of an error of x, y and z on top of the vehicles' poses, metres.
     #[arg(long, default_value_t = 0.0)]
     position_noise: f64,
-    /// Standard deviation of the neighbours' headings in training, degrees.
+    /// Standard deviation of an error of yaw on top of the vehicles' poses, degrees.
     #[arg(long, default_value_t = 0.0)]
     heading_noise: f64,
+    /// How the errors of a sample's vehicles and moments hang together.
+    #[arg(long, value_enum, default_value_t = Mode::Independent)]
+    noise_mode: Mode,
+    /// Share of the samples with that error.
+    #[arg(long, default_value_t = 1.0)]
+    noise_share: f64,
+    /// Neighbours' maps are up to so much older than the ego's in training, milliseconds.
+    #[arg(long, value_name = "MS", default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=5_000))]
+    max_delay: u64,
+    /// Ticks between two time steps of a method with history at most; every sample draws its own number.
+    #[arg(long, default_value_t = 1)]
+    gap: usize,
+    /// Time steps of every vehicle [default: what the method takes].
+    #[arg(long)]
+    frames: Option<usize>,
+    /// Parts of pastat to leave out.
+    #[arg(long, value_enum, value_delimiter = ',')]
+    without: Vec<Part>,
+    /// Leave the encoder of --init as it is and learn the fusion and the head alone: fast, as maps are computed once.
+    #[arg(long, requires = "init")]
+    freeze_encoder: bool,
+    /// Where such maps are kept.
+    #[arg(long, value_name = "DIR", default_value = "runs/maps")]
+    maps: PathBuf,
+    /// Most gigabytes of them per set of data; sweeps beyond are encoded whenever they are needed.
+    #[arg(long, value_name = "GB", default_value_t = 8.0)]
+    maps_limit: f64,
     /// Largest turn of a vehicle's frame in training, degrees.
     #[arg(long, default_value_t = 45.0)]
     turn: f64,
@@ -95,7 +130,8 @@ impl Arguments {
         let samples = SampleConfig {
             augmentation: Augmentation { turn_rad: self.turn.to_radians(), ..Augmentation::default() },
             drop_neighbour: self.drop_neighbour,
-            pose_noise: PoseNoise { position_m: self.position_noise, yaw_rad: self.heading_noise.to_radians() },
+            poses: self.poses()?,
+            moments: Moments { frames: 1, gap: self.gap, max_delay_nanos: self.max_delay * 1_000_000 },
             max_agents: self.max_agents.max(1),
             ..SampleConfig::training(SampleKind::Single)
         };
@@ -107,6 +143,10 @@ impl Arguments {
             method: self.method,
             detector: self.config.clone(),
             init: self.init.clone(),
+            fusion: self.fusion()?,
+            frozen_encoder: self
+                .freeze_encoder
+                .then(|| KeptMaps { folder: self.maps.clone(), limit_bytes: (self.maps_limit.max(0.0) * 1e9) as u64 }),
             run: RunConfig { optimizer: AdamWConfig { weight_decay: self.weight_decay, ..run.optimizer }, ..run },
             validate_every: self.validate_every,
             validation_frames: self.validation_frames,
@@ -114,6 +154,54 @@ impl Arguments {
             loss: LossConfig { unassigned, ..LossConfig::default() },
         })
     }
+
+    /// The poses that maps are aligned by.
+    fn poses(&self) -> Result<SamplePoses> {
+        if !(0.0..=1.0).contains(&self.noise_share) {
+            return Err(BadInput("--noise-share is a probability".into()).into());
+        }
+        let read = |file: &PathBuf| PoseTable::read(file).map(Arc::new).map_err(|error| BadInput(error.to_string()));
+        let is_noisy = self.position_noise != 0.0 || self.heading_noise != 0.0;
+        let noise = is_noisy.then(|| NoisyPoseConfig {
+            mode: match self.noise_mode {
+                Mode::Fixed => NoiseMode::Fixed,
+                Mode::Independent => NoiseMode::Independent,
+                Mode::Autoregressive => NoiseMode::Autoregressive,
+            },
+            position_std_m: self.position_noise,
+            heading_std_deg: self.heading_noise,
+            ..NoisyPoseConfig::default()
+        });
+        let poses =
+            SamplePoses { table: self.poses.as_ref().map(read).transpose()?, noise, noise_share: self.noise_share };
+        poses.validate().map_err(|error| BadInput(error.to_string()))?;
+        Ok(poses)
+    }
+
+    /// The fusion, where the command line changes it.
+    fn fusion(&self) -> Result<Option<FusionConfig>> {
+        if self.without.is_empty() && self.frames.is_none() {
+            return Ok(None);
+        }
+        let detector = match &self.init {
+            Some(init) => Weights::load(init)?.config()?,
+            None => self.config.clone(),
+        };
+        let usual = FusionConfig::for_detector(self.method, &detector);
+        let fusion = usual.ablated(&self.without, self.frames).map_err(|error| BadInput(error.to_string()))?;
+        Ok(Some(fusion))
+    }
+}
+
+/// How errors of poses hang together.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+enum Mode {
+    /// One offset of all neighbours in all frames; the ego is exact.
+    Fixed,
+    /// Drawn anew for every vehicle and frame.
+    Independent,
+    /// Wanders, as a filter's error does.
+    Autoregressive,
 }
 
 /// Shows on standard error how it goes.
@@ -123,6 +211,13 @@ struct Progress(TrainingBar);
 impl Observer for Progress {
     fn opened(&mut self, data: &DataListing) {
         data.left_out().iter().for_each(|text| self.0.say(text));
+    }
+
+    fn encoded(&mut self, done: u64, all: u64) {
+        let share = done as f64 / all.max(1) as f64;
+        if done % 50 == 0 || done == all {
+            self.0.report(share, 0.0, &format!("{done} of {all} sweeps encoded"));
+        }
     }
 
     fn stepped(&mut self, report: &StepReport) {

@@ -10,7 +10,7 @@ use super::coalign::CoAlignConfig;
 use super::cobevt::{Cobevt, CobevtConfig};
 use super::disconet::{DiscoNet, DiscoNetConfig};
 use super::ermvp::{Ermvp, ErmvpConfig};
-use super::pastat::{Pastat, PastatConfig};
+use super::pastat::{Part, Pastat, PastatConfig};
 use super::traf_align::{TrafAlign, TrafAlignConfig};
 use super::v2vnet::{V2vNet, V2vNetConfig};
 use super::v2xvit::{V2xVit, V2xVitConfig};
@@ -94,6 +94,24 @@ impl FusionConfig {
         match self {
             Self::CoAlign(config) => config.pose_graph.as_ref(),
             _ => None,
+        }
+    }
+
+    /// The same without some parts of PASTAT, or with another number of time steps; other methods have no such parts.
+    ///
+    /// # Errors
+    /// [`ConfigError`] where there is nothing to leave out.
+    pub fn ablated(self, without: &[Part], frames: Option<usize>) -> Result<Self, ConfigError> {
+        match self {
+            Self::Pastat(config) => {
+                let frames = frames.unwrap_or(config.frames);
+                Ok(Self::Pastat(PastatConfig { frames, ..config.without(without) }))
+            }
+            other if without.is_empty() && frames.is_none() => Ok(other),
+            _ => {
+                let value = format!("without {without:?}, {frames:?} frames");
+                Err(ConfigError::Value { field: "fusion", value, must: "as it is but for pastat" })
+            }
         }
     }
 

@@ -5,14 +5,16 @@ use std::sync::Arc;
 use agent::crop::Crop;
 use agent::model_config::DetectorConfig;
 use agent::pillars::{Pillars, Voxeliser};
-use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
-use protocol::{Box3d, PointCloud, Pose};
+use nalgebra::Point3;
+use protocol::{Box3d, PointCloud, Pose, PoseEstimate};
 use rand::Rng;
-use rand_distr::StandardNormal;
 use sim_replay::frame::Frame;
 use sim_replay::ground_truth::{self, GroundTruthRule};
+use tch::Tensor;
 
-use super::{Augmentation, SampleError, SceneSet, TickRef, ViewAugment};
+use super::poses::DrawnError;
+use super::{Augmentation, Moments, SampleError, SamplePoses, SceneSet, TickRef, ViewAugment};
+use crate::feature_store::MapSource;
 use crate::fusion::ViewFacts;
 use crate::targets::{Labels, TargetAssigner};
 
@@ -30,17 +32,8 @@ pub enum SampleKind {
     Cooperative,
 }
 
-/// Normal noise on the poses of neighbours.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub struct PoseNoise {
-    /// Standard deviation of x and y, metres.
-    pub position_m: f64,
-    /// Standard deviation of yaw, radians.
-    pub yaw_rad: f64,
-}
-
 /// How samples are made.
-#[derive(Debug, Clone, PartialEq)]
+#[derive(Debug, Clone)]
 pub struct SampleConfig {
     /// Which views.
     pub kind: SampleKind,
@@ -48,8 +41,10 @@ pub struct SampleConfig {
     pub augmentation: Augmentation,
     /// Probability that a neighbour is missing.
     pub drop_neighbour: f64,
-    /// Error of the poses that maps are aligned by.
-    pub pose_noise: PoseNoise,
+    /// The poses that maps are aligned by.
+    pub poses: SamplePoses,
+    /// From which moments maps are.
+    pub moments: Moments,
     /// Vehicles of a sample at most, the ego included.
     pub max_agents: usize,
     /// Vehicles farther away do not take part, metres in the plane.
@@ -66,7 +61,8 @@ impl SampleConfig {
             kind,
             augmentation: Augmentation::default(),
             drop_neighbour: 0.1,
-            pose_noise: PoseNoise::default(),
+            poses: SamplePoses::default(),
+            moments: Moments::default(),
             max_agents: 5,
             comm_range_m: 70.0,
             merged_truth: false,
@@ -74,11 +70,20 @@ impl SampleConfig {
     }
 }
 
+/// What the views of a sample are given as.
+#[derive(Debug)]
+pub enum SampleViews {
+    /// Pillars, to be encoded.
+    Pillars(Vec<Pillars>),
+    /// `[N, C, H, W]` maps in half precision, of an encoder that does not learn.
+    Maps(Tensor),
+}
+
 /// Views of one tick with what is to be found in them.
-#[derive(Debug, Clone)]
+#[derive(Debug)]
 pub struct Sample {
-    /// Pillars of every view, the ego first.
-    pub pillars: Vec<Pillars>,
+    /// Every view, the ego's newest first, then the neighbours' newest, then older ones.
+    pub views: SampleViews,
     /// What is known of every view, the ego's pose being the identity.
     pub facts: Vec<ViewFacts>,
     /// True boxes in the ego frame with their centre on the lattice.
@@ -96,6 +101,19 @@ pub struct SampleBuilder {
     assigner: Arc<TargetAssigner>,
     crop: Crop,
     voxeliser: Voxeliser,
+    maps: Option<MapSource>,
+}
+
+/// One view on its way into a sample.
+struct Entry {
+    /// Place of its vehicle in the scenario.
+    agent: usize,
+    /// Place of its vehicle in the sample, the ego's being 0.
+    place: usize,
+    tick: usize,
+    world_from_cav: Pose,
+    confidence: f64,
+    age_secs: f64,
 }
 
 impl SampleBuilder {
@@ -109,7 +127,13 @@ impl SampleBuilder {
     ) -> Self {
         let voxeliser = Voxeliser::for_detector(&detector);
         let crop = Crop::for_detector(&detector);
-        Self { scenes, config, detector, assigner, crop, voxeliser }
+        Self { scenes, config, detector, assigner, crop, voxeliser, maps: None }
+    }
+
+    /// The same with maps of an encoder that does not learn, in place of pillars.
+    #[must_use]
+    pub fn with_maps(self, maps: MapSource) -> Self {
+        Self { maps: Some(maps), ..self }
     }
 
     /// The scenes it draws from.
@@ -121,44 +145,114 @@ impl SampleBuilder {
     /// The sample of a tick, seen from a random vehicle.
     ///
     /// # Errors
-    /// [`SampleError`] when a file is missing or malformed, or a vehicle has no pose.
+    /// [`SampleError`] when a file is missing or malformed, or nothing is known of a vehicle's pose.
     pub fn build(&mut self, tick: TickRef, rng: &mut impl Rng) -> Result<Sample, SampleError> {
         let frames = self.scenes.annotations(tick)?;
         let ego = rng.random_range(0..frames.len());
         let agents = self.choose_agents(tick, &frames, ego, rng)?;
-        let world_from_ego = self.world_from_lidar(tick, &frames[ego])?;
-        let scene = self.config.augmentation.scene(rng);
-        let ego_view = scene.view(rng);
         let single = self.config.kind == SampleKind::Single;
-        let views = if single { &agents[..1] } else { &agents[..] };
         let annotators = if single && !self.config.merged_truth { &agents[..1] } else { &agents[..] };
-        let mut clouds = Vec::with_capacity(views.len());
-        let mut ego_from_cav = Vec::with_capacity(views.len());
-        for &agent in views {
-            let view = if agent == ego { ego_view } else { scene.view(rng) };
+        let entries = self.entries(tick, if single { &agents[..1] } else { &agents[..] }, rng)?;
+        let scene = self.config.augmentation.scene(rng);
+        let changes: Vec<ViewAugment> = entries.iter().map(|_| scene.view(rng)).collect();
+        let objects = self.objects(&frames, annotators, &changes[0]);
+        let mut facts: Vec<ViewFacts> = entries
+            .iter()
+            .zip(&changes)
+            .map(|(entry, change)| {
+                let ego_from_cav = entries[0].world_from_cav.from_world(&entry.world_from_cav);
+                let ego_from_cav = changes[0].pose(&ego_from_cav, change);
+                ViewFacts { agent: entry.place, ego_from_cav, confidence: entry.confidence, age_secs: entry.age_secs }
+            })
+            .collect();
+        // Not but for the last bits: what moves nothing is known by it.
+        facts[0].ego_from_cav = Pose::IDENTITY;
+        let views = match &mut self.maps {
+            Some(maps) => {
+                let scenario = self.scenes.scenario(tick);
+                let map = |entry: &Entry| maps.map(tick.scenario, scenario, entry.agent, entry.tick);
+                let maps: Vec<Tensor> = entries.iter().map(map).collect::<Result<_, _>>()?;
+                SampleViews::Maps(Tensor::f_cat(&maps, 0)?)
+            }
+            None => SampleViews::Pillars(self.pillars(tick.scenario, &entries, &changes, &mut facts)?),
+        };
+        Ok(Sample { views, facts, labels: self.assigner.assign(&objects), objects })
+    }
+
+    /// Which views a sample has: the newest of every vehicle, the ego first, then older ones. Vehicles that do not know
+    /// where they are have no part; an ego that does not is alone with its newest view.
+    fn entries(&self, now: TickRef, agents: &[usize], rng: &mut impl Rng) -> Result<Vec<Entry>, SampleError> {
+        let ticks = &self.scenes.scenario(now).ticks;
+        let gap = self.config.moments.draw_gap(rng);
+        let error = self.config.poses.draw(rng)?;
+        let (mut newest, mut older) = (Vec::new(), Vec::new());
+        for (index, &agent) in agents.iter().enumerate() {
+            let is_ego = index == 0;
+            let last = if is_ego { now.tick } else { self.config.moments.draw_newest(ticks, now.tick, rng) };
+            let place = newest.len();
+            for (step, tick) in self.config.moments.steps(ticks, now.tick, last, gap).into_iter().enumerate() {
+                let pose = self.pose_at(TickRef { tick, ..now }, agent, is_ego, &error)?;
+                let PoseEstimate::Pose { world_from_cav, confidence } = pose else {
+                    match step {
+                        0 => break,
+                        _ => continue,
+                    }
+                };
+                let age_secs = (ticks[now.tick].capture_nanos - ticks[tick].capture_nanos) as f64 * 1e-9;
+                let entry = Entry { agent, place, tick, world_from_cav, confidence: f64::from(confidence), age_secs };
+                if step == 0 { newest.push(entry) } else { older.push(entry) }
+            }
+            if is_ego && newest.is_empty() {
+                let world_from_cav = Pose::IDENTITY;
+                return Ok(vec![Entry {
+                    agent,
+                    place,
+                    tick: now.tick,
+                    world_from_cav,
+                    confidence: 0.0,
+                    age_secs: 0.0,
+                }]);
+            }
+        }
+        newest.append(&mut older);
+        Ok(newest)
+    }
+
+    fn pose_at(
+        &self,
+        tick: TickRef,
+        agent: usize,
+        is_ego: bool,
+        error: &DrawnError,
+    ) -> Result<PoseEstimate, SampleError> {
+        let frames = self.scenes.annotations(tick)?;
+        let frame = &frames[agent];
+        let found = self.config.poses.found(&self.scenes.scenario(tick).name, frame)?;
+        Ok(error.added(found, &frame.cav, frame.capture_nanos, is_ego))
+    }
+
+    /// The pillars of all views; of one view where all points are merged.
+    fn pillars(
+        &mut self,
+        scenario: usize,
+        entries: &[Entry],
+        changes: &[ViewAugment],
+        facts: &mut Vec<ViewFacts>,
+    ) -> Result<Vec<Pillars>, SampleError> {
+        let mut clouds = Vec::with_capacity(entries.len());
+        for (entry, change) in entries.iter().zip(changes) {
+            let points = self.scenes.points(TickRef { scenario, tick: entry.tick }, entry.agent)?;
             // Hits on the vehicle that carries the LiDAR are cut out before anything turns.
-            let mut points = self.crop.without_own_body(&self.scenes.points(tick, agent)?);
-            view.points(&mut points.xyzi);
+            let mut points = self.crop.without_own_body(&points);
+            change.points(&mut points.xyzi);
             clouds.push(points);
-            let pose = if agent == ego {
-                Pose::IDENTITY
-            } else {
-                let pose = world_from_ego.from_world(&self.world_from_lidar(tick, &frames[agent])?);
-                self.disturb(&ego_view.pose(&pose, &view), rng)
-            };
-            ego_from_cav.push(pose);
         }
         if self.config.kind == SampleKind::Merged {
-            clouds = vec![merge_points(&clouds, &ego_from_cav)];
-            ego_from_cav.truncate(1);
+            let poses: Vec<Pose> = facts.iter().map(|facts| facts.ego_from_cav).collect();
+            clouds = vec![merge_points(&clouds, &poses)];
+            facts.truncate(1);
         }
-        let objects = self.objects(&frames, annotators, &ego_view);
-        Ok(Sample {
-            pillars: clouds.iter().map(|cloud| self.voxeliser.voxelise(&cloud.xyzi)).collect(),
-            facts: ego_from_cav.into_iter().enumerate().map(|(agent, pose)| ViewFacts::fresh(agent, pose)).collect(),
-            labels: self.assigner.assign(&objects),
-            objects,
-        })
+        Ok(clouds.iter().map(|cloud| self.voxeliser.voxelise(&cloud.xyzi)).collect())
     }
 
     /// The ego, then the neighbours in reach that are not dropped.
@@ -183,27 +277,11 @@ impl SampleBuilder {
     }
 
     fn world_from_lidar(&self, tick: TickRef, frame: &Frame) -> Result<Pose, SampleError> {
-        frame.world_from_lidar.ok_or_else(|| {
-            let scenario = self.scenes.scenario(tick);
-            SampleError::NoPose {
-                scenario: scenario.name.clone(),
-                stem: scenario.ticks[tick.tick].stem.clone(),
-                cav: frame.cav.to_string(),
-            }
+        frame.world_from_lidar.ok_or_else(|| SampleError::NoPose {
+            scenario: self.scenes.scenario(tick).name.clone(),
+            capture_nanos: frame.capture_nanos,
+            cav: frame.cav.to_string(),
         })
-    }
-
-    fn disturb(&self, pose: &Pose, rng: &mut impl Rng) -> Pose {
-        let noise = self.config.pose_noise;
-        if noise == PoseNoise::default() {
-            return *pose;
-        }
-        let mut normal = |deviation: f64| deviation * rng.sample::<f64, _>(StandardNormal);
-        let shift = Vector3::new(normal(noise.position_m), normal(noise.position_m), 0.0);
-        let turn = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), normal(noise.yaw_rad));
-        let isometry = pose.isometry();
-        let translation = Translation3::from(isometry.translation.vector + shift);
-        Isometry3::from_parts(translation, turn * isometry.rotation).into()
     }
 
     /// What `annotators`, the ego first, have annotated, in the changed ego frame, on the lattice.

@@ -1,21 +1,32 @@
 //! Samples in batches, in the order of a training.
 
+use agent::head::HeadOutput;
 use agent::pillar_batch::{PillarBatch, PillarLattice};
-use agent::pillars::Pillars;
 use agent::training::{Prefetch, RunConfig};
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
+use tch::{Kind, Tensor};
 
-use super::{Sample, SampleBuilder, SampleError, TickRef};
+use super::{Sample, SampleBuilder, SampleError, SampleViews, TickRef};
 use crate::fusion::ViewFacts;
+use crate::model::{CooperativeModel, ModelError};
 use crate::targets::Labels;
+
+/// The views of all samples of a batch.
+#[derive(Debug)]
+pub enum BatchViews {
+    /// Pillars, to be encoded.
+    Pillars(PillarBatch),
+    /// `[sum of views, C, H, W]` maps in half precision, of an encoder that does not learn.
+    Maps(Tensor),
+}
 
 /// Samples of one training step.
 #[derive(Debug)]
 pub struct Batch {
-    /// Pillars of all views of all samples.
-    pub pillars: PillarBatch,
+    /// All views of all samples.
+    pub views: BatchViews,
     /// What is known of the views of each sample, ego first.
     pub facts: Vec<Vec<ViewFacts>>,
     /// Targets of each sample.
@@ -23,13 +34,39 @@ pub struct Batch {
 }
 
 impl Batch {
-    /// Puts samples together.
-    #[must_use]
-    pub fn collate(samples: Vec<Sample>, lattice: &PillarLattice) -> Self {
-        let views: Vec<&Pillars> = samples.iter().flat_map(|sample| &sample.pillars).collect();
-        let pillars = PillarBatch::new(&views, lattice);
+    /// Puts samples together, all of pillars or all of maps.
+    ///
+    /// # Errors
+    /// [`SampleError::Torch`] when maps are of different shapes.
+    pub fn collate(samples: Vec<Sample>, lattice: &PillarLattice) -> Result<Self, SampleError> {
+        let (mut pillars, mut maps) = (Vec::new(), Vec::new());
+        for sample in &samples {
+            match &sample.views {
+                SampleViews::Pillars(of_sample) => pillars.extend(of_sample),
+                SampleViews::Maps(of_sample) => maps.push(of_sample),
+            }
+        }
+        let views = if maps.is_empty() {
+            BatchViews::Pillars(PillarBatch::new(&pillars, lattice))
+        } else {
+            BatchViews::Maps(Tensor::f_cat(&maps, 0)?)
+        };
         let (facts, labels) = samples.into_iter().map(|sample| (sample.facts, sample.labels)).unzip();
-        Self { pillars, facts, labels }
+        Ok(Self { views, facts, labels })
+    }
+
+    /// The output of a model for all samples.
+    ///
+    /// # Errors
+    /// [`ModelError`] when facts and views do not add up.
+    pub fn output(&self, model: &CooperativeModel, train: bool) -> Result<HeadOutput, ModelError> {
+        match &self.views {
+            BatchViews::Pillars(pillars) => model.forward(&pillars.to_device(model.device()), &self.facts, train),
+            BatchViews::Maps(maps) => {
+                let maps = maps.f_to_device(model.device())?.f_to_kind(Kind::Float)?;
+                model.fuse_and_detect(&model.network().through_compressor(&maps, train), &self.facts, train)
+            }
+        }
     }
 }
 
@@ -52,7 +89,7 @@ pub fn batches(
             builder.build(order.tick(index), &mut rng)
         };
         let samples: Result<Vec<Sample>, _> = (number * size..(number + 1) * size).map(sample).collect();
-        Ok(Batch::collate(samples?, &lattice))
+        Batch::collate(samples?, &lattice)
     })
 }
 

@@ -6,15 +6,22 @@
 mod augment;
 mod builder;
 mod loader;
+mod moments;
+mod poses;
 mod scenes;
 
 pub use augment::{Augmentation, SceneAugment, ViewAugment};
-pub use builder::{PoseNoise, Sample, SampleBuilder, SampleConfig, SampleKind, merge_points};
-pub use loader::{Batch, batches};
+pub use builder::{Sample, SampleBuilder, SampleConfig, SampleKind, SampleViews, merge_points};
+pub use loader::{Batch, BatchViews, batches};
+pub use moments::Moments;
+pub use poses::SamplePoses;
 pub use scenes::{SceneSet, TickRef};
 
+use agent::pose_source::PoseSourceError;
 use sim_replay::dataset::ReadError;
+use tch::TchError;
 
+use crate::feature_store::FeatureStoreError;
 use crate::targets::LatticeError;
 
 /// Why there is no next sample.
@@ -26,16 +33,25 @@ pub enum SampleError {
     /// A dataset has nothing to learn from.
     #[error("{0}")]
     Empty(String),
-    /// A frame has no pose, so views cannot be put together.
-    #[error("scenario {scenario}, tick {stem}: agent {cav} has no pose in the recording")]
+    /// Nothing is said of a frame's pose, so views cannot be put together.
+    #[error("scenario {scenario}, {capture_nanos} ns: nothing is known of the pose of agent {cav}")]
     NoPose {
         /// The scenario.
         scenario: String,
-        /// The tick.
-        stem: String,
+        /// The capture time.
+        capture_nanos: u64,
         /// The agent.
         cav: String,
     },
+    /// The poses' error makes no sense.
+    #[error(transparent)]
+    Poses(#[from] PoseSourceError),
+    /// Maps of a frozen encoder cannot be had.
+    #[error(transparent)]
+    Maps(#[from] FeatureStoreError),
+    /// The tensor library refused.
+    #[error("samples: {0}")]
+    Torch(#[from] TchError),
     /// The anchors of the configuration are no lattice.
     #[error(transparent)]
     Lattice(#[from] LatticeError),

@@ -21,7 +21,8 @@ pub(super) fn card(config: &TrainConfig, model: &CooperativeModel, scenes: &Scen
         format_args!("{:e}, weight decay {:e}", run.learning_rate, run.optimizer.weight_decay),
     );
     card.row("anchors between the thresholds", format_args!("{:?}", config.loss.unassigned));
-    let SampleConfig { augmentation, drop_neighbour, pose_noise, max_agents, comm_range_m, .. } = &config.samples;
+    let samples = super::frozen::sample_config(config, model);
+    let SampleConfig { augmentation, drop_neighbour, poses, moments, max_agents, comm_range_m, .. } = &samples;
     card.row(
         "augmentation",
         format_args!(
@@ -34,15 +35,34 @@ pub(super) fn card(config: &TrainConfig, model: &CooperativeModel, scenes: &Scen
     card.row(
         "vehicles",
         format_args!(
-            "up to {max_agents} within {comm_range_m} m, each neighbour missing in {:.0} %, poses off by {} m and {} degrees",
+            "up to {max_agents} within {comm_range_m} m, each neighbour missing in {:.0} % and up to {:.1} s late",
             100.0 * drop_neighbour,
-            pose_noise.position_m,
-            pose_noise.yaw_rad.to_degrees()
+            moments.max_delay_nanos as f64 * 1e-9
         ),
     );
+    card.row(
+        "moments",
+        format_args!("{} frames of each vehicle, up to {} ticks from one to the next", moments.frames, moments.gap),
+    );
+    card.row("poses", if poses.table.is_some() { "found by a pose generator" } else { "true" });
+    if let Some(noise) = &poses.noise {
+        card.row(
+            "error on top of poses",
+            format_args!(
+                "{:?}, {} m and {} degrees, in {:.0} % of the samples",
+                noise.mode,
+                noise.position_std_m,
+                noise.heading_std_deg,
+                100.0 * poses.noise_share
+            ),
+        );
+    }
+    if config.frozen_encoder.is_some() {
+        card.row("encoder", "frozen, its maps kept in half precision");
+    }
     if let Some(accuracy) = &summary.accuracy {
         card.paragraph(&format!(
-            "Validation on {} frames, true poses, ground truth of all vehicles within {comm_range_m} m, area of the network:",
+            "Validation on {} frames, ground truth of all vehicles within {comm_range_m} m, area of the network:",
             accuracy.frames
         ));
         let row =
@@ -54,5 +74,6 @@ pub(super) fn card(config: &TrainConfig, model: &CooperativeModel, scenes: &Scen
         ));
     }
     card.configuration(detector);
+    card.configuration(model.fusion().config());
     card
 }

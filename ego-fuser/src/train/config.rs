@@ -5,9 +5,19 @@ use std::path::PathBuf;
 use agent::model_config::DetectorConfig;
 use agent::training::RunConfig;
 
+use crate::fusion::FusionConfig;
 use crate::loss::LossConfig;
 use crate::method::Method;
 use crate::samples::SampleConfig;
+
+/// Where the maps of a frozen encoder are kept.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct KeptMaps {
+    /// The folder; a file per encoder and listing of data.
+    pub folder: PathBuf,
+    /// Size of a file at most, bytes; sweeps beyond are encoded whenever they are needed.
+    pub limit_bytes: u64,
+}
 
 /// What to train, on what, for how long.
 #[derive(Debug, Clone)]
@@ -22,6 +32,10 @@ pub struct TrainConfig {
     pub detector: DetectorConfig,
     /// Weights to begin with.
     pub init: Option<PathBuf>,
+    /// The fusion, where it is not that of `init` or the usual one of the method.
+    pub fusion: Option<FusionConfig>,
+    /// Where the encoder of `init` stays as it is: where its maps are kept.
+    pub frozen_encoder: Option<KeptMaps>,
     /// How; a batch are samples.
     pub run: RunConfig,
     /// Steps between two validations.

@@ -21,6 +21,9 @@ pub enum TrainError {
     /// The method cannot be trained.
     #[error("method {0} exchanges boxes and is not trained; train `none` and use its weights")]
     NotTrained(Method),
+    /// An encoder that does not learn must have learnt before.
+    #[error("a frozen encoder needs weights to begin with")]
+    NothingToFreeze,
     /// The picture of the curve cannot be written.
     #[error(transparent)]
     Picture(#[from] agent::canvas::CanvasError),

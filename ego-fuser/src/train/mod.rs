@@ -6,6 +6,7 @@ mod card;
 mod config;
 mod curve;
 mod error;
+mod frozen;
 mod observer;
 mod validation;
 
@@ -13,8 +14,9 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use agent::training::{ComputePrecision, Trainer};
+use agent::weights::Weights;
 
-pub use config::TrainConfig;
+pub use config::{KeptMaps, TrainConfig};
 pub use error::TrainError;
 pub use observer::{Observer, StepReport, Summary};
 pub use validation::{Accuracy, Validator};
@@ -22,7 +24,7 @@ pub use validation::{Accuracy, Validator};
 use self::curve::DetectorCurve;
 use crate::loss::{LabelTensors, detection_loss};
 use crate::method::{Exchange, Method};
-use crate::model::CooperativeModel;
+use crate::model::{CooperativeModel, ModelError};
 use crate::samples::{Batch, SampleBuilder, SampleConfig, SampleError, SampleKind, SceneSet, batches};
 
 /// Steps between two readings of the loss: reading waits for the device.
@@ -32,7 +34,7 @@ const READ_EVERY: u64 = 10;
 /// # Errors
 /// [`TrainError`]; the last checkpoint stays.
 pub fn run(config: &TrainConfig, observer: &mut dyn Observer) -> Result<Summary, TrainError> {
-    Training::prepare(config)?.run(observer)
+    Training::prepare(config, observer)?.run(observer)
 }
 
 /// The views that a method learns from.
@@ -43,6 +45,19 @@ fn sample_kind(method: Method) -> Result<SampleKind, TrainError> {
         Exchange::Features => Ok(SampleKind::Cooperative),
         Exchange::Boxes => Err(TrainError::NotTrained(method)),
     }
+}
+
+/// The model as a training finds it.
+fn first_model(config: &TrainConfig) -> Result<CooperativeModel, TrainError> {
+    let TrainConfig { method, run, fusion, .. } = config;
+    Ok(match (&config.init, fusion) {
+        (Some(path), fusion) => {
+            let weights = Weights::load(path).map_err(ModelError::from)?;
+            CooperativeModel::from_weights(&weights, Some(*method), fusion.as_ref(), run.device)?
+        }
+        (None, Some(fusion)) => CooperativeModel::with_fusion(&config.detector, *method, fusion, run.device)?,
+        (None, None) => CooperativeModel::new(&config.detector, *method, run.device)?,
+    })
 }
 
 struct Training<'a> {
@@ -57,22 +72,28 @@ struct Training<'a> {
 }
 
 impl<'a> Training<'a> {
-    fn prepare(config: &'a TrainConfig) -> Result<Self, TrainError> {
-        let samples = SampleConfig { kind: sample_kind(config.method)?, ..config.samples.clone() };
+    fn prepare(config: &'a TrainConfig, observer: &mut dyn Observer) -> Result<Self, TrainError> {
+        let kind = sample_kind(config.method)?;
         let run = &config.run;
         run.start()?;
-        let mut model = match &config.init {
-            Some(path) => CooperativeModel::load(path, Some(config.method), run.device)?,
-            None => CooperativeModel::new(&config.detector, config.method, run.device)?,
-        };
+        let mut model = first_model(config)?;
+        let frozen = frozen::FrozenEncoder::of(config, &model)?;
+        let samples = SampleConfig { kind, ..frozen::sample_config(config, &model) };
+        samples.poses.validate().map_err(SampleError::from)?;
         model.set_precision(run.precision);
         let scenes = Arc::new(SceneSet::open(&config.data)?);
         let assigner = Arc::new(model.assigner().map_err(SampleError::from)?);
-        let builder = SampleBuilder::new(Arc::clone(&scenes), samples.clone(), model.config().clone(), assigner);
-        let validator = match config.validation.as_slice() {
+        let mut builder = SampleBuilder::new(Arc::clone(&scenes), samples.clone(), model.config().clone(), assigner);
+        let mut validator = match config.validation.as_slice() {
             [] => None,
             folders => Some(Validator::open(folders, &samples, &model, config.validation_frames)?),
         };
+        if let Some(frozen) = &frozen {
+            builder = builder.with_maps(frozen.maps(&scenes, observer)?);
+            if let Some(validator) = &mut validator {
+                validator.use_maps(frozen.maps(validator.scenes(), observer)?);
+            }
+        }
         let trainer = Trainer::begin(run, &model.variables, Some(config.method.name()), Instant::now())?;
         let curve = DetectorCurve::open(&trainer)?;
         Ok(Self { config, model, trainer, scenes, builder, validator, curve, accuracy: None })
@@ -106,9 +127,8 @@ impl<'a> Training<'a> {
     /// One step; its losses, or nothing when the gradient was not finite.
     fn step(&mut self, batch: &Batch) -> Result<Option<[f64; 2]>, TrainError> {
         let device = self.config.run.device;
-        let pillars = batch.pillars.to_device(device);
         let labels = LabelTensors::gather(&batch.labels, self.config.loss.unassigned, device);
-        let output = self.model.forward(&pillars, &batch.facts, true)?;
+        let output = batch.output(&self.model, true)?;
         let loss = detection_loss(&output.scores, &output.offsets, &labels, &self.config.loss)?;
         let share_done = self.share_done();
         Ok(match self.trainer.step(&loss.total(), share_done)? {

@@ -33,6 +33,10 @@ pub trait Observer {
     fn opened(&mut self, data: &DataListing) {
         let _ = data;
     }
+    /// So many sweeps of all have been encoded, for an encoder that does not learn.
+    fn encoded(&mut self, done: u64, all: u64) {
+        let _ = (done, all);
+    }
     /// Some steps are done.
     fn stepped(&mut self, report: &StepReport);
     /// A validation is done.

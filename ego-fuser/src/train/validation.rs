@@ -12,8 +12,9 @@ use tch::no_grad;
 
 use super::TrainError;
 use crate::average_precision::{Ordering, Scorer};
+use crate::feature_store::MapSource;
 use crate::model::CooperativeModel;
-use crate::samples::{Augmentation, Batch, PoseNoise, SampleBuilder, SampleConfig, SampleError, SceneSet, TickRef};
+use crate::samples::{Augmentation, Batch, Moments, SampleBuilder, SampleConfig, SampleError, SceneSet, TickRef};
 
 /// AP over the frames of a validation.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize)]
@@ -26,7 +27,8 @@ pub struct Accuracy {
     pub ap_frame_order: [f64; 3],
 }
 
-/// Measures AP on a fixed choice of frames, each seen from a fixed vehicle, with true poses and nobody missing.
+/// Measures AP on a fixed choice of frames, each seen from a fixed vehicle, with nobody missing or late and no error on top
+/// of poses.
 #[derive(Debug)]
 pub struct Validator {
     builder: SampleBuilder,
@@ -51,13 +53,24 @@ impl Validator {
         let samples = SampleConfig {
             augmentation: Augmentation::OFF,
             drop_neighbour: 0.0,
-            pose_noise: PoseNoise::default(),
+            poses: samples.poses.without_noise(),
+            moments: Moments { max_delay_nanos: 0, gap: 1, ..samples.moments },
             merged_truth: true,
             ..samples.clone()
         };
         let assigner = Arc::new(model.assigner().map_err(SampleError::from)?);
         let builder = SampleBuilder::new(scenes, samples, model.config().clone(), assigner);
         Ok(Self { builder, ticks })
+    }
+
+    /// The scenes that frames are chosen from.
+    pub(super) fn scenes(&self) -> &SceneSet {
+        self.builder.scenes()
+    }
+
+    /// From now on samples are of maps that were kept.
+    pub(super) fn use_maps(&mut self, maps: MapSource) {
+        self.builder = self.builder.clone().with_maps(maps);
     }
 
     /// AP of `model` now.
@@ -77,9 +90,8 @@ impl Validator {
                     && corners.iter().all(|corner| (limits.z_range_m[0]..=limits.z_range_m[1]).contains(&corner[2]))
             };
             let objects: Vec<_> = sample.objects.iter().filter(inside).copied().collect();
-            let batch = Batch::collate(vec![sample], model.network().lattice());
-            let pillars = batch.pillars.to_device(model.device());
-            let output = no_grad(|| model.forward(&pillars, &batch.facts, false))?;
+            let batch = Batch::collate(vec![sample], model.network().lattice())?;
+            let output = no_grad(|| batch.output(model, false))?;
             for detections in model.detections(&output, &limits)? {
                 scorer.add(&detections, &objects);
             }

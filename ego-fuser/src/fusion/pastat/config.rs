@@ -23,6 +23,17 @@ pub enum Wavelengths {
     Usual,
 }
 
+/// A part that can be left out, for the ablation.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub enum Part {
+    /// Confidence Embedding.
+    Ce,
+    /// Feature Spatial Alignment.
+    Fsa,
+    /// Temporal Encoding.
+    Te,
+}
+
 /// Feature Spatial Alignment.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -111,6 +122,19 @@ impl PastatConfig {
             fsa: Some(FsaConfig { matching: 16, radius: 3, channels: 32, ..FsaConfig::default() }),
             ..Self::lean(channels)
         }
+    }
+
+    /// The same without some parts.
+    #[must_use]
+    pub fn without(mut self, parts: &[Part]) -> Self {
+        for part in parts {
+            match part {
+                Part::Ce => self.ce = false,
+                Part::Fsa => self.fsa = None,
+                Part::Te => self.te = None,
+            }
+        }
+        self
     }
 
     /// Maps are padded to multiples of this many cells, so that tokens fill every window.

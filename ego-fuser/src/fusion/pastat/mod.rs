@@ -20,7 +20,7 @@ use agent::model_config::ConfigError;
 use protocol::{BevGrid, Pose};
 use tch::{Kind, TchError, Tensor, nn};
 
-pub use config::{FsaConfig, PastatConfig, Rows, Wavelengths};
+pub use config::{FsaConfig, Part, PastatConfig, Rows, Wavelengths};
 
 use self::alignment::{Area, SpatialAlignment, lattice, resample};
 use self::block::Block;

@@ -1,0 +1,126 @@
+//! Where vehicles of a sample believe to be.
+
+use std::sync::Arc;
+
+use agent::pose_source::{NoiseMode, NoisyPose, NoisyPoseConfig, PoseSourceError, PoseTable};
+use protocol::{CavId, PoseEstimate};
+use rand::Rng;
+use sim_replay::frame::Frame;
+
+use super::SampleError;
+
+/// Poses of samples: the recording's, or those that a pose generator found; some samples with an error on top.
+#[derive(Debug, Clone, Default)]
+pub struct SamplePoses {
+    /// Poses that were found, in place of the recording's.
+    pub table: Option<Arc<PoseTable>>,
+    /// Error on top; its seed is drawn anew for every sample.
+    pub noise: Option<NoisyPoseConfig>,
+    /// Share of the samples that have that error.
+    pub noise_share: f64,
+}
+
+impl SamplePoses {
+    /// Checks the numbers of the error.
+    ///
+    /// # Errors
+    /// [`PoseSourceError`] names the field.
+    pub fn validate(&self) -> Result<(), PoseSourceError> {
+        self.noise.as_ref().map_or(Ok(()), |noise| NoisyPose::new(noise).map(|_| ()))
+    }
+
+    /// The same without an error on top.
+    #[must_use]
+    pub fn without_noise(&self) -> Self {
+        Self { noise: None, ..self.clone() }
+    }
+
+    /// Draws the error of one sample.
+    pub(super) fn draw(&self, rng: &mut impl Rng) -> Result<DrawnError, SampleError> {
+        let is_noisy = self.noise_share >= 1.0 || rng.random_bool(self.noise_share.clamp(0.0, 1.0));
+        let seed = rng.random();
+        let Some(noise) = self.noise.as_ref().filter(|_| is_noisy) else { return Ok(DrawnError::default()) };
+        let spares_ego = noise.mode == NoiseMode::Fixed;
+        let noise = NoisyPose::new(&NoisyPoseConfig { seed, ..noise.clone() })?;
+        Ok(DrawnError { noise: Some(noise), spares_ego })
+    }
+
+    /// Where a vehicle believes to have been, without an error on top.
+    pub(super) fn found(&self, scenario: &str, frame: &Frame) -> Result<PoseEstimate, SampleError> {
+        let missing = || SampleError::NoPose {
+            scenario: scenario.to_owned(),
+            capture_nanos: frame.capture_nanos,
+            cav: frame.cav.to_string(),
+        };
+        match &self.table {
+            Some(table) => table.get(scenario, &frame.cav, frame.capture_nanos).copied().ok_or_else(missing),
+            None => Ok(PoseEstimate::new(frame.world_from_lidar.ok_or_else(missing)?, 1.0)),
+        }
+    }
+}
+
+/// The error of the poses of one sample.
+#[derive(Debug, Default)]
+pub(super) struct DrawnError {
+    noise: Option<NoisyPose>,
+    /// The reference code leaves the ego exact where all others are off by the same.
+    spares_ego: bool,
+}
+
+impl DrawnError {
+    /// A pose with the error on top; the confidence falls with it.
+    pub(super) fn added(&self, found: PoseEstimate, cav: &CavId, capture_nanos: u64, is_ego: bool) -> PoseEstimate {
+        let (Some(noise), PoseEstimate::Pose { world_from_cav, confidence }) = (&self.noise, found) else {
+            return found;
+        };
+        if is_ego && self.spares_ego {
+            return found;
+        }
+        match noise.disturbed(cav, capture_nanos, &world_from_cav) {
+            PoseEstimate::Pose { world_from_cav, confidence: of_error } => {
+                PoseEstimate::new(world_from_cav, confidence * of_error)
+            }
+            none @ PoseEstimate::NoPose { .. } => none,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use protocol::Pose;
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+
+    use super::*;
+
+    fn drawn(mode: NoiseMode, noise_share: f64, seed: u64) -> DrawnError {
+        let noise = NoisyPoseConfig { mode, position_std_m: 1.0, ..NoisyPoseConfig::default() };
+        let poses = SamplePoses { table: None, noise: Some(noise), noise_share };
+        poses.validate().unwrap();
+        poses.draw(&mut ChaCha8Rng::seed_from_u64(seed)).unwrap()
+    }
+
+    #[test]
+    fn each_sample_draws_its_own_error_and_confidence_falls_with_it() {
+        let cav = CavId::new("a").unwrap();
+        let found = PoseEstimate::new(Pose::IDENTITY, 0.8);
+        let off = |seed| drawn(NoiseMode::Independent, 1.0, seed).added(found, &cav, 5, true);
+        assert_eq!(off(1), off(1));
+        assert_ne!(off(1), off(2));
+        let PoseEstimate::Pose { world_from_cav, confidence } = off(1) else { panic!() };
+        let [x, y, z] = world_from_cav.translation_m;
+        let square = x * x + y * y + z * z;
+        assert!((f64::from(confidence) - 0.8 / (1.0 + square)).abs() < 1e-5);
+    }
+
+    #[test]
+    fn a_fixed_error_spares_the_ego_and_some_samples_have_none() {
+        let cav = CavId::new("a").unwrap();
+        let found = PoseEstimate::new(Pose::IDENTITY, 0.8);
+        let fixed = drawn(NoiseMode::Fixed, 1.0, 3);
+        assert_eq!(fixed.added(found, &cav, 5, true), found);
+        assert_ne!(fixed.added(found, &cav, 5, false), found);
+        let noisy = (0..200).filter(|&seed| drawn(NoiseMode::Independent, 0.25, seed).noise.is_some()).count();
+        assert!((30..70).contains(&noisy), "{noisy}");
+    }
+}

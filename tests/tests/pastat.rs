@@ -1,0 +1,282 @@
+//! PASTAT end to end on a made scene: learnt behind a frozen encoder, with history, late neighbours and found poses, and
+//! judged in a table.
+
+use std::fs;
+use std::ops::ControlFlow;
+use std::path::{Path, PathBuf};
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+use agent::model_config::DetectorConfig;
+use agent::pose_source::{
+    CachedPoseConfig, NoiseMode, NoisyPoseConfig, PoseRow, PoseSourceConfig, PoseTable,
+};
+use agent::training::{Length, RunConfig};
+use agent::weights::Weights;
+use deploy::table::{self, TableObserver, TableSpec};
+use ego_fuser::Method;
+use ego_fuser::evaluate::{EvaluateConfig, EvaluatedFrame, Evaluator};
+use ego_fuser::feature_store::{FeatureStore, MapSource, is_encoder};
+use ego_fuser::fusion::FusionConfig;
+use ego_fuser::fusion::pastat::Part;
+use ego_fuser::loss::LossConfig;
+use ego_fuser::samples::{Moments, SampleConfig, SampleKind, SamplePoses};
+use ego_fuser::train::{self, Accuracy, KeptMaps, Observer, StepReport, TrainConfig};
+use protocol::{CodecConfig, Dtype, NoPoseReason, PoseEstimate};
+use sim_replay::dataset::{self, LoadOptions, Scenario};
+use tests::scene;
+
+const AGENTS: [&str; 3] = ["4279", "4288", "4301"];
+const TICKS: usize = 7;
+
+/// libtorch has one generator of random numbers per process: who begins a training has it alone.
+fn alone() -> MutexGuard<'static, ()> {
+    static GENERATOR: Mutex<()> = Mutex::new(());
+    tch::set_num_threads(1);
+    GENERATOR.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Hears of losses and of sweeps that are encoded.
+#[derive(Default)]
+struct Ear {
+    losses: Vec<f64>,
+    encoded: u64,
+}
+
+impl Observer for Ear {
+    fn encoded(&mut self, _: u64, _: u64) {
+        self.encoded += 1;
+    }
+    fn stepped(&mut self, report: &StepReport) {
+        self.losses.push(report.score_loss + report.box_loss);
+    }
+    fn validated(&mut self, _: u64, _: &Accuracy) {}
+}
+
+/// A network that a test has time for, on a lattice that no window of a transformer divides.
+fn small() -> DetectorConfig {
+    DetectorConfig {
+        pillar_channels: 8,
+        layer_nums: vec![1, 1],
+        layer_strides: vec![2, 2],
+        num_filters: vec![8, 16],
+        upsample_strides: vec![1, 2],
+        num_upsample_filters: vec![8; 2],
+        shrink: None,
+        lidar_range_m: [-25.6, -17.6, -3.0, 25.6, 17.6, 1.0],
+        ..DetectorConfig::lean()
+    }
+}
+
+fn config(data: &Path, out: &Path, method: Method, steps: u64) -> TrainConfig {
+    TrainConfig {
+        data: vec![data.to_owned()],
+        validation: vec![],
+        method,
+        detector: small(),
+        init: None,
+        fusion: None,
+        frozen_encoder: None,
+        run: RunConfig {
+            learning_rate: 2e-3,
+            seed: 3,
+            command: "a test".to_owned(),
+            ..RunConfig::new(Length::Steps(steps), out)
+        },
+        validate_every: 1_000,
+        validation_frames: 1,
+        samples: SampleConfig::training(SampleKind::Single),
+        loss: LossConfig::default(),
+    }
+}
+
+/// A scene, and weights of `none` to begin with.
+fn begin(folder: &Path) -> (PathBuf, PathBuf) {
+    let data = folder.join("data");
+    scene::write(&data, &AGENTS, TICKS);
+    let summary = train::run(&config(&data, &folder.join("none"), Method::None, 5), &mut Ear::default()).unwrap();
+    (data, summary.trained.weights)
+}
+
+/// Trains PASTAT behind the encoder of `init`, with everything that its samples can have.
+fn pastat(folder: &Path, data: &Path, init: &Path, name: &str) -> TrainConfig {
+    let noise =
+        NoisyPoseConfig { mode: NoiseMode::Independent, position_std_m: 0.5, heading_std_deg: 0.5, ..Default::default() };
+    let mut config = config(data, &folder.join(name), Method::Pastat, 10);
+    config.init = Some(init.to_owned());
+    config.frozen_encoder = Some(KeptMaps { folder: folder.join("maps"), limit_bytes: 1 << 30 });
+    config.samples.moments = Moments { frames: 1, gap: 2, max_delay_nanos: 300_000_000 };
+    config.samples.poses = SamplePoses { table: None, noise: Some(noise), noise_share: 0.5 };
+    config
+}
+
+fn evaluate(weights: &Path, data: &Path, poses: PoseSourceConfig, delay_nanos: u64, maps: bool) -> Vec<EvaluatedFrame> {
+    let codec = CodecConfig { dtype: Dtype::F16, ..CodecConfig::default() };
+    let config = EvaluateConfig {
+        weights: weights.to_owned(),
+        method: Some(Method::Pastat),
+        pose_source: poses,
+        codec,
+        rule: None,
+        delay_nanos,
+    };
+    let mut evaluator = Evaluator::new(config).unwrap();
+    let scenarios = dataset::open(data).unwrap().scenarios;
+    if maps {
+        let weights = Weights::load(weights).unwrap();
+        let folder = data.join("../evaluation-maps");
+        let store = FeatureStore::open(&folder, &weights, &scenarios, u64::MAX, &mut |_, _| {}).unwrap();
+        evaluator = evaluator.with_maps(MapSource::new(store.into(), weights.into()));
+    }
+    let mut frames = Vec::new();
+    for scenario in &scenarios {
+        let mut keep = |frame| {
+            frames.push(frame);
+            ControlFlow::Continue(())
+        };
+        let _ = evaluator.run(scenario, &mut keep).unwrap();
+    }
+    frames
+}
+
+fn ages_ms(frame: &EvaluatedFrame) -> Vec<i64> {
+    frame.result.fused.iter().map(|fused| fused.age_nanos / 1_000_000).collect()
+}
+
+#[test]
+fn pastat_learns_behind_a_frozen_encoder_and_is_judged_with_late_messages() {
+    let _alone = alone();
+    let folder = tempfile::tempdir().unwrap();
+    let (data, init) = begin(folder.path());
+    let first = pastat(folder.path(), &data, &init, "pastat");
+    let mut ear = Ear::default();
+    let summary = train::run(&first, &mut ear).unwrap();
+    assert_eq!(ear.encoded, (AGENTS.len() * TICKS) as u64, "every sweep once");
+    assert!(ear.losses.iter().all(|loss| loss.is_finite() && *loss > 0.0));
+    let before = Weights::load(&init).unwrap();
+    let after = Weights::load(&summary.trained.weights).unwrap();
+    assert_eq!(before.sha256_of(is_encoder), after.sha256_of(is_encoder), "the encoder is as it was");
+    assert_ne!(before.sha256_of(|name| name.starts_with("cls_head")), after.sha256_of(|name| name.starts_with("cls_head")));
+    assert!(after.names().any(|name| name.starts_with("fusion.fsa.")));
+    let card = fs::read_to_string(first.run.out.join("model-card.md")).unwrap();
+    assert!(card.contains("frozen") && card.contains("3 frames") && card.contains("0.3 s late"), "{card}");
+
+    // The same again, its maps being there: the same weights.
+    let mut again = Ear::default();
+    let repeated = train::run(&pastat(folder.path(), &data, &init, "again"), &mut again).unwrap();
+    assert_eq!((again.encoded, repeated.trained.sha256), (0, summary.trained.sha256));
+
+    let weights = &summary.trained.weights;
+    let frames = evaluate(weights, &data, PoseSourceConfig::Recorded, 0, false);
+    assert_eq!(frames.len(), TICKS);
+    assert!(frames.iter().all(|frame| ages_ms(frame) == [0, 0]));
+    let twice = evaluate(weights, &data, PoseSourceConfig::Recorded, 0, false);
+    let kept = evaluate(weights, &data, PoseSourceConfig::Recorded, 0, true);
+    for ((frame, twice), kept) in frames.iter().zip(&twice).zip(&kept) {
+        assert_eq!(frame.result.detections, twice.result.detections);
+        // A kept map has half precision where the head of the own agent has not: boxes may differ in the last bits.
+        assert_eq!(frame.result.fused, kept.result.fused);
+        assert_eq!(frame.result.detections.len(), kept.result.detections.len());
+    }
+    let late = evaluate(weights, &data, PoseSourceConfig::Recorded, 200_000_000, false);
+    let ages: Vec<Vec<i64>> = late.iter().map(ages_ms).collect();
+    assert_eq!(ages[..3], [vec![], vec![], vec![200, 200]]);
+}
+
+#[test]
+fn parts_are_left_out_by_the_configuration_and_stay_out() {
+    let _alone = alone();
+    let folder = tempfile::tempdir().unwrap();
+    let (data, init) = begin(folder.path());
+    let usual = FusionConfig::for_detector(Method::Pastat, &small());
+    let mut config = pastat(folder.path(), &data, &init, "ablation");
+    config.fusion = Some(usual.clone().ablated(&[Part::Ce, Part::Fsa, Part::Te], Some(1)).unwrap());
+    let summary = train::run(&config, &mut Ear::default()).unwrap();
+    let weights = Weights::load(&summary.trained.weights).unwrap();
+    assert!(!weights.names().any(|name| name.contains(".fsa.") || name.contains(".ce.")));
+    assert!(!evaluate(&summary.trained.weights, &data, PoseSourceConfig::Recorded, 0, false).is_empty());
+    let max = FusionConfig::for_detector(Method::Max, &small());
+    assert!(max.ablated(&[Part::Ce], None).unwrap_err().to_string().contains("pastat"));
+}
+
+/// A table of the true poses, but for one vehicle that does not know where it is at tick 3.
+fn poses(file: &Path, scenario: &Scenario) {
+    let mut rows = Vec::new();
+    for (agent, cav) in scenario.agents.iter().enumerate() {
+        for tick in 0..scenario.ticks.len() {
+            let frame = scenario.load(agent, tick, &LoadOptions::default()).unwrap();
+            let lost = agent == 1 && tick == 3;
+            let estimate = if lost {
+                PoseEstimate::NoPose { reason: NoPoseReason::LowConfidence, inlier_count: 3 }
+            } else {
+                PoseEstimate::new(frame.world_from_lidar.unwrap(), 0.75)
+            };
+            rows.push(PoseRow { cav, capture_nanos: frame.capture_nanos, estimate });
+        }
+    }
+    PoseTable::append(file, &scenario.name, &rows).unwrap();
+}
+
+#[test]
+fn poses_that_were_found_once_serve_training_and_evaluation() {
+    let _alone = alone();
+    let folder = tempfile::tempdir().unwrap();
+    let (data, init) = begin(folder.path());
+    let file = folder.path().join("poses.csv");
+    poses(&file, &dataset::open(&data).unwrap().scenarios[0]);
+    let mut config = pastat(folder.path(), &data, &init, "found");
+    config.samples.poses.table = Some(PoseTable::read(&file).unwrap().into());
+    let summary = train::run(&config, &mut Ear::default()).unwrap();
+    let source = PoseSourceConfig::Cached(CachedPoseConfig { file: file.clone(), scenario: None });
+    let frames = evaluate(&summary.trained.weights, &data, source, 0, true);
+    let fused: Vec<usize> = frames.iter().map(|frame| frame.result.fused.len()).collect();
+    assert_eq!(fused, [2, 2, 2, 1, 2, 2, 2], "a vehicle without a pose is left out");
+    assert!(frames[0].result.fused.iter().all(|fused| fused.confidence == 0.75));
+
+    fs::write(&file, "scenario,cav\n").unwrap();
+    let source = PoseSourceConfig::Cached(CachedPoseConfig { file, scenario: None });
+    assert!(source.build().unwrap_err().to_string().contains("poses.csv:1"));
+}
+
+#[derive(Default)]
+struct Cells {
+    known: usize,
+    computed: usize,
+}
+
+impl TableObserver for Cells {
+    fn cell(&mut self, _: &str, _: &str, _: &str, known: bool) {
+        if known { self.known += 1 } else { self.computed += 1 }
+    }
+    fn frame(&mut self) {}
+}
+
+#[test]
+fn a_table_is_filled_cell_by_cell_and_goes_on_where_it_was() {
+    let _alone = alone();
+    let folder = tempfile::tempdir().unwrap();
+    let (data, init) = begin(folder.path());
+    let spec = |rows: &str| {
+        let file = folder.path().join("tables.yaml");
+        let (data, init, maps) = (data.display(), init.display(), folder.path().join("maps"));
+        let text = format!(
+            "dataset: {data}\nframes: 3\nmaps: {}\ntables:\n- name: noise\n  rows:\n  - {{method: none, weights: [{init}]}}\n{rows}\
+             \x20 columns:\n  - name: true poses\n  - {{name: 1 m, poses: {{noisy: {{mode: independent, position_std_m: 1}}}}}}\n",
+            maps.display()
+        );
+        fs::write(&file, text).unwrap();
+        TableSpec::read(&file).unwrap()
+    };
+    let out = folder.path().join("out");
+    let mut first = Cells::default();
+    table::run(&spec(""), &out, &mut first).unwrap();
+    assert_eq!((first.known, first.computed), (0, 2));
+    let row = format!("  - {{name: best, method: max, weights: [{}, {}]}}\n", init.display(), init.display());
+    let mut second = Cells::default();
+    let filled = table::run(&spec(&row), &out, &mut second).unwrap();
+    // The second training is the same file: its cells are those of the first.
+    assert_eq!((second.known, second.computed), (4, 2));
+    assert_eq!(filled[0].rows[1].cells[0].len(), 2);
+    let text = fs::read_to_string(out.join("noise.md")).unwrap();
+    assert!(text.contains("| best |") && text.contains("1 m") && text.contains("Frames: 3."), "{text}");
+    assert_eq!(fs::read_to_string(out.join("noise.csv")).unwrap().lines().count(), 1 + 2 + 4);
+}
