@@ -8,8 +8,7 @@ use std::time::Instant;
 use agent::pose_source::PoseSourceConfig;
 use agent::weights::Weights;
 use ego_fuser::evaluate::{EvaluateConfig, EvaluateError, EvaluatedFrame, Evaluator};
-use ego_fuser::feature_store::{FeatureStore, MapSource};
-use ego_fuser::train::KeptMaps;
+use ego_fuser::feature_store::{FeatureStore, KeptMaps, MapSource};
 use ego_fuser::{Exchange, Method};
 use protocol::{CavId, CodecConfig};
 use sim_replay::dataset::{self, ReadError, Scenario};
@@ -31,7 +30,7 @@ pub struct EvaluationOptions {
     pub codec: CodecConfig,
     /// How long messages of neighbours are under way, nanoseconds.
     pub delay_nanos: u64,
-    /// Where maps of encoders are kept, in half precision, so that each is computed once for many evaluations.
+    /// Where maps of encoders are kept, so that each is computed once for many evaluations.
     pub maps: Option<KeptMaps>,
     /// Frames to judge at most, over all scenarios.
     pub frames: Option<usize>,
@@ -112,7 +111,7 @@ pub fn evaluate(
 /// The maps of all sweeps, encoded now where they have not been before.
 fn maps(kept: &KeptMaps, weights: &Path, scenarios: &[Scenario]) -> Result<MapSource, EvaluationError> {
     let weights = Arc::new(Weights::load(weights).map_err(EvaluateError::from)?);
-    let store = FeatureStore::open(&kept.folder, &weights, scenarios, kept.limit_bytes, &mut |_, _| {});
+    let store = FeatureStore::open(kept, &weights, scenarios, &mut |_, _| {});
     Ok(MapSource::new(Arc::new(store.map_err(EvaluateError::from)?), weights))
 }
 

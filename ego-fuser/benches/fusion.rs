@@ -1,6 +1,6 @@
 //! Warping and fusing maps of `lean`, per method and number of vehicles.
 //!
-//! `cargo bench -p ego-fuser --bench fusion -- attention/3`
+//! `cargo bench -p ego-fuser --bench fusion -- fuse/pastat/4`: three neighbours and the ego, three time steps.
 
 use std::hint::black_box;
 
@@ -16,16 +16,22 @@ fn fuse(criterion: &mut Criterion) {
     let config = DetectorConfig::lean();
     let grid = config.feature_grid();
     let shape = [config.feature_channels(), i64::from(grid.height), i64::from(grid.width)];
-    let mut group = criterion.benchmark_group("warp_and_fuse/lean");
-    for agents in [1usize, 2, 3, 5] {
-        let features = Tensor::rand([agents as i64, shape[0], shape[1], shape[2]], (Kind::Float, Device::Cpu));
-        let pose = |agent: usize| Pose::from_xyz_yaw([7.0 * agent as f64, 2.0, 0.0], 0.2 * agent as f64);
-        let facts: Vec<_> = (0..agents).map(|agent| ViewFacts::fresh(agent, pose(agent))).collect();
+    let mut group = criterion.benchmark_group("lean");
+    for agents in [1usize, 2, 4] {
         for method in Method::ALL.into_iter().filter(|method| method.exchange() == Exchange::Features) {
             let stage = FusionStage::untrained(method, &config).expect("lean is a valid configuration");
-            group.bench_function(BenchmarkId::new(method.name(), agents), |bencher| {
+            // The newest of all first, as the ego gives them.
+            let entries = (0..stage.frames()).flat_map(|step| (0..agents).map(move |agent| (step, agent)));
+            let facts: Vec<_> = entries.map(|(step, agent)| entry(step, agent)).collect();
+            let size = [facts.len() as i64, shape[0], shape[1], shape[2]];
+            let features = Tensor::rand(size, (Kind::Float, Device::Cpu));
+            let align = || stage.align(&features, None, &facts).expect("maps lie on the lattice");
+            group.bench_function(BenchmarkId::new(format!("warp/{method}"), agents), |bencher| {
+                bencher.iter(|| black_box(no_grad(align)));
+            });
+            let maps = align();
+            group.bench_function(BenchmarkId::new(format!("fuse/{method}"), agents), |bencher| {
                 bencher.iter(|| {
-                    let maps = stage.align(&features, None, &facts).expect("maps lie on the lattice");
                     let fused = no_grad(|| stage.fuse(&maps, &facts, false)).expect("views fit together");
                     assert_eq!(fused.size(), shape);
                     black_box(fused)
@@ -34,6 +40,13 @@ fn fuse(criterion: &mut Criterion) {
         }
     }
     group.finish();
+}
+
+/// What is known of a vehicle's map from some time steps ago.
+fn entry(step: usize, agent: usize) -> ViewFacts {
+    let [step_m, agent_m] = [step, agent].map(|count| 7.0 * count as f64);
+    let pose = Pose::from_xyz_yaw([agent_m - 0.1 * step_m, 2.0 * agent as f64, 0.0], 0.2 * agent as f64);
+    ViewFacts { age_secs: 0.1 * step as f64, ..ViewFacts::fresh(agent, pose) }
 }
 
 criterion_group!(benches, fuse);

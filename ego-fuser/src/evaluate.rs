@@ -18,7 +18,7 @@ use protocol::{Box3d, CavId, CodecConfig, HEADER_LEN, Header, Limits, PoseEstima
 use sim_replay::dataset::{LoadOptions, ReadError, Scenario};
 use sim_replay::frame::Frame;
 use sim_replay::ground_truth::{self, GroundTruthRule};
-use tch::{Kind, TchError, Tensor};
+use tch::Tensor;
 
 use crate::ego::{Content, Ego, EgoError, Skipped, View, own_content};
 use crate::feature_store::{FeatureStoreError, MapSource};
@@ -65,9 +65,6 @@ pub enum EvaluateError {
     /// Kept maps cannot be read.
     #[error(transparent)]
     Maps(#[from] FeatureStoreError),
-    /// The tensor library refused.
-    #[error("evaluation: {0}")]
-    Torch(#[from] TchError),
 }
 
 /// One frame of the ego with everything it can be judged by.
@@ -110,8 +107,8 @@ impl Evaluator {
         Ok(Self { weights: Weights::load(&config.weights)?, ego, rule, config, under_way: VecDeque::new(), maps: None })
     }
 
-    /// The same with maps that its encoder made before, kept in half precision: what a message of half precision says is
-    /// the same then.
+    /// The same with maps that its encoder made before, kept as exactly as messages say them or more: those say the same
+    /// then.
     #[must_use]
     pub fn with_maps(self, maps: MapSource) -> Self {
         Self { maps: Some(maps), ..self }
@@ -171,7 +168,7 @@ impl Evaluator {
     fn maps_at(&mut self, scenario: &Scenario, tick: usize) -> Result<Vec<Tensor>, EvaluateError> {
         let Some(maps) = &mut self.maps else { return Ok(Vec::new()) };
         let Some(index) = maps.index_of(&scenario.name) else { return Ok(Vec::new()) };
-        let map = |agent| Ok(maps.map(index, scenario, agent, tick)?.f_to_kind(Kind::Float)?);
+        let map = |agent| Ok(maps.map(index, scenario, agent, tick)?);
         (0..scenario.agents.len()).map(map).collect()
     }
 

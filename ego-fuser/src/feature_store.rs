@@ -1,8 +1,9 @@
-//! The maps of a frozen encoder, computed once and kept on disk in half precision.
+//! The maps of a frozen encoder, computed once and kept on disk.
 //!
 //! Methods that share an encoder differ in what they make of its maps; what takes the time, the encoder, need not run
 //! again for each of them, nor for each pass over the data. The file belongs to one encoder and one listing of data: both
-//! hashes are in its name.
+//! hashes are in its name. It holds one packed message per sweep, as on the wire, each after its length: what is cut off
+//! or changed is found out.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Write};
@@ -12,11 +13,18 @@ use std::sync::Arc;
 
 use agent::detector::{Detector, DetectorError};
 use agent::weights::{Weights, WeightsError};
+use protocol::codec::encode_features;
+use protocol::message::Bev;
+use protocol::{
+    BevFeatures, CavId, CodecConfig, Dtype, Header, Limits, NoPoseReason, PoseEstimate, Stamp, WireError, wire,
+};
 use sim_replay::dataset::{self, LoadOptions, ReadError, Scenario};
-use tch::{Kind, TchError, Tensor};
+use tch::{TchError, Tensor};
 
 /// Digits of each hash in the name of a file.
 const HASH_DIGITS: usize = 12;
+/// zstd level of a message: more costs time and saves nothing.
+const PACKING: i32 = 1;
 
 /// Why maps cannot be kept or read.
 #[derive(Debug, thiserror::Error)]
@@ -28,6 +36,14 @@ pub enum FeatureStoreError {
         path: PathBuf,
         /// What the system said.
         source: io::Error,
+    },
+    /// A map cannot be packed or unpacked.
+    #[error("{}: {source}", path.display())]
+    Wire {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        source: WireError,
     },
     /// A sweep cannot be read.
     #[error(transparent)]
@@ -43,6 +59,17 @@ pub enum FeatureStoreError {
     Torch(#[from] TchError),
 }
 
+/// Where maps are kept, how exactly and how many.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct KeptMaps {
+    /// The folder; a file per encoder, listing of data and kind of number.
+    pub folder: PathBuf,
+    /// How exactly.
+    pub dtype: Dtype,
+    /// Size of a file at most, bytes; sweeps beyond are encoded whenever they are needed.
+    pub limit_bytes: u64,
+}
+
 /// Whether a parameter is one of the encoder.
 #[must_use]
 pub fn is_encoder(name: &str) -> bool {
@@ -54,90 +81,117 @@ pub fn is_encoder(name: &str) -> bool {
 pub struct FeatureStore {
     path: PathBuf,
     file: File,
-    /// Channels, rows and columns.
-    shape: [i64; 3],
+    dtype: Dtype,
     /// Names of the scenarios.
     names: Vec<String>,
     /// Place of each scenario's first sweep, and of the end.
-    first: Vec<u64>,
+    first: Vec<usize>,
     /// Ticks of each scenario.
-    ticks: Vec<u64>,
-    /// Sweeps that are there.
-    stored: u64,
+    ticks: Vec<usize>,
+    /// Where each message that is there begins, and where the last one ends.
+    starts: Vec<u64>,
 }
 
 impl FeatureStore {
-    /// Opens the file of these scenarios in `folder` and encodes what it does not have yet, up to a size.
+    /// Opens the file of these scenarios and encodes what it does not have yet, up to its size.
     ///
-    /// `on_sweep` is told how many sweeps are there, and how many there will be. An interrupted run is gone on with.
+    /// `on_sweep` is told how many sweeps are there, and of how many. An interrupted run is gone on with.
     ///
     /// # Errors
     /// [`FeatureStoreError`] names the file.
     pub fn open(
-        folder: &Path,
+        kept: &KeptMaps,
         weights: &Weights,
         scenarios: &[Scenario],
-        limit_bytes: u64,
-        on_sweep: &mut dyn FnMut(u64, u64),
+        on_sweep: &mut dyn FnMut(usize, usize),
     ) -> Result<Self, FeatureStoreError> {
-        let mut detector = Detector::from_weights(weights, &weights.config().map_err(DetectorError::from)?)?;
         let [encoder, data] = [weights.sha256_of(is_encoder), dataset::listing_sha256(scenarios)];
-        let path = folder.join(format!("{}-{}.maps", &encoder[..HASH_DIGITS], &data[..HASH_DIGITS]));
+        let dtype = format!("{:?}", kept.dtype).to_lowercase();
+        let name = format!("{}-{}-{dtype}.maps", &encoder[..HASH_DIGITS], &data[..HASH_DIGITS]);
+        let path = kept.folder.join(name);
         let io = |source| FeatureStoreError::Io { path: path.clone(), source };
-        fs::create_dir_all(folder).map_err(io)?;
+        fs::create_dir_all(&kept.folder).map_err(io)?;
         let file = OpenOptions::new().create(true).read(true).append(true).open(&path).map_err(io)?;
+        let starts = starts(&file).map_err(io)?;
+        // A message that was cut off is made anew.
+        file.set_len(starts[starts.len() - 1]).map_err(io)?;
         let mut first = vec![0];
         for scenario in scenarios {
-            first.push(first[first.len() - 1] + (scenario.agents.len() * scenario.ticks.len()) as u64);
+            first.push(first[first.len() - 1] + scenario.agents.len() * scenario.ticks.len());
         }
-        let ticks = scenarios.iter().map(|scenario| scenario.ticks.len() as u64).collect();
         let names = scenarios.iter().map(|scenario| scenario.name.clone()).collect();
-        let mut store = Self { path: path.clone(), file, shape: detector.map_shape(), names, first, ticks, stored: 0 };
-        // A record that was cut off is made anew.
-        store.stored = store.file.metadata().map_err(io)?.len() / store.record_bytes();
-        store.file.set_len(store.stored * store.record_bytes()).map_err(io)?;
-        store.fill(&mut detector, scenarios, limit_bytes, on_sweep)?;
+        let ticks = scenarios.iter().map(|scenario| scenario.ticks.len()).collect();
+        let mut store = Self { path: path.clone(), file, dtype: kept.dtype, names, first, ticks, starts };
+        store.fill(weights, scenarios, kept.limit_bytes, on_sweep)?;
         Ok(store)
     }
 
     fn fill(
         &mut self,
-        detector: &mut Detector,
+        weights: &Weights,
         scenarios: &[Scenario],
         limit_bytes: u64,
-        on_sweep: &mut dyn FnMut(u64, u64),
+        on_sweep: &mut dyn FnMut(usize, usize),
     ) -> Result<(), FeatureStoreError> {
-        let wanted = self.first[self.first.len() - 1].min(limit_bytes / self.record_bytes());
+        let (stored, all) = self.sweeps();
+        if stored == all || self.bytes() >= limit_bytes {
+            return Ok(());
+        }
+        let mut detector = Detector::from_weights(weights, &weights.config()?)?;
         for (index, scenario) in scenarios.iter().enumerate() {
             for sweep in 0..self.first[index + 1] - self.first[index] {
-                let place = self.first[index] + sweep;
-                if place < self.stored || place >= wanted {
+                if self.first[index] + sweep < stored {
                     continue;
                 }
-                let (agent, tick) = ((sweep / self.ticks[index]) as usize, (sweep % self.ticks[index]) as usize);
-                let frame = scenario.load(agent, tick, &LoadOptions::default())?;
-                let bytes = half_bytes(&detector.encode(&frame.points)?.features)?;
-                self.file.write_all(&bytes).map_err(|source| self.io(source))?;
-                self.stored += 1;
-                on_sweep(self.stored, wanted);
+                if self.bytes() >= limit_bytes {
+                    return Ok(());
+                }
+                let frame =
+                    scenario.load(sweep / self.ticks[index], sweep % self.ticks[index], &LoadOptions::default())?;
+                let map = detector.encode(&frame.points)?.features;
+                let message = self.packed(detector.to_message(&map)?)?;
+                let length = u32::try_from(message.len()).map_err(|_| self.io(io::ErrorKind::FileTooLarge.into()))?;
+                let record = [&length.to_le_bytes()[..], &message].concat();
+                self.file.write_all(&record).map_err(|source| self.io(source))?;
+                self.starts.push(self.bytes() + record.len() as u64);
+                on_sweep(self.sweeps().0, all);
             }
         }
         Ok(())
     }
 
-    /// The map of a sweep, `[1, C, H, W]` in half precision, by scenario, agent and tick; nothing where it did not fit.
+    fn packed(&self, features: BevFeatures) -> Result<Vec<u8>, FeatureStoreError> {
+        let codec = CodecConfig { dtype: self.dtype, budget_bytes: None, zstd_level: Some(PACKING) };
+        // Whose map it is, and when, is told by its place.
+        let cav = CavId::new("0").map_err(|_| self.io(io::ErrorKind::InvalidInput.into()))?;
+        let stamp = Stamp { cav, epoch: 0, sequence: 0, capture_nanos: 0, publish_nanos: 0 };
+        let pose = PoseEstimate::NoPose { reason: NoPoseReason::NoSource, inlier_count: 0 };
+        let encode = || -> Result<_, WireError> {
+            let features = encode_features(features, &codec, None)?;
+            Ok(wire::encode(&stamp, Bev { pose, features })?.to_vec())
+        };
+        encode().map_err(|source| FeatureStoreError::Wire { path: self.path.clone(), source })
+    }
+
+    /// The map of a sweep, `[1, C, H, W]`, by scenario, agent and tick; nothing where it did not fit.
     ///
     /// # Errors
-    /// [`FeatureStoreError::Io`] when the file cannot be read.
+    /// [`FeatureStoreError`] when the file cannot be read or was changed.
     pub fn map(&self, scenario: usize, agent: usize, tick: usize) -> Result<Option<Tensor>, FeatureStoreError> {
-        let place = self.first[scenario] + agent as u64 * self.ticks[scenario] + tick as u64;
-        if place >= self.stored.min(self.first[scenario + 1]) {
+        let place = self.first[scenario] + agent * self.ticks[scenario] + tick;
+        let Some(&[start, end]) = self.starts.get(place..place + 2) else {
             return Ok(None);
-        }
-        let mut bytes = vec![0; self.record_bytes() as usize];
-        self.file.read_exact_at(&mut bytes, place * self.record_bytes()).map_err(|source| self.io(source))?;
-        let [channels, height, width] = self.shape;
-        Ok(Some(Tensor::f_from_data_size(&bytes, &[1, channels, height, width], Kind::Half)?))
+        };
+        let start = start + LENGTH_BYTES;
+        let mut bytes = vec![0; (end - start) as usize];
+        self.file.read_exact_at(&mut bytes, start).map_err(|source| self.io(source))?;
+        let decode = || -> Result<_, WireError> {
+            let (_, message): (Header, Bev) = wire::decode([bytes.as_slice()], &Limits::default())?;
+            message.features.decode(&Limits::default())
+        };
+        let features = decode().map_err(|source| FeatureStoreError::Wire { path: self.path.clone(), source })?.features;
+        let size = [1, i64::from(features.channels), i64::from(features.grid.height), i64::from(features.grid.width)];
+        Ok(Some(Tensor::f_from_slice(&features.values)?.f_view(size)?))
     }
 
     /// The index of a scenario.
@@ -148,16 +202,38 @@ impl FeatureStore {
 
     /// Sweeps that are there, and all of the scenarios.
     #[must_use]
-    pub fn sweeps(&self) -> (u64, u64) {
-        (self.stored, self.first[self.first.len() - 1])
+    pub fn sweeps(&self) -> (usize, usize) {
+        (self.starts.len() - 1, self.first[self.first.len() - 1])
     }
 
-    fn record_bytes(&self) -> u64 {
-        2 * self.shape.iter().product::<i64>().unsigned_abs()
+    fn bytes(&self) -> u64 {
+        self.starts[self.starts.len() - 1]
     }
 
     fn io(&self, source: io::Error) -> FeatureStoreError {
         FeatureStoreError::Io { path: self.path.clone(), source }
+    }
+}
+
+/// Bytes that tell the length of the message behind them.
+const LENGTH_BYTES: u64 = 4;
+
+/// Where each whole message of a file begins, and where the last one ends.
+fn starts(file: &File) -> io::Result<Vec<u64>> {
+    let end = file.metadata()?.len();
+    let mut starts = vec![0];
+    loop {
+        let start = starts[starts.len() - 1];
+        if start + LENGTH_BYTES > end {
+            return Ok(starts);
+        }
+        let mut length = [0; LENGTH_BYTES as usize];
+        file.read_exact_at(&mut length, start)?;
+        let next = start + LENGTH_BYTES + u64::from(u32::from_le_bytes(length));
+        if next > end {
+            return Ok(starts);
+        }
+        starts.push(next);
     }
 }
 
@@ -189,7 +265,7 @@ impl MapSource {
         self.store.index_of(scenario)
     }
 
-    /// The map of a sweep, `[1, C, H, W]` in half precision; `scenario` is the one of that index.
+    /// The map of a sweep, `[1, C, H, W]`; `scenario` is the one of that index.
     ///
     /// # Errors
     /// [`FeatureStoreError`] when it cannot be read.
@@ -211,13 +287,6 @@ impl MapSource {
                 self.encoder.insert(Detector::from_weights(&self.weights, &config)?)
             }
         };
-        Ok(encoder.encode(&frame.points)?.features.f_to_kind(Kind::Half)?)
+        Ok(encoder.encode(&frame.points)?.features)
     }
-}
-
-fn half_bytes(map: &Tensor) -> Result<Vec<u8>, TchError> {
-    let half = map.f_to_kind(Kind::Half)?.f_contiguous()?.f_view([-1])?;
-    let mut bytes = vec![0; 2 * half.numel()];
-    half.f_copy_data_u8(&mut bytes, half.numel())?;
-    Ok(bytes)
 }

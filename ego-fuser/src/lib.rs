@@ -23,6 +23,7 @@ mod neighbourhood;
 pub mod node;
 pub mod pairing;
 mod peer_models;
+pub mod residual;
 pub mod samples;
 pub mod targets;
 pub mod train;

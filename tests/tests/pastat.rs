@@ -7,20 +7,18 @@ use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use agent::model_config::DetectorConfig;
-use agent::pose_source::{
-    CachedPoseConfig, NoiseMode, NoisyPoseConfig, PoseRow, PoseSourceConfig, PoseTable,
-};
+use agent::pose_source::{CachedPoseConfig, NoiseMode, NoisyPoseConfig, PoseRow, PoseSourceConfig, PoseTable};
 use agent::training::{Length, RunConfig};
 use agent::weights::Weights;
 use deploy::table::{self, TableObserver, TableSpec};
 use ego_fuser::Method;
 use ego_fuser::evaluate::{EvaluateConfig, EvaluatedFrame, Evaluator};
-use ego_fuser::feature_store::{FeatureStore, MapSource, is_encoder};
+use ego_fuser::feature_store::{FeatureStore, KeptMaps, MapSource, is_encoder};
 use ego_fuser::fusion::FusionConfig;
 use ego_fuser::fusion::pastat::Part;
 use ego_fuser::loss::LossConfig;
 use ego_fuser::samples::{Moments, SampleConfig, SampleKind, SamplePoses};
-use ego_fuser::train::{self, Accuracy, KeptMaps, Observer, StepReport, TrainConfig};
+use ego_fuser::train::{self, Accuracy, Observer, StepReport, TrainConfig};
 use protocol::{CodecConfig, Dtype, NoPoseReason, PoseEstimate};
 use sim_replay::dataset::{self, LoadOptions, Scenario};
 use tests::scene;
@@ -39,11 +37,11 @@ fn alone() -> MutexGuard<'static, ()> {
 #[derive(Default)]
 struct Ear {
     losses: Vec<f64>,
-    encoded: u64,
+    encoded: usize,
 }
 
 impl Observer for Ear {
-    fn encoded(&mut self, _: u64, _: u64) {
+    fn encoded(&mut self, _: usize, _: usize) {
         self.encoded += 1;
     }
     fn stepped(&mut self, report: &StepReport) {
@@ -99,11 +97,15 @@ fn begin(folder: &Path) -> (PathBuf, PathBuf) {
 
 /// Trains PASTAT behind the encoder of `init`, with everything that its samples can have.
 fn pastat(folder: &Path, data: &Path, init: &Path, name: &str) -> TrainConfig {
-    let noise =
-        NoisyPoseConfig { mode: NoiseMode::Independent, position_std_m: 0.5, heading_std_deg: 0.5, ..Default::default() };
+    let noise = NoisyPoseConfig {
+        mode: NoiseMode::Independent,
+        position_std_m: 0.5,
+        heading_std_deg: 0.5,
+        ..Default::default()
+    };
     let mut config = config(data, &folder.join(name), Method::Pastat, 10);
     config.init = Some(init.to_owned());
-    config.frozen_encoder = Some(KeptMaps { folder: folder.join("maps"), limit_bytes: 1 << 30 });
+    config.frozen_encoder = Some(KeptMaps { folder: folder.join("maps"), dtype: Dtype::I8, limit_bytes: 1 << 30 });
     config.samples.moments = Moments { frames: 1, gap: 2, max_delay_nanos: 300_000_000 };
     config.samples.poses = SamplePoses { table: None, noise: Some(noise), noise_share: 0.5 };
     config
@@ -124,7 +126,8 @@ fn evaluate(weights: &Path, data: &Path, poses: PoseSourceConfig, delay_nanos: u
     if maps {
         let weights = Weights::load(weights).unwrap();
         let folder = data.join("../evaluation-maps");
-        let store = FeatureStore::open(&folder, &weights, &scenarios, u64::MAX, &mut |_, _| {}).unwrap();
+        let kept = KeptMaps { folder, dtype: Dtype::F16, limit_bytes: u64::MAX };
+        let store = FeatureStore::open(&kept, &weights, &scenarios, &mut |_, _| {}).unwrap();
         evaluator = evaluator.with_maps(MapSource::new(store.into(), weights.into()));
     }
     let mut frames = Vec::new();
@@ -150,12 +153,15 @@ fn pastat_learns_behind_a_frozen_encoder_and_is_judged_with_late_messages() {
     let first = pastat(folder.path(), &data, &init, "pastat");
     let mut ear = Ear::default();
     let summary = train::run(&first, &mut ear).unwrap();
-    assert_eq!(ear.encoded, (AGENTS.len() * TICKS) as u64, "every sweep once");
+    assert_eq!(ear.encoded, AGENTS.len() * TICKS, "every sweep once");
     assert!(ear.losses.iter().all(|loss| loss.is_finite() && *loss > 0.0));
     let before = Weights::load(&init).unwrap();
     let after = Weights::load(&summary.trained.weights).unwrap();
     assert_eq!(before.sha256_of(is_encoder), after.sha256_of(is_encoder), "the encoder is as it was");
-    assert_ne!(before.sha256_of(|name| name.starts_with("cls_head")), after.sha256_of(|name| name.starts_with("cls_head")));
+    assert_ne!(
+        before.sha256_of(|name| name.starts_with("cls_head")),
+        after.sha256_of(|name| name.starts_with("cls_head"))
+    );
     assert!(after.names().any(|name| name.starts_with("fusion.fsa.")));
     let card = fs::read_to_string(first.run.out.join("model-card.md")).unwrap();
     assert!(card.contains("frozen") && card.contains("3 frames") && card.contains("0.3 s late"), "{card}");
@@ -180,6 +186,43 @@ fn pastat_learns_behind_a_frozen_encoder_and_is_judged_with_late_messages() {
     let late = evaluate(weights, &data, PoseSourceConfig::Recorded, 200_000_000, false);
     let ages: Vec<Vec<i64>> = late.iter().map(ages_ms).collect();
     assert_eq!(ages[..3], [vec![], vec![], vec![200, 200]]);
+}
+
+#[test]
+fn kept_maps_are_bounded_and_survive_a_cut() {
+    let _alone = alone();
+    let folder = tempfile::tempdir().unwrap();
+    let (data, init) = begin(folder.path());
+    let weights = Weights::load(&init).unwrap();
+    let scenarios = dataset::open(&data).unwrap().scenarios;
+    let open = |limit_bytes: u64| {
+        let kept = KeptMaps { folder: folder.path().join("maps"), dtype: Dtype::F16, limit_bytes };
+        let mut encoded = 0;
+        let store = FeatureStore::open(&kept, &weights, &scenarios, &mut |_, _| encoded += 1).unwrap();
+        (store, encoded)
+    };
+    let (few, encoded) = open(1);
+    assert_eq!((few.sweeps(), encoded), ((1, AGENTS.len() * TICKS), 1), "no more once the limit is passed");
+    assert!(few.map(0, 0, 0).unwrap().is_some() && few.map(0, 2, 3).unwrap().is_none());
+    // What is not kept is encoded when it is needed.
+    let mut maps = MapSource::new(few.into(), Weights::load(&init).unwrap().into());
+    let live = maps.map(0, &scenarios[0], 2, 3).unwrap();
+    let (whole, encoded) = open(u64::MAX);
+    assert_eq!(encoded, AGENTS.len() * TICKS - 1);
+    let kept = whole.map(0, 2, 3).unwrap().unwrap();
+    assert!(kept.allclose(&live, 1e-3, 1e-3, false));
+    let file = fs::read_dir(folder.path().join("maps")).unwrap().next().unwrap().unwrap().path();
+    let length = fs::metadata(&file).unwrap().len();
+    fs::OpenOptions::new().write(true).open(&file).unwrap().set_len(length - 5).unwrap();
+    let (mended, encoded) = open(u64::MAX);
+    assert_eq!((encoded, mended.sweeps().0), (1, AGENTS.len() * TICKS));
+    assert!(mended.map(0, 2, TICKS - 1).unwrap().is_some());
+    let mut bytes = fs::read(&file).unwrap();
+    let last = bytes.len() - 3;
+    bytes[last] ^= 0x55;
+    fs::write(&file, bytes).unwrap();
+    let message = open(u64::MAX).0.map(0, 2, TICKS - 1).unwrap_err().to_string();
+    assert!(message.contains(".maps"), "{message}");
 }
 
 #[test]

@@ -20,7 +20,7 @@ pub use text::{csv, markdown};
 
 use crate::evaluation::{EvaluationError, EvaluationOptions, evaluate};
 use crate::weights_choice::WeightsChoiceError;
-use ego_fuser::train::KeptMaps;
+use ego_fuser::feature_store::KeptMaps;
 
 /// Why a table came to nothing.
 #[derive(Debug, thiserror::Error)]
@@ -162,6 +162,7 @@ impl Run<'_> {
             delay_nanos: column.delay_ms.saturating_mul(1_000_000),
             maps: self.spec.maps.as_ref().map(|folder| KeptMaps {
                 folder: folder.clone(),
+                dtype: self.spec.dtype,
                 limit_bytes: (self.spec.maps_limit_gb.max(0.0) * 1e9) as u64,
             }),
             frames: self.spec.frames,

@@ -3,6 +3,7 @@
 mod align;
 mod eval;
 mod methods;
+mod residual;
 mod run;
 mod train;
 
@@ -22,6 +23,8 @@ pub(crate) enum Command {
     Methods(methods::Arguments),
     /// Measure AP on recorded scenes.
     Eval(eval::Arguments),
+    /// Measure what a method's own alignment leaves of offsets that are put on true poses.
+    Residual(residual::Arguments),
     /// Run the fusing vehicle of a live fleet.
     Run(run::Arguments),
     /// Train a method on scenes.
@@ -35,6 +38,7 @@ impl Command {
             Self::Align(arguments) => arguments.run(),
             Self::Methods(arguments) => arguments.run(),
             Self::Eval(arguments) => arguments.run(),
+            Self::Residual(arguments) => arguments.run(),
             Self::Run(arguments) => arguments.run(),
             Self::Train(arguments) => arguments.run(),
         }

@@ -9,11 +9,13 @@ use agent::training::{AdamWConfig, DataListing, RunConfig, TrainingBar, Training
 use agent::weights::Weights;
 use anyhow::{Context, Result};
 use ego_fuser::Method;
+use ego_fuser::feature_store::KeptMaps;
 use ego_fuser::fusion::FusionConfig;
 use ego_fuser::fusion::pastat::Part;
 use ego_fuser::loss::{LossConfig, Unassigned};
 use ego_fuser::samples::{Augmentation, Moments, SampleConfig, SampleKind, SamplePoses};
-use ego_fuser::train::{self, Accuracy, KeptMaps, Observer, StepReport, TrainConfig};
+use ego_fuser::train::{self, Accuracy, Observer, StepReport, TrainConfig};
+use protocol::Dtype;
 
 use super::BadInput;
 
@@ -86,6 +88,9 @@ pub(crate) struct Arguments {
     /// Most gigabytes of them per set of data; sweeps beyond are encoded whenever they are needed.
     #[arg(long, value_name = "GB", default_value_t = 8.0)]
     maps_limit: f64,
+    /// How exactly they are kept.
+    #[arg(long, value_enum, default_value_t = Exactness::F16)]
+    maps_dtype: Exactness,
     /// Largest turn of a vehicle's frame in training, degrees.
     #[arg(long, default_value_t = 45.0)]
     turn: f64,
@@ -144,9 +149,14 @@ impl Arguments {
             detector: self.config.clone(),
             init: self.init.clone(),
             fusion: self.fusion()?,
-            frozen_encoder: self
-                .freeze_encoder
-                .then(|| KeptMaps { folder: self.maps.clone(), limit_bytes: (self.maps_limit.max(0.0) * 1e9) as u64 }),
+            frozen_encoder: self.freeze_encoder.then(|| KeptMaps {
+                folder: self.maps.clone(),
+                dtype: match self.maps_dtype {
+                    Exactness::F16 => Dtype::F16,
+                    Exactness::I8 => Dtype::I8,
+                },
+                limit_bytes: (self.maps_limit.max(0.0) * 1e9) as u64,
+            }),
             run: RunConfig { optimizer: AdamWConfig { weight_decay: self.weight_decay, ..run.optimizer }, ..run },
             validate_every: self.validate_every,
             validation_frames: self.validation_frames,
@@ -193,6 +203,15 @@ impl Arguments {
     }
 }
 
+/// How exactly maps are kept.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+enum Exactness {
+    /// 2 bytes a value, packed.
+    F16,
+    /// 1 byte a value and a scale per channel, packed.
+    I8,
+}
+
 /// How errors of poses hang together.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
 enum Mode {
@@ -213,7 +232,7 @@ impl Observer for Progress {
         data.left_out().iter().for_each(|text| self.0.say(text));
     }
 
-    fn encoded(&mut self, done: u64, all: u64) {
+    fn encoded(&mut self, done: usize, all: usize) {
         let share = done as f64 / all.max(1) as f64;
         if done % 50 == 0 || done == all {
             self.0.report(share, 0.0, &format!("{done} of {all} sweeps encoded"));

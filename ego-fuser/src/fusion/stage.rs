@@ -121,6 +121,16 @@ impl FusionStage {
         Ok(AlignedMaps { own_frame, warped })
     }
 
+    /// How the method would move the maps beyond their poses, see [`Fusion::corrections`].
+    ///
+    /// # Errors
+    /// [`WarpError::Torch`] when the tensor library refuses.
+    pub fn corrections(&self, maps: &AlignedMaps, facts: &[ViewFacts]) -> Result<Option<Tensor>, WarpError> {
+        let AlignedMaps { own_frame, warped } = maps;
+        let views = AlignedViews { features: &warped.features, mask: &warped.mask, own_frame, grid: &self.grid, facts };
+        Ok(self.fusion.corrections(&views)?)
+    }
+
     /// Fuses aligned maps into `[C, H, W]` in the frame of the ego.
     ///
     /// # Errors

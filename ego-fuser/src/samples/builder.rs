@@ -75,7 +75,7 @@ impl SampleConfig {
 pub enum SampleViews {
     /// Pillars, to be encoded.
     Pillars(Vec<Pillars>),
-    /// `[N, C, H, W]` maps in half precision, of an encoder that does not learn.
+    /// `[N, C, H, W]` maps, of an encoder that does not learn.
     Maps(Tensor),
 }
 

@@ -6,7 +6,7 @@ use agent::training::{Prefetch, RunConfig};
 use rand::SeedableRng;
 use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
-use tch::{Kind, Tensor};
+use tch::Tensor;
 
 use super::{Sample, SampleBuilder, SampleError, SampleViews, TickRef};
 use crate::fusion::ViewFacts;
@@ -18,7 +18,7 @@ use crate::targets::Labels;
 pub enum BatchViews {
     /// Pillars, to be encoded.
     Pillars(PillarBatch),
-    /// `[sum of views, C, H, W]` maps in half precision, of an encoder that does not learn.
+    /// `[sum of views, C, H, W]` maps, of an encoder that does not learn.
     Maps(Tensor),
 }
 
@@ -63,7 +63,7 @@ impl Batch {
         match &self.views {
             BatchViews::Pillars(pillars) => model.forward(&pillars.to_device(model.device()), &self.facts, train),
             BatchViews::Maps(maps) => {
-                let maps = maps.f_to_device(model.device())?.f_to_kind(Kind::Float)?;
+                let maps = maps.f_to_device(model.device())?;
                 model.fuse_and_detect(&model.network().through_compressor(&maps, train), &self.facts, train)
             }
         }

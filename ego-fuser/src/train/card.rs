@@ -58,7 +58,7 @@ pub(super) fn card(config: &TrainConfig, model: &CooperativeModel, scenes: &Scen
         );
     }
     if config.frozen_encoder.is_some() {
-        card.row("encoder", "frozen, its maps kept in half precision");
+        card.row("encoder", "frozen, its maps kept");
     }
     if let Some(accuracy) = &summary.accuracy {
         card.paragraph(&format!(

@@ -5,19 +5,11 @@ use std::path::PathBuf;
 use agent::model_config::DetectorConfig;
 use agent::training::RunConfig;
 
+use crate::feature_store::KeptMaps;
 use crate::fusion::FusionConfig;
 use crate::loss::LossConfig;
 use crate::method::Method;
 use crate::samples::SampleConfig;
-
-/// Where the maps of a frozen encoder are kept.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct KeptMaps {
-    /// The folder; a file per encoder and listing of data.
-    pub folder: PathBuf,
-    /// Size of a file at most, bytes; sweeps beyond are encoded whenever they are needed.
-    pub limit_bytes: u64,
-}
 
 /// What to train, on what, for how long.
 #[derive(Debug, Clone)]

@@ -4,8 +4,8 @@ use std::sync::Arc;
 
 use agent::weights::Weights;
 
-use super::{KeptMaps, Observer, TrainConfig, TrainError};
-use crate::feature_store::{FeatureStore, FeatureStoreError, MapSource, is_encoder};
+use super::{Observer, TrainConfig, TrainError};
+use crate::feature_store::{FeatureStore, FeatureStoreError, KeptMaps, MapSource, is_encoder};
 use crate::model::{CooperativeModel, ModelError};
 use crate::samples::{Augmentation, SampleConfig, SampleError, SceneSet};
 
@@ -31,9 +31,8 @@ impl<'a> FrozenEncoder<'a> {
 
     /// The maps of all sweeps of some scenes, encoded now where they have not been before.
     pub(super) fn maps(&self, scenes: &SceneSet, observer: &mut dyn Observer) -> Result<MapSource, TrainError> {
-        let KeptMaps { folder, limit_bytes } = self.kept;
         let on_sweep = &mut |done, all| observer.encoded(done, all);
-        let open = FeatureStore::open(folder, &self.weights, scenes.scenarios(), *limit_bytes, on_sweep);
+        let open = FeatureStore::open(self.kept, &self.weights, scenes.scenarios(), on_sweep);
         let store = open.map_err(|error: FeatureStoreError| SampleError::from(error))?;
         Ok(MapSource::new(Arc::new(store), Arc::clone(&self.weights)))
     }

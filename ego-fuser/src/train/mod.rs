@@ -16,7 +16,7 @@ use std::time::{Duration, Instant};
 use agent::training::{ComputePrecision, Trainer};
 use agent::weights::Weights;
 
-pub use config::{KeptMaps, TrainConfig};
+pub use config::TrainConfig;
 pub use error::TrainError;
 pub use observer::{Observer, StepReport, Summary};
 pub use validation::{Accuracy, Validator};

@@ -34,7 +34,7 @@ pub trait Observer {
         let _ = data;
     }
     /// So many sweeps of all have been encoded, for an encoder that does not learn.
-    fn encoded(&mut self, done: u64, all: u64) {
+    fn encoded(&mut self, done: usize, all: usize) {
         let _ = (done, all);
     }
     /// Some steps are done.

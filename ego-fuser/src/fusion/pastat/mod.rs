@@ -210,6 +210,18 @@ impl Fusion for Pastat {
         self.fuse_visible(&pick(features, &visible)?, &pick(mask, &visible)?, &facts, grid)
     }
 
+    fn corrections(&self, views: &AlignedViews<'_>) -> Result<Option<Tensor>, TchError> {
+        let AlignedViews { features, mask, facts, .. } = views;
+        let Some(alignment) = self.alignment.as_ref().filter(|_| facts.len() > 1) else { return Ok(None) };
+        let told = Told::new(facts);
+        let shares = Tensor::f_from_slice(&told.shares)?.f_to_device(features.device())?;
+        let cells = self.config.padding_cells();
+        let tokens =
+            self.tokeniser.forward(&padded(&features.f_to_kind(Kind::Float)?, cells)?, &shares, &told.age_secs)?;
+        let valid = self.tokeniser.valid(&padded(&mask.f_to_kind(Kind::Float)?, cells)?)?;
+        Ok(Some(alignment.deltas(&tokens, &valid, &shares)?))
+    }
+
     fn frames(&self) -> usize {
         self.config.frames
     }
