@@ -8,7 +8,7 @@
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Write};
 use std::os::unix::fs::FileExt;
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 use std::sync::Arc;
 
 use agent::detector::{Detector, DetectorError};
@@ -161,7 +161,7 @@ impl FeatureStore {
     }
 
     fn packed(&self, features: BevFeatures) -> Result<Vec<u8>, FeatureStoreError> {
-        let codec = CodecConfig { dtype: self.dtype, budget_bytes: None, zstd_level: Some(PACKING) };
+        let codec = CodecConfig { dtype: self.dtype, zstd_level: Some(PACKING), ..CodecConfig::default() };
         // Whose map it is, and when, is told by its place.
         let cav = CavId::new("0").map_err(|_| self.io(io::ErrorKind::InvalidInput.into()))?;
         let stamp = Stamp { cav, epoch: 0, sequence: 0, capture_nanos: 0, publish_nanos: 0 };

@@ -127,6 +127,7 @@ impl FusionStage {
     /// [`WarpError::Torch`] when the tensor library refuses.
     pub fn corrections(&self, maps: &AlignedMaps, facts: &[ViewFacts]) -> Result<Option<Tensor>, WarpError> {
         let AlignedMaps { own_frame, warped } = maps;
+        let facts = &*self.of_network(facts);
         let views = AlignedViews { features: &warped.features, mask: &warped.mask, own_frame, grid: &self.grid, facts };
         Ok(self.fusion.corrections(&views)?)
     }
