@@ -10,7 +10,7 @@ use std::path::PathBuf;
 use agent::agent::{Agent, AgentInput, Perception};
 use agent::detector::{Detector, DetectorError};
 use agent::model_config::DetectorConfig;
-use agent::pose_source::{PoseSourceConfig, PoseSourceError};
+use agent::pose_source::{NoiseMode, PoseSourceConfig, PoseSourceError};
 use agent::weights::{Weights, WeightsError};
 use protocol::codec::encode_features;
 use protocol::message::{Bev, Boxes, Detections, FusedNeighbour, Payload, Points, SkippedNeighbour};
@@ -144,7 +144,8 @@ impl Evaluator {
         let mut agents = Vec::with_capacity(scenario.agents.len());
         for cav in &scenario.agents {
             let detector = Detector::from_weights(&self.weights, &detector_config)?;
-            agents.push(Agent::new(cav.clone(), pose_source.build()?, detector));
+            let source = if agents.is_empty() { source_of_ego(&pose_source) } else { pose_source.clone() };
+            agents.push(Agent::new(cav.clone(), source.build()?, detector));
         }
         for tick in 0..scenario.ticks.len() {
             let frames: Result<Vec<Frame>, _> =
@@ -257,6 +258,15 @@ pub fn rule_for(config: &DetectorConfig) -> GroundTruthRule {
         z_m: [z_low, z_high],
         comm_range_m: Ego::COMM_RANGE_M,
         min_corners: 8,
+    }
+}
+
+/// Where the ego's own poses come from: one fixed offset spares it, as in the reference code. With the same offset on all
+/// vehicles they would hardly be displaced among each other.
+fn source_of_ego(all: &PoseSourceConfig) -> PoseSourceConfig {
+    match all {
+        PoseSourceConfig::Noisy(noisy) if noisy.mode == NoiseMode::Fixed => PoseSourceConfig::Recorded,
+        other => other.clone(),
     }
 }
 
