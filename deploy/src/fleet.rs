@@ -11,6 +11,7 @@ use protocol::{CavId, Dtype, ProcessId, Role, RunId, Smoothing, Stream, Topic};
 use sim_replay::bus::{Route, process_id};
 use sim_replay::dataset::{self, ReadError};
 use sim_replay::ground_truth::GroundTruthRule;
+use sim_replay::link::{Air, LinkError};
 use tch::Device;
 
 use crate::scenario::{Launch, NoiseMode, PoseSource, Publish, Scenario};
@@ -81,6 +82,9 @@ pub enum FleetError {
     /// There are no weights for the method.
     #[error(transparent)]
     NoWeights(#[from] WeightsChoiceError),
+    /// The emulated air cannot be made.
+    #[error(transparent)]
+    Link(#[from] LinkError),
     /// The networks that find poses cannot be used, or not together.
     #[error("localizer: {0}")]
     Localizer(#[from] LocalizerError),
@@ -118,6 +122,9 @@ impl Fleet {
         }
         if let Some(weights) = scenario.models.end_to_end.as_ref().filter(|_| scenario.uses_end_to_end()) {
             EndToEndLocalizer::load(weights, Device::Cpu)?;
+        }
+        if let Some(link) = &scenario.link {
+            Air::open(&link.air.to_string_lossy(), link.seed)?;
         }
         let scene = &mut scenario.scene;
         let dataset = dataset::open(&scene.dir)?;
@@ -199,6 +206,7 @@ impl Fleet {
         let mut specs: Vec<ProcessSpec> =
             self.agents.iter().filter(here).map(|cav| self.agent(cav, &meeting)).collect();
         specs.push(self.ego_fuser(&meeting));
+        specs.extend(self.link(&meeting));
         specs.push(self.replay(&meeting));
         specs
     }
@@ -252,7 +260,34 @@ impl Fleet {
         args.option("--method", self.scenario.method.name());
         args.option("--deadline-ms", &self.scenario.ego.deadline_ms.to_string());
         args.option("--max-age-ms", &self.scenario.ego.max_age_ms.to_string());
+        if self.is_over_link() {
+            args.flag("--over-link");
+        }
         meeting.process(format!("ego-{}", self.ego), "ego-fuser", args, Life::Service)
+    }
+
+    /// The emulated air, where the scenario has one and the method sends anything through it.
+    fn link(&self, meeting: &Meeting<'_>) -> Option<ProcessSpec> {
+        let link = self.scenario.link.as_ref().filter(|_| self.is_over_link())?;
+        let mut streams: Vec<Stream> = self.neighbours().map(|cav| self.publish(cav).stream()).collect();
+        streams.extend([Stream::Pose, Stream::Descriptor]);
+        streams.sort_unstable();
+        streams.dedup();
+        let streams: Vec<String> = streams.iter().map(ToString::to_string).collect();
+        let mut args = Arguments::of("link", meeting);
+        args.option("--ego", self.ego.as_str());
+        args.option("--link", &link.air);
+        args.option("--seed", &link.seed.to_string());
+        args.option("--streams", &streams.join(","));
+        Some(meeting.process(format!("link-{}", self.ego), "sim-replay", args, Life::Service))
+    }
+
+    fn is_over_link(&self) -> bool {
+        self.scenario.link.is_some() && self.scenario.method.exchange() != Exchange::Nothing
+    }
+
+    fn neighbours(&self) -> impl Iterator<Item = &CavId> {
+        self.agents.iter().filter(|cav| **cav != self.ego)
     }
 
     fn replay(&self, meeting: &Meeting<'_>) -> ProcessSpec {
@@ -299,9 +334,20 @@ impl Fleet {
         ];
         for cav in &self.agents {
             routes.push(route(cav, Stream::Pose, &scorer));
-            // Alone, the ego listens to nobody but its own agent.
-            if *cav == self.ego || self.scenario.method.exchange() != Exchange::Nothing {
-                routes.push(route(cav, self.publish(cav).stream(), &ego));
+        }
+        routes.push(route(&self.ego, self.publish(&self.ego).stream(), &ego));
+        // Alone, the ego listens to nobody but its own agent.
+        if self.scenario.method.exchange() == Exchange::Nothing {
+            return routes;
+        }
+        for cav in self.neighbours() {
+            let stream = self.publish(cav).stream();
+            if self.is_over_link() {
+                let topic = Topic::Received { ego: self.ego.clone(), cav: cav.clone(), stream };
+                routes.push(route(cav, stream, &process_id(Role::Link, &self.ego)));
+                routes.push(Route { topic, receiver: ego.clone() });
+            } else {
+                routes.push(route(cav, stream, &ego));
             }
         }
         routes

@@ -15,6 +15,7 @@ const SILENT_AFTER: u32 = 3;
 pub(crate) struct Neighbourhood {
     ego: CavId,
     streams: Vec<Stream>,
+    over_link: bool,
     allowed: Option<BTreeSet<CavId>>,
     roll_call: RollCall,
     members: BTreeMap<CavId, Member>,
@@ -25,16 +26,36 @@ struct Member {
     _subscriptions: Vec<Subscription>,
 }
 
+/// Where an ego hears a vehicle: directly, or behind the emulated air if there is one. Its own agent it always hears
+/// directly.
+pub(crate) fn heard_on(ego: &CavId, cav: &CavId, stream: Stream, over_link: bool) -> Topic {
+    if over_link && cav != ego {
+        Topic::Received { ego: ego.clone(), cav: cav.clone(), stream }
+    } else {
+        Topic::Stream { cav: cav.clone(), stream }
+    }
+}
+
+/// Whose message a topic carries, and which.
+pub(crate) fn sender_of(topic: &Topic) -> Option<(&CavId, Stream)> {
+    match topic {
+        Topic::Stream { cav, stream } | Topic::Received { cav, stream, .. } => Some((cav, *stream)),
+        _ => None,
+    }
+}
+
 impl Neighbourhood {
-    /// Watches for agents other than `ego`'s own, to listen to these streams of theirs; `allowed` restricts them.
+    /// Watches for agents other than `ego`'s own, to listen to these streams of theirs, behind the link where there is
+    /// one; `allowed` restricts them.
     pub(crate) fn watch(
         bus: &Bus,
         ego: &CavId,
         streams: Vec<Stream>,
+        over_link: bool,
         allowed: Option<BTreeSet<CavId>>,
     ) -> Result<Self, BusError> {
         let roll_call = RollCall::begin(bus, Role::Agent, 2 * MAX_NEIGHBOURS)?;
-        Ok(Self { ego: ego.clone(), streams, allowed, roll_call, members: BTreeMap::new() })
+        Ok(Self { ego: ego.clone(), streams, over_link, allowed, roll_call, members: BTreeMap::new() })
     }
 
     /// Follows up on who came and went; those who went are returned.
@@ -48,7 +69,7 @@ impl Neighbourhood {
                 }
             } else if self.is_wanted(&cav) {
                 tracing::info!(%cav, "a neighbour has come");
-                let topics = self.streams.iter().map(|&stream| Topic::Stream { cav: cav.clone(), stream });
+                let topics = self.streams.iter().map(|&stream| heard_on(&self.ego, &cav, stream, self.over_link));
                 let subscriptions = topics.map(|topic| bus.subscribe(topic, inbox)).collect::<Result<_, _>>()?;
                 self.members.insert(cav, Member { silent_frames: 0, _subscriptions: subscriptions });
             }

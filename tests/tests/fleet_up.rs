@@ -45,6 +45,29 @@ fn a_fleet_plays_its_scene_and_accounts_for_every_message() {
 }
 
 #[test]
+fn a_fleet_talks_through_the_emulated_air() {
+    let _alone = alone();
+    let folder = tempfile::tempdir().unwrap();
+    // 131 kB at 20 Mbit/s take 53 ms; what follows has to be awaited.
+    let air = "capacity: {token_bucket: {rate_mbps: 20}}\ndelay: {constant_ms: 30}\n";
+    fs::write(folder.path().join("air.yaml"), air).unwrap();
+    let rest = "link: {air: air.yaml}\nego: {deadline_ms: 5000}";
+    let scenario = write_scenario(folder.path(), 4, "lockstep: true", rest);
+    let mut up = Up::start(folder.path(), &scenario);
+    let status = up.wait();
+    let run = &up.folder;
+    let ledger = json(&run.join("ledger.json"));
+    assert_eq!(ledger["balances"], true, "{}", ledger["balance"]);
+    assert_eq!(status.code(), Some(0), "{}", ledger["total"]);
+    let results = results(run);
+    assert!(results.len() == 4 && results.iter().all(|result| fused(result) == 1), "all maps came through");
+    let metrics = json(&run.join("metrics.json"));
+    let latency_ms = metrics["latency_ms"]["capture_to_detection"]["p50"].as_f64().unwrap();
+    assert!(latency_ms > 82.0, "{latency_ms} ms are less than the air takes");
+    assert!(run.join("log/link-4279.log").exists());
+}
+
+#[test]
 fn ctrl_c_ends_everything_within_five_seconds() {
     let _alone = alone();
     let folder = tempfile::tempdir().unwrap();

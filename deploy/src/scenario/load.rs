@@ -2,6 +2,8 @@
 
 use std::path::{Path, PathBuf};
 
+use sim_replay::link::PRESETS;
+
 use super::Scenario;
 
 /// Largest scenario file, bytes.
@@ -86,10 +88,12 @@ impl Scenario {
         let mut scenario = Self::parse(&text, path)?;
         let folder = std::path::absolute(path).map_err(unreadable)?;
         let folder = folder.parent().unwrap_or(Path::new("/"));
-        let Scenario { scene, models, .. } = &mut scenario;
+        let Scenario { scene, models, link, .. } = &mut scenario;
         let localizer = models.localizer.iter_mut().flat_map(|models| [&mut models.encoder, &mut models.head]);
         let networks = localizer.chain(&mut models.end_to_end);
-        for place in [&mut scene.dir, &mut models.weights].into_iter().chain(networks) {
+        let is_preset = |air: &Path| PRESETS.iter().any(|(name, _)| Path::new(name) == air);
+        let air = link.iter_mut().map(|link| &mut link.air).filter(|air| !is_preset(air));
+        for place in [&mut scene.dir, &mut models.weights].into_iter().chain(networks).chain(air) {
             *place = without_dots(&folder.join(&place));
         }
         Ok(scenario)

@@ -42,6 +42,9 @@ pub struct Scenario {
     /// The fusing vehicle.
     #[serde(default)]
     pub ego: Ego,
+    /// The emulated air between the neighbours and the ego; absent: they hear each other directly.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub link: Option<Link>,
     /// Where the processes meet.
     #[serde(default)]
     pub network: Network,
@@ -89,6 +92,17 @@ impl Scene {
     fn default_rate() -> f64 {
         1.0
     }
+}
+
+/// The emulated air.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Link {
+    /// A preset of `sim-replay link`, or a YAML file with the stages of a link, relative to the scenario file.
+    pub air: PathBuf,
+    /// Same seed, same losses and delays.
+    #[serde(default)]
+    pub seed: u64,
 }
 
 /// Which clock a run keeps.

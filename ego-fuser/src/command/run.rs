@@ -37,6 +37,9 @@ pub(crate) struct Arguments {
     /// "discover": all agents that are found; or the ids of those that may take part.
     #[arg(long, value_delimiter = ',', default_value = "discover", allow_hyphen_values = true)]
     neighbours: Vec<String>,
+    /// Hear neighbours behind the emulated air (`sim-replay link`) and not directly.
+    #[arg(long)]
+    over_link: bool,
     /// Threads to compute with; the same number gives the same bits.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
     threads: u16,
@@ -86,6 +89,7 @@ impl Arguments {
             deadline: Duration::from_millis(self.deadline_ms),
             pairing: PairingConfig { max_age_nanos, ..PairingConfig::default() },
             neighbours,
+            over_link: self.over_link,
             keeps_running: self.keep_running || self.bus.supervised,
             ..NodeOptions::default()
         })

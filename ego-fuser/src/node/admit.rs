@@ -3,17 +3,18 @@
 use std::time::{Duration, Instant};
 
 use protocol::message::{Bev, Boxes, Descriptor, Points};
-use protocol::{CavId, DropReason, HEADER_LEN, PoseEstimate, Stamp, Stream, Topic, wire};
+use protocol::{CavId, DropReason, HEADER_LEN, PoseEstimate, Stamp, Stream, wire};
 use sim_replay::bus::{Arrival, unix_nanos};
 
 use super::{Node, OwnFrame, Received};
 use crate::ego::{Content, View};
+use crate::neighbourhood::sender_of;
 
 impl Node<'_> {
     /// Takes a message in: the own agent's begins a frame, a neighbour's waits for one.
     pub(super) fn admit(&mut self, arrival: &Arrival) {
-        let Topic::Stream { cav, stream } = &arrival.topic else { return };
-        if *stream == Stream::Descriptor {
+        let Some((cav, stream)) = sender_of(&arrival.topic) else { return };
+        if stream == Stream::Descriptor {
             return self.hear_of(cav, arrival);
         }
         if *cav != self.cav && self.models.is_other(cav) {

@@ -18,7 +18,7 @@ use sim_replay::bus::{Bus, BusError, Event, Inbox, Publisher, PublisherOptions, 
 
 use crate::ego::{Ego, View, own_content};
 use crate::method::{Exchange, Method};
-use crate::neighbourhood::Neighbourhood;
+use crate::neighbourhood::{Neighbourhood, heard_on, sender_of};
 use crate::pairing::{Pairing, PairingConfig};
 use crate::peer_models::PeerModels;
 
@@ -40,6 +40,8 @@ pub struct NodeOptions {
     pub pairing: PairingConfig,
     /// The neighbours that may take part; `None`: all that are found.
     pub neighbours: Option<BTreeSet<CavId>>,
+    /// Whether neighbours are heard behind the emulated air.
+    pub over_link: bool,
     /// Whether to go on when the own agent has ended, for the next one.
     pub keeps_running: bool,
     /// What it takes from the bus.
@@ -53,6 +55,7 @@ impl Default for NodeOptions {
             deadline: Duration::from_millis(50),
             pairing: PairingConfig::default(),
             neighbours: None,
+            over_link: false,
             keeps_running: false,
             limits: Limits::DEFAULT,
         }
@@ -135,7 +138,7 @@ impl<'a> Node<'a> {
         let own = streams.iter().map(|&stream| bus.subscribe(topic(stream), &inbox)).collect::<Result<_, _>>()?;
         // Alone, an ego has nothing to hear from others.
         let neighbourhood = (ego.method() != Method::None)
-            .then(|| Neighbourhood::watch(bus, cav, streams, options.neighbours.clone()))
+            .then(|| Neighbourhood::watch(bus, cav, streams, options.over_link, options.neighbours.clone()))
             .transpose()?;
         Ok(Self {
             bus,
@@ -199,10 +202,10 @@ impl<'a> Node<'a> {
 
     /// A neighbour sends nothing to fuse any more.
     fn end(&mut self, topic: Topic) {
-        if let Topic::Stream { cav, stream } = topic
+        if let Some((cav, stream)) = sender_of(&topic)
             && stream == self.stream
         {
-            self.ended.insert(cav);
+            self.ended.insert(cav.clone());
         }
     }
 
@@ -213,7 +216,7 @@ impl<'a> Node<'a> {
     fn look_round(&mut self) -> Result<(), BusError> {
         let Some(neighbourhood) = &mut self.neighbourhood else { return Ok(()) };
         for cav in neighbourhood.update(self.bus, &self.inbox)? {
-            let topic = Topic::Stream { cav: cav.clone(), stream: self.stream };
+            let topic = self.topic(&cav);
             self.models.forget(&cav);
             for _ in 0..self.pairing.forget(&cav) {
                 self.bus.books().dropped(&topic, DropReason::Stale);
@@ -223,7 +226,7 @@ impl<'a> Node<'a> {
     }
 
     fn topic(&self, cav: &CavId) -> Topic {
-        Topic::Stream { cav: cav.clone(), stream: self.stream }
+        heard_on(&self.cav, cav, self.stream, self.options.over_link)
     }
 
     fn next_moment(&self) -> Instant {

@@ -1,12 +1,10 @@
 //! `sim-replay link`: the emulated air between the agents of a run and an ego.
 
-use std::path::{Path, PathBuf};
-
 use anyhow::Context;
 use protocol::{CavId, Role, Stream};
 use sim_replay::bus::{BusArgs, STOP_LIMIT, log_to_stderr};
 use sim_replay::link::node::{self, LinkReport, NodeOptions};
-use sim_replay::link::{Air, LinkConfig, PRESETS};
+use sim_replay::link::{Air, PRESETS};
 
 use crate::cli::Outcome;
 
@@ -27,7 +25,7 @@ pub(crate) struct Args {
     /// What crosses the link.
     #[arg(long, value_delimiter = ',', default_value = "pose,bev,descriptor")]
     streams: Vec<Stream>,
-    /// Go on when all agents have ended.
+    /// Go on when all agents have ended, for the next ones; always so with --supervised.
     #[arg(long)]
     keep_running: bool,
     /// Print a JSON summary.
@@ -43,37 +41,26 @@ fn link_help() -> String {
 /// Carries messages and prints a summary to standard output.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     log_to_stderr();
-    let air = match args.air() {
+    let air = match Air::open(&args.link, args.seed) {
         Ok(air) => air,
         Err(error) => {
-            eprintln!("error: {error:#}");
+            eprintln!("error: {error}");
             return Ok(Outcome::BadInput);
         }
     };
     let stop = args.bus.stop().context("installing signal handlers")?;
     let bus = args.bus.join(Role::Link, &args.ego)?;
-    let options =
-        NodeOptions { ego: args.ego.clone(), streams: args.streams.clone(), keeps_running: args.keep_running };
+    let options = NodeOptions {
+        ego: args.ego.clone(),
+        streams: args.streams.clone(),
+        keeps_running: args.keep_running || args.bus.supervised,
+    };
     let report = node::run(&bus, air, &options, &stop)?;
     print(&report, args.json)?;
     if let Err(overdue) = bus.leave(STOP_LIMIT) {
         tracing::warn!("{overdue}");
     }
     Ok(Outcome::Done)
-}
-
-impl Args {
-    fn air(&self) -> anyhow::Result<Air> {
-        if PRESETS.iter().any(|(name, _)| *name == self.link) {
-            return Ok(Air::new(LinkConfig::preset(&self.link)?, Path::new("."), self.seed)?);
-        }
-        let path = PathBuf::from(&self.link);
-        let text = std::fs::read_to_string(&path)
-            .with_context(|| format!("{}: neither a preset nor a file that can be read", path.display()))?;
-        let config = serde_saphyr::from_str(&text).with_context(|| path.display().to_string())?;
-        let folder = path.parent().unwrap_or(Path::new("."));
-        Air::new(config, folder, self.seed).with_context(|| path.display().to_string())
-    }
 }
 
 fn print(report: &LinkReport, as_json: bool) -> anyhow::Result<()> {

@@ -39,6 +39,32 @@ pub enum LinkError {
     /// The trace is not readable.
     #[error(transparent)]
     Trace(#[from] TraceError),
+    /// What was named is no preset, and no file that can be read.
+    #[error("{}: neither a preset of a link ({known}) nor a file that can be read: {source}", path.display())]
+    File {
+        /// What was named.
+        path: PathBuf,
+        /// The presets.
+        known: String,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// The file says no link.
+    #[error("{}: {source}", path.display())]
+    Yaml {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong, with its place.
+        source: Box<serde_saphyr::Error>,
+    },
+    /// The link of a file is wrong.
+    #[error("{}: {source}", path.display())]
+    InFile {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        source: Box<LinkError>,
+    },
 }
 
 /// Who shares what.
