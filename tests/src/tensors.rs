@@ -11,7 +11,6 @@ use tch::{Kind, Tensor};
 use crate::fixtures::Golden;
 
 /// An `f32` tensor of an archive.
-#[must_use]
 pub fn tensor(golden: &Golden, name: &str) -> Tensor {
     let (shape, values) = golden.f32(name);
     Tensor::from_slice(&values).reshape(shape.iter().map(|&size| size as i64).collect::<Vec<_>>())

@@ -85,7 +85,7 @@ impl ConvGru {
     }
 
     /// The state `[N, hidden, H, W]` after `x` `[N, in, H, W]` has come to an empty one: `update * candidate`.
-    pub(super) fn from_empty_state(&self, x: &Tensor) -> Result<Tensor, TchError> {
+    pub(super) fn first_state(&self, x: &Tensor) -> Result<Tensor, TchError> {
         let hidden = self.hidden;
         self.cells.iter().try_fold(x.shallow_clone(), |x, Cell { gates, candidate }| {
             let input = x.size4()?.1;

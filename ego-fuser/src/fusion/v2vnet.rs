@@ -143,7 +143,7 @@ impl V2vNet {
         if self.config.gru_layers == 0 {
             return Ok(receivers + heard);
         }
-        self.gru.from_empty_state(&Tensor::f_cat(&[receivers, heard], 1)?)
+        self.gru.first_state(&Tensor::f_cat(&[receivers, heard], 1)?)
     }
 }
 
