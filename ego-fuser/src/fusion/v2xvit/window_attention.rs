@@ -147,14 +147,15 @@ impl WindowAttention {
         let shares = match &self.gate {
             None => biases.f_ones_like()? / self.branches.len() as f64,
             Some(gate) => {
-                let mut mean = biases.f_sum_dim_intlist([0i64].as_slice(), false, None::<Kind>)?;
+                let mut parts = vec![biases.f_sum_dim_intlist([0i64].as_slice(), false, None::<Kind>)?];
                 for (index, branch) in self.branches.iter().enumerate() {
                     let sums =
                         seen.iter().map(|seen| seen[index].f_sum_dim_intlist([0i64].as_slice(), false, None::<Kind>));
                     let sums = Tensor::f_stack(&sums.collect::<Result<Vec<_>, _>>()?, 0)?;
                     let sum = sums.f_sum_dim_intlist([0i64].as_slice(), false, None::<Kind>)? / tokens as f64;
-                    mean = mean + branch.out.weight.f_mv(&sum)?;
+                    parts.push(branch.out.weight.f_mv(&sum)?);
                 }
+                let mean = Tensor::f_stack(&parts, 0)?.f_sum_dim_intlist([0i64].as_slice(), false, None::<Kind>)?;
                 gate.shares(&mean)?
             }
         };
