@@ -107,7 +107,7 @@ fn pastat(folder: &Path, data: &Path, init: &Path, name: &str) -> TrainConfig {
     config.init = Some(init.to_owned());
     config.frozen_encoder = Some(KeptMaps { folder: folder.join("maps"), dtype: Dtype::I8, limit_bytes: 1 << 30 });
     config.samples.moments = Moments { frames: 1, gap: 2, max_delay_nanos: 300_000_000 };
-    config.samples.poses = SamplePoses { table: None, noise: Some(noise), noise_share: 0.5 };
+    config.samples.poses = SamplePoses { tables: vec![], noise: Some(noise), noise_share: 0.5 };
     config
 }
 
@@ -267,7 +267,7 @@ fn poses_that_were_found_once_serve_training_and_evaluation() {
     let file = folder.path().join("poses.csv");
     poses(&file, &dataset::open(&data).unwrap().scenarios[0]);
     let mut config = pastat(folder.path(), &data, &init, "found");
-    config.samples.poses.table = Some(PoseTable::read(&file).unwrap().into());
+    config.samples.poses.tables = vec![PoseTable::read(&file).unwrap().into()];
     let summary = train::run(&config, &mut Ear::default()).unwrap();
     let source = PoseSourceConfig::Cached(CachedPoseConfig { file: file.clone(), scenario: None });
     let frames = evaluate(&summary.trained.weights, &data, source, 0, true);

@@ -52,9 +52,9 @@ pub(crate) struct Arguments {
     /// Probability that a neighbour is missing from a sample.
     #[arg(long, default_value_t = 0.1)]
     drop_neighbour: f64,
-    /// Poses to align maps by, as `agent localize` wrote them [default: true poses].
-    #[arg(long, value_name = "FILE")]
-    poses: Option<PathBuf>,
+    /// Poses to align maps by, as `agent localize` wrote them, of all scenes in one table or several [default: true poses].
+    #[arg(long, value_name = "FILE", num_args = 1..)]
+    poses: Vec<PathBuf>,
     /// Standard deviation of an error of x, y and z on top of the vehicles' poses, metres.
     #[arg(long, default_value_t = 0.0)]
     position_noise: f64,
@@ -182,8 +182,8 @@ impl Arguments {
             heading_std_deg: self.heading_noise,
             ..NoisyPoseConfig::default()
         });
-        let poses =
-            SamplePoses { table: self.poses.as_ref().map(read).transpose()?, noise, noise_share: self.noise_share };
+        let tables = self.poses.iter().map(read).collect::<Result<_, _>>()?;
+        let poses = SamplePoses { tables, noise, noise_share: self.noise_share };
         poses.validate().map_err(|error| BadInput(error.to_string()))?;
         Ok(poses)
     }

@@ -12,8 +12,8 @@ use super::SampleError;
 /// Poses of samples: the recording's, or those that a pose generator found; some samples with an error on top.
 #[derive(Debug, Clone, Default)]
 pub struct SamplePoses {
-    /// Poses that were found, in place of the recording's.
-    pub table: Option<Arc<PoseTable>>,
+    /// Poses that were found, in place of the recording's; each table is of some of the scenarios.
+    pub tables: Vec<Arc<PoseTable>>,
     /// Error on top; its seed is drawn anew for every sample.
     pub noise: Option<NoisyPoseConfig>,
     /// Share of the samples that have that error.
@@ -52,10 +52,11 @@ impl SamplePoses {
             capture_nanos: frame.capture_nanos,
             cav: frame.cav.to_string(),
         };
-        match &self.table {
-            Some(table) => table.get(scenario, &frame.cav, frame.capture_nanos).copied().ok_or_else(missing),
-            None => Ok(PoseEstimate::new(frame.world_from_lidar.ok_or_else(missing)?, 1.0)),
+        if self.tables.is_empty() {
+            return Ok(PoseEstimate::new(frame.world_from_lidar.ok_or_else(missing)?, 1.0));
         }
+        let found = self.tables.iter().find_map(|table| table.get(scenario, &frame.cav, frame.capture_nanos));
+        found.copied().ok_or_else(missing)
     }
 }
 
@@ -95,7 +96,7 @@ mod tests {
 
     fn drawn(mode: NoiseMode, noise_share: f64, seed: u64) -> DrawnError {
         let noise = NoisyPoseConfig { mode, position_std_m: 1.0, ..NoisyPoseConfig::default() };
-        let poses = SamplePoses { table: None, noise: Some(noise), noise_share };
+        let poses = SamplePoses { tables: vec![], noise: Some(noise), noise_share };
         poses.validate().unwrap();
         poses.draw(&mut ChaCha8Rng::seed_from_u64(seed)).unwrap()
     }

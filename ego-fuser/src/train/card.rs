@@ -44,7 +44,7 @@ pub(super) fn card(config: &TrainConfig, model: &CooperativeModel, scenes: &Scen
         "moments",
         format_args!("{} frames of each vehicle, up to {} ticks from one to the next", moments.frames, moments.gap),
     );
-    card.row("poses", if poses.table.is_some() { "found by a pose generator" } else { "true" });
+    card.row("poses", if poses.tables.is_empty() { "true" } else { "found by a pose generator" });
     if let Some(noise) = &poses.noise {
         card.row(
             "error on top of poses",

@@ -164,14 +164,14 @@ fn fsa_learns_a_shift_from_the_maps_alone() {
     let error = |step: u64, train: bool| {
         let mut scene = Scene::new(&[0, 1], &[0.0, 0.0]);
         let cells = Tensor::rand([1, 4, 12, 20], FLOAT).gt(0.9).to_kind(Kind::Float) * 3.0;
-        let shift = if step % 2 == 0 { 1 } else { -1 };
+        let shift = if step.is_multiple_of(2) { 1 } else { -1 };
         scene.features = Tensor::cat(&[&cells, &cells.roll([shift], [3])], 0);
         let entries = pastat.align(&scene.features, &scene.mask, &Told::new(&scene.facts), &GRID).unwrap();
         let inside = |map: Tensor| map.narrow(1, 2, 8).narrow(2, 4, 12);
         let difference = inside(entries.newest.get(1)) - inside(cells.get(0));
         let loss = difference.square().mean(Kind::Float);
         if train {
-            let _ = no_grad(|| optimizer.zero_grad());
+            optimizer.zero_grad();
             loss.backward();
             optimizer.step(3e-3).unwrap();
         }
