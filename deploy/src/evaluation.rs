@@ -112,7 +112,7 @@ pub fn evaluate(
 fn maps(kept: &KeptMaps, weights: &Path, scenarios: &[Scenario]) -> Result<MapSource, EvaluationError> {
     let weights = Arc::new(Weights::load(weights).map_err(EvaluateError::from)?);
     let store = FeatureStore::open(kept, &weights, scenarios, &mut |_, _| {});
-    Ok(MapSource::new(Arc::new(store.map_err(EvaluateError::from)?), weights))
+    Ok(MapSource::new(Arc::new(store.map_err(|error| EvaluateError::from(Box::new(error)))?), weights))
 }
 
 fn judge(board: &mut Board, frame: EvaluatedFrame) {

@@ -64,7 +64,7 @@ pub enum EvaluateError {
     Wire(#[from] WireError),
     /// Kept maps cannot be read.
     #[error(transparent)]
-    Maps(#[from] FeatureStoreError),
+    Maps(#[from] Box<FeatureStoreError>),
 }
 
 /// One frame of the ego with everything it can be judged by.
@@ -169,7 +169,7 @@ impl Evaluator {
     fn maps_at(&mut self, scenario: &Scenario, tick: usize) -> Result<Vec<Tensor>, EvaluateError> {
         let Some(maps) = &mut self.maps else { return Ok(Vec::new()) };
         let Some(index) = maps.index_of(&scenario.name) else { return Ok(Vec::new()) };
-        let map = |agent| Ok(maps.map(index, scenario, agent, tick)?);
+        let map = |agent| Ok(maps.map(index, scenario, agent, tick).map_err(Box::new)?);
         (0..scenario.agents.len()).map(map).collect()
     }
 

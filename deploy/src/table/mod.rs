@@ -52,7 +52,7 @@ pub enum TableError {
     Dataset(#[from] ReadError),
     /// A cell cannot be evaluated.
     #[error(transparent)]
-    Evaluation(#[from] EvaluationError),
+    Evaluation(#[from] Box<EvaluationError>),
 }
 
 /// The cells of a row: for each column one per training.
@@ -167,7 +167,7 @@ impl Run<'_> {
             }),
             frames: self.spec.frames,
         };
-        let metrics = evaluate(&options, row.method, &mut || observer.frame())?;
+        let metrics = evaluate(&options, row.method, &mut || observer.frame()).map_err(Box::new)?;
         let cell = Cell { key, weights: weights.to_owned(), commit: self.commit.clone(), metrics };
         cell.write(&self.cells)?;
         Ok(cell)
