@@ -40,18 +40,32 @@ fn topic(cav_id: &str, stream: Stream) -> Topic {
     Topic::Stream { cav: cav(cav_id), stream }
 }
 
-/// The same random network every time, with a head that believes in vehicles everywhere.
-fn detector() -> Detector {
+/// What `build` makes, with the same random parameters every time.
+fn seeded<T>(build: impl FnOnce() -> T) -> T {
     // The seed is that of the whole process: nobody else may draw between it and the last parameter.
     static SEEDING: Mutex<()> = Mutex::new(());
     let _alone = SEEDING.lock().unwrap_or_else(PoisonError::into_inner);
     tch::set_num_threads(1);
     tch::manual_seed(5);
+    build()
+}
+
+/// A network with a head that believes in vehicles everywhere.
+fn network() -> Detector {
     let config = DetectorConfig { lidar_range_m: [-25.6, -12.8, -3.0, 25.6, 12.8, 1.0], ..DetectorConfig::lean() };
     let network = VarStore::new(Device::Cpu);
     let pillars = PointPillars::new(&network.root(), &config).unwrap();
     let _ = tch::no_grad(|| network.variables()["cls_head.bias"].shallow_clone().fill_(0.3));
     Detector::from_network(pillars)
+}
+
+fn detector() -> Detector {
+    seeded(network)
+}
+
+/// An ego around the same network, its fusion with the same random parameters every time.
+fn ego(method: Method) -> Ego {
+    seeded(|| Ego::new(network(), method).unwrap())
 }
 
 fn agent(cav_id: &str) -> Agent {
@@ -134,8 +148,7 @@ fn play_in_lockstep(dir: &Path, method: Method) -> (Vec<(u64, Detections)>, Ledg
         let ego = scope.spawn(|| {
             let bus = router.join("ego-10", "10");
             let options = ego_node::NodeOptions { deadline: PATIENCE, ..ego_node::NodeOptions::default() };
-            let report =
-                ego_node::run(&bus, &cav("10"), Ego::new(detector(), method).unwrap(), &options, &stop).unwrap();
+            let report = ego_node::run(&bus, &cav("10"), ego(method), &options, &stop).unwrap();
             assert_eq!((report.frames, report.at_deadline, report.failed), (TICKS as u64, 0, 0));
             leave(bus)
         });
@@ -165,7 +178,7 @@ fn play_in_lockstep(dir: &Path, method: Method) -> (Vec<(u64, Detections)>, Ledg
 /// The same pipelines without any network.
 fn play_offline(scenario: &Scenario, method: Method) -> Vec<(u64, Vec<Detection>)> {
     let mut agents: Vec<Agent> = AGENTS.iter().map(|cav_id| agent(cav_id)).collect();
-    let mut ego = Ego::new(detector(), method).unwrap();
+    let mut ego = ego(method);
     let mut results = Vec::new();
     for (tick_index, tick) in scenario.ticks.iter().enumerate() {
         let views: Vec<View> = (agents.iter_mut().enumerate())
@@ -308,7 +321,7 @@ fn late_killed_and_lying_neighbours_are_named_and_the_ego_goes_on() {
                 keeps_running: true,
                 ..ego_node::NodeOptions::default()
             };
-            ego_node::run(&bus, &cav("10"), Ego::new(detector(), Method::Max).unwrap(), &options, &stop).unwrap();
+            ego_node::run(&bus, &cav("10"), ego(Method::Max), &options, &stop).unwrap();
             leave(bus)
         });
         fleet.iter().for_each(|puppet| puppet.wait_until_heard("ego-10"));
@@ -380,8 +393,7 @@ fn maps_of_a_network_that_a_neighbour_names_as_another_are_left_out() {
             let bus = router.join("ego-10", "10");
             // A frame that waited for what is left out would take for ever.
             let options = ego_node::NodeOptions { deadline: PATIENCE, keeps_running: true, ..Default::default() };
-            let report =
-                ego_node::run(&bus, &cav("10"), Ego::new(detector(), Method::Max).unwrap(), &options, &stop).unwrap();
+            let report = ego_node::run(&bus, &cav("10"), ego(Method::Max), &options, &stop).unwrap();
             assert_eq!((report.frames, report.at_deadline), (4, 0));
             leave(bus)
         });

@@ -25,7 +25,7 @@ pub(crate) struct Arguments {
     /// Weights (safetensors; configuration and method are inside).
     #[arg(long)]
     weights: PathBuf,
-    /// none, late, early, max or attention [default: what the weights were trained for].
+    /// A method of `ego-fuser methods` [default: what the weights were trained for].
     #[arg(long)]
     method: Option<Method>,
     /// Milliseconds a frame waits for its neighbours, from the arrival of the own agent's message.
