@@ -34,6 +34,16 @@ pub struct EvaluationOptions {
     pub maps: Option<KeptMaps>,
     /// Frames to judge at most, over all scenarios.
     pub frames: Option<usize>,
+    /// Scenarios to judge at most, evenly spread over all there are.
+    pub scenarios: Option<usize>,
+}
+
+impl EvaluationOptions {
+    /// The scenarios of `dataset` that are judged.
+    fn chosen<'a>(&self, scenarios: &'a [Scenario]) -> impl Iterator<Item = &'a Scenario> {
+        let count = self.scenarios.map_or(scenarios.len(), |most| most.min(scenarios.len()));
+        (0..count).map(move |index| &scenarios[index * scenarios.len() / count])
+    }
 }
 
 /// Why an evaluation came to nothing.
@@ -58,7 +68,8 @@ pub enum EvaluationError {
 /// # Errors
 /// [`EvaluationError`] when the data set cannot be read.
 pub fn frame_count(options: &EvaluationOptions) -> Result<usize, EvaluationError> {
-    let ticks = dataset::open(&options.dataset)?.scenarios.iter().map(|scenario| scenario.ticks.len()).sum();
+    let dataset = dataset::open(&options.dataset)?;
+    let ticks = options.chosen(&dataset.scenarios).map(|scenario| scenario.ticks.len()).sum();
     Ok(options.frames.map_or(ticks, |frames| frames.min(ticks)))
 }
 
@@ -90,7 +101,7 @@ pub fn evaluate(
     let map_values = u64::from(grid.width) * u64::from(grid.height) * u64::try_from(channels).unwrap_or(0);
     let left = options.frames.unwrap_or(usize::MAX);
     let mut board: Option<Board> = None;
-    for scenario in &dataset.scenarios {
+    for scenario in options.chosen(&dataset.scenarios) {
         let Some(ego) = scenario.agents.first() else { continue };
         let board = board.get_or_insert_with(|| Board::new(ego.clone(), *evaluator.rule(), map_values));
         board.change_ego(ego);

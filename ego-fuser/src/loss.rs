@@ -5,7 +5,11 @@
 
 use tch::{Device, Kind, TchError, Tensor};
 
+use crate::samples::Offset;
 use crate::targets::{BOX_CODE, Labels};
+
+/// What a turn by a radian weighs against a shift by a metre: about the distance at which neighbours see what the ego sees.
+const METRES_PER_RADIAN: f64 = 20.0;
 
 /// Weights and shapes of the two terms.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -20,6 +24,9 @@ pub struct LossConfig {
     pub score_weight: f64,
     /// Weight of the regression term.
     pub box_weight: f64,
+    /// Weight of the alignment term: how far a fusion's own corrections of poses are from the errors that were put on top
+    /// of them. None: the detection loss alone teaches a fusion to align, as in the paper.
+    pub alignment_weight: f64,
     /// What unassigned anchors count as.
     pub unassigned: Unassigned,
 }
@@ -32,6 +39,7 @@ impl Default for LossConfig {
             beta: 1.0 / 9.0,
             score_weight: 1.0,
             box_weight: 2.0,
+            alignment_weight: 0.0,
             unassigned: Unassigned::Background,
         }
     }
@@ -128,6 +136,30 @@ pub fn detection_loss(
     let score = focal_loss(scores, labels, config)?.f_sum(Kind::Float)? * (config.score_weight / batch);
     let boxes = box_loss(boxes, labels, config)?.f_sum(Kind::Float)? * (config.box_weight / batch);
     Ok(Loss { score, boxes })
+}
+
+/// How far corrections are from what would undo the errors put on poses: smooth L1 per view, mean over views and samples.
+///
+/// A metre counts as much as [`METRES_PER_RADIAN`] say a turn does. No true pose takes part: an error that was put on top is
+/// known whatever lies below.
+///
+/// # Errors
+/// [`TchError`] when a sample has other views than offsets.
+pub fn alignment_loss(corrections: &[Option<Tensor>], offsets: &[Vec<Offset>]) -> Result<Tensor, TchError> {
+    let unit = Tensor::f_from_slice(&[1.0, 1.0, METRES_PER_RADIAN as f32])?;
+    let mut losses = Vec::new();
+    for (moved_by, offsets) in corrections.iter().zip(offsets) {
+        let Some(moved_by) = moved_by else { continue };
+        let wanted: Vec<f32> =
+            offsets.iter().skip(1).flat_map(|Offset(offset)| offset.map(|value| value as f32)).collect();
+        let wanted = Tensor::f_from_slice(&wanted)?.f_view([-1, 3])?.f_to_device(moved_by.device())?;
+        let off = (moved_by.f_to_kind(Kind::Float)? - wanted) * unit.f_to_device(moved_by.device())?;
+        losses.push(off.f_smooth_l1_loss(&off.f_zeros_like()?, tch::Reduction::Mean, 1.0)?);
+    }
+    match losses.as_slice() {
+        [] => Tensor::f_zeros([], (Kind::Float, Device::Cpu)),
+        _ => Tensor::f_stack(&losses, 0)?.f_mean(Kind::Float),
+    }
 }
 
 /// Weighted focal loss of every anchor, `[B, H*W*A]`.

@@ -60,6 +60,15 @@ pub enum ModelError {
     },
 }
 
+/// What a model makes of a batch.
+#[derive(Debug)]
+pub struct CooperativeOutput {
+    /// Scores and boxes of every anchor.
+    pub head: HeadOutput,
+    /// For each sample how the fusion has moved its views but the first, see [`crate::fusion::Fusion::fuse_and_correct`].
+    pub corrections: Vec<Option<Tensor>>,
+}
+
 /// Encoder, fusion and head of one method under one set of variables.
 #[derive(Debug)]
 pub struct CooperativeModel {
@@ -189,7 +198,7 @@ impl CooperativeModel {
         pillars: &PillarBatch,
         facts: &[Vec<ViewFacts>],
         train: bool,
-    ) -> Result<HeadOutput, ModelError> {
+    ) -> Result<CooperativeOutput, ModelError> {
         let features = self.network.features(pillars, train);
         self.fuse_and_detect(&self.network.through_compressor(&features, train), facts, train)
     }
@@ -203,24 +212,28 @@ impl CooperativeModel {
         features: &Tensor,
         facts: &[Vec<ViewFacts>],
         train: bool,
-    ) -> Result<HeadOutput, ModelError> {
+    ) -> Result<CooperativeOutput, ModelError> {
         let told: usize = facts.iter().map(Vec::len).sum();
         let views = features.size4()?.0;
         if views != told as i64 {
             return Err(ModelError::ViewCount { views, told });
         }
         if self.fusion.config() == &FusionConfig::Own && told == facts.len() {
-            return Ok(self.network.heads(features)?);
+            let corrections = facts.iter().map(|_| None).collect();
+            return Ok(CooperativeOutput { head: self.network.heads(features)?, corrections });
         }
-        let mut fused = Vec::with_capacity(facts.len());
+        let (mut fused, mut corrections) = (Vec::with_capacity(facts.len()), Vec::with_capacity(facts.len()));
         let mut first = 0;
         for facts in facts {
             let views = features.f_narrow(0, first, facts.len() as i64)?;
             first += facts.len() as i64;
             let sent = if train { self.sent_in_training(&views)? } else { None };
-            fused.push(self.fusion.fuse(&self.fusion.align(&views, sent.as_ref(), facts)?, facts, train)?);
+            let aligned = self.fusion.align(&views, sent.as_ref(), facts)?;
+            let (map, moved_by) = self.fusion.fuse_and_correct(&aligned, facts, train)?;
+            fused.push(map);
+            corrections.push(moved_by);
         }
-        Ok(self.network.heads(&Tensor::f_stack(&fused, 0)?)?)
+        Ok(CooperativeOutput { head: self.network.heads(&Tensor::f_stack(&fused, 0)?)?, corrections })
     }
 
     /// What agents would have sent of their maps `[N, C, H, W]`, for a method in which they choose: in training a random

@@ -152,9 +152,9 @@ impl ResidualMeter {
         let facts = [ViewFacts::fresh(0, Pose::IDENTITY), ViewFacts::fresh(1, off)];
         let correction = no_grad(|| {
             let maps = self.fusion.align(&pair.maps, None, &facts)?;
-            self.fusion.corrections(&maps, &facts)
+            self.fusion.fuse_and_correct(&maps, &facts, false)
         })?;
-        let correction = correction.ok_or(ResidualError::NoAlignment)?;
+        let correction = correction.1.ok_or(ResidualError::NoAlignment)?;
         let values: Vec<f64> = Vec::try_from(correction.f_to_kind(Kind::Double)?.f_view([-1])?)?;
         let [dx, dy, theta] = [0, 1, 2].map(|index| values[index]);
         let corrected = moved(&off, [dx, dy, theta]);

@@ -78,6 +78,9 @@ pub(crate) struct Arguments {
     /// Frames to judge at most, over all scenarios [default: all].
     #[arg(long, value_parser = clap::value_parser!(u64).range(1..))]
     frames: Option<u64>,
+    /// Scenarios to judge at most, evenly spread [default: all].
+    #[arg(long, value_parser = clap::value_parser!(u64).range(1..))]
+    scenarios: Option<u64>,
     /// Threads to compute with.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
     threads: u16,
@@ -118,6 +121,10 @@ enum Exactness {
     F16,
     /// 1 byte and a scale per channel.
     I8,
+}
+
+fn at_most(count: u64) -> usize {
+    usize::try_from(count).unwrap_or(usize::MAX)
 }
 
 impl Arguments {
@@ -162,7 +169,8 @@ impl Arguments {
             },
             delay_nanos: self.delay * 1_000_000,
             maps: None,
-            frames: self.frames.map(|frames| usize::try_from(frames).unwrap_or(usize::MAX)),
+            frames: self.frames.map(at_most),
+            scenarios: self.scenarios.map(at_most),
         })
     }
 

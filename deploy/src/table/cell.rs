@@ -31,6 +31,9 @@ pub struct CellKey {
     pub dtype: protocol::Dtype,
     /// Frames at most.
     pub frames: Option<usize>,
+    /// Scenarios at most, evenly spread.
+    #[serde(default)]
+    pub scenarios: Option<usize>,
     /// Version of the program.
     pub version: String,
 }

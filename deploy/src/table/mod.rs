@@ -147,6 +147,7 @@ impl Run<'_> {
             delay_ms: column.delay_ms,
             dtype: self.spec.dtype,
             frames: self.spec.frames,
+            scenarios: table.scenarios,
             version: env!("CARGO_PKG_VERSION").to_owned(),
         };
         let known = Cell::read(&key, &self.cells)?;
@@ -166,6 +167,7 @@ impl Run<'_> {
                 limit_bytes: (self.spec.maps_limit_gb.max(0.0) * 1e9) as u64,
             }),
             frames: self.spec.frames,
+            scenarios: table.scenarios,
         };
         let metrics = evaluate(&options, row.method, &mut || observer.frame()).map_err(Box::new)?;
         let cell = Cell { key, weights: weights.to_owned(), commit: self.commit.clone(), metrics };

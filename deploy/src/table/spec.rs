@@ -41,6 +41,9 @@ pub struct TableSpec {
 pub struct Table {
     /// Name of its files.
     pub name: String,
+    /// Scenarios to judge at most, evenly spread over the data set; absent: all.
+    #[serde(default)]
+    pub scenarios: Option<usize>,
     /// Its rows.
     pub rows: Vec<Row>,
     /// Its columns.

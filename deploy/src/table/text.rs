@@ -180,6 +180,7 @@ mod tests {
             delay_ms: 0,
             dtype: protocol::Dtype::F16,
             frames: None,
+            scenarios: None,
             version: "1".into(),
         };
         Cell { key, weights: "w.safetensors".into(), commit: "abc".into(), metrics }

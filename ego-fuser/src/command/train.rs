@@ -79,6 +79,9 @@ pub(crate) struct Arguments {
     /// Parts of pastat to leave out.
     #[arg(long, value_enum, value_delimiter = ',')]
     without: Vec<Part>,
+    /// Weight of what teaches a fusion that corrects poses (pastat) the errors that were put on top of them.
+    #[arg(long, default_value_t = 0.0)]
+    alignment_weight: f64,
     /// Leave the encoder of --init as it is and learn the fusion and the head alone: fast, as maps are computed once.
     #[arg(long, requires = "init")]
     freeze_encoder: bool,
@@ -161,7 +164,7 @@ impl Arguments {
             validate_every: self.validate_every,
             validation_frames: self.validation_frames,
             samples,
-            loss: LossConfig { unassigned, ..LossConfig::default() },
+            loss: LossConfig { unassigned, alignment_weight: self.alignment_weight, ..LossConfig::default() },
         })
     }
 

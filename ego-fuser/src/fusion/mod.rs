@@ -80,14 +80,14 @@ pub trait Fusion: Debug + Send {
     /// [`TchError`] when the shapes of features and mask do not fit.
     fn fuse(&self, views: &AlignedViews<'_>, train: bool) -> Result<Tensor, TchError>;
 
-    /// How it would move each entry but the first beyond its pose, `[N - 1, 3]`: along x and y of the ego, metres, and about
-    /// the entry's sender, radians. Nothing for methods that take poses as they are, and where there is one entry.
+    /// The same, with how it has moved each entry but the first beyond its pose, `[N - 1, 3]`: along x and y of the ego,
+    /// metres, and about the entry's sender, radians. Nothing for methods that take poses as they are, and where there is
+    /// one entry.
     ///
     /// # Errors
-    /// [`TchError`] when the shapes of features and mask do not fit.
-    fn corrections(&self, views: &AlignedViews<'_>) -> Result<Option<Tensor>, TchError> {
-        let _ = views;
-        Ok(None)
+    /// As [`Self::fuse`].
+    fn fuse_and_correct(&self, views: &AlignedViews<'_>, train: bool) -> Result<(Tensor, Option<Tensor>), TchError> {
+        Ok((self.fuse(views, train)?, None))
     }
 
     /// Time steps that it wants of every agent, the newest included.

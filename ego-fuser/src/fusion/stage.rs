@@ -121,26 +121,28 @@ impl FusionStage {
         Ok(AlignedMaps { own_frame, warped })
     }
 
-    /// How the method would move the maps beyond their poses, see [`Fusion::corrections`].
-    ///
-    /// # Errors
-    /// [`WarpError::Torch`] when the tensor library refuses.
-    pub fn corrections(&self, maps: &AlignedMaps, facts: &[ViewFacts]) -> Result<Option<Tensor>, WarpError> {
-        let AlignedMaps { own_frame, warped } = maps;
-        let facts = &*self.of_network(facts);
-        let views = AlignedViews { features: &warped.features, mask: &warped.mask, own_frame, grid: &self.grid, facts };
-        Ok(self.fusion.corrections(&views)?)
-    }
-
     /// Fuses aligned maps into `[C, H, W]` in the frame of the ego.
     ///
     /// # Errors
     /// [`WarpError::Torch`] when the tensor library refuses.
     pub fn fuse(&self, maps: &AlignedMaps, facts: &[ViewFacts], train: bool) -> Result<Tensor, WarpError> {
+        Ok(self.fuse_and_correct(maps, facts, train)?.0)
+    }
+
+    /// The same, with how the method has moved the maps beyond their poses, see [`Fusion::fuse_and_correct`].
+    ///
+    /// # Errors
+    /// As [`Self::fuse`].
+    pub fn fuse_and_correct(
+        &self,
+        maps: &AlignedMaps,
+        facts: &[ViewFacts],
+        train: bool,
+    ) -> Result<(Tensor, Option<Tensor>), WarpError> {
         let AlignedMaps { own_frame, warped } = maps;
         let facts = &*self.of_network(facts);
         let views = AlignedViews { features: &warped.features, mask: &warped.mask, own_frame, grid: &self.grid, facts };
-        Ok(self.fusion.fuse(&views, train)?)
+        Ok(self.fusion.fuse_and_correct(&views, train)?)
     }
 }
 

@@ -13,7 +13,7 @@ use sim_replay::ground_truth::{self, GroundTruthRule};
 use tch::Tensor;
 
 use super::poses::DrawnError;
-use super::{Augmentation, Moments, SampleError, SamplePoses, SceneSet, TickRef, ViewAugment};
+use super::{Augmentation, Moments, Offset, SampleError, SamplePoses, SceneSet, TickRef, ViewAugment};
 use crate::feature_store::MapSource;
 use crate::fusion::ViewFacts;
 use crate::targets::{Labels, TargetAssigner};
@@ -86,6 +86,8 @@ pub struct Sample {
     pub views: SampleViews,
     /// What is known of every view, the ego's pose being the identity.
     pub facts: Vec<ViewFacts>,
+    /// How far each view's pose is off by what was put on top of it.
+    pub offsets: Vec<Offset>,
     /// True boxes in the ego frame with their centre on the lattice.
     pub objects: Vec<Box3d>,
     /// Targets of those boxes.
@@ -112,6 +114,8 @@ struct Entry {
     place: usize,
     tick: usize,
     world_from_cav: Pose,
+    /// The same without what was put on top.
+    found: Pose,
     confidence: f64,
     age_secs: f64,
 }
@@ -156,15 +160,7 @@ impl SampleBuilder {
         let scene = self.config.augmentation.scene(rng);
         let changes: Vec<ViewAugment> = entries.iter().map(|_| scene.view(rng)).collect();
         let objects = self.objects(&frames, annotators, &changes[0]);
-        let mut facts: Vec<ViewFacts> = entries
-            .iter()
-            .zip(&changes)
-            .map(|(entry, change)| {
-                let ego_from_cav = entries[0].world_from_cav.from_world(&entry.world_from_cav);
-                let ego_from_cav = changes[0].pose(&ego_from_cav, change);
-                ViewFacts { agent: entry.place, ego_from_cav, confidence: entry.confidence, age_secs: entry.age_secs }
-            })
-            .collect();
+        let (mut facts, offsets) = told(&entries, &changes);
         // Not but for the last bits: what moves nothing is known by it.
         facts[0].ego_from_cav = Pose::IDENTITY;
         let views = match &mut self.maps {
@@ -176,7 +172,7 @@ impl SampleBuilder {
             }
             None => SampleViews::Pillars(self.pillars(tick.scenario, &entries, &changes, &mut facts)?),
         };
-        Ok(Sample { views, facts, labels: self.assigner.assign(&objects), objects })
+        Ok(Sample { views, facts, offsets, labels: self.assigner.assign(&objects), objects })
     }
 
     /// Which views a sample has: the newest of every vehicle, the ego first, then older ones. Vehicles that do not know
@@ -191,7 +187,7 @@ impl SampleBuilder {
             let last = if is_ego { now.tick } else { self.config.moments.draw_newest(ticks, now.tick, rng) };
             let place = newest.len();
             for (step, tick) in self.config.moments.steps(ticks, now.tick, last, gap).into_iter().enumerate() {
-                let pose = self.pose_at(TickRef { tick, ..now }, agent, is_ego, &error)?;
+                let [found, pose] = self.pose_at(TickRef { tick, ..now }, agent, is_ego, &error)?;
                 let PoseEstimate::Pose { world_from_cav, confidence } = pose else {
                     match step {
                         0 => break,
@@ -199,7 +195,9 @@ impl SampleBuilder {
                     }
                 };
                 let age_secs = (ticks[now.tick].capture_nanos - ticks[tick].capture_nanos) as f64 * 1e-9;
-                let entry = Entry { agent, place, tick, world_from_cav, confidence: f64::from(confidence), age_secs };
+                let found = found.world_from_cav().copied().unwrap_or(world_from_cav);
+                let confidence = f64::from(confidence);
+                let entry = Entry { agent, place, tick, world_from_cav, found, confidence, age_secs };
                 if step == 0 { newest.push(entry) } else { older.push(entry) }
             }
             if is_ego && newest.is_empty() {
@@ -209,6 +207,7 @@ impl SampleBuilder {
                     place,
                     tick: now.tick,
                     world_from_cav,
+                    found: world_from_cav,
                     confidence: 0.0,
                     age_secs: 0.0,
                 }]);
@@ -218,17 +217,18 @@ impl SampleBuilder {
         Ok(newest)
     }
 
+    /// The pose that was found, and the same with what is put on top.
     fn pose_at(
         &self,
         tick: TickRef,
         agent: usize,
         is_ego: bool,
         error: &DrawnError,
-    ) -> Result<PoseEstimate, SampleError> {
+    ) -> Result<[PoseEstimate; 2], SampleError> {
         let frames = self.scenes.annotations(tick)?;
         let frame = &frames[agent];
         let found = self.config.poses.found(&self.scenes.scenario(tick).name, frame)?;
-        Ok(error.added(found, &frame.cav, frame.capture_nanos, is_ego))
+        Ok([found, error.added(found, &frame.cav, frame.capture_nanos, is_ego)])
     }
 
     /// The pillars of all views; of one view where all points are merged.
@@ -300,6 +300,18 @@ impl SampleBuilder {
         let merged = ground_truth::merge(&views, 0, &rule);
         merged.iter().map(|(_, object)| ego_view.box3d(object)).filter(on_lattice).collect()
     }
+}
+
+/// What is told of the views, and how far that is off; both after the changes of the scene.
+fn told(entries: &[Entry], changes: &[ViewAugment]) -> (Vec<ViewFacts>, Vec<Offset>) {
+    let relative = |ego: &Pose, cav: &Pose, change: &ViewAugment| changes[0].pose(&ego.from_world(cav), change);
+    let of_entry = |(entry, change): (&Entry, &ViewAugment)| {
+        let Entry { place: agent, confidence, age_secs, .. } = *entry;
+        let ego_from_cav = relative(&entries[0].world_from_cav, &entry.world_from_cav, change);
+        let real = relative(&entries[0].found, &entry.found, change);
+        (ViewFacts { agent, ego_from_cav, confidence, age_secs }, Offset::between(&ego_from_cav, &real))
+    };
+    entries.iter().zip(changes).map(of_entry).unzip()
 }
 
 /// The points of several sweeps in the frame of the ego.

@@ -1,6 +1,5 @@
 //! Samples in batches, in the order of a training.
 
-use agent::head::HeadOutput;
 use agent::pillar_batch::{PillarBatch, PillarLattice};
 use agent::training::{Prefetch, RunConfig};
 use rand::SeedableRng;
@@ -8,9 +7,9 @@ use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
 use tch::Tensor;
 
-use super::{Sample, SampleBuilder, SampleError, SampleViews, TickRef};
+use super::{Offset, Sample, SampleBuilder, SampleError, SampleViews, TickRef};
 use crate::fusion::ViewFacts;
-use crate::model::{CooperativeModel, ModelError};
+use crate::model::{CooperativeModel, CooperativeOutput, ModelError};
 use crate::targets::Labels;
 
 /// The views of all samples of a batch.
@@ -29,6 +28,8 @@ pub struct Batch {
     pub views: BatchViews,
     /// What is known of the views of each sample, ego first.
     pub facts: Vec<Vec<ViewFacts>>,
+    /// How far the poses of the views of each sample are off, by what was put on top of them.
+    pub offsets: Vec<Vec<Offset>>,
     /// Targets of each sample.
     pub labels: Vec<Labels>,
 }
@@ -51,15 +52,20 @@ impl Batch {
         } else {
             BatchViews::Maps(Tensor::f_cat(&maps, 0)?)
         };
-        let (facts, labels) = samples.into_iter().map(|sample| (sample.facts, sample.labels)).unzip();
-        Ok(Self { views, facts, labels })
+        let mut batch = Self { views, facts: Vec::new(), offsets: Vec::new(), labels: Vec::new() };
+        for sample in samples {
+            batch.facts.push(sample.facts);
+            batch.offsets.push(sample.offsets);
+            batch.labels.push(sample.labels);
+        }
+        Ok(batch)
     }
 
     /// The output of a model for all samples.
     ///
     /// # Errors
     /// [`ModelError`] when facts and views do not add up.
-    pub fn output(&self, model: &CooperativeModel, train: bool) -> Result<HeadOutput, ModelError> {
+    pub fn output(&self, model: &CooperativeModel, train: bool) -> Result<CooperativeOutput, ModelError> {
         match &self.views {
             BatchViews::Pillars(pillars) => model.forward(&pillars.to_device(model.device()), &self.facts, train),
             BatchViews::Maps(maps) => {

@@ -14,7 +14,7 @@ pub use augment::{Augmentation, SceneAugment, ViewAugment};
 pub use builder::{Sample, SampleBuilder, SampleConfig, SampleKind, SampleViews, merge_points};
 pub use loader::{Batch, BatchViews, batches};
 pub use moments::Moments;
-pub use poses::SamplePoses;
+pub use poses::{Offset, SamplePoses};
 pub use scenes::{SceneSet, TickRef};
 
 use agent::pose_source::PoseSourceError;

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 
 use agent::pose_source::{NoiseMode, NoisyPose, NoisyPoseConfig, PoseSourceError, PoseTable};
-use protocol::{CavId, PoseEstimate};
+use protocol::{CavId, Pose, PoseEstimate};
 use rand::Rng;
 use sim_replay::frame::Frame;
 
@@ -60,6 +60,21 @@ impl SamplePoses {
     }
 }
 
+/// What would bring a map that was moved by a wrong pose to its place: a shift along x and y of the ego, metres, and a turn
+/// about the map's sender, radians.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Offset(pub [f64; 3]);
+
+impl Offset {
+    /// The offset between where a sender was said to be and where it is, both in the ego frame.
+    #[must_use]
+    pub fn between(said: &Pose, real: &Pose) -> Self {
+        let along = |axis: usize| real.translation_m[axis] - said.translation_m[axis];
+        let turn_rad = real.yaw_rad() - said.yaw_rad();
+        Self([along(0), along(1), turn_rad.sin().atan2(turn_rad.cos())])
+    }
+}
+
 /// The error of the poses of one sample.
 #[derive(Debug, Default)]
 pub(super) struct DrawnError {
@@ -88,7 +103,6 @@ impl DrawnError {
 
 #[cfg(test)]
 mod tests {
-    use protocol::Pose;
     use rand::SeedableRng;
     use rand_chacha::ChaCha8Rng;
 
@@ -112,6 +126,16 @@ mod tests {
         let [x, y, z] = world_from_cav.translation_m;
         let square = x * x + y * y + z * z;
         assert!((f64::from(confidence) - 0.8 / (1.0 + square)).abs() < 1e-5);
+    }
+
+    #[test]
+    fn an_offset_brings_a_map_back() {
+        let real = Pose::from_xyz_yaw([20.0, -5.0, 0.0], 3.1);
+        let said = Pose::from_xyz_yaw([21.0, -5.5, 0.0], -3.1);
+        let Offset([dx, dy, turn_rad]) = Offset::between(&said, &real);
+        assert!((dx + 1.0).abs() < 1e-9 && (dy - 0.5).abs() < 1e-9);
+        assert!((turn_rad - (6.2 - std::f64::consts::TAU)).abs() < 1e-9, "{turn_rad}");
+        assert_eq!(Offset::between(&real, &real), Offset::default());
     }
 
     #[test]

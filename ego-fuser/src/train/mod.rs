@@ -22,7 +22,7 @@ pub use observer::{Observer, StepReport, Summary};
 pub use validation::{Accuracy, Validator};
 
 use self::curve::DetectorCurve;
-use crate::loss::{LabelTensors, detection_loss};
+use crate::loss::{LabelTensors, alignment_loss, detection_loss};
 use crate::method::{Exchange, Method};
 use crate::model::{CooperativeModel, ModelError};
 use crate::samples::{Batch, SampleBuilder, SampleConfig, SampleError, SampleKind, SceneSet, batches};
@@ -129,9 +129,13 @@ impl<'a> Training<'a> {
         let device = self.config.run.device;
         let labels = LabelTensors::gather(&batch.labels, self.config.loss.unassigned, device);
         let output = batch.output(&self.model, true)?;
-        let loss = detection_loss(&output.scores, &output.offsets, &labels, &self.config.loss)?;
+        let loss = detection_loss(&output.head.scores, &output.head.offsets, &labels, &self.config.loss)?;
         let share_done = self.share_done();
-        Ok(match self.trainer.step(&loss.total(), share_done)? {
+        let total = match self.config.loss.alignment_weight {
+            weight if weight > 0.0 => loss.total() + alignment_loss(&output.corrections, &batch.offsets)? * weight,
+            _ => loss.total(),
+        };
+        Ok(match self.trainer.step(&total, share_done)? {
             true => Some([loss.score.f_double_value(&[])?, loss.boxes.f_double_value(&[])?]),
             false => None,
         })

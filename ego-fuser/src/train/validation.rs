@@ -92,7 +92,7 @@ impl Validator {
             let objects: Vec<_> = sample.objects.iter().filter(inside).copied().collect();
             let batch = Batch::collate(vec![sample], model.network().lattice())?;
             let output = no_grad(|| batch.output(model, false))?;
-            for detections in model.detections(&output, &limits)? {
+            for detections in model.detections(&output.head, &limits)? {
                 scorer.add(&detections, &objects);
             }
         }

@@ -5,57 +5,74 @@ use tch::nn::{self, Init, Module};
 use tch::{Kind, TchError, Tensor};
 
 use super::config::FsaConfig;
+use super::correlation::{PARTS, correlate, peaks, shifts};
 use crate::warp::{BILINEAR, NEAREST, PADDING_ZEROS};
 
-/// Rows and columns that the last convolution is pooled to: enough to tell a turn from a shift.
-const POOLED: i64 = 4;
-/// Keeps the length of an empty token from being divided by.
+/// Keeps the weight of a map that fits nowhere from being divided by.
 const EPSILON: f64 = 1e-6;
+/// How sharply the best shift stands out before it is trained: correlations lie between -1 and 1.
+const SHARPNESS: f64 = 20.0;
+/// What is added to the lever arm of a turn, metres.
+const ARM_M: f64 = 5.0;
 
 /// The area of a padded map, metres.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Area {
     middle_m: [f64; 2],
     half_m: [f64; 2],
+    cell_m: f64,
 }
 
 impl Area {
     /// The area of `height` x `width` cells that begin where `grid` begins.
     pub(super) fn new(grid: &BevGrid, [height, width]: [i64; 2]) -> Self {
         let half_m = [width as f64 * grid.cell_m / 2.0, height as f64 * grid.cell_m / 2.0];
-        Self { middle_m: [grid.x_min_m + half_m[0], grid.y_min_m + half_m[1]], half_m }
+        Self { middle_m: [grid.x_min_m + half_m[0], grid.y_min_m + half_m[1]], half_m, cell_m: grid.cell_m }
+    }
+
+    /// `[PARTS^2, 2]`: the middles of the parts that maps are compared by, metres from the middle of the area.
+    fn middles_of_parts(&self) -> Result<Tensor, TchError> {
+        let along = |part: i64, half_m: f64| (((2 * part + 1) as f64 / PARTS as f64 - 1.0) * half_m) as f32;
+        let [half_x, half_y] = self.half_m;
+        let middles: Vec<f32> = (0..PARTS)
+            .flat_map(|row| (0..PARTS).flat_map(move |column| [along(column, half_x), along(row, half_y)]))
+            .collect();
+        Tensor::f_from_slice(&middles)?.f_view([-1, 2])
     }
 }
 
 /// Predicts `(dx, dy, theta)` of every neighbour's map from what it shows and what the ego shows, and how much its pose
-/// is trusted. The detection loss alone teaches it.
+/// is trusted: convolutions make both comparable, the shifts at which they fit best, part by part of the lattice, go
+/// through fully connected layers.
 #[derive(Debug)]
 pub(super) struct SpatialAlignment {
     config: FsaConfig,
-    matching: nn::Linear,
-    convolutions: [nn::Conv2D; 3],
+    matching: [nn::Conv2D; 2],
+    /// How sharply the best shift stands out, its logarithm.
+    sharpness: Tensor,
     hidden: nn::Linear,
     delta: nn::Linear,
+    /// `[3]`: how much of the rigid motion that fits the parts' shifts is taken as it is.
+    gain: Tensor,
 }
 
 impl SpatialAlignment {
     /// Moves nothing before it is trained.
-    pub(super) fn new(path: &nn::Path<'_>, dim: i64, config: &FsaConfig) -> Self {
-        let FsaConfig { matching, radius, channels, .. } = *config;
-        let inputs = (2 * radius + 1).pow(2) + 2 * matching + 1;
-        let stride = |name: &str, from, to, stride| {
-            nn::conv2d(path / name, from, to, 3, nn::ConvConfig { stride, padding: 1, ..Default::default() })
-        };
+    pub(super) fn new(path: &nn::Path<'_>, channels: i64, config: &FsaConfig) -> Self {
+        let FsaConfig { matching, hidden, .. } = *config;
         let still = nn::LinearConfig { ws_init: Init::Const(0.0), bs_init: Some(Init::Const(0.0)), bias: true };
+        let around = nn::ConvConfig { padding: 1, ..Default::default() };
+        // Of each part the shift along x and y and how well it fits; the same of the whole; the motion; the share of trust.
+        let inputs = 3 * (PARTS * PARTS + 1) + 3 + 1;
         Self {
-            matching: nn::linear(path / "matching", dim, matching, nn::LinearConfig::default()),
-            convolutions: [
-                stride("conv0", inputs, channels, 2),
-                stride("conv1", channels, channels, 2),
-                stride("conv2", channels, 2 * channels, 1),
+            matching: [
+                nn::conv2d(path / "matching0", channels, matching, 1, nn::ConvConfig::default()),
+                nn::conv2d(path / "matching1", matching, matching, 3, around),
             ],
-            hidden: nn::linear(path / "hidden", 2 * channels * POOLED * POOLED, 64, nn::LinearConfig::default()),
-            delta: nn::linear(path / "delta", 64, 3, still),
+            sharpness: path.var("sharpness", &[], Init::Const(SHARPNESS.ln())),
+            hidden: nn::linear(path / "hidden", inputs, hidden, nn::LinearConfig::default()),
+            delta: nn::linear(path / "delta", hidden, 3, still),
+            gain: path.var("gain", &[3], Init::Const(0.0)),
             config: config.clone(),
         }
     }
@@ -63,46 +80,79 @@ impl SpatialAlignment {
     /// `[N - 1, 3]`: shift along x and y in metres, turn in radians, of every entry but the first.
     ///
     /// # Shapes
-    /// - `tokens`: `[N, h, w, D]`, the ego's newest map first
-    /// - `valid`: `[N, h, w]`, 1 where a token shows something
+    /// - `maps`: `[N, C, H, W]`, the ego's newest first
+    /// - `mask`: `[N, 1, H, W]`, 1 where a map shows something
     /// - `shares`: `[N]`, the confidence embedding
-    pub(super) fn deltas(&self, tokens: &Tensor, valid: &Tensor, shares: &Tensor) -> Result<Tensor, TchError> {
-        let (entries, height, width, _) = tokens.size4()?;
-        let matching = self.matching.forward(tokens).f_permute([0, 3, 1, 2])?;
-        let valid = valid.f_unsqueeze(1)?;
-        let length = matching.f_square()?.f_sum_dim_intlist([1_i64].as_slice(), true, None)?.f_add_scalar(EPSILON)?;
-        let matching = (matching * length.f_rsqrt()? * &valid).f_contiguous()?;
-        let (ego, others) = (matching.f_narrow(0, 0, 1)?, matching.f_narrow(0, 1, entries - 1)?);
-        let share = shares.f_narrow(0, 1, entries - 1)?.f_view([-1, 1, 1, 1])?;
-        let mut inputs = self.likeness(&ego, &others)?;
-        inputs.push(ego.f_expand([entries - 1, -1, -1, -1], false)?);
-        inputs.push(others);
-        inputs.push(share.f_expand([entries - 1, 1, height, width], false)? * valid.f_narrow(0, 1, entries - 1)?);
-        let mut map = Tensor::f_cat(&inputs, 1)?;
-        for convolution in &self.convolutions {
-            map = convolution.forward(&map).f_relu()?;
-        }
-        let pooled = map.f_adaptive_avg_pool2d([POOLED, POOLED])?.f_flatten(1, -1)?;
+    /// - `ego_from_cav`: `N` poses of the maps' senders
+    pub(super) fn deltas(
+        &self,
+        maps: &Tensor,
+        mask: &Tensor,
+        shares: &Tensor,
+        ego_from_cav: &[Pose],
+        area: &Area,
+    ) -> Result<Tensor, TchError> {
+        let entries = maps.size4()?.0;
+        let shown = self.shown(maps, mask)?;
+        let (ego, others) = (shown.f_narrow(0, 0, 1)?, shown.f_narrow(0, 1, entries - 1)?);
+        let found = correlate(&ego, &others, self.config.radius)?;
+        let shifts = (shifts(self.config.radius)? * area.cell_m).f_to_device(maps.device())?;
+        let sharpness = self.sharpness.f_exp()?;
+        let parts = peaks(&found.parts, &sharpness, &shifts)?;
+        let whole = peaks(&found.whole, &sharpness, &shifts)?;
+        let [fit, fit_whole] = [&found.parts, &found.whole].map(|found| found.f_amax([-1_i64].as_slice(), false));
+        let (fit, fit_whole) = (fit?, fit_whole?);
+        let weight = fit.f_relu()?.f_square()? * &found.energy;
+        let motion = rigid_motion(&parts, &weight, ego_from_cav, area)?;
+        let by_entry = |parts: Tensor| parts.f_transpose(0, 1)?.f_reshape([entries - 1, -1]);
+        let share = shares.f_narrow(0, 1, entries - 1)?.f_unsqueeze(1)?;
+        let inputs =
+            [by_entry(parts)?, by_entry(fit)?, whole, fit_whole.f_unsqueeze(1)?, motion.shallow_clone(), share];
+        let learnt = self.delta.forward(&self.hidden.forward(&Tensor::f_cat(&inputs, 1)?).f_relu()?);
         let FsaConfig { max_shift_m, max_turn_rad, .. } = self.config;
         let bounds = Tensor::f_from_slice(&[max_shift_m as f32, max_shift_m as f32, max_turn_rad as f32])?;
-        let raw = self.delta.forward(&self.hidden.forward(&pooled).f_relu()?);
-        Ok(raw.f_tanh()? * bounds.f_to_device(tokens.device())?)
+        let bounds = bounds.f_to_device(maps.device())?;
+        let raw = learnt + motion / &bounds * &self.gain;
+        Ok(raw.f_tanh()? * bounds)
     }
 
-    /// How alike the tokens of others are to the ego's some tokens away: `[N - 1, 1, h, w]` for every such step.
-    fn likeness(&self, ego: &Tensor, others: &Tensor) -> Result<Vec<Tensor>, TchError> {
-        let (_, _, height, width) = ego.size4()?;
-        let radius = self.config.radius;
-        let around = ego.f_constant_pad_nd([radius; 4])?;
-        let mut likeness = Vec::new();
-        for row in 0..=2 * radius {
-            for column in 0..=2 * radius {
-                let moved = around.f_narrow(2, row, height)?.f_narrow(3, column, width)?;
-                likeness.push((others * moved).f_sum_dim_intlist([1_i64].as_slice(), true, None)?);
-            }
-        }
-        Ok(likeness)
+    /// What is compared, `[N, M, H, W]`: zero in the mean of what a map shows, so that empty road fits nothing.
+    fn shown(&self, maps: &Tensor, mask: &Tensor) -> Result<Tensor, TchError> {
+        let [cell, around] = &self.matching;
+        let shown = around.forward(&cell.forward(maps).f_relu()?);
+        let over_map = |tensor: &Tensor| tensor.f_sum_dim_intlist([2_i64, 3].as_slice(), true, None);
+        let mean = over_map(&(&shown * mask))? / over_map(mask)?.f_clamp_min(1.0)?;
+        Ok((shown - mean) * mask)
     }
+}
+
+/// The motion that fits the shifts of the parts best, `[N, 3]`: a shift, metres, after a small turn about the sender, radians.
+///
+/// # Shapes
+/// - `parts`: `[PARTS^2, N, 2]` shifts, metres
+/// - `weight`: `[PARTS^2, N]` how sure each of them is
+fn rigid_motion(parts: &Tensor, weight: &Tensor, ego_from_cav: &[Pose], area: &Area) -> Result<Tensor, TchError> {
+    let over_parts = |tensor: &Tensor| tensor.f_sum_dim_intlist([0_i64].as_slice(), false, None);
+    let share = weight / over_parts(weight)?.f_add_scalar(EPSILON)?;
+    let share = share.f_unsqueeze(2)?;
+    // Middles of the parts, from the middle of the lattice.
+    let middles = area.middles_of_parts()?.f_to_device(parts.device())?.f_unsqueeze(1)?;
+    let (mean, middle) = (over_parts(&(parts * &share))?, over_parts(&(&middles * &share))?);
+    let (shift, arm) = (parts - mean.f_unsqueeze(0)?, &middles - middle.f_unsqueeze(0)?);
+    let column = |tensor: &Tensor, axis: i64| tensor.f_narrow(2, axis, 1);
+    let turning = column(&arm, 0)? * column(&shift, 1)? - column(&arm, 1)? * column(&shift, 0)?;
+    let inertia = over_parts(&(arm.f_square()?.f_sum_dim_intlist([2_i64].as_slice(), true, None)? * &share))?;
+    // A single part says nothing of a turn: a few metres keep that from being divided by.
+    let turn = over_parts(&(turning * &share))? / inertia.f_add_scalar(ARM_M * ARM_M)?;
+    let senders: Vec<f32> = ego_from_cav[1..]
+        .iter()
+        .flat_map(|pose| [0, 1].map(|axis| (pose.translation_m[axis] - area.middle_m[axis]) as f32))
+        .collect();
+    let senders = Tensor::f_from_slice(&senders)?.f_view([-1, 2])?.f_to_device(parts.device())?;
+    let to_sender = senders - middle;
+    // The middle of what was seen moves by `mean`; a turn moves the sender beside it.
+    let across = Tensor::f_cat(&[-(to_sender.f_narrow(1, 1, 1)?), to_sender.f_narrow(1, 0, 1)?], 1)?;
+    Tensor::f_cat(&[mean + across * &turn, turn], 1)
 }
 
 /// Where the cells of the ego's lattice lie on maps that are moved by `deltas`, for `grid_sampler`: `[N, H, W, 2]`.
@@ -160,14 +210,14 @@ mod tests {
     #[test]
     fn untrained_it_moves_nothing_and_gradients_reach_it() {
         let variables = VarStore::new(Device::Cpu);
-        let fsa = SpatialAlignment::new(&variables.root(), 8, &FsaConfig::default());
-        let tokens = Tensor::randn([3, 16, 32, 8], FLOAT);
-        let valid = Tensor::ones([3, 16, 32], FLOAT);
-        let deltas = fsa.deltas(&tokens, &valid, &Tensor::from_slice(&[0.5f32, 0.25, 0.25])).unwrap();
+        let fsa = SpatialAlignment::new(&variables.root(), 4, &FsaConfig::default());
+        let poses = [Pose::IDENTITY, Pose::from_xyz_yaw([3.0, 1.0, 0.0], 0.3), Pose::IDENTITY];
+        let (maps, mask) = (Tensor::randn([3, 4, 16, 32], FLOAT), Tensor::ones([3, 1, 16, 32], FLOAT));
+        let shares = Tensor::from_slice(&[0.5f32, 0.25, 0.25]);
+        let deltas = fsa.deltas(&maps, &mask, &shares, &poses, &area()).unwrap();
         assert_eq!(deltas, Tensor::zeros([2, 3], FLOAT));
         let maps = Tensor::randn([2, 4, 16, 32], FLOAT);
-        let poses = [Pose::from_xyz_yaw([3.0, 1.0, 0.0], 0.3), Pose::IDENTITY];
-        let lattice = lattice(&deltas, &poses, &area(), [16, 32]).unwrap();
+        let lattice = lattice(&deltas, &poses[1..], &area(), [16, 32]).unwrap();
         let (same, valid) = resample(&maps, &Tensor::ones([2, 1, 16, 32], FLOAT), &lattice).unwrap();
         assert!(same.allclose(&maps, 1e-4, 1e-4, false));
         assert_eq!(valid.min().double_value(&[]), 1.0);
@@ -201,11 +251,37 @@ mod tests {
     fn the_shift_is_bounded_whatever_is_learnt() {
         let variables = VarStore::new(Device::Cpu);
         let config = FsaConfig::default();
-        let fsa = SpatialAlignment::new(&variables.root(), 8, &config);
+        let fsa = SpatialAlignment::new(&variables.root(), 4, &config);
         let _ = tch::no_grad(|| variables.variables()["delta.bias"].shallow_clone().fill_(1e6));
+        let (maps, mask) = (Tensor::randn([2, 4, 16, 32], FLOAT), Tensor::ones([2, 1, 16, 32], FLOAT));
         let shares = Tensor::from_slice(&[0.5f32, 0.5]);
-        let deltas = fsa.deltas(&Tensor::randn([2, 8, 8, 8], FLOAT), &Tensor::ones([2, 8, 8], FLOAT), &shares).unwrap();
+        let deltas = fsa.deltas(&maps, &mask, &shares, &[Pose::IDENTITY; 2], &area()).unwrap();
         let found = Vec::<f32>::try_from(deltas.view(-1)).unwrap();
         assert!((found[0] - 3.0).abs() < 1e-6 && (f64::from(found[2]) - config.max_turn_rad).abs() < 1e-6);
+    }
+
+    #[test]
+    fn shifts_of_parts_make_the_motion_that_a_wrong_pose_needs() {
+        let sender = Pose::from_xyz_yaw([3.0, -1.0, 0.0], 0.4);
+        let (turn, shift) = (0.02_f64, [0.7, -0.3]);
+        let middles = area().middles_of_parts().unwrap();
+        // Each part moves by the shift, and by the turn about the sender.
+        let parts: Vec<f32> = (0..PARTS * PARTS)
+            .flat_map(|part| {
+                let [x, y] = [0, 1].map(|axis| {
+                    middles.double_value(&[part, axis]) + area().middle_m[axis as usize]
+                        - sender.translation_m[axis as usize]
+                });
+                [(shift[0] - turn * y) as f32, (shift[1] + turn * x) as f32]
+            })
+            .collect();
+        let parts = Tensor::from_slice(&parts).view([-1, 1, 2]);
+        let wide = Area { cell_m: 0.5, ..area() };
+        let motion =
+            rigid_motion(&parts, &Tensor::ones([PARTS * PARTS, 1], FLOAT), &[Pose::IDENTITY, sender], &wide).unwrap();
+        let [dx, dy, theta] = [0, 1, 2].map(|index| motion.double_value(&[0, index]));
+        // The turn comes out smaller by the arm that is added, and the shift by what that turn moves the sender.
+        assert!(theta > 0.4 * turn && theta <= turn, "{theta}");
+        assert!((dx - shift[0]).abs() < 0.05 && (dy - shift[1]).abs() < 0.05, "{dx} {dy}");
     }
 }

@@ -3,6 +3,8 @@
 use agent::model_config::ConfigError;
 use serde::{Deserialize, Serialize};
 
+use super::correlation::PARTS;
+
 /// Which tokens ask in the attention over agents and time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -40,10 +42,10 @@ pub enum Part {
 pub struct FsaConfig {
     /// Channels that maps are compared in.
     pub matching: i64,
-    /// Tokens are compared with those of the ego up to so many tokens away, along x and along y.
+    /// Cells are compared with those of the ego up to so many cells away, along x and along y.
     pub radius: i64,
-    /// Channels of the convolutions.
-    pub channels: i64,
+    /// Neurons of the fully connected layer.
+    pub hidden: i64,
     /// Largest shift along x or y, metres.
     pub max_shift_m: f64,
     /// Largest turn, radians.
@@ -52,7 +54,7 @@ pub struct FsaConfig {
 
 impl Default for FsaConfig {
     fn default() -> Self {
-        Self { matching: 8, radius: 2, channels: 16, max_shift_m: 3.0, max_turn_rad: 5.0_f64.to_radians() }
+        Self { matching: 4, radius: 4, hidden: 64, max_shift_m: 3.0, max_turn_rad: 5.0_f64.to_radians() }
     }
 }
 
@@ -76,6 +78,9 @@ pub struct PastatConfig {
     pub windows: Vec<i64>,
     /// Which tokens ask.
     pub rows: Rows,
+    /// Channels inside the two convolutions that sharpen the fused map; absent: there are none.
+    #[serde(default)]
+    pub refine: Option<i64>,
     /// Time steps wanted of every agent, the T of the paper.
     pub frames: usize,
     /// Time from one step to the next that the temporal encoding counts in, seconds.
@@ -101,6 +106,7 @@ impl PastatConfig {
             mlp_ratio: 2,
             windows: vec![4, 8],
             rows: Rows::Ego,
+            refine: Some(32),
             frames: 3,
             frame_secs: 0.1,
             ce: true,
@@ -119,7 +125,8 @@ impl PastatConfig {
             depth: 3,
             windows: vec![4, 8],
             rows: Rows::All,
-            fsa: Some(FsaConfig { matching: 16, radius: 3, channels: 32, ..FsaConfig::default() }),
+            refine: Some(channels),
+            fsa: Some(FsaConfig { matching: 16, ..FsaConfig::default() }),
             ..Self::lean(channels)
         }
     }
@@ -137,10 +144,12 @@ impl PastatConfig {
         self
     }
 
-    /// Maps are padded to multiples of this many cells, so that tokens fill every window.
+    /// Maps are padded to multiples of this many cells, so that tokens fill every window and cells every part that FSA
+    /// compares.
     #[must_use]
     pub fn padding_cells(&self) -> i64 {
-        self.patch * self.windows.iter().copied().fold(1, lcm)
+        let parts = if self.fsa.is_some() { PARTS } else { 1 };
+        lcm(self.patch * self.windows.iter().copied().fold(1, lcm), parts)
     }
 
     /// Checks that a module can be built.
@@ -156,6 +165,7 @@ impl PastatConfig {
             ("pastat heads", self.heads, 64),
             ("pastat mlp_ratio", self.mlp_ratio, 16),
             ("pastat depth", i64::try_from(self.depth).unwrap_or(i64::MAX), 32),
+            ("pastat refine", self.refine.unwrap_or(1), 4096),
             ("pastat frames", i64::try_from(self.frames).unwrap_or(i64::MAX), 16),
         ] {
             if !(1..=most).contains(&value) {
@@ -180,11 +190,15 @@ impl PastatConfig {
 impl FsaConfig {
     fn validate(&self) -> Result<(), ConfigError> {
         let error = |field, value: String, must| Err(ConfigError::Value { field, value, must });
-        if !(1..=256).contains(&self.matching) || !(1..=256).contains(&self.channels) {
-            return error("pastat fsa channels", format!("{}, {}", self.matching, self.channels), "1 to 256");
+        if !(1..=256).contains(&self.matching) || !(1..=4096).contains(&self.hidden) {
+            return error(
+                "pastat fsa channels",
+                format!("{}, {}", self.matching, self.hidden),
+                "1 to 256 and 1 to 4096",
+            );
         }
         if !(0..=8).contains(&self.radius) {
-            return error("pastat fsa radius", self.radius.to_string(), "0 to 8 tokens");
+            return error("pastat fsa radius", self.radius.to_string(), "0 to 8 cells");
         }
         if !(0.0..=50.0).contains(&self.max_shift_m) || !(0.0..=1.6).contains(&self.max_turn_rad) {
             let value = format!("{} m, {} rad", self.max_shift_m, self.max_turn_rad);

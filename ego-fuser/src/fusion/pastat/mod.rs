@@ -13,6 +13,7 @@ mod attention;
 mod block;
 mod confidence;
 mod config;
+mod correlation;
 mod temporal;
 mod tokens;
 
@@ -25,7 +26,7 @@ pub use config::{FsaConfig, Part, PastatConfig, Rows, Wavelengths};
 use self::alignment::{Area, SpatialAlignment, lattice, resample};
 use self::block::Block;
 use self::confidence::{shares, steps_back};
-use self::tokens::{Decoder, Tokeniser, TrustGate, padded};
+use self::tokens::{Decoder, Refiner, Tokeniser, TrustGate, padded};
 use super::{AlignedViews, Fusion, ViewFacts};
 
 /// PASTAT between encoder and head.
@@ -37,6 +38,7 @@ pub struct Pastat {
     blocks: Vec<Block>,
     gate: TrustGate,
     decoder: Decoder,
+    refiner: Option<Refiner>,
 }
 
 /// What is told of the entries that show anything, by property.
@@ -74,6 +76,8 @@ struct Entries {
     tokens: Tensor,
     /// `[N, h, w]`.
     valid: Tensor,
+    /// `[N - 1, 3]`: how FSA has moved all but the ego's newest.
+    deltas: Option<Tensor>,
 }
 
 impl Pastat {
@@ -83,13 +87,14 @@ impl Pastat {
     /// [`ConfigError`] when it cannot be built.
     pub fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Result<Self, ConfigError> {
         config.validate()?;
-        let alignment = |fsa| SpatialAlignment::new(&(path / "fsa"), config.dim, fsa);
+        let alignment = |fsa| SpatialAlignment::new(&(path / "fsa"), config.channels, fsa);
         Ok(Self {
             tokeniser: Tokeniser::new(path, config),
             alignment: config.fsa.as_ref().map(alignment),
             blocks: (0..config.depth).map(|index| Block::new(&(path / "blocks" / index), config)).collect(),
             gate: TrustGate::new(&(path / "gate"), config),
             decoder: Decoder::new(&(path / "decoder"), config),
+            refiner: config.refine.map(|hidden| Refiner::new(&(path / "refine"), config.channels, hidden)),
             config: config.clone(),
         })
     }
@@ -102,50 +107,20 @@ impl Pastat {
         let shares = Tensor::f_from_slice(&told.shares)?.f_to_device(maps.device())?;
         let tokens = self.tokeniser.forward(&maps, &shares, &told.age_secs)?;
         let valid = self.tokeniser.valid(&mask)?;
-        let entries =
-            Entries { newest: pick(&maps, &told.newest)?, newest_valid: pick(&mask, &told.newest)?, tokens, valid };
-        match &self.alignment {
-            Some(alignment) if told.age_secs.len() > 1 => self.move_by(alignment, told, entries, &shares, grid),
-            _ => Ok(entries),
+        let deltas = match &self.alignment {
+            Some(alignment) if told.age_secs.len() > 1 => {
+                let (_, _, height, width) = maps.size4()?;
+                let area = Area::new(grid, [height, width]);
+                Some((alignment.deltas(&maps, &mask, &shares, &told.ego_from_cav, &area)?, area))
+            }
+            _ => None,
+        };
+        let (newest, newest_valid) = (pick(&maps, &told.newest)?, pick(&mask, &told.newest)?);
+        let entries = Entries { newest, newest_valid, tokens, valid, deltas: None };
+        match deltas {
+            Some((deltas, area)) => moved(told, entries, deltas, &area),
+            None => Ok(entries),
         }
-    }
-
-    /// FSA: every entry but the ego's newest, its tokens and where it is a newest map the map itself, is moved.
-    fn move_by(
-        &self,
-        alignment: &SpatialAlignment,
-        told: &Told,
-        entries: Entries,
-        shares: &Tensor,
-        grid: &BevGrid,
-    ) -> Result<Entries, TchError> {
-        let Entries { newest: maps, newest_valid, tokens, valid } = entries;
-        let (_, _, height, width) = maps.size4()?;
-        let (count, rows, columns, _) = tokens.size4()?;
-        let area = Area::new(grid, [height, width]);
-        let deltas = alignment.deltas(&tokens, &valid, shares)?;
-        let after_first = |tensor: &Tensor| tensor.f_narrow(0, 1, tensor.size()[0] - 1);
-        let with_first = |first: &Tensor, moved: &Tensor| Tensor::f_cat(&[&first.f_narrow(0, 0, 1)?, moved], 0);
-
-        let places = lattice(&deltas, &told.ego_from_cav[1..], &area, [rows, columns])?;
-        let by_channel = after_first(&tokens)?.f_permute([0, 3, 1, 2])?.f_contiguous()?;
-        let (moved, moved_valid) = resample(&by_channel, &after_first(&valid)?.f_unsqueeze(1)?, &places)?;
-        let tokens = with_first(&tokens, &moved.f_permute([0, 2, 3, 1])?.f_contiguous()?)?;
-        let valid = with_first(&valid, &moved_valid.f_view([count - 1, rows, columns])?)?;
-        if told.newest.len() == 1 {
-            return Ok(Entries { newest: maps, newest_valid, tokens, valid });
-        }
-        // Entry 0 is the ego's newest; deltas begin with entry 1.
-        let others: Vec<i64> = told.newest[1..].iter().map(|entry| entry - 1).collect();
-        let poses: Vec<Pose> = others.iter().map(|&entry| told.ego_from_cav[entry as usize + 1]).collect();
-        let places = lattice(&pick(&deltas, &others)?, &poses, &area, [height, width])?;
-        let (moved, moved_valid) = resample(&after_first(&maps)?, &after_first(&newest_valid)?, &places)?;
-        Ok(Entries {
-            newest: with_first(&maps, &moved)?,
-            newest_valid: with_first(&newest_valid, &moved_valid)?,
-            tokens,
-            valid,
-        })
     }
 
     /// The ego's tokens `[1, h, w, D]` after all blocks.
@@ -186,18 +161,24 @@ impl Pastat {
         mask: &Tensor,
         facts: &[ViewFacts],
         grid: &BevGrid,
-    ) -> Result<Tensor, TchError> {
+    ) -> Result<(Tensor, Option<Tensor>), TchError> {
         let (_, _, height, width) = maps.size4()?;
         let told = Told::new(facts);
         let entries = self.align(maps, mask, &told, grid)?;
         let ego = self.transform(&entries)?;
         let fused = self.strongest(&entries, &ego, &told.newest)? + self.decoder.forward(&ego)?;
-        fused.f_narrow(1, 0, height)?.f_narrow(2, 0, width)?.f_to_kind(maps.kind())
+        let fused =
+            self.refiner.as_ref().map_or_else(|| Ok(fused.shallow_clone()), |refiner| refiner.forward(&fused))?;
+        Ok((fused.f_narrow(1, 0, height)?.f_narrow(2, 0, width)?.f_to_kind(maps.kind())?, entries.deltas))
     }
 }
 
 impl Fusion for Pastat {
-    fn fuse(&self, views: &AlignedViews<'_>, _train: bool) -> Result<Tensor, TchError> {
+    fn fuse(&self, views: &AlignedViews<'_>, train: bool) -> Result<Tensor, TchError> {
+        Ok(self.fuse_and_correct(views, train)?.0)
+    }
+
+    fn fuse_and_correct(&self, views: &AlignedViews<'_>, _train: bool) -> Result<(Tensor, Option<Tensor>), TchError> {
         let AlignedViews { features, mask, grid, facts, .. } = views;
         // A map that nowhere reaches is no partner: it has no share of the trust either.
         let reach: Vec<f32> = Vec::try_from(mask.f_amax([1_i64, 2, 3].as_slice(), false)?.f_to_kind(Kind::Float)?)?;
@@ -206,25 +187,50 @@ impl Fusion for Pastat {
         if visible.len() == facts.len() {
             return self.fuse_visible(features, mask, facts, grid);
         }
-        let facts: Vec<ViewFacts> = visible.iter().map(|&entry| facts[entry as usize]).collect();
-        self.fuse_visible(&pick(features, &visible)?, &pick(mask, &visible)?, &facts, grid)
-    }
-
-    fn corrections(&self, views: &AlignedViews<'_>) -> Result<Option<Tensor>, TchError> {
-        let AlignedViews { features, mask, facts, .. } = views;
-        let Some(alignment) = self.alignment.as_ref().filter(|_| facts.len() > 1) else { return Ok(None) };
-        let told = Told::new(facts);
-        let shares = Tensor::f_from_slice(&told.shares)?.f_to_device(features.device())?;
-        let cells = self.config.padding_cells();
-        let tokens =
-            self.tokeniser.forward(&padded(&features.f_to_kind(Kind::Float)?, cells)?, &shares, &told.age_secs)?;
-        let valid = self.tokeniser.valid(&padded(&mask.f_to_kind(Kind::Float)?, cells)?)?;
-        Ok(Some(alignment.deltas(&tokens, &valid, &shares)?))
+        let told: Vec<ViewFacts> = visible.iter().map(|&entry| facts[entry as usize]).collect();
+        let (fused, deltas) = self.fuse_visible(&pick(features, &visible)?, &pick(mask, &visible)?, &told, grid)?;
+        // What shows nothing is not moved.
+        let still = |deltas: Tensor| {
+            let all = Tensor::f_zeros([facts.len() as i64 - 1, 3], (deltas.kind(), deltas.device()))?;
+            let places: Vec<i64> = visible[1..].iter().map(|entry| entry - 1).collect();
+            all.f_index_copy(0, &Tensor::f_from_slice(&places)?.f_to_device(deltas.device())?, &deltas)
+        };
+        Ok((fused, deltas.map(still).transpose()?))
     }
 
     fn frames(&self) -> usize {
         self.config.frames
     }
+}
+
+/// FSA: every entry but the ego's newest, its tokens and where it is a newest map the map itself, is moved by `deltas`.
+fn moved(told: &Told, entries: Entries, deltas: Tensor, area: &Area) -> Result<Entries, TchError> {
+    let Entries { newest: maps, newest_valid, tokens, valid, .. } = entries;
+    let (_, _, height, width) = maps.size4()?;
+    let (count, rows, columns, _) = tokens.size4()?;
+    let after_first = |tensor: &Tensor| tensor.f_narrow(0, 1, tensor.size()[0] - 1);
+    let with_first = |first: &Tensor, moved: &Tensor| Tensor::f_cat(&[&first.f_narrow(0, 0, 1)?, moved], 0);
+
+    let places = lattice(&deltas, &told.ego_from_cav[1..], area, [rows, columns])?;
+    let by_channel = after_first(&tokens)?.f_permute([0, 3, 1, 2])?.f_contiguous()?;
+    let (moved, moved_valid) = resample(&by_channel, &after_first(&valid)?.f_unsqueeze(1)?, &places)?;
+    let tokens = with_first(&tokens, &moved.f_permute([0, 2, 3, 1])?.f_contiguous()?)?;
+    let valid = with_first(&valid, &moved_valid.f_view([count - 1, rows, columns])?)?;
+    if told.newest.len() == 1 {
+        return Ok(Entries { newest: maps, newest_valid, tokens, valid, deltas: Some(deltas) });
+    }
+    // Entry 0 is the ego's newest; deltas begin with entry 1.
+    let others: Vec<i64> = told.newest[1..].iter().map(|entry| entry - 1).collect();
+    let poses: Vec<Pose> = others.iter().map(|&entry| told.ego_from_cav[entry as usize + 1]).collect();
+    let places = lattice(&pick(&deltas, &others)?, &poses, area, [height, width])?;
+    let (moved, moved_valid) = resample(&after_first(&maps)?, &after_first(&newest_valid)?, &places)?;
+    Ok(Entries {
+        newest: with_first(&maps, &moved)?,
+        newest_valid: with_first(&newest_valid, &moved_valid)?,
+        tokens,
+        valid,
+        deltas: Some(deltas),
+    })
 }
 
 /// Some entries of a tensor, along its first dimension.

@@ -65,7 +65,7 @@ fn trained(config: &PastatConfig) -> (VarStore, Pastat) {
     let pastat = Pastat::new(&variables.root(), config).unwrap();
     no_grad(|| {
         for (name, mut variable) in variables.variables() {
-            if name.contains("delta") || name.contains("out") || name.contains("cells") {
+            if ["delta", "out", "cells", "conv1"].iter().any(|part| name.contains(part)) {
                 let _ = variable.normal_(0.0, 0.2);
             }
         }

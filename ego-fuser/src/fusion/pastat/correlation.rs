@@ -1,0 +1,99 @@
+//! How well a neighbour's map fits the ego's when it is shifted, part by part of the lattice.
+
+use tch::{Kind, TchError, Tensor};
+
+/// Parts of the lattice along each edge: enough to tell a turn from a shift.
+pub(super) const PARTS: i64 = 4;
+/// Keeps the length of an empty part from being divided by.
+const EPSILON: f64 = 1e-6;
+
+/// How alike maps are, by shift.
+pub(super) struct Correlation {
+    /// `[PARTS^2, N, K]`: -1..1, of each part.
+    pub parts: Tensor,
+    /// `[PARTS^2, N]`: how much there is to see in both maps.
+    pub energy: Tensor,
+    /// `[N, K]`: of the whole lattice.
+    pub whole: Tensor,
+}
+
+/// The shifts in the order of [`Correlation`], `[K, 2]`: cells along x and y that lead from a cell of a neighbour's map to
+/// the cell of the ego's that it is compared with.
+pub(super) fn shifts(radius: i64) -> Result<Tensor, TchError> {
+    let steps = || -radius..=radius;
+    let all: Vec<f32> = steps().flat_map(|row| steps().flat_map(move |column| [column as f32, row as f32])).collect();
+    Tensor::f_from_slice(&all)?.f_view([-1, 2])
+}
+
+/// Compares the maps of neighbours with the ego's, moved by up to `radius` cells.
+///
+/// # Shapes
+/// - `ego`: `[1, M, H, W]`, `H` and `W` multiples of [`PARTS`]; no gradient flows into it: `others` learn the same
+/// - `others`: `[N, M, H, W]`
+pub(super) fn correlate(ego: &Tensor, others: &Tensor, radius: i64) -> Result<Correlation, TchError> {
+    let (count, channels, height, width) = others.size4()?;
+    let (rows, columns, edge) = (height / PARTS, width / PARTS, 2 * radius + 1);
+    let cells = channels * rows * columns;
+    let others = others
+        .f_reshape([count, channels, PARTS, rows, PARTS, columns])?
+        .f_permute([2, 4, 0, 1, 3, 5])?
+        .f_reshape([PARTS * PARTS, count, cells])?;
+    let around = ego.f_detach()?.f_constant_pad_nd([radius; 4])?.f_squeeze_dim(0)?;
+    // [M, H, W, edge, edge]: what lies around each cell, without a copy until it is sorted by part.
+    let windows = around.f_unfold(1, edge, 1)?.f_unfold(2, edge, 1)?;
+    let windows = windows
+        .f_reshape([channels, PARTS, rows, PARTS, columns, edge * edge])?
+        .f_permute([1, 3, 0, 2, 4, 5])?
+        .f_reshape([PARTS * PARTS, cells, edge * edge])?;
+    let products = others.f_matmul(&windows)?;
+    let own = windows.f_select(2, edge * edge / 2)?.f_square()?.f_sum_dim_intlist([1_i64].as_slice(), false, None)?;
+    let theirs = others.f_square()?.f_sum_dim_intlist([2_i64].as_slice(), false, None)?;
+    let length = |square: Tensor| square.f_add_scalar(EPSILON)?.f_sqrt();
+    let energy = length(own.f_unsqueeze(1)? * &theirs)?;
+    let whole_energy = length(own.f_sum(None::<Kind>)? * theirs.f_sum_dim_intlist([0_i64].as_slice(), false, None)?)?;
+    Ok(Correlation {
+        parts: &products / energy.f_unsqueeze(2)?,
+        whole: products.f_sum_dim_intlist([0_i64].as_slice(), false, None)? / whole_energy.f_unsqueeze(1)?,
+        energy,
+    })
+}
+
+/// The shift at which correlations `[.., K]` are highest, `[.., 2]`, as a mean weighted by `exp(sharpness * correlation)`.
+pub(super) fn peaks(correlation: &Tensor, sharpness: &Tensor, shifts: &Tensor) -> Result<Tensor, TchError> {
+    (correlation * sharpness).f_softmax(-1, None)?.f_matmul(shifts)
+}
+
+#[cfg(test)]
+mod tests {
+    use tch::Device;
+
+    use super::*;
+
+    #[test]
+    fn a_moved_map_fits_where_it_was_moved_from() {
+        tch::manual_seed(3);
+        let ego = Tensor::randn([1, 3, 16, 24], (Kind::Float, Device::Cpu));
+        // Two cells further along x, one back along y.
+        let other = ego.roll([-1, 2], [2, 3]);
+        let found = correlate(&ego, &other, 3).unwrap();
+        let shifts = shifts(3).unwrap();
+        let whole = peaks(&found.whole, &Tensor::from(60f32), &shifts).unwrap();
+        let parts = peaks(&found.parts, &Tensor::from(60f32), &shifts).unwrap();
+        let near = |found: &Tensor, place: &[i64]| {
+            let at = |axis: i64| found.double_value(&[place, &[axis]].concat());
+            (at(0) + 2.0).abs() < 0.05 && (at(1) - 1.0).abs() < 0.05
+        };
+        assert!(near(&whole, &[0]), "{whole}");
+        // Part 5 lies inside, where nothing has come around the edges.
+        assert!(near(&parts, &[5, 0]), "{parts}");
+        assert!(found.parts.abs().max().double_value(&[]) < 1.5);
+    }
+
+    #[test]
+    fn where_nothing_is_to_be_seen_nothing_fits() {
+        let options = (Kind::Float, Device::Cpu);
+        let found = correlate(&Tensor::zeros([1, 2, 8, 8], options), &Tensor::zeros([2, 2, 8, 8], options), 2).unwrap();
+        assert_eq!(found.parts.abs().max().double_value(&[]), 0.0);
+        assert_eq!(found.whole.size(), [2, 25]);
+    }
+}
