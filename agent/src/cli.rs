@@ -2,6 +2,8 @@
 
 use std::process::ExitCode;
 
+use agent::process;
+use anyhow::Context;
 use clap::{Parser, Subcommand};
 
 use crate::command;
@@ -29,12 +31,13 @@ pub(crate) struct BadInput(pub(crate) anyhow::Error);
 
 /// Runs what was asked for and prints the chain of causes where it failed.
 pub(crate) fn run(cli: Cli) -> ExitCode {
-    let outcome = match cli.command {
+    let kept = process::ensure(&process::KEPT_MEMORY).context("this program again");
+    let outcome = kept.and_then(|()| match cli.command {
         Command::Run(args) => command::run::run(&args),
         Command::Eval(args) => command::eval::run(&args),
         Command::Localize(args) => command::localize::run(&args),
         Command::Train(args) => command::train::run(&args),
-    };
+    });
     match outcome {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {

@@ -23,6 +23,7 @@ pub mod point_pillars;
 pub mod pose_error;
 pub mod pose_source;
 pub mod postprocess;
+pub mod process;
 pub mod registration;
 pub mod residual;
 pub mod rotated_iou;

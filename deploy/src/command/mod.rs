@@ -7,6 +7,7 @@ mod up;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
+use agent::process;
 use anyhow::Context;
 use deploy::evaluation::EvaluationError;
 use deploy::fleet::FleetError;
@@ -28,6 +29,7 @@ pub(crate) enum Command {
 impl Command {
     /// Does what was asked.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
+        process::ensure(&process::KEPT_MEMORY).context("this program again")?;
         match self {
             Self::Demo(arguments) => arguments.run(),
             Self::Eval(arguments) => arguments.run(),

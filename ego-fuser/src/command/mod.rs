@@ -11,6 +11,8 @@ use std::io::IsTerminal;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
+use agent::process;
+use anyhow::Context;
 use indicatif::{ProgressBar, ProgressStyle};
 use sim_replay::dataset::{self, Scenario};
 
@@ -34,6 +36,7 @@ pub(crate) enum Command {
 impl Command {
     /// Does what was asked.
     pub(crate) fn run(self) -> anyhow::Result<()> {
+        process::ensure(&process::KEPT_MEMORY).context("this program again")?;
         match self {
             Self::Align(arguments) => arguments.run(),
             Self::Methods(arguments) => arguments.run(),

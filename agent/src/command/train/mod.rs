@@ -3,9 +3,10 @@
 mod encoder;
 mod end_to_end;
 mod options;
-mod product_caches;
 mod scene;
 
+use agent::process;
+use anyhow::Context;
 use clap::Subcommand;
 
 /// Train a localizer: an encoder once, over many towns; then a head for each town.
@@ -24,7 +25,7 @@ enum Stage {
 
 /// Trains what was asked for.
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
-    product_caches::keep_few()?;
+    process::ensure(&process::FEW_PRODUCTS).context("this program again")?;
     match &args.stage {
         Stage::Encoder(args) => encoder::run(args),
         Stage::Scene(args) => scene::run(args),

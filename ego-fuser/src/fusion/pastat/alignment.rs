@@ -12,6 +12,8 @@ use crate::warp::{BILINEAR, NEAREST, PADDING_ZEROS};
 const EPSILON: f64 = 1e-6;
 /// How sharply the best shift stands out before it is trained: correlations lie between -1 and 1.
 const SHARPNESS: f64 = 20.0;
+/// Numbers that tell how much a pose is trusted.
+pub(super) const TRUST: i64 = 3;
 /// What is added to the lever arm of a turn, metres.
 const ARM_M: f64 = 5.0;
 
@@ -51,9 +53,8 @@ pub(super) struct SpatialAlignment {
     /// How sharply the best shift stands out, its logarithm.
     sharpness: Tensor,
     hidden: nn::Linear,
+    /// What is added to the motion that fits the parts' shifts, and how much of that motion is taken.
     delta: nn::Linear,
-    /// `[3]`: how much of the rigid motion that fits the parts' shifts is taken as it is.
-    gain: Tensor,
 }
 
 impl SpatialAlignment {
@@ -62,8 +63,8 @@ impl SpatialAlignment {
         let FsaConfig { matching, hidden, .. } = *config;
         let still = nn::LinearConfig { ws_init: Init::Const(0.0), bs_init: Some(Init::Const(0.0)), bias: true };
         let around = nn::ConvConfig { padding: 1, ..Default::default() };
-        // Of each part the shift along x and y and how well it fits; the same of the whole; the motion; the share of trust.
-        let inputs = 3 * (PARTS * PARTS + 1) + 3 + 1;
+        // Of each part the shift along x and y and how well it fits; the same of the whole; the motion; the trust.
+        let inputs = 3 * (PARTS * PARTS + 1) + 3 + TRUST;
         Self {
             matching: [
                 nn::conv2d(path / "matching0", channels, matching, 1, nn::ConvConfig::default()),
@@ -71,8 +72,7 @@ impl SpatialAlignment {
             ],
             sharpness: path.var("sharpness", &[], Init::Const(SHARPNESS.ln())),
             hidden: nn::linear(path / "hidden", inputs, hidden, nn::LinearConfig::default()),
-            delta: nn::linear(path / "delta", hidden, 3, still),
-            gain: path.var("gain", &[3], Init::Const(0.0)),
+            delta: nn::linear(path / "delta", hidden, 6, still),
             config: config.clone(),
         }
     }
@@ -82,13 +82,13 @@ impl SpatialAlignment {
     /// # Shapes
     /// - `maps`: `[N, C, H, W]`, the ego's newest first
     /// - `mask`: `[N, 1, H, W]`, 1 where a map shows something
-    /// - `shares`: `[N]`, the confidence embedding
+    /// - `trust`: `[N, 3]`, the confidence embedding, the confidence itself and the ego's; zeros: nothing is known
     /// - `ego_from_cav`: `N` poses of the maps' senders
     pub(super) fn deltas(
         &self,
         maps: &Tensor,
         mask: &Tensor,
-        shares: &Tensor,
+        trust: &Tensor,
         ego_from_cav: &[Pose],
         area: &Area,
     ) -> Result<Tensor, TchError> {
@@ -105,14 +105,14 @@ impl SpatialAlignment {
         let weight = fit.f_relu()?.f_square()? * &found.energy;
         let motion = rigid_motion(&parts, &weight, ego_from_cav, area)?;
         let by_entry = |parts: Tensor| parts.f_transpose(0, 1)?.f_reshape([entries - 1, -1]);
-        let share = shares.f_narrow(0, 1, entries - 1)?.f_unsqueeze(1)?;
+        let trust = trust.f_narrow(0, 1, entries - 1)?;
         let inputs =
-            [by_entry(parts)?, by_entry(fit)?, whole, fit_whole.f_unsqueeze(1)?, motion.shallow_clone(), share];
+            [by_entry(parts)?, by_entry(fit)?, whole, fit_whole.f_unsqueeze(1)?, motion.shallow_clone(), trust];
         let learnt = self.delta.forward(&self.hidden.forward(&Tensor::f_cat(&inputs, 1)?).f_relu()?);
         let FsaConfig { max_shift_m, max_turn_rad, .. } = self.config;
         let bounds = Tensor::f_from_slice(&[max_shift_m as f32, max_shift_m as f32, max_turn_rad as f32])?;
         let bounds = bounds.f_to_device(maps.device())?;
-        let raw = learnt + motion / &bounds * &self.gain;
+        let raw = learnt.f_narrow(1, 0, 3)? + motion / &bounds * learnt.f_narrow(1, 3, 3)?;
         Ok(raw.f_tanh()? * bounds)
     }
 
@@ -213,8 +213,7 @@ mod tests {
         let fsa = SpatialAlignment::new(&variables.root(), 4, &FsaConfig::default());
         let poses = [Pose::IDENTITY, Pose::from_xyz_yaw([3.0, 1.0, 0.0], 0.3), Pose::IDENTITY];
         let (maps, mask) = (Tensor::randn([3, 4, 16, 32], FLOAT), Tensor::ones([3, 1, 16, 32], FLOAT));
-        let shares = Tensor::from_slice(&[0.5f32, 0.25, 0.25]);
-        let deltas = fsa.deltas(&maps, &mask, &shares, &poses, &area()).unwrap();
+        let deltas = fsa.deltas(&maps, &mask, &Tensor::ones([3, TRUST], FLOAT), &poses, &area()).unwrap();
         assert_eq!(deltas, Tensor::zeros([2, 3], FLOAT));
         let maps = Tensor::randn([2, 4, 16, 32], FLOAT);
         let lattice = lattice(&deltas, &poses[1..], &area(), [16, 32]).unwrap();
@@ -254,8 +253,8 @@ mod tests {
         let fsa = SpatialAlignment::new(&variables.root(), 4, &config);
         let _ = tch::no_grad(|| variables.variables()["delta.bias"].shallow_clone().fill_(1e6));
         let (maps, mask) = (Tensor::randn([2, 4, 16, 32], FLOAT), Tensor::ones([2, 1, 16, 32], FLOAT));
-        let shares = Tensor::from_slice(&[0.5f32, 0.5]);
-        let deltas = fsa.deltas(&maps, &mask, &shares, &[Pose::IDENTITY; 2], &area()).unwrap();
+        let trust = Tensor::ones([2, TRUST], FLOAT);
+        let deltas = fsa.deltas(&maps, &mask, &trust, &[Pose::IDENTITY; 2], &area()).unwrap();
         let found = Vec::<f32>::try_from(deltas.view(-1)).unwrap();
         assert!((found[0] - 3.0).abs() < 1e-6 && (f64::from(found[2]) - config.max_turn_rad).abs() < 1e-6);
     }

@@ -23,7 +23,7 @@ use tch::{Kind, TchError, Tensor, nn};
 
 pub use config::{FsaConfig, Part, PastatConfig, Rows, Wavelengths};
 
-use self::alignment::{Area, SpatialAlignment, lattice, resample};
+use self::alignment::{Area, SpatialAlignment, TRUST, lattice, resample};
 use self::block::Block;
 use self::confidence::{shares, steps_back};
 use self::tokens::{Decoder, Refiner, Tokeniser, TrustGate, padded};
@@ -47,6 +47,9 @@ struct Told {
     age_secs: Vec<f64>,
     /// Eq. 7.
     shares: Vec<f32>,
+    /// What FSA is told of each entry: its share, its confidence and the ego's. Shares alone do not tell whether all
+    /// poses are good or all are bad.
+    trust: Vec<f32>,
     /// The entries that are the newest of their agents, the ego's first.
     newest: Vec<i64>,
 }
@@ -57,9 +60,12 @@ impl Told {
         let age_secs: Vec<f64> = facts.iter().map(|facts| facts.age_secs).collect();
         let confidence: Vec<f64> = facts.iter().map(|facts| facts.confidence).collect();
         let steps = steps_back(&agent, &age_secs);
+        let shares = shares(&confidence, &steps);
+        let of_entry = |(share, &own): (&f32, &f64)| [*share, own as f32, confidence[0] as f32];
         Self {
+            trust: shares.iter().zip(&confidence).flat_map(of_entry).collect(),
             ego_from_cav: facts.iter().map(|facts| facts.ego_from_cav).collect(),
-            shares: shares(&confidence, &steps),
+            shares,
             newest: (0..).zip(&steps).filter(|(_, step)| **step == 0).map(|(entry, _)| entry).collect(),
             age_secs,
         }
@@ -111,7 +117,9 @@ impl Pastat {
             Some(alignment) if told.age_secs.len() > 1 => {
                 let (_, _, height, width) = maps.size4()?;
                 let area = Area::new(grid, [height, width]);
-                Some((alignment.deltas(&maps, &mask, &shares, &told.ego_from_cav, &area)?, area))
+                let trust = Tensor::f_from_slice(&told.trust)?.f_view([-1, TRUST])?.f_to_device(maps.device())?;
+                let trust = if self.config.ce { trust } else { trust.f_zeros_like()? };
+                Some((alignment.deltas(&maps, &mask, &trust, &told.ego_from_cav, &area)?, area))
             }
             _ => None,
         };
