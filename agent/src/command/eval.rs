@@ -166,7 +166,8 @@ impl Args {
             localizer.set_solver(PoseSolver { solver, ..PoseSolver::default() });
             return Ok(Box::new(localizer));
         }
-        let mut localizer = Localizer::load(&self.encoder(), &self.head, device)?;
+        let load = if self.fit_confidence { Localizer::load_without_confidence } else { Localizer::load };
+        let mut localizer = load(&self.encoder(), &self.head, device)?;
         let confidence = localizer.solver().confidence.clone();
         localizer.set_solver(PoseSolver { solver, confidence });
         Ok(Box::new(localizer))

@@ -102,6 +102,22 @@ impl Localizer {
     /// [`LocalizerError`] when a file is missing, cut off, of something else, or when the head was trained on the
     /// features of another encoder.
     pub fn load(encoder: &Path, head: &Path, device: Device) -> Result<Self, LocalizerError> {
+        let (mut localizer, weights) = Self::open(encoder, head, device)?;
+        if weights.metadata(CONFIDENCE_KEY).is_some() {
+            localizer.solver.confidence = Confidence::Calibrated(weights.metadata_json(CONFIDENCE_KEY)?);
+        }
+        Ok(localizer)
+    }
+
+    /// The same without the confidence in the head's file, to fit one anew: one of an earlier version has other features.
+    ///
+    /// # Errors
+    /// As [`Self::load`].
+    pub fn load_without_confidence(encoder: &Path, head: &Path, device: Device) -> Result<Self, LocalizerError> {
+        Ok(Self::open(encoder, head, device)?.0)
+    }
+
+    fn open(encoder: &Path, head: &Path, device: Device) -> Result<(Self, Weights), LocalizerError> {
         let (network, encoder_sha256) = SceneEncoder::load(encoder, device)?;
         let weights = Weights::load(head)?;
         weights.check_kind(SceneHead::KIND)?;
@@ -118,13 +134,8 @@ impl Localizer {
         let scene_head = SceneHead::new(&variables.root(), &config)?;
         weights.copy_into(&variables)?;
         variables.freeze();
-        let confidence = match weights.metadata(CONFIDENCE_KEY) {
-            Some(_) => Confidence::Calibrated(weights.metadata_json(CONFIDENCE_KEY)?),
-            None => Confidence::Plain,
-        };
-        let solver = PoseSolver { confidence, ..PoseSolver::default() };
         let sha256 = [encoder_sha256, weights.sha256().to_owned()];
-        Ok(Self { encoder: network, head: scene_head, solver, device, sha256 })
+        Ok((Self { encoder: network, head: scene_head, solver: PoseSolver::default(), device, sha256 }, weights))
     }
 
     /// Hashes of encoder and head.

@@ -45,6 +45,13 @@ pub struct SecondEvidence {
     pub inlier_sigma: f64,
     /// How far the second look moved the pose, metres.
     pub moved_m: f64,
+    /// A quarter of all cells answer nearer than this to where the pose puts them, metres.
+    pub residual_quartile_m: f64,
+    /// Sum of the last fit's weights, the inverse squares of the cells' predicted errors as far as the fit listened to them,
+    /// 1 / square metres.
+    pub information_per_m2: f64,
+    /// Standard deviation of the position along the axis that is known worst, metres.
+    pub worst_axis_std_m: f64,
 }
 
 impl PoseEvidence {
@@ -98,7 +105,7 @@ impl PoseEvidence {
 
 impl SecondEvidence {
     fn gather(first: &Registration, second: &SecondLook) -> Self {
-        let SecondLook { registration, epsilon_m, .. } = second;
+        let SecondLook { registration, epsilon_m, residual_quartile_m, std, information_per_m2 } = second;
         let moved = registration.target_from_source.translation.vector - first.target_from_source.translation.vector;
         Self {
             inlier_ratio: registration.inlier_ratio,
@@ -106,6 +113,9 @@ impl SecondEvidence {
             median_epsilon_m: median(epsilon_m),
             inlier_sigma: mean_over(&registration.inliers, epsilon_m, |epsilon| f64::from(sigma(epsilon))),
             moved_m: moved.norm(),
+            residual_quartile_m: *residual_quartile_m,
+            information_per_m2: *information_per_m2,
+            worst_axis_std_m: std.worst_axis_m,
         }
     }
 }
@@ -161,7 +171,13 @@ mod tests {
         let found = solve(&pairs, &RansacConfig::default()).unwrap();
         let mut sharper = Registration::judge(&pairs, found.target_from_source, 1.0);
         sharper.target_from_source.translation.vector.x += 0.3;
-        let second = SecondLook { registration: sharper, epsilon_m: vec![0.0; pairs.len()], std: PoseStd::UNBOUNDED };
+        let second = SecondLook {
+            registration: sharper,
+            epsilon_m: vec![0.0; pairs.len()],
+            residual_quartile_m: 0.1,
+            std: PoseStd::UNBOUNDED,
+            information_per_m2: 400.0,
+        };
         let evidence = PoseEvidence::gather(&coordinates, &found, Some(&second));
         assert!((evidence.plain_sigma() - found.inlier_ratio).abs() < 1e-9);
         assert!((evidence.second.unwrap().moved_m - 0.3).abs() < 1e-9);

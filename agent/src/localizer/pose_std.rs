@@ -9,13 +9,15 @@ use crate::registration::Correspondence;
 pub(super) struct PoseStd {
     /// Of the position, all axes together, metres.
     pub(super) position_m: f64,
+    /// Of the position along the axis that is known worst, metres: along the road, mostly.
+    pub(super) worst_axis_m: f64,
     /// Of the orientation, all axes together, radians.
     pub(super) rotation_rad: f64,
 }
 
 impl PoseStd {
     /// Where the cells do not bound the pose.
-    pub(super) const UNBOUNDED: Self = Self { position_m: 1e3, rotation_rad: 1e3 };
+    pub(super) const UNBOUNDED: Self = Self { position_m: 1e3, worst_axis_m: 1e3, rotation_rad: 1e3 };
 
     /// Of the weighted fit of `target_from_source` to pairs, each with its weight there.
     ///
@@ -40,11 +42,23 @@ impl PoseStd {
         }
         let Some(inverse) = information.try_inverse() else { return Self::UNBOUNDED };
         let covariance = inverse * gradients * inverse;
-        let std = |from: usize, most: f64| {
-            let std = (from..from + 3).map(|axis| covariance[(axis, axis)]).sum::<f64>().sqrt();
+        let bounded = |variance: f64, most: f64| {
+            let std = variance.sqrt();
             if std.is_finite() { std.min(most) } else { most }
         };
-        Self { position_m: std(0, Self::UNBOUNDED.position_m), rotation_rad: std(3, Self::UNBOUNDED.rotation_rad) }
+        let variance = |from: usize| (from..from + 3).map(|axis| covariance[(axis, axis)]).sum();
+        let position = covariance.fixed_view::<3, 3>(0, 0);
+        // Of a matrix that is not finite there are no eigenvalues to ask for.
+        let worst_axis = if position.iter().all(|entry| entry.is_finite()) {
+            position.into_owned().symmetric_eigenvalues().max()
+        } else {
+            f64::NAN
+        };
+        Self {
+            position_m: bounded(variance(0), Self::UNBOUNDED.position_m),
+            worst_axis_m: bounded(worst_axis, Self::UNBOUNDED.worst_axis_m),
+            rotation_rad: bounded(variance(3), Self::UNBOUNDED.rotation_rad),
+        }
     }
 }
 
@@ -71,6 +85,25 @@ mod tests {
         }
         let ratio = expected_m / square_m.sqrt();
         assert!((0.75..1.25).contains(&ratio), "{ratio}");
+    }
+
+    #[test]
+    fn the_worst_axis_is_the_one_along_which_residuals_are_large() {
+        let std = |noise_m: [f64; 3]| {
+            let pairs: Vec<Correspondence> = (0..200)
+                .map(|k| {
+                    let source_m = [(k % 10) as f32 * 4.0 - 18.0, (k / 10) as f32 * 3.0 - 28.0, (k % 7) as f32];
+                    let sign = |bit: i32| if k * 2_654_435 >> bit & 1 == 0 { -1.0 } else { 1.0 };
+                    let target_m =
+                        std::array::from_fn(|axis| source_m[axis] + (sign(axis as i32 + 4) * noise_m[axis]) as f32);
+                    Correspondence { source_m, target_m, weight: 1.0 }
+                })
+                .collect();
+            PoseStd::of(&Isometry3::identity(), pairs.iter().map(|pair| (pair, 1.0)))
+        };
+        let (even, long) = (std([0.2; 3]), std([0.8, 0.2, 0.2]));
+        assert!(even.worst_axis_m < even.position_m && long.worst_axis_m < long.position_m);
+        assert!(long.worst_axis_m > 2.5 * even.worst_axis_m, "{even:?} {long:?}");
     }
 
     #[test]

@@ -24,8 +24,13 @@ pub(super) struct SecondLook {
     pub(super) registration: Registration,
     /// `[N]`: predicted L1 error of each cell's last answer, metres.
     pub(super) epsilon_m: Vec<f32>,
+    /// A quarter of the cells, all of them counted, answer nearer than this to where the pose puts them, metres.
+    pub(super) residual_quartile_m: f64,
     /// How far it may be off.
     pub(super) std: PoseStd,
+    /// Sum of the weights of the last fit, 1 / square metres: what the cells know of the place by their own account, as far
+    /// as the fit listened to them.
+    pub(super) information_per_m2: f64,
 }
 
 /// Asks the refiner where cells are that `start` puts somewhere.
@@ -80,17 +85,44 @@ pub(super) fn look_again(
             Err(_) => return Ok(None),
         }
         let scale_m = scales_m.last().copied().unwrap_or(AGREES_M);
-        let weighted = pairs.iter().filter(|pair| pair.usable()).map(|pair| {
-            let forgiven = forgiveness(pair.residual_m(&pose), scale_m);
-            (pair, f64::from(pair.weight) * forgiven)
-        });
-        let std = PoseStd::of(&pose, weighted);
-        answer = Some(SecondLook { registration: Registration::judge(&pairs, pose, AGREES_M), epsilon_m, std });
+        let weigh = |pair: &Correspondence| f64::from(pair.weight) * forgiveness(pair.residual_m(&pose), scale_m);
+        let weighted: Vec<_> = pairs.iter().filter(|pair| pair.usable()).map(|pair| (pair, weigh(pair))).collect();
+        let information_per_m2 = weighted.iter().map(|(_, weight)| weight).sum();
+        let std = PoseStd::of(&pose, weighted.into_iter());
+        let registration = Registration::judge(&pairs, pose, AGREES_M);
+        let residual_quartile_m = lower_quartile(pairs.iter().map(|pair| distance_m(pair, &pose)).collect());
+        answer = Some(SecondLook { registration, epsilon_m, residual_quartile_m, std, information_per_m2 });
     }
     Ok(answer)
+}
+
+/// How far an answer is from where a pose puts its cell, metres; infinite where it is no place.
+fn distance_m(pair: &Correspondence, pose: &Isometry3<f64>) -> f64 {
+    if pair.usable() { pair.residual_m(pose) } else { f64::INFINITY }
+}
+
+/// A quarter of the values is below it; infinite where there are none.
+fn lower_quartile(mut values: Vec<f64>) -> f64 {
+    let quarter = values.len() / 4;
+    if values.is_empty() { f64::INFINITY } else { *values.select_nth_unstable_by(quarter, f64::total_cmp).1 }
 }
 
 /// Weight of an answer: the inverse of its expected squared error.
 fn precision(epsilon_m: f32) -> f32 {
     1.0 / (FLOOR_M * FLOOR_M + epsilon_m * epsilon_m)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_quarter_lies_below_the_lower_quartile() {
+        let values: Vec<f64> = (0..100).map(|k| f64::from((k * 37) % 100)).collect();
+        assert_eq!(lower_quartile(values), 25.0);
+        assert_eq!(lower_quartile(vec![3.0]), 3.0);
+        assert_eq!(lower_quartile(Vec::new()), f64::INFINITY);
+        let nowhere = Correspondence { source_m: [1.0; 3], target_m: [f32::NAN; 3], weight: 1.0 };
+        assert_eq!(distance_m(&nowhere, &Isometry3::identity()), f64::INFINITY);
+    }
 }

@@ -15,7 +15,7 @@ pub use isotonic::MonotoneMap;
 use super::pose_evidence::{PoseEvidence, SecondEvidence};
 
 /// Number of features of [`PoseEvidence`].
-const FEATURES: usize = 11;
+const FEATURES: usize = 14;
 
 /// Metadata key of a head's file that the [`ConfidenceModel`] of its town lies under, as JSON.
 pub const CONFIDENCE_KEY: &str = "confidence";
@@ -87,7 +87,7 @@ impl ConfidenceModel {
 
 /// What speaks against a pose, each the larger the worse: logarithms, because errors span orders of magnitude.
 fn features(evidence: &PoseEvidence) -> [f64; FEATURES] {
-    let log = |value: f64| value.max(1e-3).ln();
+    let log = |value: f64| value.clamp(1e-3, 1e6).ln();
     // A head has a refiner or has none: features that are always 0 get no weight.
     let again = |value: fn(&SecondEvidence) -> f64| evidence.second.as_ref().map_or(0.0, |second| log(value(second)));
     [
@@ -102,6 +102,9 @@ fn features(evidence: &PoseEvidence) -> [f64; FEATURES] {
         again(|second| second.rms_m),
         again(|second| second.median_epsilon_m),
         again(|second| second.moved_m),
+        again(|second| second.residual_quartile_m),
+        -again(|second| second.information_per_m2),
+        again(|second| second.worst_axis_std_m),
     ]
 }
 

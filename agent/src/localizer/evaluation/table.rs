@@ -11,7 +11,7 @@ use super::{EvaluatedSweep, outcome};
 
 const HEADER: &str = "scenario,cav,frame,true_x_m,true_y_m,true_z_m,true_yaw_deg,x_m,y_m,z_m,yaw_deg,error_m,error_deg,\
     sigma,outcome,cells,inliers,inlier_ratio,rms_m,inlier_epsilon_m,median_epsilon_m,position_std_m,rotation_std_deg,\
-    second_inlier_ratio,second_rms_m,second_epsilon_m,moved_m,ms";
+    second_inlier_ratio,second_rms_m,second_epsilon_m,moved_m,residual_quartile_m,information_per_m2,worst_axis_std_m,ms";
 
 /// Writes one row per sweep; fields of sweeps without a pose are empty.
 ///
@@ -58,14 +58,20 @@ fn csv(sweeps: &[EvaluatedSweep]) -> String {
                 let _ = match &evidence.second {
                     Some(second) => write!(
                         text,
-                        ",{:.4},{:.4},{:.4},{:.4}",
-                        second.inlier_ratio, second.rms_m, second.median_epsilon_m, second.moved_m
+                        ",{:.4},{:.4},{:.4},{:.4},{:.4},{:.3},{:.4}",
+                        second.inlier_ratio,
+                        second.rms_m,
+                        second.median_epsilon_m,
+                        second.moved_m,
+                        second.residual_quartile_m,
+                        second.information_per_m2,
+                        second.worst_axis_std_m
                     ),
-                    None => write!(text, ",,,,"),
+                    None => write!(text, ",,,,,,,"),
                 };
             }
             _ => {
-                let _ = write!(text, ",,,,,,,,{},,,,,,,,,,,,", outcome(&localization.estimate));
+                let _ = write!(text, ",,,,,,,,{},,,,,,,,,,,,,,,", outcome(&localization.estimate));
             }
         }
         let _ = writeln!(text, ",{:.3}", localization.times.total().as_secs_f64() * 1e3);
