@@ -33,7 +33,7 @@ impl ModelCard {
         self.row("command", format_args!("`{}`", run.command));
         self.row("parameters", trained.parameters);
         self.row("weights", format_args!("SHA-256 `{}`", trained.sha256));
-        self.row("data", format_args!("{data}, listing SHA-256 `{}`", trained.data.sha256));
+        self.row("data", format_args!("{data}, contents SHA-256 `{}`", trained.data.sha256));
         if let Some(left_out) = trained.data.left_out() {
             self.row("left out", left_out);
         }

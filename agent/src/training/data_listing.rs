@@ -3,7 +3,8 @@
 /// Which data a training learns from, and what of it cannot be used.
 #[derive(Debug, Clone, Default, PartialEq, Eq)]
 pub struct DataListing {
-    /// SHA-256 over names, agents and capture times.
+    /// SHA-256 over names, agents, capture times and cheap digests of what the files hold: see
+    /// [`content_sha256`](sim_replay::dataset::content_sha256).
     pub sha256: String,
     /// Sweeps whose pose is not known.
     pub without_pose: usize,

@@ -2,7 +2,7 @@
 
 use std::collections::HashMap;
 use std::path::PathBuf;
-use std::sync::{Arc, Mutex, PoisonError};
+use std::sync::{Arc, Mutex, OnceLock, PoisonError};
 
 use agent::training::DataListing;
 use protocol::PointCloud;
@@ -31,6 +31,8 @@ pub struct SceneSet {
     /// What was wrong with the datasets and could be left out.
     problems: Vec<String>,
     known: Mutex<HashMap<TickRef, Arc<Vec<Frame>>>>,
+    /// Hash of the contents, once someone has asked: it reads a little of every file.
+    sha256: OnceLock<String>,
 }
 
 impl SceneSet {
@@ -59,7 +61,7 @@ impl SceneSet {
             (0..found.ticks.len()).map(move |tick| TickRef { scenario, tick }).collect::<Vec<_>>()
         };
         let ticks = scenarios.iter().enumerate().flat_map(of_scenario).collect();
-        Self { scenarios, ticks, problems: Vec::new(), known: Mutex::default() }
+        Self { scenarios, ticks, problems: Vec::new(), known: Mutex::default(), sha256: OnceLock::new() }
     }
 
     /// All ticks, scenario after scenario.
@@ -109,7 +111,7 @@ impl SceneSet {
     /// Which data it is, and what was wrong with it.
     #[must_use]
     pub fn data(&self) -> DataListing {
-        let sha256 = dataset::listing_sha256(&self.scenarios);
+        let sha256 = self.sha256.get_or_init(|| dataset::content_sha256(&self.scenarios)).clone();
         DataListing { sha256, problems: self.problems.clone(), without_pose: 0 }
     }
 }

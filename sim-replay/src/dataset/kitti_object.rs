@@ -47,8 +47,7 @@ impl FrameSource for Split {
             let calibration = Calibration::read(&self.dir.join("calib").join(format!("{}.txt", tick.stem)))?;
             let rectified = calibration.rotation("R0_rect")?.isometry();
             let camera_from_lidar = rectified * calibration.transform("Tr_velo_to_cam")?.isometry();
-            let labels = self.dir.join("label_2").join(format!("{}.txt", tick.stem));
-            frame.objects = objects(&labels, &camera_from_lidar.inverse())?;
+            frame.objects = objects(&self.labels(tick), &camera_from_lidar.inverse())?;
         }
         Ok(frame)
     }
@@ -57,8 +56,18 @@ impl FrameSource for Split {
         points::read_interleaved(&self.points_path(agent, tick, variant))
     }
 
+    fn annotation_path(&self, _agent: &CavId, tick: &Tick) -> Option<PathBuf> {
+        self.has_labels.then(|| self.labels(tick))
+    }
+
     fn points_path(&self, _agent: &CavId, tick: &Tick, _variant: Option<&str>) -> PathBuf {
         self.dir.join("velodyne").join(format!("{}.bin", tick.stem))
+    }
+}
+
+impl Split {
+    fn labels(&self, tick: &Tick) -> PathBuf {
+        self.dir.join("label_2").join(format!("{}.txt", tick.stem))
     }
 }
 

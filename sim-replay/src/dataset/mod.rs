@@ -36,7 +36,7 @@ use protocol::{CavId, Handedness};
 use serde::Serialize;
 
 pub use error::ReadError;
-pub use listing::listing_sha256;
+pub use listing::{content_sha256, listing_sha256};
 pub use open::{OpenOptions, open, open_with};
 
 use crate::frame::Frame;
@@ -140,6 +140,11 @@ trait FrameSource: std::fmt::Debug + Send + Sync {
     fn radar(&self, agent: &CavId, tick: &Tick) -> Result<PcdCloud, ReadError> {
         let path = self.points_path(agent, tick, None);
         Err(ReadError::malformed(&path, "there are no radar points beside it"))
+    }
+
+    /// The file that tells the pose and objects of this frame alone, in layouts that have one.
+    fn annotation_path(&self, _agent: &CavId, _tick: &Tick) -> Option<PathBuf> {
+        None
     }
 
     /// The file that the LiDAR's points come from.

@@ -35,6 +35,10 @@ impl FrameSource for Opv2v {
         mirrored(&self.0.radar(agent, &tick.stem))
     }
 
+    fn annotation_path(&self, agent: &CavId, tick: &Tick) -> Option<PathBuf> {
+        Some(self.0.yaml(agent, &tick.stem))
+    }
+
     fn points_path(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> PathBuf {
         self.0.pcd(agent, &tick.stem, variant)
     }

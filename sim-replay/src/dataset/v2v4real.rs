@@ -36,6 +36,10 @@ impl FrameSource for V2v4Real {
         points::read_pcd(&self.points_path(agent, tick, variant))
     }
 
+    fn annotation_path(&self, agent: &CavId, tick: &Tick) -> Option<PathBuf> {
+        Some(self.0.yaml(agent, &tick.stem))
+    }
+
     fn points_path(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> PathBuf {
         self.0.pcd(agent, &tick.stem, variant)
     }

@@ -113,7 +113,7 @@ impl SweepList {
         if places.is_empty() {
             return Err(LocalizerTrainError::NoSweeps(folders.to_vec()));
         }
-        let sha256 = dataset::listing_sha256(scenarios.iter().map(AsRef::as_ref));
+        let sha256 = dataset::content_sha256(scenarios.iter().map(AsRef::as_ref));
         Ok(Self { places, sha256, problems, without_pose: Mutex::default() })
     }
 
