@@ -5,6 +5,7 @@
 use std::hint::black_box;
 
 use agent::model_config::DetectorConfig;
+use agent::process;
 use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
 use ego_fuser::fusion::{FusionStage, ViewFacts};
 use ego_fuser::{Exchange, Method};
@@ -12,6 +13,8 @@ use protocol::Pose;
 use tch::{Device, Kind, Tensor, no_grad};
 
 fn fuse(criterion: &mut Criterion) {
+    // As in the programs.
+    process::ensure(&process::KEPT_MEMORY).expect("this program can be started again");
     tch::set_num_threads(1);
     let config = DetectorConfig::lean();
     let grid = config.feature_grid();

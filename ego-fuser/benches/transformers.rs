@@ -9,6 +9,7 @@
 use std::hint::black_box;
 use std::time::Instant;
 
+use agent::process;
 use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
 use ego_fuser::fusion::cobevt::{Cobevt, CobevtConfig};
 use ego_fuser::fusion::ermvp::{Ermvp, ErmvpConfig};
@@ -54,6 +55,8 @@ fn attention_gflop(agents: i64, [channels, height, width]: [i64; 3]) -> f64 {
 }
 
 fn fuse(criterion: &mut Criterion) {
+    // As in the programs.
+    process::ensure(&process::KEPT_MEMORY).expect("this program can be started again");
     tch::set_num_threads(2);
     let [channels, height, width] = FULL;
     let cells = height * width;

@@ -229,6 +229,23 @@ mod tests {
     }
 
     #[test]
+    fn the_alignment_term_is_zero_where_errors_are_undone_and_weighs_turns_by_an_arm() {
+        let offsets = vec![vec![Offset::default(), Offset([1.0, -0.5, 0.02]), Offset([0.0, 2.0, 0.0])]];
+        let undone = Tensor::from_slice(&[1.0f32, -0.5, 0.02, 0.0, 2.0, 0.0]).view([2, 3]);
+        let loss = |corrections: &[Option<Tensor>], offsets: &[Vec<Offset>]| {
+            alignment_loss(corrections, offsets).unwrap().double_value(&[])
+        };
+        assert!(loss(&[Some(undone.shallow_clone())], &offsets) < 1e-12);
+        // Nothing moved: |1|, |-0.5|, 20 m * |0.02|, |2| by smooth L1, over six numbers.
+        let still = Tensor::zeros([2, 3], (Kind::Float, Device::Cpu)).set_requires_grad(true);
+        let expected = (0.5 + 0.125 + 0.08 + 1.5) / 6.0;
+        assert!((loss(&[Some(still.shallow_clone())], &offsets) - expected).abs() < 1e-6);
+        alignment_loss(&[Some(still.shallow_clone()), None], &[offsets[0].clone(), vec![]]).unwrap().backward();
+        assert!(still.grad().double_value(&[0, 0]) < 0.0, "towards the offset");
+        assert_eq!(loss(&[None], &[vec![Offset::default()]]), 0.0, "an ego alone has nothing to align");
+    }
+
+    #[test]
     fn the_box_term_reads_the_channels_of_its_anchor() {
         let (scores, mut boxes) = maps();
         // Row 1, column 2, anchor 1.
