@@ -102,13 +102,13 @@ fn masked_entries_change_nothing_also_after_training() {
         for entry in [1, 3] {
             let _ = scene.features.get(entry).fill_(5.0);
         }
-        assert!(distance(&scene.fused(&pastat), &fused) < 1e-5);
-        assert!(distance(&scene.only(&[0, 2]).fused(&pastat), &fused) < 1e-5);
+        assert!(distance(&scene.fused(&pastat), &fused) < 1e-4);
+        assert!(distance(&scene.only(&[0, 2]).fused(&pastat), &fused) < 1e-4);
         // One that reaches some cells only counts there alone.
         let _ = scene.mask.get(1).narrow(2, 0, 4).fill_(1.0);
         let near = scene.fused(&pastat);
         let _ = scene.features.get(1).narrow(2, 8, 12).fill_(-5.0);
-        assert!(distance(&scene.fused(&pastat), &near) < 1e-5);
+        assert!(distance(&scene.fused(&pastat), &near) < 1e-4);
     }
 }
 
