@@ -57,6 +57,10 @@ pub(super) fn card(config: &TrainConfig, model: &CooperativeModel, scenes: &Scen
             ),
         );
     }
+    if config.loss.alignment_weight > 0.0 {
+        let weight = config.loss.alignment_weight;
+        card.row("alignment", format_args!("learns to undo that error, loss with weight {weight}"));
+    }
     if config.frozen_encoder.is_some() {
         card.row("encoder", "frozen, its maps kept");
     }
