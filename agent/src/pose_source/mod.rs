@@ -8,10 +8,11 @@ mod icp_map;
 mod localized;
 mod noise;
 mod noisy;
+mod numpy_normals;
 mod pose_table;
 pub mod sanity;
 
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use protocol::{CavId, NoPoseReason, PointCloud, Pose, PoseEstimate, StageTiming};
 use serde::{Deserialize, Serialize};
@@ -186,6 +187,18 @@ impl PoseSourceConfig {
                 Self::Cached(CachedPoseConfig { scenario: Some(name.to_owned()), ..config.clone() })
             }
             other => other.clone(),
+        }
+    }
+
+    /// The files that poses come from.
+    #[must_use]
+    pub fn files(&self) -> Vec<&Path> {
+        match self {
+            Self::Recorded => vec![],
+            Self::Noisy(noisy) => noisy.table.iter().map(PathBuf::as_path).collect(),
+            Self::Pgc(pgc) => vec![&pgc.encoder, &pgc.head],
+            Self::EndToEnd(network) => vec![&network.weights],
+            Self::Cached(cached) => vec![&cached.file],
         }
     }
 

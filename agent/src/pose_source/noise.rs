@@ -7,6 +7,8 @@ use rand_chacha::ChaCha8Rng;
 use rand_distr::StandardNormal;
 use sha2::{Digest, Sha256};
 
+use super::numpy_normals::NumpyNormals;
+
 /// Random words set aside for one draw; four normals take about eight.
 const WORDS_PER_DRAW: u128 = 64;
 
@@ -61,16 +63,19 @@ impl PoseNoise {
         Self { position_std_m, yaw_std_rad, seed }
     }
 
-    /// The one error of everyone, always.
+    /// The one error of everyone, always: to the digit what OpenCOOD draws with this seed at every call. Of six normals,
+    /// three are of the position, the fifth of the heading.
     #[must_use]
     pub fn fixed(&self) -> PlanarError {
-        self.scaled(draw(&self.random(None), 0))
+        let mut random = NumpyNormals::new(self.seed);
+        let [x, y, z, _, yaw] = std::array::from_fn(|_| random.normal());
+        self.scaled([x, y, z, yaw])
     }
 
     /// The error of a vehicle at a step of time, independent of all others.
     #[must_use]
     pub fn independent(&self, cav: &CavId, step: u64) -> PlanarError {
-        self.scaled(draw(&self.random(Some(cav)), step))
+        self.scaled(draw(&self.random(cav), step))
     }
 
     /// The error of a vehicle at a step of time, correlated by `rho` from one step to the next.
@@ -79,7 +84,7 @@ impl PoseNoise {
     /// decayed: so it depends on no earlier call, and frames may be lost, repeated or begun anywhere.
     #[must_use]
     pub fn autoregressive(&self, cav: &CavId, step: u64, rho: f64) -> PlanarError {
-        let random = self.random(Some(cav));
+        let random = self.random(cav);
         let depth = if rho > 0.0 { (NEGLIGIBLE.ln() / rho.ln()).ceil() as u64 } else { 0 };
         let mut sum = [0.0; 4];
         let mut weight = (1.0 - rho * rho).sqrt();
@@ -101,17 +106,17 @@ impl PoseNoise {
         }
     }
 
-    fn random(&self, cav: Option<&CavId>) -> ChaCha8Rng {
+    fn random(&self, cav: &CavId) -> ChaCha8Rng {
         ChaCha8Rng::from_seed(key(self.seed, cav))
     }
 }
 
 /// A generator's key from seed and vehicle.
-pub(super) fn key(seed: u64, cav: Option<&CavId>) -> [u8; 32] {
+pub(super) fn key(seed: u64, cav: &CavId) -> [u8; 32] {
     let mut hash = Sha256::new();
     hash.update(b"v2vloc pose noise");
     hash.update(seed.to_le_bytes());
-    hash.update(cav.map_or(b"".as_slice(), |cav| cav.as_str().as_bytes()));
+    hash.update(cav.as_str().as_bytes());
     hash.finalize().into()
 }
 
@@ -134,6 +139,13 @@ mod tests {
         let pairs: Vec<_> = pairs.collect();
         let variance = pairs.iter().map(|(a, _)| a * a).sum::<f64>();
         (pairs.iter().map(|(a, b)| a * b).sum::<f64>() / variance, (variance / pairs.len() as f64).sqrt())
+    }
+
+    #[test]
+    fn the_fixed_error_is_that_of_opencood() {
+        let error = PoseNoise::new(1.0, 1f64.to_radians(), 20).fixed();
+        let off = error.position_m.iter().zip([0.884, 0.196, 0.358]).map(|(found, known)| (found - known).abs());
+        assert!(off.fold(0.0, f64::max) < 1e-3 && (error.yaw_rad.to_degrees() + 1.085).abs() < 1e-3, "{error:?}");
     }
 
     #[test]

@@ -68,7 +68,7 @@ impl NoisyPose {
 
     /// Vehicles start at different rows of the table, so that they do not err alike.
     fn first_row(&self, cav: &CavId) -> u64 {
-        let key = noise::key(self.seed, Some(cav));
+        let key = noise::key(self.seed, cav);
         u64::from_le_bytes(std::array::from_fn(|byte| key[byte]))
     }
 }
