@@ -11,9 +11,9 @@ use embedded_graphics::primitives::{Circle, PrimitiveStyle, Rectangle};
 use crate::canvas::{Canvas, CanvasError};
 
 /// Size of one chart, pixels.
-const CHART: Size = Size::new(560, 440);
+pub(crate) const CHART: Size = Size::new(560, 440);
 /// Space around the plotted area: left, top, right, bottom, pixels.
-const MARGIN: [i32; 4] = [64, 44, 20, 52];
+pub(crate) const MARGIN: [i32; 4] = [64, 44, 20, 52];
 /// Lines and points are drawn this much larger and averaged down, which smooths their edges.
 const OVERSAMPLING: u32 = 3;
 
@@ -21,8 +21,16 @@ const PAPER: Rgb888 = Rgb888::new(255, 255, 255);
 const INK: Rgb888 = Rgb888::new(40, 44, 52);
 const RULE: Rgb888 = Rgb888::new(226, 229, 234);
 /// Colours of the series; told apart by most colour-blind readers.
-const COLOURS: [Rgb888; 4] =
-    [Rgb888::new(0, 114, 178), Rgb888::new(150, 150, 150), Rgb888::new(213, 94, 0), Rgb888::new(0, 158, 115)];
+pub(crate) const COLOURS: [Rgb888; 8] = [
+    Rgb888::new(0, 114, 178),
+    Rgb888::new(150, 150, 150),
+    Rgb888::new(213, 94, 0),
+    Rgb888::new(0, 158, 115),
+    Rgb888::new(204, 121, 167),
+    Rgb888::new(86, 180, 233),
+    Rgb888::new(230, 159, 0),
+    Rgb888::new(60, 60, 60),
+];
 
 /// One axis.
 #[derive(Debug, Clone, PartialEq)]
@@ -91,7 +99,7 @@ impl Axis {
     }
 
     /// Where lines and numbers stand.
-    fn ticks(&self) -> Vec<f64> {
+    pub(crate) fn ticks(&self) -> Vec<f64> {
         let [low, high] = self.range;
         if self.is_logarithmic {
             let decades = low.log10().ceil() as i32..=high.log10().floor() as i32;
@@ -126,7 +134,7 @@ fn draw(charts: &[Chart]) -> Canvas {
 
 impl Chart {
     /// Pixel of a value on the finished picture, for a chart whose left edge is at `left`.
-    fn pixel(&self, x: f64, y: f64, left: i32) -> Option<[f64; 2]> {
+    pub(crate) fn pixel(&self, x: f64, y: f64, left: i32) -> Option<[f64; 2]> {
         let [margin_left, top, right, bottom] = MARGIN.map(f64::from);
         let (width, height) = (f64::from(CHART.width), f64::from(CHART.height));
         let (across, up) = (self.x.share(x), self.y.share(y));
@@ -195,7 +203,7 @@ impl Chart {
 }
 
 /// A number as short as it can be read.
-fn number(value: f64) -> String {
+pub(crate) fn number(value: f64) -> String {
     let rounded = (value * 1000.0).round() / 1000.0;
     format!("{rounded}")
 }

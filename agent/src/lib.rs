@@ -6,6 +6,7 @@ pub mod anchors;
 pub mod backbone;
 pub mod canvas;
 pub mod chart;
+pub mod chart_svg;
 pub mod convolution;
 pub mod crop;
 pub mod decode;
