@@ -2,7 +2,6 @@
 
 use std::cmp::Reverse;
 use std::collections::{BTreeMap, BinaryHeap};
-use std::fs;
 use std::path::Path;
 
 use protocol::{CavId, DropReason, Stream};
@@ -13,7 +12,6 @@ use super::config::{CapacityConfig, LinkConfig, LinkError, Medium};
 use super::line::{Left, Line, Rules};
 use super::loss::{LossState, SentMessage};
 use super::nanos_of_ms;
-use super::preset::PRESETS;
 use super::trace::Trace;
 use crate::random::derive_seed;
 
@@ -123,21 +121,8 @@ impl Air {
     /// # Errors
     /// [`LinkError`] names the file and what is wrong with it.
     pub fn open(name: &str, seed: u64) -> Result<Self, LinkError> {
-        let names = PRESETS.map(|(preset, _)| preset);
-        if names.contains(&name) {
-            return Self::new(LinkConfig::preset(name)?, Path::new("."), seed);
-        }
-        let path = Path::new(name).to_path_buf();
-        let text = fs::read_to_string(&path).map_err(|source| LinkError::File {
-            path: path.clone(),
-            known: names.join(", "),
-            source,
-        })?;
-        let config = serde_saphyr::from_str(&text)
-            .map_err(|source| LinkError::Yaml { path: path.clone(), source: Box::new(source) })?;
-        let folder = path.parent().unwrap_or(Path::new("."));
-        Self::new(config, folder, seed)
-            .map_err(|source| LinkError::InFile { path: path.clone(), source: Box::new(source) })
+        let (config, folder) = LinkConfig::open(name)?;
+        Self::new(config, &folder, seed).map_err(|source| LinkError::in_file(name, source))
     }
 
     /// The air of a configuration; paths of traces start at `folder`. The same seed gives the same air.

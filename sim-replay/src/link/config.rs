@@ -67,6 +67,16 @@ pub enum LinkError {
     },
 }
 
+impl LinkError {
+    /// The same with the file that the link stands in, where it does not say that yet.
+    pub(super) fn in_file(name: &str, source: Self) -> Self {
+        match source {
+            in_file @ Self::InFile { .. } => in_file,
+            source => Self::InFile { path: name.into(), source: Box::new(source) },
+        }
+    }
+}
+
 /// Who shares what.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -319,6 +329,15 @@ impl LinkConfig {
             bounded("outages.to_s", *to_s, *from_s, 1e9, "after from_s")?;
         }
         Ok(())
+    }
+
+    /// The file of the trace that the capacity names.
+    #[must_use]
+    pub fn trace_file(&self) -> Option<&Path> {
+        match &self.capacity {
+            CapacityConfig::Unlimited | CapacityConfig::TokenBucket { .. } => None,
+            CapacityConfig::Trace(path) | CapacityConfig::Mahimahi(path) => Some(path),
+        }
     }
 
     /// The trace that the capacity names; relative paths start at `folder`.

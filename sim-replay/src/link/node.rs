@@ -19,6 +19,8 @@ use crate::bus::{Arrival, Bus, BusError, Event, Inbox, Publisher, PublisherOptio
 const PLACES: usize = 64;
 /// Vehicles that a link carries at most.
 const MAX_VEHICLES: usize = 64;
+/// Bytes of messages that are kept at most: under a long delay the air itself has no bound.
+const MAX_KEPT_BYTES: u64 = 1 << 30;
 /// How often the node looks for newcomers though nothing happens.
 const LOOK_ROUND: Duration = Duration::from_millis(20);
 
@@ -84,6 +86,8 @@ struct Node<'a> {
     vehicles: BTreeMap<CavId, Vehicle>,
     /// Messages that are under way.
     kept: BTreeMap<u64, Arrival>,
+    /// Their bytes.
+    kept_bytes: u64,
     next_id: u64,
     /// When the first message came: time 0 of the air.
     began: Option<Instant>,
@@ -106,6 +110,7 @@ impl<'a> Node<'a> {
             roll_call,
             vehicles: BTreeMap::new(),
             kept: BTreeMap::new(),
+            kept_bytes: 0,
             next_id: 0,
             began: None,
             report: LinkReport::default(),
@@ -147,7 +152,10 @@ impl<'a> Node<'a> {
     /// Follows up on who came and went.
     fn look_round(&mut self) -> Result<(), BusError> {
         while let Some((cav, is_there)) = self.roll_call.next() {
-            if is_there && !self.vehicles.contains_key(&cav) && self.vehicles.len() < MAX_VEHICLES {
+            if is_there && let Some(vehicle) = self.vehicles.get_mut(&cav) {
+                // It was away and sends again.
+                vehicle.ended.clear();
+            } else if is_there && self.vehicles.len() < MAX_VEHICLES {
                 let vehicle = self.attach(&cav)?;
                 tracing::info!(%cav, "its messages cross the link");
                 self.vehicles.insert(cav, vehicle);
@@ -188,6 +196,12 @@ impl<'a> Node<'a> {
         let began = *self.began.get_or_insert(arrival.at);
         let distance_m = self.distance_m(&from);
         self.report.offered += 1;
+        if self.kept_bytes.saturating_add(arrival.wire_bytes()) > MAX_KEPT_BYTES {
+            *self.report.dropped.entry(DropReason::LinkQueue).or_default() += 1;
+            self.bus.books().dropped(&arrival.topic, DropReason::LinkQueue);
+            return;
+        }
+        self.kept_bytes += arrival.wire_bytes();
         self.air.offer(Parcel {
             id: self.next_id,
             from,
@@ -218,7 +232,7 @@ impl<'a> Node<'a> {
             match fate {
                 Fate::Dropped(reason) => {
                     *self.report.dropped.entry(reason).or_default() += 1;
-                    if let Some(lost) = self.kept.remove(&parcel.id) {
+                    if let Some(lost) = self.release(parcel.id) {
                         self.bus.books().dropped(&lost.topic, reason);
                     }
                 }
@@ -238,8 +252,15 @@ impl<'a> Node<'a> {
             self.bus.books().received(&arrival.topic);
         }
         if !is_repeated {
-            self.kept.remove(&parcel.id);
+            self.release(parcel.id);
         }
+    }
+
+    /// Keeps a message no longer.
+    fn release(&mut self, id: u64) -> Option<Arrival> {
+        let released = self.kept.remove(&id)?;
+        self.kept_bytes = self.kept_bytes.saturating_sub(released.wire_bytes());
+        Some(released)
     }
 
     fn next_moment(&self) -> Instant {

@@ -1,4 +1,7 @@
-//! Links that others have described.
+//! Links by name: those that others have described, and files.
+
+use std::fs;
+use std::path::{Path, PathBuf};
 
 use super::config::{CapacityConfig, DelayLaw, LinkConfig, LinkError, LossLaw, LossUnit, Medium, QueueConfig};
 
@@ -13,6 +16,29 @@ pub const PRESETS: [(&str, &str); 6] = [
 ];
 
 impl LinkConfig {
+    /// The link that a preset or a YAML file describes, and the folder that paths in it start at. Checked, but for the
+    /// traces it names.
+    ///
+    /// # Errors
+    /// [`LinkError`] names the file and what is wrong with it.
+    pub fn open(name: &str) -> Result<(Self, PathBuf), LinkError> {
+        let names = PRESETS.map(|(preset, _)| preset);
+        if names.contains(&name) {
+            return Ok((Self::preset(name)?, PathBuf::from(".")));
+        }
+        let path = PathBuf::from(name);
+        let text = fs::read_to_string(&path).map_err(|source| LinkError::File {
+            path: path.clone(),
+            known: names.join(", "),
+            source,
+        })?;
+        let config: Self = serde_saphyr::from_str(&text)
+            .map_err(|source| LinkError::Yaml { path: path.clone(), source: Box::new(source) })?;
+        config.validate().map_err(|source| LinkError::in_file(name, source))?;
+        let folder = path.parent().unwrap_or(Path::new(".")).to_path_buf();
+        Ok((config, folder))
+    }
+
     /// A link that others have described, by name.
     ///
     /// # Errors
