@@ -7,7 +7,8 @@ use anyhow::Context;
 use protocol::{CavId, Role};
 use sim_replay::bus::{BusArgs, Route, STOP_LIMIT, log_to_stderr};
 use sim_replay::dataset::{self, LoadOptions, Scenario};
-use sim_replay::stream::{Replay, StreamError, StreamOptions, StreamReport};
+use sim_replay::link::{CapacityConfig, DelayLaw, LinkConfig, LossLaw};
+use sim_replay::stream::{AirReport, Replay, StreamError, StreamOptions, StreamReport};
 
 use crate::cli::Outcome;
 
@@ -61,6 +62,21 @@ pub(crate) struct Args {
     /// Seconds to wait for an ego's answer under --lockstep.
     #[arg(long, default_value_t = 60.0)]
     answer_timeout: f64,
+    /// Mean delay of sensor frames on their way to the agents, milliseconds.
+    #[arg(long, value_name = "MS")]
+    latency: Option<f64>,
+    /// Standard deviation of that delay, milliseconds; the order of frames stays.
+    #[arg(long, value_name = "MS", requires = "latency")]
+    jitter: Option<f64>,
+    /// Rate of each vehicle's link from its sensors, Mbit/s.
+    #[arg(long, value_name = "MBPS")]
+    bandwidth: Option<f64>,
+    /// Share of the sensor frames that get lost.
+    #[arg(long, value_name = "SHARE")]
+    loss: Option<f64>,
+    /// Same seed, same delays and losses.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
     /// Print a JSON summary.
     #[arg(long)]
     json: bool,
@@ -77,7 +93,13 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     let bus = args.bus.join(Role::Replay, &CavId::new("replay")?)?;
     let replay = match Replay::prepare(&bus, &scenario, args.options(), &stop) {
         Ok(replay) => replay,
-        Err(error @ (StreamError::NoAgent { .. } | StreamError::NoTick { .. } | StreamError::Rate(_))) => {
+        Err(
+            error @ (StreamError::NoAgent { .. }
+            | StreamError::NoTick { .. }
+            | StreamError::Rate(_)
+            | StreamError::Link(_)
+            | StreamError::LinkInLockstep),
+        ) => {
             return Ok(bad_input(&error.into()));
         }
         Err(error) => return Err(error.into()),
@@ -111,7 +133,31 @@ impl Args {
             patience: seconds(self.ready_timeout),
             lockstep: self.lockstep.clone(),
             answer_patience: seconds(self.answer_timeout),
+            link: self.link().map(|link| (link, self.seed)),
         }
+    }
+
+    /// The link from sensors to agents; none where nothing is asked of it.
+    fn link(&self) -> Option<LinkConfig> {
+        let Self { latency, jitter, bandwidth, loss, .. } = self;
+        if latency.is_none() && bandwidth.is_none() && loss.is_none() {
+            return None;
+        }
+        Some(LinkConfig {
+            delay: match (latency, jitter) {
+                (None, _) => DelayLaw::None,
+                (Some(mean_ms), None) => DelayLaw::ConstantMs(*mean_ms),
+                (Some(mean_ms), Some(std_ms)) => DelayLaw::Normal { mean_ms: *mean_ms, std_ms: *std_ms },
+            },
+            capacity: bandwidth.map_or(CapacityConfig::Unlimited, |rate_mbps| CapacityConfig::TokenBucket {
+                rate_mbps,
+                burst_bytes: 0,
+            }),
+            loss: loss.map_or(LossLaw::None, LossLaw::Bernoulli),
+            // A vehicle's own bus does not reorder.
+            keep_order: true,
+            ..LinkConfig::default()
+        })
     }
 }
 
@@ -148,6 +194,10 @@ fn print(report: &StreamReport, as_json: bool) -> anyhow::Result<()> {
         "late by p50 {:.1} ms, p95 {:.1} ms, at most {:.1} ms; {} ticks over 5 ms",
         lateness.p50_ms, lateness.p95_ms, lateness.max_ms, lateness.late_ticks
     );
+    if let Some(AirReport { offered, arrived, dropped }) = &report.air {
+        let lost: Vec<String> = dropped.iter().map(|(reason, count)| format!(", {count} {reason}")).collect();
+        println!("{offered} sensor frames crossed a link: {arrived} arrived{}", lost.concat());
+    }
     if report.unreadable_frames > 0 {
         println!("{} frames could not be read", report.unreadable_frames);
     }

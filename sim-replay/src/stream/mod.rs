@@ -3,7 +3,8 @@
 //! - [`Schedule`]: which tick comes next, and its time on the replay's clock.
 //! - [`ReplayClock`]: when that is on the wall; pause, step, rate.
 //! - [`ReadAhead`]: the next ticks are read while the current one is waited for.
-//! - [`Replay`]: the loop over the three, steered over `control/*`.
+//! - [`AirReport`]: what became of frames that cross an emulated link on their way.
+//! - [`Replay`]: the loop over them, steered over `control/*`.
 
 mod clock;
 mod outlet;
@@ -11,9 +12,11 @@ mod read_ahead;
 mod replay;
 mod report;
 mod schedule;
+mod sensor_air;
 
 pub use clock::ReplayClock;
 pub use read_ahead::{ReadAhead, TickFrames};
 pub use replay::{Replay, StreamError, StreamOptions};
 pub use report::{Lateness, StreamReport, Unreadable};
 pub use schedule::{Planned, Schedule};
+pub use sensor_air::AirReport;

@@ -11,10 +11,12 @@ use super::outlet::{Outlet, truth_of};
 use super::read_ahead::{ReadAhead, TickFrames};
 use super::report::StreamReport;
 use super::schedule::{Planned, Schedule};
+use super::sensor_air::{Held, SensorAir};
 use crate::bus::mailbox::Taken;
 use crate::bus::shutdown::Stop;
 use crate::bus::{Barrier, Bus, BusError, Event, Inbox, NotReady, Presence, Route, Subscription, process_id};
 use crate::dataset::{LoadOptions, Scenario};
+use crate::link::{LinkConfig, LinkError};
 
 /// Ticks read ahead of the clock.
 const READ_AHEAD: usize = 4;
@@ -46,6 +48,8 @@ pub struct StreamOptions {
     pub lockstep: Vec<CavId>,
     /// How long to wait for an ego's detections before the tick is counted as unanswered.
     pub answer_patience: Duration,
+    /// A link that sensor frames cross on their way to the agents, and its seed; none: they arrive at once.
+    pub link: Option<(LinkConfig, u64)>,
 }
 
 impl Default for StreamOptions {
@@ -62,6 +66,7 @@ impl Default for StreamOptions {
             patience: Duration::from_secs(60),
             lockstep: Vec::new(),
             answer_patience: Duration::from_secs(60),
+            link: None,
         }
     }
 }
@@ -92,6 +97,12 @@ pub enum StreamError {
     /// A rate that is none.
     #[error("rate is {0}, not a number from 0 to 1000")]
     Rate(f64),
+    /// The link makes no sense.
+    #[error(transparent)]
+    Link(#[from] LinkError),
+    /// A frame that is lost is never answered.
+    #[error("a link and lockstep exclude each other: a tick whose frames are late or lost is not answered")]
+    LinkInLockstep,
     /// Not every route came up.
     #[error("the fleet is not ready: {0}")]
     NotReady(#[from] NotReady),
@@ -112,6 +123,7 @@ pub struct Replay<'a> {
     schedule: Schedule,
     clock: ReplayClock,
     outlet: Outlet,
+    air: Option<SensorAir>,
     inbox: Arc<Inbox>,
     stop: Stop,
     report: StreamReport,
@@ -146,6 +158,7 @@ impl<'a> Replay<'a> {
         let verbs = [Verb::Start, Verb::Pause, Verb::Resume, Verb::Step, Verb::Seek].map(Topic::Control);
         let answers = options.lockstep.iter().map(|ego| Topic::Stream { cav: ego.clone(), stream: Stream::Detections });
         let subscriptions = verbs.into_iter().chain(answers).map(|topic| bus.subscribe(topic, &inbox));
+        let air = options.link.as_ref().map(|(link, seed)| SensorAir::new(link, *seed)).transpose()?;
         let is_paced = options.rate == 0.0 || !options.lockstep.is_empty();
         Ok(Self {
             bus,
@@ -155,6 +168,7 @@ impl<'a> Replay<'a> {
             clock: ReplayClock::new(options.rate),
             outlet: Outlet::open(bus, &options.agents, options.load.radar, is_paced)?,
             _subscriptions: subscriptions.collect::<Result<_, _>>()?,
+            air,
             inbox,
             stop: stop.clone(),
             report: StreamReport::default(),
@@ -184,7 +198,9 @@ impl<'a> Replay<'a> {
             last = Instant::now();
             self.wait_for_answers(planned.capture_nanos);
         }
-        let Self { bus, outlet, mut report, .. } = self;
+        self.await_the_last();
+        let Self { bus, outlet, air, mut report, .. } = self;
+        report.air = air.map(|air| air.report().clone());
         report.seconds = last.duration_since(began).as_secs_f64();
         report.lateness.sum_up();
         report.sent = outlet.finish();
@@ -213,6 +229,7 @@ impl<'a> Replay<'a> {
             // A command may change what comes next, so the plan is made anew each time.
             let planned = self.schedule.clone().next()?;
             let due = self.clock.due(planned.capture_nanos, Instant::now());
+            self.deliver();
             match due {
                 Some(due) if due <= Instant::now() && !self.stop.requested() => {
                     self.schedule.next();
@@ -220,7 +237,7 @@ impl<'a> Replay<'a> {
                 }
                 _ => {}
             }
-            match self.inbox.take(due) {
+            match self.inbox.take(due.into_iter().chain(self.next_arrival()).min()) {
                 Taken::Item(_, Event::Message(arrival)) => {
                     if let Ok(command) = arrival.decode(&Limits::DEFAULT) {
                         self.obey(command);
@@ -229,6 +246,29 @@ impl<'a> Replay<'a> {
                 Taken::Item(_, Event::End { .. }) | Taken::TimedOut => {}
                 Taken::Closed => return None,
             }
+        }
+    }
+
+    /// When the next frame that is on its way can arrive.
+    fn next_arrival(&self) -> Option<Instant> {
+        self.air.as_ref().and_then(SensorAir::next)
+    }
+
+    /// Publishes the frames that have crossed the air.
+    fn deliver(&mut self) {
+        let Some(air) = &mut self.air else { return };
+        for Held { agent, capture_nanos, frame } in air.arrived(Instant::now()) {
+            self.outlet.offer(agent, capture_nanos, frame);
+        }
+    }
+
+    /// After the last tick: waits for the frames that are on their way, unless someone asks to stop.
+    fn await_the_last(&mut self) {
+        while let Some(next) = self.next_arrival().filter(|_| !self.stop.requested()) {
+            if matches!(self.inbox.take(Some(next)), Taken::Closed) {
+                return;
+            }
+            self.deliver();
         }
     }
 
@@ -263,12 +303,19 @@ impl<'a> Replay<'a> {
             match frame {
                 Ok(frame) => {
                     agents.extend(truth_of(&frame));
-                    self.outlet.offer(agent, capture_nanos, frame);
+                    match &mut self.air {
+                        None => self.outlet.offer(agent, capture_nanos, frame),
+                        Some(air) => {
+                            let cav = frame.cav.clone();
+                            air.offer(&cav, Held { agent, capture_nanos, frame }, Instant::now());
+                        }
+                    }
                 }
                 Err(error) => self.report.unreadable(capture_nanos, &error),
             }
         }
         self.outlet.offer_truth(capture_nanos, Truth { frame_index: tick_index as u64, agents });
+        self.deliver();
         self.report.ticks += 1;
         self.clock.published(capture_nanos, due);
     }
@@ -310,6 +357,9 @@ impl<'a> Replay<'a> {
 fn check(scenario: &Scenario, options: &StreamOptions) -> Result<(), StreamError> {
     if !(0.0..=1e3).contains(&options.rate) {
         return Err(StreamError::Rate(options.rate));
+    }
+    if options.link.is_some() && !options.lockstep.is_empty() {
+        return Err(StreamError::LinkInLockstep);
     }
     if options.seek >= scenario.ticks.len() {
         let (scenario, ticks) = (scenario.name.clone(), scenario.ticks.len());

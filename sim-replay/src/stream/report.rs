@@ -5,6 +5,8 @@ use std::time::Duration;
 use protocol::TopicCount;
 use serde::Serialize;
 
+use super::sensor_air::AirReport;
+
 /// Publishing later than this counts as late.
 const LATE: Duration = Duration::from_millis(5);
 /// Unreadable frames that are kept with their message.
@@ -27,6 +29,9 @@ pub struct StreamReport {
     pub unreadable_frames: u64,
     /// The first of them.
     pub unreadable: Vec<Unreadable>,
+    /// What the emulated air did to sensor frames, where there was one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub air: Option<AirReport>,
 }
 
 /// A frame that could not be read.
