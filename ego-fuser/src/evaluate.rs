@@ -1,7 +1,10 @@
 //! A method on recorded scenes, frame by frame, through the same code and the same messages as in a live run.
 //!
 //! Every vehicle runs an [`Agent`]; what it would publish is encoded, weighed and decoded again; the [`Ego`] detects.
-//! Nothing is lost, and nothing is late unless asked for, so a live run paced like that gives the same boxes.
+//! Nothing is lost, and nothing is late unless asked for, so a live run paced like that gives the same boxes. With
+//! [`Evaluator::over_link`] messages cross the emulated air in virtual time ([`stepped`]).
+
+pub mod stepped;
 
 use std::collections::VecDeque;
 use std::ops::ControlFlow;
@@ -14,15 +17,18 @@ use agent::pose_source::{NoiseMode, PoseSourceConfig, PoseSourceError};
 use agent::weights::{Weights, WeightsError};
 use protocol::codec::encode_features;
 use protocol::message::{Bev, Boxes, Detections, FusedNeighbour, Payload, Points, SkippedNeighbour};
-use protocol::{Box3d, CavId, CodecConfig, HEADER_LEN, Header, Limits, PoseEstimate, Stamp, WireError, wire};
+use protocol::{Box3d, CavId, CodecConfig, HEADER_LEN, Header, Ledger, Limits, PoseEstimate, Stamp, WireError, wire};
 use sim_replay::dataset::{LoadOptions, ReadError, Scenario};
 use sim_replay::frame::Frame;
 use sim_replay::ground_truth::{self, GroundTruthRule};
+use sim_replay::link::LinkError;
 use tch::Tensor;
 
-use crate::ego::{Content, Ego, EgoError, Skipped, View, own_content};
+use crate::ego::{Content, Ego, EgoError, EgoOutput, Skipped, View, own_content};
 use crate::feature_store::{FeatureStoreError, MapSource};
 use crate::method::{Exchange, Method};
+
+use stepped::{SteppedConfig, VehicleConfig};
 
 /// What to evaluate.
 #[derive(Debug, Clone)]
@@ -65,6 +71,21 @@ pub enum EvaluateError {
     /// Kept maps cannot be read.
     #[error(transparent)]
     Maps(#[from] Box<FeatureStoreError>),
+    /// The emulated air cannot be made.
+    #[error(transparent)]
+    Link(#[from] LinkError),
+    /// A computer of the fleet does not keep up with the scene.
+    #[error(
+        "{what} takes {takes_ms} ms, but the scene has a frame every {period_ms} ms: choose a smaller time in `compute`"
+    )]
+    TooSlow {
+        /// What takes too long.
+        what: &'static str,
+        /// How long, milliseconds.
+        takes_ms: f64,
+        /// From frame to frame, milliseconds.
+        period_ms: f64,
+    },
 }
 
 /// One frame of the ego with everything it can be judged by.
@@ -92,6 +113,9 @@ pub struct Evaluator {
     /// What the neighbours have sent, oldest first; the first is what has arrived last, or has not arrived yet.
     under_way: VecDeque<Vec<Sent>>,
     maps: Option<MapSource>,
+    /// How messages cross the air; absent: at once, or after a fixed delay.
+    stepped: Option<SteppedConfig>,
+    ledger: Ledger,
 }
 
 impl Evaluator {
@@ -104,7 +128,21 @@ impl Evaluator {
         let rule = config.rule.unwrap_or_else(|| rule_of(ego.detector()));
         let codec = CodecConfig { gate: config.codec.gate.or(ego.method().gate()), ..config.codec };
         let config = EvaluateConfig { codec, ..config };
-        Ok(Self { weights: Weights::load(&config.weights)?, ego, rule, config, under_way: VecDeque::new(), maps: None })
+        let weights = Weights::load(&config.weights)?;
+        let (under_way, ledger) = (VecDeque::new(), Ledger::default());
+        Ok(Self { weights, ego, rule, config, under_way, maps: None, stepped: None, ledger })
+    }
+
+    /// The same with messages that cross the emulated air, in virtual time.
+    #[must_use]
+    pub fn over_link(self, stepped: SteppedConfig) -> Self {
+        Self { stepped: Some(stepped), ..self }
+    }
+
+    /// The books of all messages that crossed the air so far; empty without one.
+    #[must_use]
+    pub fn ledger(&self) -> &Ledger {
+        &self.ledger
     }
 
     /// The same with maps that its encoder made before, kept as exactly as messages say them or more: those say the same
@@ -137,15 +175,14 @@ impl Evaluator {
     ) -> Result<ControlFlow<()>, EvaluateError> {
         self.ego.forget();
         self.under_way.clear();
-        let pose_source = self.config.pose_source.for_scenario(&scenario.name);
+        if let Some(stepped) = self.stepped.clone() {
+            return stepped::run(self, &stepped, scenario, on_frame);
+        }
         let points = self.needs_points();
         let load = LoadOptions { points, ..LoadOptions::default() };
-        let detector_config = self.weights.config()?;
         let mut agents = Vec::with_capacity(scenario.agents.len());
         for cav in &scenario.agents {
-            let detector = Detector::from_weights(&self.weights, &detector_config)?;
-            let source = if agents.is_empty() { source_of_ego(&pose_source) } else { pose_source.clone() };
-            agents.push(Agent::new(cav.clone(), source.build()?, detector));
+            agents.push(self.agent(scenario, cav, agents.is_empty(), None)?);
         }
         for tick in 0..scenario.ticks.len() {
             let frames: Result<Vec<Frame>, _> =
@@ -159,6 +196,24 @@ impl Evaluator {
         Ok(ControlFlow::Continue(()))
     }
 
+    /// The pipeline of a vehicle.
+    fn agent(
+        &self,
+        scenario: &Scenario,
+        cav: &CavId,
+        is_ego: bool,
+        own: Option<&VehicleConfig>,
+    ) -> Result<Agent, EvaluateError> {
+        let all = &self.config.pose_source;
+        let source = match own {
+            Some(own) => own.pose_source.clone(),
+            None if is_ego => source_of_ego(all),
+            None => all.clone(),
+        };
+        let detector = Detector::from_weights(&self.weights, &self.weights.config()?)?;
+        Ok(Agent::new(cav.clone(), source.for_scenario(&scenario.name).build()?, detector))
+    }
+
     /// Whether sweeps have to be read at all.
     fn needs_points(&self) -> bool {
         let shares_points = own_content(self.ego.method()) == Exchange::Points;
@@ -167,10 +222,15 @@ impl Evaluator {
 
     /// The kept maps of all vehicles at a tick, in the order of the scenario's agents; none where none are kept.
     fn maps_at(&mut self, scenario: &Scenario, tick: usize) -> Result<Vec<Tensor>, EvaluateError> {
-        let Some(maps) = &mut self.maps else { return Ok(Vec::new()) };
-        let Some(index) = maps.index_of(&scenario.name) else { return Ok(Vec::new()) };
-        let map = |agent| Ok(maps.map(index, scenario, agent, tick).map_err(Box::new)?);
-        (0..scenario.agents.len()).map(map).collect()
+        let maps = (0..scenario.agents.len()).map(|agent| self.map_of(scenario, agent, tick));
+        Ok(maps.collect::<Result<Vec<_>, _>>()?.into_iter().flatten().collect())
+    }
+
+    /// The kept map of a vehicle's sweep; none where none are kept.
+    fn map_of(&mut self, scenario: &Scenario, agent: usize, tick: usize) -> Result<Option<Tensor>, EvaluateError> {
+        let Some(maps) = &mut self.maps else { return Ok(None) };
+        let Some(index) = maps.index_of(&scenario.name) else { return Ok(None) };
+        Ok(Some(maps.map(index, scenario, agent, tick).map_err(Box::new)?))
     }
 
     fn frame(
@@ -197,10 +257,26 @@ impl Evaluator {
         let (neighbours, bytes): (Vec<View>, Vec<_>) =
             self.arrived(own.capture_nanos).iter().filter_map(Sent::heard).unzip();
         let output = self.ego.detect(&own, &neighbours)?;
+        let result = self.report(tick, &own, &neighbours, &bytes, output);
+        let objects = ground_truth::merge(&frames.iter().collect::<Vec<_>>(), 0, &self.rule);
+        let objects = objects.into_iter().map(|(_, object)| object).collect();
+        let stamp = stamp(&own.cav, frames[0].capture_nanos);
+        Ok(EvaluatedFrame { stamp, result, frames, poses, objects })
+    }
+
+    /// What the ego would publish; `bytes` are payload and wire bytes of each neighbour's message.
+    fn report(
+        &self,
+        tick: usize,
+        own: &View,
+        neighbours: &[View],
+        bytes: &[(u64, u64)],
+        output: EgoOutput,
+    ) -> Detections {
         let fused = (output.fused.iter())
             .map(|&index| FusedNeighbour {
                 cav: neighbours[index].cav.clone(),
-                age_nanos: neighbours[index].age_nanos(&own),
+                age_nanos: neighbours[index].age_nanos(own),
                 confidence: neighbours[index].pose.confidence(),
                 payload_bytes: bytes[index].0,
                 wire_bytes: bytes[index].1,
@@ -213,7 +289,7 @@ impl Evaluator {
                 Skipped::NotNeeded => None,
             },
         });
-        let result = Detections {
+        Detections {
             ego: own.cav.clone(),
             frame_index: tick as u64,
             method: self.ego.method().name().to_owned(),
@@ -222,11 +298,7 @@ impl Evaluator {
             fused,
             skipped: skipped.collect(),
             stages: output.stages,
-        };
-        let objects = ground_truth::merge(&frames.iter().collect::<Vec<_>>(), 0, &self.rule);
-        let objects = objects.into_iter().map(|(_, object)| object).collect();
-        let stamp = stamp(&own.cav, frames[0].capture_nanos);
-        Ok(EvaluatedFrame { stamp, result, frames, poses, objects })
+        }
     }
 
     /// What the neighbours sent last of all that has arrived; nothing where all is still under way.
@@ -279,6 +351,8 @@ struct Sent {
     content: Option<Content>,
     payload_bytes: u64,
     wire_bytes: u64,
+    /// Of these, the pose's own message.
+    pose_bytes: u64,
 }
 
 impl Sent {
@@ -316,6 +390,7 @@ fn view(
         content,
         payload_bytes,
         wire_bytes,
+        pose_bytes,
     };
     let (content, bytes) = match exchange {
         None => return Ok(sent(None, 0, 0)),

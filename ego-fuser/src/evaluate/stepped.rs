@@ -1,0 +1,368 @@
+//! Virtual time: who computes how long is given, the emulated air decides when what arrives, and the ego fuses at each
+//! tick exactly what has arrived by its deadline.
+//!
+//! Nothing here looks at a clock, so the same inputs and seed give the same result on a busy and on an idle machine. The
+//! pipelines, the pairing and the air are those of the live processes.
+
+mod compute;
+mod courier;
+
+use std::collections::{BTreeMap, VecDeque};
+use std::ops::{ControlFlow, Range};
+use std::path::PathBuf;
+
+use agent::agent::Agent;
+use agent::pose_source::PoseSourceConfig;
+use protocol::{CavId, CodecConfig, DropReason, PoseEstimate, SkippedNeighbour, StageTiming, Stream};
+use sim_replay::dataset::{LoadOptions, Scenario};
+use sim_replay::frame::Frame;
+use sim_replay::ground_truth;
+use sim_replay::link::{Air, LinkConfig};
+use sim_replay::random::derive_seed;
+
+pub use compute::ComputeTimes;
+
+use super::{EvaluateError, EvaluatedFrame, Evaluator, Sent, stamp, view};
+use crate::ego::{Skipped, View, own_content};
+use crate::method::{Exchange, Method};
+use crate::pairing::{Paired, Pairing, PairingConfig};
+use courier::{Arrived, Courier, Letter};
+
+/// A fleet in virtual time.
+#[derive(Debug, Clone)]
+pub struct SteppedConfig {
+    /// The air between the neighbours and the ego.
+    pub link: LinkConfig,
+    /// Where paths of traces in it start.
+    pub link_folder: PathBuf,
+    /// Same seed, same losses and delays. Every scenario has its own of it.
+    pub seed: u64,
+    /// The ego fuses what has arrived so long after its tick, nanoseconds.
+    pub deadline_nanos: u64,
+    /// Which messages belong together.
+    pub pairing: PairingConfig,
+    /// How long everyone computes.
+    pub compute: ComputeTimes,
+    /// Who takes part.
+    pub crew: Crew,
+    /// Vehicles with settings of their own.
+    pub vehicles: BTreeMap<CavId, VehicleConfig>,
+    /// Which ticks of a scenario; clipped to those there are.
+    pub ticks: Range<usize>,
+    /// A variant of the sweeps, see [`Scenario::lidar_variants`].
+    pub lidar_variant: Option<String>,
+}
+
+/// Who takes part.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Crew {
+    /// The first so many vehicles of a scenario, or all where it has fewer; the first is the ego. What the others see
+    /// counts as there all the same, so that the truth does not depend on how many talk.
+    First(usize),
+    /// These, the ego first; the others are not there at all.
+    Named(Vec<CavId>),
+}
+
+/// Settings of one vehicle.
+#[derive(Debug, Clone, PartialEq)]
+pub struct VehicleConfig {
+    /// Where its pose comes from.
+    pub pose_source: PoseSourceConfig,
+    /// How it writes its maps.
+    pub codec: CodecConfig,
+}
+
+/// Runs a scenario; `on_frame` may end it. Each frame's stamp says when the ego published it.
+pub(super) fn run(
+    evaluator: &mut Evaluator,
+    config: &SteppedConfig,
+    scenario: &Scenario,
+    on_frame: &mut dyn FnMut(EvaluatedFrame) -> ControlFlow<()>,
+) -> Result<ControlFlow<()>, EvaluateError> {
+    let mut run = Run::open(evaluator, config, scenario)?;
+    let mut flow = ControlFlow::Continue(());
+    for tick in run.next..run.end {
+        let frame = run.decide(tick)?;
+        flow = on_frame(frame);
+        if flow.is_break() {
+            break;
+        }
+    }
+    run.close();
+    Ok(flow)
+}
+
+/// A vehicle that takes part.
+struct Member {
+    /// Its place among the scenario's.
+    place: usize,
+    agent: Agent,
+    codec: CodecConfig,
+}
+
+/// A tick whose sweeps are computed.
+struct Computed {
+    own: View,
+    /// Of all vehicles, the ego first.
+    frames: Vec<Frame>,
+    poses: Vec<PoseEstimate>,
+}
+
+struct Run<'a> {
+    evaluator: &'a mut Evaluator,
+    config: &'a SteppedConfig,
+    scenario: &'a Scenario,
+    /// The ego first.
+    crew: Vec<Member>,
+    /// Places of those that are only asked what there is.
+    witnesses: Vec<usize>,
+    /// The next tick to compute, and the one behind the last.
+    next: usize,
+    end: usize,
+    computed: VecDeque<Computed>,
+    courier: Courier,
+    pairing: Pairing<Letter>,
+    /// When messages arrived, by vehicle: capture time and arrival.
+    arrivals: BTreeMap<CavId, VecDeque<(u64, u64)>>,
+    /// When the ego has done with what it fuses.
+    ego_free_nanos: u64,
+}
+
+impl<'a> Run<'a> {
+    fn open(
+        evaluator: &'a mut Evaluator,
+        config: &'a SteppedConfig,
+        scenario: &'a Scenario,
+    ) -> Result<Self, EvaluateError> {
+        config.compute.check(scenario)?;
+        let places = places(scenario, &config.crew);
+        let mut crew = Vec::with_capacity(places.len());
+        for &place in &places {
+            let cav = &scenario.agents[place];
+            let own = config.vehicles.get(cav);
+            let codec = own.map_or(evaluator.config.codec, |own| own.codec);
+            let gate = codec.gate.or(evaluator.ego.method().gate());
+            // What the ego leaves out for others it has itself.
+            let codec = if crew.is_empty() {
+                CodecConfig { gate: None, budget_bytes: None, ..codec }
+            } else {
+                CodecConfig { gate, ..codec }
+            };
+            crew.push(Member { place, agent: evaluator.agent(scenario, cav, crew.is_empty(), own)?, codec });
+        }
+        let is_witness = |place: &usize| matches!(config.crew, Crew::First(_)) && !places.contains(place);
+        let witnesses = (0..scenario.agents.len()).filter(is_witness).collect();
+        let ticks = config.ticks.start.min(scenario.ticks.len())..config.ticks.end.min(scenario.ticks.len());
+        let began_nanos = scenario.ticks.get(ticks.start).map_or(0, |tick| tick.capture_nanos);
+        let letters: Vec<u64> = scenario.name.bytes().map(u64::from).collect();
+        let air = Air::new(config.link.clone(), &config.link_folder, derive_seed(config.seed, &letters))?;
+        let ego = crew.first().map_or_else(|| scenario.agents[0].clone(), |ego| ego.agent.cav().clone());
+        Ok(Self {
+            courier: Courier::new(air, &ego, began_nanos),
+            evaluator,
+            config,
+            scenario,
+            crew,
+            witnesses,
+            next: ticks.start,
+            end: ticks.end,
+            computed: VecDeque::new(),
+            pairing: Pairing::new(config.pairing),
+            arrivals: BTreeMap::new(),
+            ego_free_nanos: 0,
+        })
+    }
+
+    /// Computes the sweeps of the next tick and hands what the neighbours send to the air.
+    fn compute(&mut self) -> Result<(), EvaluateError> {
+        let tick = self.next;
+        self.next += 1;
+        let method = self.evaluator.ego.method();
+        let load = self.load_options();
+        let mut frames = Vec::with_capacity(self.scenario.agents.len());
+        let mut poses = Vec::with_capacity(self.crew.len());
+        let mut own = None;
+        for member in &mut self.crew {
+            let frame = self.scenario.load(member.place, tick, &load)?;
+            let is_ego = frames.is_empty();
+            let map = if is_ego || method != Method::None {
+                self.evaluator.map_of(self.scenario, member.place, tick)?
+            } else {
+                None
+            };
+            // Without an exchange, neighbours have nothing to encode; where they are is still asked.
+            let exchange = (is_ego || method != Method::None).then(|| own_content(method));
+            let sent = view(&mut member.agent, &frame, map.as_ref(), exchange, &member.codec)?;
+            poses.push(sent.pose);
+            if is_ego {
+                own = sent.view();
+            } else if sent.content.is_some() {
+                let distance_m = distance_m(&frames[0], &frame);
+                post(&mut self.courier, &self.config.compute, tick, sent, distance_m);
+            }
+            frames.push(frame);
+        }
+        let blind = LoadOptions { points: false, ..load };
+        for &place in &self.witnesses {
+            frames.push(self.scenario.load(place, tick, &blind)?);
+        }
+        let own = own.expect("the ego is needed by every method");
+        self.computed.push_back(Computed { own, frames, poses });
+        Ok(())
+    }
+
+    fn load_options(&self) -> LoadOptions {
+        let own = self.config.vehicles.values().any(|own| own.pose_source.looks_at_sweeps());
+        let points = own || self.evaluator.needs_points();
+        LoadOptions { points, lidar_variant: self.config.lidar_variant.clone(), ..LoadOptions::default() }
+    }
+
+    /// Fuses a tick.
+    fn decide(&mut self, tick: usize) -> Result<EvaluatedFrame, EvaluateError> {
+        let capture_nanos = self.scenario.ticks[tick].capture_nanos;
+        let compute = self.config.compute;
+        let ready_nanos = capture_nanos.saturating_add(compute.agent_nanos());
+        let closes_nanos = capture_nanos.saturating_add(self.config.deadline_nanos).max(ready_nanos);
+        while self.next < self.end && self.scenario.ticks[self.next].capture_nanos <= closes_nanos {
+            self.compute()?;
+        }
+        for arrived in self.courier.until(closes_nanos) {
+            self.take_in(arrived);
+        }
+        let Computed { own, frames, poses } = self.computed.pop_front().expect("a tick closes after it began");
+        let decided_nanos = self.complete_nanos(capture_nanos).unwrap_or(closes_nanos).max(ready_nanos);
+        let done_nanos = decided_nanos.max(self.ego_free_nanos).saturating_add(compute.fuse_nanos());
+        self.ego_free_nanos = done_nanos;
+        let mut result = self.fuse(tick, &own)?;
+        // Measured times would be another every time.
+        let stage = |name: &str, nanos| StageTiming { stage: name.into(), nanos };
+        result.stages = vec![
+            stage("pose", compute.pose_nanos()),
+            stage("map", compute.map_nanos()),
+            stage("wait", decided_nanos - ready_nanos),
+            stage("fuse", done_nanos - decided_nanos),
+        ];
+        let objects = ground_truth::merge(&frames.iter().collect::<Vec<_>>(), 0, &self.evaluator.rule);
+        let objects = objects.into_iter().map(|(_, object)| object).collect();
+        let stamp = protocol::Stamp { publish_nanos: done_nanos, ..stamp(&own.cav, capture_nanos) };
+        Ok(EvaluatedFrame { stamp, result, frames, poses, objects })
+    }
+
+    /// Lays a message where it waits for its tick.
+    fn take_in(&mut self, arrived: Arrived) {
+        let Arrived { nanos, letter } = arrived;
+        let (cav, capture_nanos) = (letter.view.cav.clone(), letter.view.capture_nanos);
+        let arrivals = self.arrivals.entry(cav.clone()).or_default();
+        arrivals.push_back((capture_nanos, nanos));
+        if arrivals.len() > self.config.pairing.depth {
+            arrivals.pop_front();
+        }
+        if let Some(lost) = self.pairing.insert(&cav, capture_nanos, letter) {
+            self.courier.dropped(&lost.cav, lost.reason);
+        }
+    }
+
+    /// When the last neighbour's message of a tick had come; none where one is missing.
+    fn complete_nanos(&self, capture_nanos: u64) -> Option<u64> {
+        if self.evaluator.ego.method() == Method::None {
+            return Some(capture_nanos);
+        }
+        let of_tick = |(time, _): &&(u64, u64)| time.abs_diff(capture_nanos) <= self.config.pairing.max_lead_nanos;
+        let mut complete_nanos = capture_nanos;
+        for member in &self.crew[1..] {
+            let arrivals = self.arrivals.get(member.agent.cav())?;
+            complete_nanos = complete_nanos.max(arrivals.iter().filter(of_tick).map(|(_, nanos)| *nanos).min()?);
+        }
+        Some(complete_nanos)
+    }
+
+    fn fuse(&mut self, tick: usize, own: &View) -> Result<protocol::Detections, EvaluateError> {
+        let (paired, dropped) = self.pairing.pair(own.capture_nanos);
+        let (mut views, mut bytes, mut first_uses) = (Vec::new(), Vec::new(), Vec::new());
+        for Paired { is_first_use, message, .. } in paired {
+            // A copy, as the message may serve the next tick too.
+            views.push(message.view.clone());
+            bytes.push((message.payload_bytes, message.wire_bytes));
+            first_uses.push(is_first_use);
+        }
+        let output = self.evaluator.ego.detect(own, &views)?;
+        for lost in &dropped {
+            self.courier.dropped(&lost.cav, lost.reason);
+        }
+        for (index, view) in views.iter().enumerate().filter(|(index, _)| first_uses[*index]) {
+            let left_out = output.skipped.iter().find(|(skipped, _)| *skipped == index);
+            match left_out {
+                Some((_, Skipped::Unusable(reason))) => self.courier.dropped(&view.cav, *reason),
+                Some((_, Skipped::NotNeeded)) | None => self.courier.received(&view.cav),
+            }
+        }
+        let mut result = self.evaluator.report(tick, own, &views, &bytes, output);
+        if self.evaluator.ego.method() != Method::None {
+            let silent = self.crew[1..].iter().map(|member| member.agent.cav());
+            for cav in silent.filter(|cav| views.iter().all(|view| view.cav != **cav)) {
+                let reason = dropped.iter().rev().find(|lost| lost.cav == *cav).map(|lost| lost.reason);
+                result.skipped.push(SkippedNeighbour { cav: cav.clone(), reason });
+            }
+        }
+        Ok(result)
+    }
+
+    /// Closes the books: what is still on its way or waits for a tick that will not come is in flight.
+    fn close(&mut self) {
+        for member in self.crew.iter().skip(1) {
+            let cav = member.agent.cav();
+            let waiting = self.pairing.forget(cav) as u64;
+            self.courier.close(cav, waiting);
+        }
+        self.evaluator.ledger.merge(self.courier.ledger());
+    }
+}
+
+/// Hands over what a neighbour sends for a tick: its pose as soon as it is known, the rest when it is computed.
+fn post(courier: &mut Courier, compute: &ComputeTimes, tick: usize, sent: Sent, distance_m: f64) {
+    let sequence = tick as u64;
+    let pose_nanos = sent.capture_nanos.saturating_add(compute.pose_nanos());
+    let (cav, pose_bytes) = (sent.cav.clone(), sent.pose_bytes);
+    courier.post_pose(&cav, sequence, pose_bytes, pose_nanos, distance_m);
+    let (payload_bytes, wire_bytes) = (sent.payload_bytes, sent.wire_bytes);
+    let sent_nanos = sent.capture_nanos.saturating_add(compute.agent_nanos());
+    let stream = match sent.content.as_ref().map(crate::ego::Content::exchange) {
+        Some(Exchange::Boxes) => Stream::Boxes,
+        Some(Exchange::Points) => Stream::Points,
+        _ => Stream::Bev,
+    };
+    if let Some(view) = sent.into_view() {
+        let letter = Letter { view, payload_bytes, wire_bytes };
+        courier.post(stream, sequence, wire_bytes - pose_bytes, sent_nanos, distance_m, letter);
+    }
+}
+
+/// The places of those who take part, the ego first.
+fn places(scenario: &Scenario, crew: &Crew) -> Vec<usize> {
+    match crew {
+        Crew::First(count) => (0..scenario.agents.len()).take(*count).collect(),
+        Crew::Named(names) => {
+            names.iter().filter_map(|name| scenario.agents.iter().position(|agent| agent == name)).collect()
+        }
+    }
+}
+
+/// Between two vehicles, metres; 0 where the recording does not know.
+fn distance_m(one: &Frame, other: &Frame) -> f64 {
+    let place = |frame: &Frame| frame.world_from_lidar.map(|pose| pose.translation_m);
+    match (place(one), place(other)) {
+        (Some(one), Some(other)) => (one[0] - other[0]).hypot(one[1] - other[1]),
+        _ => 0.0,
+    }
+}
+
+/// Reasons by which messages leave the air, for tables with a column for each.
+pub const DROP_REASONS: [DropReason; 7] = [
+    DropReason::LinkLoss,
+    DropReason::LinkQueue,
+    DropReason::Superseded,
+    DropReason::Stale,
+    DropReason::Duplicate,
+    DropReason::NoPose,
+    DropReason::OutOfRange,
+];
