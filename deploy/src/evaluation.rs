@@ -1,4 +1,5 @@
-//! A method on recorded scenes without a network: the numbers of a run in which nothing is late.
+//! A method on recorded scenes without a network: the numbers of a run in which nothing is late, or of one whose messages
+//! cross the emulated air in virtual time.
 
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
@@ -7,6 +8,7 @@ use std::time::Instant;
 
 use agent::pose_source::PoseSourceConfig;
 use agent::weights::Weights;
+use ego_fuser::evaluate::stepped::SteppedConfig;
 use ego_fuser::evaluate::{EvaluateConfig, EvaluateError, EvaluatedFrame, Evaluator};
 use ego_fuser::feature_store::{FeatureStore, KeptMaps, MapSource};
 use ego_fuser::{Exchange, Method};
@@ -18,7 +20,7 @@ use crate::score::Board;
 use crate::weights_choice::{WeightsChoiceError, weights_of};
 
 /// What to evaluate.
-#[derive(Debug, Clone)]
+#[derive(Debug, Clone, Default)]
 pub struct EvaluationOptions {
     /// Data set, split or scenario.
     pub dataset: PathBuf,
@@ -34,13 +36,35 @@ pub struct EvaluationOptions {
     pub maps: Option<KeptMaps>,
     /// Frames to judge at most, over all scenarios.
     pub frames: Option<usize>,
-    /// Scenarios to judge at most, evenly spread over all there are.
-    pub scenarios: Option<usize>,
+    /// The air that messages cross, in virtual time; absent: none.
+    pub stepped: Option<SteppedConfig>,
+    /// The part of the data set that is judged.
+    pub part: Part,
 }
 
-impl EvaluationOptions {
-    /// The scenarios of `dataset` that are judged.
-    fn chosen<'a>(&self, scenarios: &'a [Scenario]) -> impl Iterator<Item = &'a Scenario> {
+/// A part of a data set.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct Part {
+    /// So many scenarios, evenly spread; all where absent.
+    pub scenarios: Option<usize>,
+    /// The first so many ticks of each; all where absent.
+    pub ticks: Option<usize>,
+}
+
+impl Part {
+    /// Opens a data set: all its scenarios, each with the ticks that are asked for. Maps are kept of these, so that another
+    /// choice among them needs no others.
+    ///
+    /// # Errors
+    /// [`ReadError`] when it cannot be read.
+    pub fn open(&self, path: &Path) -> Result<Vec<Scenario>, ReadError> {
+        let mut scenarios = dataset::open(path)?.scenarios;
+        scenarios.iter_mut().for_each(|scenario| scenario.ticks.truncate(self.ticks.unwrap_or(usize::MAX)));
+        Ok(scenarios)
+    }
+
+    /// Those of all scenarios that are asked for.
+    pub fn chosen<'a>(&self, scenarios: &'a [Scenario]) -> impl Iterator<Item = &'a Scenario> {
         let count = self.scenarios.map_or(scenarios.len(), |most| most.min(scenarios.len()));
         (0..count).map(move |index| &scenarios[index * scenarios.len() / count])
     }
@@ -68,8 +92,8 @@ pub enum EvaluationError {
 /// # Errors
 /// [`EvaluationError`] when the data set cannot be read.
 pub fn frame_count(options: &EvaluationOptions) -> Result<usize, EvaluationError> {
-    let dataset = dataset::open(&options.dataset)?;
-    let ticks = options.chosen(&dataset.scenarios).map(|scenario| scenario.ticks.len()).sum();
+    let scenarios = options.part.open(&options.dataset)?;
+    let ticks = options.part.chosen(&scenarios).map(|scenario| scenario.ticks.len()).sum();
     Ok(options.frames.map_or(ticks, |frames| frames.min(ticks)))
 }
 
@@ -82,8 +106,21 @@ pub fn evaluate(
     method: Method,
     on_frame: &mut dyn FnMut(),
 ) -> Result<Metrics, EvaluationError> {
+    let (board, evaluator, began) = judged(options, method, on_frame)?;
+    Ok(metrics(&board, &evaluator, options, began))
+}
+
+/// The same with the board itself, for those who want to know more than the numbers.
+///
+/// # Errors
+/// As [`evaluate`].
+pub(crate) fn judged(
+    options: &EvaluationOptions,
+    method: Method,
+    on_frame: &mut dyn FnMut(),
+) -> Result<(Board, Evaluator, Instant), EvaluationError> {
     let began = Instant::now();
-    let dataset = dataset::open(&options.dataset)?;
+    let scenarios = options.part.open(&options.dataset)?;
     let weights = weights_of(&options.weights, method)?;
     let mut evaluator = Evaluator::new(EvaluateConfig {
         weights: weights.clone(),
@@ -94,19 +131,23 @@ pub fn evaluate(
         delay_nanos: options.delay_nanos,
     })?;
     if let Some(kept) = options.maps.as_ref().filter(|_| method.exchange() != Exchange::Points) {
-        evaluator = evaluator.with_maps(maps(kept, &weights, &dataset.scenarios)?);
+        evaluator = evaluator.with_maps(maps(kept, &weights, &scenarios)?);
+    }
+    if let Some(stepped) = &options.stepped {
+        evaluator = evaluator.over_link(stepped.clone());
     }
     let grid = evaluator.ego().detector().config().feature_grid();
     let channels = evaluator.ego().detector().config().feature_channels();
     let map_values = u64::from(grid.width) * u64::from(grid.height) * u64::try_from(channels).unwrap_or(0);
     let left = options.frames.unwrap_or(usize::MAX);
+    let is_stepped = options.stepped.is_some();
     let mut board: Option<Board> = None;
-    for scenario in options.chosen(&dataset.scenarios) {
+    for scenario in options.part.chosen(&scenarios) {
         let Some(ego) = scenario.agents.first() else { continue };
         let board = board.get_or_insert_with(|| Board::new(ego.clone(), *evaluator.rule(), map_values));
         board.change_ego(ego);
         let judged = evaluator.run(scenario, &mut |frame| {
-            judge(board, frame);
+            judge(board, frame, is_stepped);
             on_frame();
             if board.records().len() >= left { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
         })?;
@@ -116,7 +157,7 @@ pub fn evaluate(
     }
     let board =
         board.filter(|board| !board.records().is_empty()).ok_or(EvaluationError::Empty(options.dataset.clone()))?;
-    Ok(metrics(&board, method, &options.pose_source, began))
+    Ok((board, evaluator, began))
 }
 
 /// The maps of all sweeps, encoded now where they have not been before.
@@ -126,27 +167,31 @@ fn maps(kept: &KeptMaps, weights: &Path, scenarios: &[Scenario]) -> Result<MapSo
     Ok(MapSource::new(Arc::new(store.map_err(|error| EvaluateError::from(Box::new(error)))?), weights))
 }
 
-fn judge(board: &mut Board, frame: EvaluatedFrame) {
+/// Judges a frame; in virtual time its stamp says when it was published.
+pub(crate) fn judge(board: &mut Board, frame: EvaluatedFrame, is_stepped: bool) {
     let EvaluatedFrame { stamp, result, frames, poses, objects } = frame;
     let poses: Vec<_> = frames.iter().map(|frame| frame.cav.clone()).zip(poses).collect();
     let truth: Vec<(CavId, _)> =
         frames.iter().filter_map(|frame| Some((frame.cav.clone(), frame.world_from_lidar?))).collect();
-    board.judge_whole(stamp.capture_nanos, result, objects, &poses, truth);
+    let latency_ms = is_stepped.then(|| (stamp.publish_nanos - stamp.capture_nanos) as f64 / 1e6);
+    board.judge_whole(stamp.capture_nanos, latency_ms, result, objects, &poses, truth);
 }
 
-fn metrics(board: &Board, method: Method, pose_source: &PoseSourceConfig, began: Instant) -> Metrics {
+pub(crate) fn metrics(board: &Board, evaluator: &Evaluator, options: &EvaluationOptions, began: Instant) -> Metrics {
     let (ap_global, ap_frame_order) = board.average_precision();
+    let is_stepped = options.stepped.is_some();
     Metrics {
         frames: board.records().len() as u64,
-        seconds: began.elapsed().as_secs_f64(),
-        clock: "offline".into(),
-        method: method.name().into(),
-        pose_source: pose_source.name().into(),
+        seconds: if is_stepped { board.seconds() } else { began.elapsed().as_secs_f64() },
+        clock: if is_stepped { "stepped" } else { "offline" }.into(),
+        method: evaluator.ego().method().name().into(),
+        pose_source: options.pose_source.name().into(),
         ap_global,
         ap_frame_order,
         pose: board.pose_errors(),
         latency_ms: board.latencies(),
+        age_ms: board.ages(),
         comm: board.communication(),
-        messages: Messages::default(),
+        messages: Messages::of(&evaluator.ledger().total()),
     }
 }

@@ -3,7 +3,8 @@
 //!
 //! - [`scenario`]: what is asked for; [`fleet`]: which processes that takes.
 //! - [`up`]: one run, with its [`network`], [`supervise`]d processes and [`score`].
-//! - [`evaluation`]: the same numbers without a network; [`table`]: many of them.
+//! - [`stepped`]: the same in virtual time.
+//! - [`evaluation`]: the same numbers without a network; [`table`]: many of them; [`sweep`]: grids of them in virtual time.
 //! - [`run_folder`], [`metrics`], [`ledger_report`], [`picture`]: what is kept of it.
 
 pub mod evaluation;
@@ -19,7 +20,9 @@ pub mod run_folder;
 pub mod scenario;
 pub mod score;
 pub mod showcase;
+pub mod stepped;
 pub mod supervise;
+pub mod sweep;
 pub mod table;
 pub mod up;
 pub mod weights_choice;

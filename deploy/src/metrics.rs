@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 
 pub use agent::pose_error::PoseError;
 use agent::statistics::{quantile, sorted};
-use protocol::DropReason;
+use protocol::{Counts, DropReason};
 use serde::{Deserialize, Serialize};
 
 /// A pose nearer to the truth than this is a success, metres.
@@ -31,6 +31,10 @@ pub struct Metrics {
     pub pose: PoseErrors,
     /// Delays.
     pub latency_ms: Latencies,
+    /// Age of what neighbours contributed: capture time of the ego's sweep less that of the neighbour's, per neighbour and
+    /// frame that was fused, milliseconds.
+    #[serde(default)]
+    pub age_ms: Percentiles,
     /// What crossed the air.
     pub comm: Communication,
     /// The ledger's totals.
@@ -118,6 +122,15 @@ impl Percentiles {
     pub fn of(sample: &[f64]) -> Self {
         let sorted = sorted(sample);
         Self { p50: quantile(&sorted, 0.50), p95: quantile(&sorted, 0.95), p99: quantile(&sorted, 0.99) }
+    }
+}
+
+impl Messages {
+    /// The totals of a ledger.
+    #[must_use]
+    pub fn of(total: &Counts) -> Self {
+        let Counts { sent, received, in_flight, dropped } = total.clone();
+        Self { sent, received, in_flight, dropped }
     }
 }
 

@@ -92,6 +92,7 @@ mod tests {
             ap_frame_order: ByIou::default(),
             pose: PoseErrors::default(),
             latency_ms: Latencies { capture_to_detection: Percentiles { p50: Some(81.4), ..Percentiles::default() } },
+            age_ms: Percentiles::default(),
             comm: Communication::default(),
             messages: Messages::default(),
         };

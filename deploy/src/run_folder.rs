@@ -100,7 +100,7 @@ impl RunFolder {
 /// The table of a run's frames: a header line, then a line per frame.
 fn frames_csv(records: &[FrameRecord]) -> String {
     let mut text = String::from(
-        "frame_index,capture_nanos,latency_ms,detected,truth,found,fused,skipped,payload_bytes,wire_bytes,ego_error_m,\
+        "frame_index,capture_nanos,latency_ms,detected,truth,found,fused,skipped,oldest_ms,stale,payload_bytes,wire_bytes,ego_error_m,\
          ego_error_deg\n",
     );
     let optional = |number: &Option<f64>| number.map_or(String::new(), |number| format!("{number:.4}"));
@@ -115,17 +115,20 @@ fn frames_csv(records: &[FrameRecord]) -> String {
             found,
             fused,
             skipped,
+            oldest_ms,
+            stale,
             payload_bytes,
             wire_bytes,
             ego_error_m,
             ego_error_deg,
         } = record;
-        let [latency_ms, error_m, error_deg] = [latency_ms, ego_error_m, ego_error_deg].map(optional);
+        let [latency_ms, oldest_ms, error_m, error_deg] =
+            [latency_ms, oldest_ms, ego_error_m, ego_error_deg].map(optional);
         // Writing to a string cannot fail.
         let _ = writeln!(
             text,
             "{frame_index},{capture_nanos},{latency_ms},{detected},{truth},{found},{fused},{skipped},\
-             {payload_bytes},{wire_bytes},{error_m},{error_deg}"
+             {oldest_ms},{stale},{payload_bytes},{wire_bytes},{error_m},{error_deg}"
         );
     }
     text
@@ -184,6 +187,8 @@ mod tests {
             found: 18,
             fused: 1,
             skipped: 0,
+            oldest_ms: Some(100.0),
+            stale: 1,
             payload_bytes: 1000,
             wire_bytes: 1300,
             ego_error_m: Some(0.25),
@@ -191,7 +196,7 @@ mod tests {
         };
         let text = frames_csv(&[record]);
         let lines: Vec<&str> = text.lines().collect();
-        assert_eq!(lines[1], "3,300000000,81.2500,20,22,18,1,0,1000,1300,0.2500,");
+        assert_eq!(lines[1], "3,300000000,81.2500,20,22,18,1,0,100.0000,1,1000,1300,0.2500,");
         assert_eq!(lines[0].matches(',').count(), lines[1].matches(',').count());
     }
 

@@ -5,6 +5,7 @@ use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
+use ego_fuser::evaluate::EvaluateError;
 use protocol::{Balance, Ledger, RunId};
 use sim_replay::bus::shutdown::Stop;
 use sim_replay::bus::{BusError, Endpoint};
@@ -15,7 +16,7 @@ use crate::metrics::{Messages, Metrics};
 use crate::network::MeetingPlace;
 use crate::progress::Display;
 use crate::run_folder::{RunFolder, RunFolderError, name_of_now};
-use crate::scenario::Scenario;
+use crate::scenario::{Clock, Scenario};
 use crate::score::{Board, Progress, Scored, ScorerError, ScorerNode};
 use crate::supervise::{Happening, ProcessEvent, SuperviseError, Supervisor};
 
@@ -86,6 +87,9 @@ pub enum UpError {
     /// Signals cannot be caught.
     #[error("cannot catch Ctrl-C: {0}")]
     Signals(std::io::Error),
+    /// A run in virtual time cannot be computed.
+    #[error(transparent)]
+    Evaluate(Box<EvaluateError>),
     /// A process stays down.
     #[error("{process} {how} (log: {})", log.display())]
     Process {
@@ -102,7 +106,11 @@ impl UpError {
     /// Whether the input is at fault, and not the run.
     #[must_use]
     pub fn is_bad_input(&self) -> bool {
-        matches!(self, Self::Fleet(_) | Self::Folder(RunFolderError::Taken(_)))
+        match self {
+            Self::Fleet(_) | Self::Folder(RunFolderError::Taken(_)) => true,
+            Self::Evaluate(error) => matches!(**error, EvaluateError::TooSlow { .. } | EvaluateError::Link(_)),
+            _ => false,
+        }
     }
 }
 
@@ -121,6 +129,9 @@ enum Ending {
 /// # Errors
 /// [`UpError`] when the run cannot start, or a process stays down.
 pub fn up(scenario: &Scenario, options: &UpOptions) -> Result<RunResult, UpError> {
+    if scenario.clock == Clock::Stepped {
+        return crate::stepped::up(scenario, options);
+    }
     let fleet = Fleet::plan(scenario)?;
     let run = fleet.scenario.run.clone().unwrap_or_else(|| name_of_now(options.prefix));
     let folder = RunFolder::create(&options.runs, &run)?;
@@ -296,7 +307,6 @@ fn write(
 }
 
 fn metrics(fleet: &Fleet, board: &Board, progress: &Progress, sum: &Ledger) -> Metrics {
-    let total = sum.total();
     let (ap_global, ap_frame_order) = board.average_precision();
     Metrics {
         frames: board.records().len() as u64,
@@ -308,12 +318,8 @@ fn metrics(fleet: &Fleet, board: &Board, progress: &Progress, sum: &Ledger) -> M
         ap_frame_order,
         pose: board.pose_errors(),
         latency_ms: board.latencies(),
+        age_ms: board.ages(),
         comm: board.communication(),
-        messages: Messages {
-            sent: total.sent,
-            received: total.received,
-            in_flight: total.in_flight,
-            dropped: total.dropped,
-        },
+        messages: Messages::of(&sum.total()),
     }
 }

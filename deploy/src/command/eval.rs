@@ -1,5 +1,6 @@
 //! `v2vloc eval`.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use agent::pose_source::sanity::SanityConfig;
@@ -7,12 +8,15 @@ use agent::pose_source::{
     CachedPoseConfig, EndToEndPoseConfig, NoiseMode, NoisyPoseConfig, PgcConfig, PoseSourceConfig,
 };
 use clap::ValueEnum;
-use deploy::evaluation::{EvaluationOptions, evaluate, frame_count};
+use deploy::evaluation::{EvaluationOptions, Part, evaluate, frame_count};
 use deploy::report;
 use deploy::table::{self, TableObserver, TableSpec};
 use ego_fuser::Method;
+use ego_fuser::evaluate::stepped::{ComputeTimes, Crew, SteppedConfig};
+use ego_fuser::pairing::PairingConfig;
 use indicatif::{ProgressBar, ProgressStyle};
 use protocol::{CodecConfig, ConfidenceGate, Dtype};
+use sim_replay::link::LinkConfig;
 
 use super::{BadInput, Outcome};
 
@@ -63,6 +67,21 @@ pub(crate) struct Arguments {
     /// How long messages of neighbours are under way, milliseconds.
     #[arg(long, value_name = "MS", default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=10_000))]
     delay: u64,
+    /// The emulated air between neighbours and ego, in virtual time: a preset of `sim-replay link`, or a file.
+    #[arg(long, value_name = "PRESET|FILE", conflicts_with = "delay")]
+    link: Option<String>,
+    /// Same seed, same losses and delays (--link).
+    #[arg(long, default_value_t = 0, requires = "link")]
+    seed: u64,
+    /// The ego fuses what has arrived so long after its sweep, milliseconds (--link).
+    #[arg(long, value_name = "MS", default_value_t = 100, requires = "link")]
+    deadline: u64,
+    /// Oldest map that is still fused, by capture time, milliseconds (--link).
+    #[arg(long, value_name = "MS", default_value_t = 300, requires = "link")]
+    max_age: u64,
+    /// Compute time of pose, map and fusion, milliseconds, for example 20,60,30 (--link).
+    #[arg(long, value_name = "MS,MS,MS", value_delimiter = ',', num_args = 1, default_values_t = [0.0; 3], requires = "link")]
+    compute: Vec<f64>,
     /// How exactly feature values cross the air.
     #[arg(long, value_enum, default_value_t = Exactness::F32)]
     dtype: Exactness,
@@ -170,7 +189,31 @@ impl Arguments {
             delay_nanos: self.delay * 1_000_000,
             maps: None,
             frames: self.frames.map(at_most),
-            scenarios: self.scenarios.map(at_most),
+            stepped: self.link.as_deref().map(|link| self.stepped(link)).transpose()?,
+            part: Part { scenarios: self.scenarios.map(at_most), ticks: None },
+        })
+    }
+
+    fn stepped(&self, link: &str) -> Result<SteppedConfig, BadInput> {
+        let (link, link_folder) = LinkConfig::open(link).map_err(|error| BadInput(error.to_string()))?;
+        let &[pose_ms, map_ms, fuse_ms] = &self.compute[..] else {
+            return Err(BadInput(format!("--compute takes 3 numbers, not {}", self.compute.len())));
+        };
+        if let Some(ms) = self.compute.iter().find(|ms| !(0.0..=60_000.0).contains(*ms)) {
+            return Err(BadInput(format!("--compute: {ms} is not 0 to 60000 ms")));
+        }
+        let nanos = |ms: u64| ms.saturating_mul(1_000_000);
+        Ok(SteppedConfig {
+            link,
+            link_folder,
+            seed: self.seed,
+            deadline_nanos: nanos(self.deadline),
+            pairing: PairingConfig { max_age_nanos: nanos(self.max_age), ..PairingConfig::default() },
+            compute: ComputeTimes { pose_ms, map_ms, fuse_ms },
+            crew: Crew::First(usize::MAX),
+            vehicles: BTreeMap::new(),
+            ticks: 0..usize::MAX,
+            lidar_variant: None,
         })
     }
 

@@ -2,6 +2,7 @@
 
 mod demo;
 mod eval;
+mod sweep;
 mod up;
 
 use std::path::PathBuf;
@@ -12,6 +13,7 @@ use anyhow::Context;
 use deploy::evaluation::EvaluationError;
 use deploy::fleet::FleetError;
 use deploy::scenario::ScenarioError;
+use deploy::sweep::SweepError;
 use deploy::table::TableError;
 use deploy::up::UpError;
 
@@ -22,6 +24,8 @@ pub(crate) enum Command {
     Demo(demo::Arguments),
     /// Judge methods on recorded scenes without a network: AP, pose errors, bytes.
     Eval(eval::Arguments),
+    /// Run a grid of experiments in virtual time: one CSV, charts, a report.
+    Sweep(sweep::Arguments),
     /// Start a fleet: processes, scene, models, network; Ctrl-C ends it.
     Up(up::Arguments),
 }
@@ -33,6 +37,7 @@ impl Command {
         match self {
             Self::Demo(arguments) => arguments.run(),
             Self::Eval(arguments) => arguments.run(),
+            Self::Sweep(arguments) => arguments.run(),
             Self::Up(arguments) => arguments.run(),
         }
     }
@@ -75,6 +80,7 @@ pub(crate) fn exit_code(error: &anyhow::Error) -> ExitCode {
             || cause.is::<FleetError>()
             || cause.is::<EvaluationError>()
             || cause.is::<TableError>()
+            || cause.downcast_ref::<SweepError>().is_some_and(SweepError::is_bad_input)
             || cause.downcast_ref::<UpError>().is_some_and(UpError::is_bad_input)
     });
     if is_bad_input { ExitCode::from(2) } else { ExitCode::FAILURE }

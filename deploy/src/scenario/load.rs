@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use sim_replay::link::PRESETS;
 
-use super::Scenario;
+use super::{Clock, Launch, Scenario};
 
 /// Largest scenario file, bytes.
 const MAX_BYTES: u64 = 1 << 20;
@@ -130,6 +130,7 @@ impl Scenario {
         if self.ego.deadline_ms > 60_000 {
             return Err(value("ego.deadline_ms", self.ego.deadline_ms.to_string(), "must be at most 60000"));
         }
+        self.check_clock(path)?;
         if let Some(ego) = &self.ego.id
             && !self.scene.agents.is_empty()
             && !self.scene.agents.contains(ego)
@@ -166,6 +167,41 @@ impl Scenario {
         for (field, place) in places.into_iter().chain(networks) {
             if !place.exists() {
                 return Err(ScenarioError::Missing { path: path.into(), field, missing: place.clone() });
+            }
+        }
+        Ok(())
+    }
+
+    /// Checks that nothing contradicts the clock: virtual time knows no pace, no waiting and no other hosts.
+    fn check_clock(&self, path: &Path) -> Result<(), ScenarioError> {
+        let value = |field, found: String, rule| Err(ScenarioError::Value { path: path.into(), field, found, rule });
+        if self.clock == Clock::Wall {
+            return match self.stepped {
+                Some(_) => value("stepped", "given".into(), "must be left out unless clock is stepped"),
+                None => Ok(()),
+            };
+        }
+        if self.scene.rate != 1.0 {
+            return value("scene.rate", self.scene.rate.to_string(), "must be 1 with clock stepped, which has no pace");
+        }
+        for (field, is_set) in [("scene.loop", self.scene.repeat), ("scene.lockstep", self.scene.lockstep)] {
+            if is_set {
+                return value(field, "true".into(), "must be false with clock stepped");
+            }
+        }
+        let launches = self.vehicles.values().filter_map(|own| own.launch).chain([self.agents.launch]);
+        if launches.into_iter().any(|launch| launch == Launch::Elsewhere) {
+            return value("launch", "elsewhere".into(), "must be here with clock stepped, which runs in one process");
+        }
+        for (field, ms) in self.stepped.and_then(|stepped| stepped.compute).into_iter().flat_map(|compute| {
+            [
+                ("stepped.compute.pose_ms", compute.pose_ms),
+                ("stepped.compute.map_ms", compute.map_ms),
+                ("stepped.compute.fuse_ms", compute.fuse_ms),
+            ]
+        }) {
+            if !(0.0..=60_000.0).contains(&ms) {
+                return value(field, ms.to_string(), "must be 0 to 60000");
             }
         }
         Ok(())
@@ -292,6 +328,13 @@ mod tests {
             ("scene: {dir: nowhere}", "nowhere does not exist"),
             ("scene: {dir: .}\nnetwork: {listen: localhost}", "network is localhost"),
             ("scene: {dir: ., agents: [a]}\nego: {id: b}", "ego.id is b"),
+            ("scene: {dir: ., rate: 2}\nclock: stepped", "scene.rate is 2"),
+            ("scene: {dir: ., lockstep: true}\nclock: stepped", "scene.lockstep is true"),
+            ("scene: {dir: .}\nstepped: {}", "stepped is given"),
+            (
+                "scene: {dir: .}\nclock: stepped\nstepped: {compute: {pose_ms: -1, map_ms: 0, fuse_ms: 0}}",
+                "pose_ms is -1",
+            ),
             ("scene: {dir: .}\nmodels: {weights: none.safetensors}", "none.safetensors does not exist"),
         ] {
             let models = if line.contains("models") { "" } else { "models: {weights: s.yaml}\n" };

@@ -8,6 +8,7 @@ mod load;
 use std::collections::BTreeMap;
 use std::path::PathBuf;
 
+use ego_fuser::evaluate::stepped::ComputeTimes;
 use ego_fuser::{Exchange, Method};
 use protocol::{CavId, CodecConfig, RunId, Stream};
 use serde::{Deserialize, Serialize};
@@ -28,6 +29,9 @@ pub struct Scenario {
     /// Which clock the run keeps.
     #[serde(default)]
     pub clock: Clock,
+    /// What a run in virtual time is told; only with `clock: stepped`.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub stepped: Option<Stepped>,
     /// The networks.
     pub models: Models,
     /// How the ego fuses.
@@ -112,6 +116,17 @@ pub enum Clock {
     /// Messages take the time they take.
     #[default]
     Wall,
+    /// Virtual time: everyone computes as long as [`Stepped`] says, the emulated air decides what arrives when, and the
+    /// ego fuses exactly what has arrived `ego.deadline_ms` after a tick. Same scenario, same bytes.
+    Stepped,
+}
+
+/// What a run in virtual time is told.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Stepped {
+    /// How long everyone computes; absent: measured once, and written into the `scenario.yaml` of the run.
+    pub compute: Option<ComputeTimes>,
 }
 
 /// The networks.

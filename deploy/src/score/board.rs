@@ -1,7 +1,7 @@
 //! The score of a run, tick by tick, from what was detected and what was there. Knows no network and no file.
 
 use ego_fuser::average_precision::{Ordering, Scorer};
-use protocol::{Box3d, CavId, Detections, Pose, PoseEstimate, Stamp, Truth};
+use protocol::{Box3d, CavId, Detections, DropReason, Pose, PoseEstimate, Stamp, Truth};
 use sim_replay::ground_truth::GroundTruthRule;
 
 use super::frame_record::{FrameRecord, JudgedFrame};
@@ -11,6 +11,9 @@ use crate::metrics::{ByIou, Communication, Latencies, Percentiles, PoseError, Po
 
 /// Overlap from which a detection counts as found in `frames.csv`.
 const FOUND_IOU: f64 = 0.5;
+
+/// A longer time between two frames is between two scenarios, nanoseconds.
+const SCENARIO_GAP_NANOS: u64 = 10_000_000_000;
 
 /// The score so far. Ticks are judged in the order of their capture times, whatever order their parts come in.
 pub struct Board {
@@ -23,6 +26,7 @@ pub struct Board {
     pose_errors: Vec<PoseError>,
     no_pose: u64,
     bytes: Vec<(u64, u64)>,
+    ages_ms: Vec<f64>,
     missed: u64,
     best: Option<JudgedFrame>,
 }
@@ -42,6 +46,7 @@ impl Board {
             pose_errors: Vec::new(),
             no_pose: 0,
             bytes: Vec::new(),
+            ages_ms: Vec::new(),
             missed: 0,
             best: None,
         }
@@ -118,6 +123,20 @@ impl Board {
         Latencies { capture_to_detection: Percentiles::of(&sample) }
     }
 
+    /// Ages of all that was fused.
+    #[must_use]
+    pub fn ages(&self) -> Percentiles {
+        Percentiles::of(&self.ages_ms)
+    }
+
+    /// From the first to the last frame on the scene's clock, seconds; scenarios that follow one another add up.
+    #[must_use]
+    pub fn seconds(&self) -> f64 {
+        let steps = self.records.windows(2).map(|pair| pair[1].capture_nanos.saturating_sub(pair[0].capture_nanos));
+        // Where another scenario begins the clock jumps, ahead or back.
+        steps.filter(|nanos| *nanos < SCENARIO_GAP_NANOS).map(|nanos| nanos as f64 * 1e-9).sum()
+    }
+
     /// Bytes of all that was fused.
     #[must_use]
     pub fn communication(&self) -> Communication {
@@ -149,13 +168,14 @@ impl Board {
     pub fn judge_whole(
         &mut self,
         capture_nanos: u64,
+        latency_ms: Option<f64>,
         result: Detections,
         boxes: Vec<Box3d>,
         poses: &[(CavId, PoseEstimate)],
         world_from_lidar: Vec<(CavId, Pose)>,
     ) {
         self.judge_poses(poses, &world_from_lidar);
-        self.judge_result((result.frame_index, capture_nanos), None, result, boxes, world_from_lidar);
+        self.judge_result((result.frame_index, capture_nanos), latency_ms, result, boxes, world_from_lidar);
     }
 
     fn judge_result(
@@ -169,6 +189,7 @@ impl Board {
         let found = self.score(&result, &boxes);
         let bytes: Vec<(u64, u64)> =
             result.fused.iter().map(|neighbour| (neighbour.payload_bytes, neighbour.wire_bytes)).collect();
+        let ages_ms = result.fused.iter().map(|neighbour| neighbour.age_nanos as f64 * 1e-6);
         let ego_error = result.pose.world_from_cav().zip(true_pose(&world_from_lidar, &self.ego));
         let ego_error = ego_error.map(|(found, truth)| PoseError::between(found, truth));
         self.records.push(FrameRecord {
@@ -180,12 +201,15 @@ impl Board {
             found,
             fused: result.fused.len(),
             skipped: result.skipped.len(),
+            oldest_ms: ages_ms.clone().max_by(f64::total_cmp),
+            stale: result.skipped.iter().filter(|left_out| left_out.reason == Some(DropReason::Stale)).count(),
             payload_bytes: bytes.iter().map(|(payload, _)| payload).sum(),
             wire_bytes: bytes.iter().map(|(_, wire)| wire).sum(),
             ego_error_m: ego_error.map(|error| error.distance_m),
             ego_error_deg: ego_error.map(|error| error.angle_deg),
         });
         self.bytes.extend(bytes);
+        self.ages_ms.extend(ages_ms);
         self.keep_showpiece(frame_index, result, boxes, world_from_lidar);
     }
 

@@ -22,6 +22,11 @@ pub struct FrameRecord {
     pub fused: usize,
     /// Neighbours whose data could not be, or that were out of range.
     pub skipped: usize,
+    /// Age of the oldest of what was fused: capture time of the ego's sweep less that of the neighbour's, milliseconds; none
+    /// where nothing was.
+    pub oldest_ms: Option<f64>,
+    /// Neighbours whose newest data were too old.
+    pub stale: usize,
     /// Bytes of metadata and body of what was fused, over all neighbours.
     pub payload_bytes: u64,
     /// Bytes of everything those neighbours sent for it.

@@ -18,7 +18,7 @@ pub use cell::{Cell, CellKey};
 pub use spec::{Column, Row, Table, TableSpec};
 pub use text::{csv, markdown};
 
-use crate::evaluation::{EvaluationError, EvaluationOptions, evaluate};
+use crate::evaluation::{EvaluationError, EvaluationOptions, Part, evaluate};
 use crate::weights_choice::WeightsChoiceError;
 use ego_fuser::feature_store::KeptMaps;
 
@@ -167,7 +167,8 @@ impl Run<'_> {
                 limit_bytes: (self.spec.maps_limit_gb.max(0.0) * 1e9) as u64,
             }),
             frames: self.spec.frames,
-            scenarios: table.scenarios,
+            part: Part { scenarios: table.scenarios, ticks: None },
+            ..EvaluationOptions::default()
         };
         let metrics = evaluate(&options, row.method, &mut || observer.frame()).map_err(Box::new)?;
         let cell = Cell { key, weights: weights.to_owned(), commit: self.commit.clone(), metrics };

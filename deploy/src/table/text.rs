@@ -150,7 +150,7 @@ mod tests {
 
     use super::super::CellKey;
     use super::*;
-    use crate::metrics::{Communication, Latencies, Messages, Metrics, PoseErrors};
+    use crate::metrics::{Communication, Latencies, Messages, Metrics, Percentiles, PoseErrors};
 
     fn cell(method: Method, at_50: f64) -> Cell {
         let ap = ByIou { at_30: Some(0.9), at_50: Some(at_50), at_70: None };
@@ -164,6 +164,7 @@ mod tests {
             ap_frame_order: ap,
             pose: PoseErrors::default(),
             latency_ms: Latencies::default(),
+            age_ms: Percentiles::default(),
             comm: Communication {
                 payload_bytes_mean: Some(1024.0),
                 log2_payload: Some(10.0),

@@ -1,0 +1,95 @@
+//! Runs of a sweep in several processes, each with one thread that computes.
+//!
+//! A worker is this program with `--worker`: it reads the number of a point from standard input, computes the run, keeps
+//! it, and answers on standard output: `frame` for each frame, then `done`, or `failed` with the reason.
+
+use std::io::{BufRead, BufReader, Write};
+use std::path::Path;
+use std::process::{Child, Command, Stdio};
+use std::sync::Mutex;
+
+use super::SweepError;
+
+/// What a worker says of a run.
+pub(super) const FRAME: &str = "frame";
+/// The run is kept.
+pub(super) const DONE: &str = "done";
+/// The run came to nothing; the reason follows on the same line.
+pub(super) const FAILED: &str = "failed";
+
+/// Has the points of these numbers computed by `jobs` processes; `on_frame` and `on_done` are told as things happen.
+pub(super) fn run(
+    file: &Path,
+    out: &Path,
+    missing: &[usize],
+    jobs: usize,
+    on_frame: &(dyn Fn() + Sync),
+    on_done: &(dyn Fn() + Sync),
+) -> Result<(), SweepError> {
+    let queue = Mutex::new(missing.iter().copied());
+    let failure = Mutex::new(None);
+    std::thread::scope(|scope| {
+        for _ in 0..jobs.min(missing.len()) {
+            scope.spawn(|| {
+                if let Err(error) = serve(file, out, &queue, &failure, on_frame, on_done) {
+                    failure.lock().unwrap_or_else(std::sync::PoisonError::into_inner).get_or_insert(error);
+                }
+            });
+        }
+    });
+    failure.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner).map_or(Ok(()), Err)
+}
+
+/// Feeds one worker until nothing is left, or another one has failed.
+fn serve(
+    file: &Path,
+    out: &Path,
+    queue: &Mutex<impl Iterator<Item = usize>>,
+    failure: &Mutex<Option<SweepError>>,
+    on_frame: &dyn Fn(),
+    on_done: &dyn Fn(),
+) -> Result<(), SweepError> {
+    let mut worker = Worker(start(file, out)?);
+    let silent = || SweepError::Worker("it ended without a word".into());
+    let mut input = worker.0.stdin.take().ok_or_else(silent)?;
+    let mut output = BufReader::new(worker.0.stdout.take().ok_or_else(silent)?).lines();
+    loop {
+        if failure.lock().unwrap_or_else(std::sync::PoisonError::into_inner).is_some() {
+            return Ok(());
+        }
+        let Some(index) = queue.lock().unwrap_or_else(std::sync::PoisonError::into_inner).next() else {
+            return Ok(());
+        };
+        writeln!(input, "{index}").map_err(|error| SweepError::Worker(error.to_string()))?;
+        loop {
+            let line = output.next().ok_or_else(silent)?.map_err(|error| SweepError::Worker(error.to_string()))?;
+            match line.split_once(' ').unwrap_or((line.as_str(), "")) {
+                (FRAME, _) => on_frame(),
+                (DONE, _) => break on_done(),
+                (FAILED, reason) => return Err(SweepError::Worker(reason.to_owned())),
+                _ => return Err(SweepError::Worker(format!("it says {line:?}"))),
+            }
+        }
+    }
+}
+
+fn start(file: &Path, out: &Path) -> Result<Child, SweepError> {
+    let program = std::env::current_exe().map_err(|source| SweepError::Io { path: "this program".into(), source })?;
+    Command::new(&program)
+        .args(["sweep".as_ref(), file.as_os_str(), "--out".as_ref(), out.as_os_str(), "--worker".as_ref()])
+        .stdin(Stdio::piped())
+        .stdout(Stdio::piped())
+        .spawn()
+        .map_err(|source| SweepError::Io { path: program, source })
+}
+
+/// A process that does not outlive its use.
+struct Worker(Child);
+
+impl Drop for Worker {
+    fn drop(&mut self) {
+        // It ends by itself when its input does; one that hangs must not stay.
+        let _ = self.0.kill();
+        let _ = self.0.wait();
+    }
+}
