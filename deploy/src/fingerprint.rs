@@ -1,6 +1,5 @@
 //! What exactly a run was made of: hashes of its programs, weights and scene.
 
-use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
@@ -59,39 +58,6 @@ impl Provenance {
             scene_files: scene_files.len(),
         })
     }
-}
-
-/// One hash over folders below `root`: names and contents of what is read of them, but for images. With `ticks` only the
-/// first so many moments of each vehicle count.
-pub(crate) fn hash_folders<'a>(
-    root: &Path,
-    folders: impl Iterator<Item = &'a str>,
-    ticks: Option<usize>,
-) -> io::Result<String> {
-    let mut all = Sha256::new();
-    for name in folders {
-        // A single scenario that was opened is called by its own name.
-        let folder = Some(root.join(name)).filter(|folder| folder.is_dir()).unwrap_or_else(|| root.to_owned());
-        let files = first_of_each(scene_files(&folder)?, ticks);
-        all.update(format!("{name} {}\n", hash_all(&folder, &files)?));
-    }
-    Ok(hex(&all.finalize()))
-}
-
-/// Of the files of each folder those of its first `ticks` moments, by their names up to the first dot or underscore.
-fn first_of_each(mut files: Vec<PathBuf>, ticks: Option<usize>) -> Vec<PathBuf> {
-    let Some(ticks) = ticks else { return files };
-    let mut stems: BTreeMap<PathBuf, BTreeSet<String>> = BTreeMap::new();
-    files.retain(|path| {
-        let name = path.file_name().unwrap_or_default().to_string_lossy();
-        let stem = name.split(['.', '_']).next().unwrap_or_default().to_owned();
-        let seen = stems.entry(path.parent().unwrap_or(Path::new("")).to_owned()).or_default();
-        if seen.len() < ticks {
-            seen.insert(stem.clone());
-        }
-        seen.contains(&stem)
-    });
-    files
 }
 
 /// What a run reads of a scene: all but images, in the order of names.

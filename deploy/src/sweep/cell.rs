@@ -44,7 +44,7 @@ pub struct CellKey {
     pub poses_sha256: Vec<String>,
     /// SHA-256 of the weights.
     pub weights_sha256: String,
-    /// SHA-256 over the part of the data that is looked at.
+    /// SHA-256 over the part of the data that is looked at ([`sim_replay::dataset::content_sha256`]).
     pub data_sha256: String,
     /// Version of the program.
     pub version: String,

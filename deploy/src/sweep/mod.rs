@@ -21,7 +21,7 @@ use ego_fuser::Exchange;
 use ego_fuser::evaluate::EvaluateError;
 use ego_fuser::feature_store::FeatureStore;
 use indicatif::{ProgressBar, ProgressStyle};
-use sim_replay::dataset::{ReadError, Scenario};
+use sim_replay::dataset::{self, ReadError, Scenario};
 use sim_replay::link::LinkError;
 use sim_replay::synth::{self, Subset, SynthError, SynthOptions};
 
@@ -31,7 +31,6 @@ pub use spec::{CodecSpec, EgoRule, Experiment, Generate, Grid, NoiseSpec};
 pub use table::csv;
 
 use crate::evaluation::{EvaluationError, evaluate};
-use crate::fingerprint::hash_folders;
 use crate::weights_choice::{WeightsChoiceError, weights_of};
 
 /// Ticks that are timed before a sweep begins, for its estimate.
@@ -129,10 +128,7 @@ impl Sweep {
         }
         check::check_scenes(&experiment, &scenarios).map_err(spec)?;
         let points = points(&experiment.grid);
-        let folders = scenarios.iter().map(|scenario| scenario.name.as_str());
-        let data_sha256 = hash_folders(&experiment.dataset, folders, experiment.ticks)
-            .map_err(|source| SweepError::Io { path: experiment.dataset.clone(), source })?;
-        let mut hashes = cell::Hashes::new(data_sha256);
+        let mut hashes = cell::Hashes::new(dataset::content_sha256(&scenarios));
         let keys = points.iter().map(|point| hashes.key(&experiment, point)).collect::<Result<_, _>>()?;
         let (file, out) = (file.to_owned(), out.to_owned());
         Ok(Self { file, experiment, points, all, scenarios, keys, out })
