@@ -149,6 +149,18 @@ impl Selector {
         Self(format!("{KEY_ROOT}/{run}/rx/{ego}/*/{stream}"))
     }
 
+    /// One stream of every vehicle as it reaches any ego over the link.
+    #[must_use]
+    pub fn received_by_anyone(run: &RunId, stream: Stream) -> Self {
+        Self(format!("{KEY_ROOT}/{run}/rx/*/*/{stream}"))
+    }
+
+    /// The truth.
+    #[must_use]
+    pub fn truth(run: &RunId) -> Self {
+        Self(format!("{KEY_ROOT}/{run}/truth"))
+    }
+
     /// Every control message.
     #[must_use]
     pub fn control(run: &RunId) -> Self {
@@ -275,6 +287,8 @@ mod tests {
         let run = RunId::new("r1").unwrap();
         assert_eq!(Selector::stream(&run, Stream::Bev).as_str(), "v2v/r1/*/bev");
         assert_eq!(Selector::received(&run, &cav("4279"), Stream::Pose).as_str(), "v2v/r1/rx/4279/*/pose");
+        assert_eq!(Selector::received_by_anyone(&run, Stream::Pose).as_str(), "v2v/r1/rx/*/*/pose");
+        assert_eq!(Selector::truth(&run).as_str(), "v2v/r1/truth");
         assert_eq!(Selector::alive(&run, Role::Agent).as_str(), "v2v/r1/alive/agent/*");
         assert_eq!(Selector::control(&run).as_str(), "v2v/r1/control/*");
         assert_eq!(Selector::stats(&run).as_str(), "v2v/r1/stats/*");

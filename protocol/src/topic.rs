@@ -22,6 +22,10 @@ named! {
         Link = "link",
         /// Compares detections with the truth.
         Scorer = "scorer",
+        /// Writes down everything that is said.
+        Recorder = "recorder",
+        /// Shows the run to people.
+        Viewer = "viewer",
     }
 }
 

@@ -6,7 +6,7 @@ use clap::{Parser, Subcommand};
 
 use crate::command;
 
-/// Scenes: look into recorded ones, generate new ones, stream either as live traffic.
+/// Scenes: look into recorded ones, generate new ones, stream either as live traffic, record what comes of it.
 #[derive(Debug, Parser)]
 #[command(version, after_help = "Exit codes: 0 done, 1 failed, 2 bad usage or input, 3 finished but data was lost.")]
 pub(crate) struct Cli {
@@ -18,6 +18,8 @@ pub(crate) struct Cli {
 enum Command {
     Inspect(command::inspect::Args),
     Link(command::link::Args),
+    Record(command::record::Args),
+    Recover(command::recover::Args),
     Stream(command::stream::Args),
     Synth(command::synth::Args),
 }
@@ -38,6 +40,8 @@ pub(crate) fn run(cli: Cli) -> ExitCode {
     let outcome = match cli.command {
         Command::Inspect(args) => command::inspect::run(&args),
         Command::Link(args) => command::link::run(&args),
+        Command::Record(args) => command::record::run(&args),
+        Command::Recover(args) => command::recover::run(&args),
         Command::Stream(args) => command::stream::run(&args),
         Command::Synth(args) => command::synth::run(args),
     };

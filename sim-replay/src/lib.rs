@@ -13,6 +13,8 @@ pub mod inspect;
 pub mod link;
 pub mod pcd;
 pub mod random;
+pub mod recording;
 pub mod stream;
 pub mod synth;
 pub mod town;
+pub mod web;

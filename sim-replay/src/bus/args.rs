@@ -1,6 +1,7 @@
 //! The arguments that every process of a fleet shares.
 
 use std::io::IsTerminal;
+use std::net::SocketAddr;
 use std::time::Duration;
 
 use protocol::{CavId, Role, RunId};
@@ -33,6 +34,9 @@ pub struct BusArgs {
     /// Largest message accepted from outside, MiB.
     #[arg(long, default_value_t = 32)]
     pub max_message_mib: usize,
+    /// Serve counters and times of this process to Prometheus at http://HOST:PORT/metrics; port 0: any free one.
+    #[arg(long, value_name = "HOST:PORT")]
+    pub metrics: Option<SocketAddr>,
     /// End when standard input ends: for a supervisor that holds the other end of the pipe.
     #[arg(long)]
     pub supervised: bool,
@@ -58,7 +62,12 @@ impl BusArgs {
     /// [`BusError`] names the endpoint and what to do.
     pub fn join(&self, role: Role, cav: &CavId) -> Result<Bus, BusError> {
         let identity = Identity { run: self.run.clone(), process: process_id(role, cav), cav: cav.clone() };
-        Bus::join(&self.options(), identity)
+        let mut bus = Bus::join(&self.options(), identity)?;
+        if let Some(address) = self.metrics {
+            let address = bus.serve_metrics(address)?;
+            tracing::info!("metrics at http://{address}/metrics");
+        }
+        Ok(bus)
     }
 
     /// A request to end that follows signals and, where asked for, the end of standard input, and that is enforced.

@@ -27,9 +27,28 @@ struct State {
     stages: BTreeMap<String, Timings>,
 }
 
+/// Upper ends of the histogram's buckets, seconds: from a checksum to a lost cause.
+const BUCKETS_S: [f64; 14] =
+    [0.0001, 0.00025, 0.0005, 0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5];
+
+/// How long a stage took, over all frames so far.
+#[derive(Debug, Clone, PartialEq)]
+pub struct StageHistogram {
+    /// Its name.
+    pub stage: String,
+    /// Frames.
+    pub count: u64,
+    /// All of their times, seconds.
+    pub sum_s: f64,
+    /// Upper end in seconds and number of frames of every bucket; the last has none ([`f64::MAX`]).
+    pub buckets: Vec<(f64, u64)>,
+}
+
 #[derive(Default)]
 struct Timings {
     count: u64,
+    sum: Duration,
+    buckets: [u64; BUCKETS_S.len() + 1],
     max: Duration,
     last: VecDeque<Duration>,
 }
@@ -106,6 +125,8 @@ impl Books {
         }
         let Some(timings) = state.stages.get_mut(stage) else { return };
         timings.count += 1;
+        timings.sum = timings.sum.saturating_add(time);
+        timings.buckets[BUCKETS_S.partition_point(|end| *end < time.as_secs_f64())] += 1;
         timings.max = timings.max.max(time);
         if timings.last.len() == KEPT_TIMINGS {
             timings.last.pop_front();
@@ -135,6 +156,20 @@ impl Books {
     pub fn stages(&self) -> Vec<StageSummary> {
         let state = self.lock();
         state.stages.iter().map(|(stage, timings)| timings.summary(stage)).collect()
+    }
+
+    /// Every stage over all its frames.
+    #[must_use]
+    pub fn histograms(&self) -> Vec<StageHistogram> {
+        let state = self.lock();
+        let ends = || BUCKETS_S.into_iter().chain([f64::MAX]);
+        let histogram = |(stage, timings): (&String, &Timings)| StageHistogram {
+            stage: stage.clone(),
+            count: timings.count,
+            sum_s: timings.sum.as_secs_f64(),
+            buckets: ends().zip(timings.buckets).collect(),
+        };
+        state.stages.iter().map(histogram).collect()
     }
 
     fn note(&self, topic: &Topic, change: impl FnOnce(&mut State)) {

@@ -1,6 +1,7 @@
 //! One process on the bus of one run.
 
 use std::hash::{BuildHasher, RandomState};
+use std::net::SocketAddr;
 use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::Duration;
@@ -9,10 +10,12 @@ use protocol::{CavId, Control, Key, ProcessId, Role, RunId, Selector, Topic};
 use zenoh::{Session, Wait};
 
 use super::liveliness::{Presence, Sighting, Watch};
+use super::metrics::MetricsServer;
 use super::notices::{Notices, Speaker};
 use super::publisher::{Publisher, PublisherOptions, unix_nanos};
 use super::shutdown::{self, Overdue};
 use super::subscriber::{Inbox, Subscription};
+use super::tap::Tap;
 use super::{Books, BusError, BusOptions, open};
 
 /// Who joins which run.
@@ -34,6 +37,7 @@ pub struct Bus {
     books: Books,
     notices: Notices,
     speaking: JoinHandle<()>,
+    metrics: Option<MetricsServer>,
 }
 
 impl Bus {
@@ -58,7 +62,17 @@ impl Bus {
             epoch,
             books: books.clone(),
         })?;
-        Ok(Self { session, identity, epoch, books, notices, speaking })
+        Ok(Self { session, identity, epoch, books, notices, speaking, metrics: None })
+    }
+
+    /// Serves the books to Prometheus for as long as this is; tells where.
+    ///
+    /// # Errors
+    /// [`BusError::Metrics`] when the address cannot be listened at.
+    pub fn serve_metrics(&mut self, address: SocketAddr) -> Result<SocketAddr, BusError> {
+        let server =
+            MetricsServer::start(address, &self.books).map_err(|cause| BusError::Metrics { address, cause })?;
+        Ok(self.metrics.insert(server).address())
     }
 
     /// Who this process is.
@@ -121,6 +135,14 @@ impl Bus {
     /// [`BusError::Zenoh`] when the session is closed.
     pub fn subscribe_all(&self, selector: &Selector, inbox: &Arc<Inbox>) -> Result<Subscription, BusError> {
         Subscription::to_all(&self.session, selector, inbox, &self.notices)
+    }
+
+    /// Listens in on `selectors` without a line in the books; of each key `places` messages may wait.
+    ///
+    /// # Errors
+    /// [`BusError::Zenoh`] when the session is closed.
+    pub fn tap(&self, selectors: &[Selector], places: usize) -> Result<Tap, BusError> {
+        Tap::open(&self.session, selectors, places, &self.notices)
     }
 
     /// Says `control` to all who listen, without waiting.

@@ -214,6 +214,14 @@ pub enum BusError {
         /// The system's words.
         cause: std::io::Error,
     },
+    /// The metrics cannot be served there.
+    #[error("cannot serve metrics at {address}: {cause}")]
+    Metrics {
+        /// Where.
+        address: std::net::SocketAddr,
+        /// The system's words.
+        cause: std::io::Error,
+    },
     /// Anything else that zenoh says.
     #[error("zenoh, {doing}: {cause}")]
     Zenoh {

@@ -158,7 +158,7 @@ impl Subscription {
 }
 
 /// Whether notices about a topic's publisher travel on it too: not where notices are all there is.
-fn has_notices(topic: &Topic) -> bool {
+pub(super) fn has_notices(topic: &Topic) -> bool {
     match topic {
         Topic::Stream { .. } | Topic::Received { .. } | Topic::Truth => true,
         Topic::Control(_) | Topic::Stats(_) | Topic::Alive { .. } => false,

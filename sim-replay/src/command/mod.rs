@@ -2,5 +2,7 @@
 
 pub(crate) mod inspect;
 pub(crate) mod link;
+pub(crate) mod record;
+pub(crate) mod recover;
 pub(crate) mod stream;
 pub(crate) mod synth;

@@ -26,6 +26,7 @@ mod numpy_tags;
 mod open;
 mod opv2v;
 mod points;
+mod recorded;
 mod v2v4real;
 mod yaml;
 
@@ -58,6 +59,8 @@ pub enum Layout {
     KittiOdometry,
     /// KITTI object detection.
     KittiObject,
+    /// A recording of a live run ([`crate::recording`]).
+    Recording,
 }
 
 /// A dataset, or the part of one that was opened.

@@ -8,7 +8,9 @@ use protocol::Handedness;
 use super::agent_folders::{self, ScenarioFolder};
 use super::opv2v::{self, Opv2v};
 use super::v2v4real::V2v4Real;
-use super::{Dataset, FrameSource, Layout, ReadError, Scenario, files, kitti_object, kitti_odometry, localization};
+use super::{
+    Dataset, FrameSource, Layout, ReadError, Scenario, files, kitti_object, kitti_odometry, localization, recorded,
+};
 
 /// How far below the opened folder sequences of a single vehicle are looked for.
 const SEQUENCE_DEPTH: usize = 2;
@@ -29,7 +31,7 @@ impl Default for OpenOptions {
     }
 }
 
-/// Opens the dataset, split, scenario or sequence in `dir`; the layout is found out.
+/// Opens the dataset, split, scenario or sequence in `dir`, or a recording; the layout is found out.
 ///
 /// # Errors
 /// [`ReadError`] when `dir` cannot be read or is no layout that is known here. What is wrong with single frames is
@@ -43,6 +45,9 @@ pub fn open(dir: &Path) -> Result<Dataset, ReadError> {
 /// # Errors
 /// As [`open`].
 pub fn open_with(dir: &Path, options: &OpenOptions) -> Result<Dataset, ReadError> {
+    if let Some(file) = recorded::file_of(dir) {
+        return recorded::open(&file);
+    }
     let folders = agent_folders::find(dir)?;
     if !folders.is_empty() {
         return open_agent_folders(dir, &folders, options);

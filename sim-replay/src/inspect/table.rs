@@ -125,5 +125,6 @@ fn layout_name(layout: Layout) -> &'static str {
         Layout::Oxford => "Oxford localization sequences",
         Layout::KittiOdometry => "KITTI odometry",
         Layout::KittiObject => "KITTI object",
+        Layout::Recording => "recording of a live run",
     }
 }

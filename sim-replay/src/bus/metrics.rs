@@ -1,0 +1,172 @@
+//! The books of a process for Prometheus.
+
+use std::borrow::Cow;
+use std::fmt;
+use std::net::SocketAddr;
+
+use prometheus_client::collector::Collector;
+use prometheus_client::encoding::{DescriptorEncoder, EncodeMetric, text};
+use prometheus_client::metrics::MetricType;
+use prometheus_client::metrics::counter::ConstCounter;
+use prometheus_client::metrics::gauge::ConstGauge;
+use prometheus_client::registry::{Registry, Unit};
+
+use super::Books;
+use crate::web::{Answer, WebServer};
+
+/// Serves the books of a process at `http://<address>/metrics` until dropped.
+pub struct MetricsServer(WebServer);
+
+impl MetricsServer {
+    /// Begins to serve `books`; port 0 takes any free one.
+    ///
+    /// # Errors
+    /// When the address cannot be listened at.
+    pub fn start(address: SocketAddr, books: &Books) -> std::io::Result<Self> {
+        let books = books.clone();
+        let server = WebServer::start(address, move |request| match request.path.as_str() {
+            "/metrics" => Answer::Page { content_type: CONTENT_TYPE, body: exposition(&books).into_bytes() },
+            other => Answer::NotFound(format!("{other} is not here, but /metrics is")),
+        })?;
+        Ok(Self(server))
+    }
+
+    /// Where it listens.
+    #[must_use]
+    pub fn address(&self) -> SocketAddr {
+        self.0.address()
+    }
+}
+
+const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0.0; charset=utf-8";
+
+/// The books in the OpenMetrics text format.
+#[must_use]
+pub fn exposition(books: &Books) -> String {
+    let process = (Cow::from("process"), Cow::from(books.process().to_string()));
+    let mut registry = Registry::with_prefix_and_labels("v2vloc", [process].into_iter());
+    registry.register_collector(Box::new(BooksCollector(books.clone())));
+    let mut text = String::new();
+    // Writing to a string cannot fail.
+    let _ = text::encode(&mut text, &registry);
+    text
+}
+
+struct BooksCollector(Books);
+
+impl fmt::Debug for BooksCollector {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "books of {}", self.0.process())
+    }
+}
+
+impl Collector for BooksCollector {
+    fn encode(&self, mut encoder: DescriptorEncoder) -> fmt::Result {
+        let ledger = self.0.ledger();
+        let topics: Vec<(String, _)> = ledger
+            .iter()
+            .map(|(account, counts)| (account.topic.to_string(), (account.to.is_some(), counts)))
+            .collect();
+        let mut sent = encoder.encode_descriptor("messages_sent", "Messages published", None, MetricType::Counter)?;
+        for (topic, (_, counts)) in topics.iter().filter(|(_, (is_received, _))| !is_received) {
+            ConstCounter::new(counts.sent).encode(sent.encode_family(&[("topic", topic.as_str())])?)?;
+        }
+        let mut received =
+            encoder.encode_descriptor("messages_received", "Messages accepted and used", None, MetricType::Counter)?;
+        for (topic, (_, counts)) in topics.iter().filter(|(_, (is_received, _))| *is_received) {
+            ConstCounter::new(counts.received).encode(received.encode_family(&[("topic", topic.as_str())])?)?;
+        }
+        let mut dropped =
+            encoder.encode_descriptor("messages_dropped", "Messages lost, by reason", None, MetricType::Counter)?;
+        for (topic, (is_received, counts)) in &topics {
+            let side = if *is_received { "receiver" } else { "sender" };
+            for (reason, count) in &counts.dropped {
+                let labels = [("topic", topic.as_str()), ("side", side), ("reason", reason.as_str())];
+                ConstCounter::new(*count).encode(dropped.encode_family(&labels)?)?;
+            }
+        }
+        let mut in_flight =
+            encoder.encode_descriptor("messages_in_flight", "Messages under way", None, MetricType::Gauge)?;
+        for (topic, (is_received, counts)) in &topics {
+            let side = if *is_received { "receiver" } else { "sender" };
+            let count = i64::try_from(counts.in_flight).unwrap_or(i64::MAX);
+            let labels = [("topic", topic.as_str()), ("side", side)];
+            ConstGauge::new(count).encode(in_flight.encode_family(&labels)?)?;
+        }
+        let seconds = Unit::Seconds;
+        let mut stages = encoder.encode_descriptor(
+            "stage",
+            "Time a stage takes for one frame",
+            Some(&seconds),
+            MetricType::Histogram,
+        )?;
+        for histogram in self.0.histograms() {
+            let labels = [("stage", histogram.stage.as_str())];
+            let mut family = stages.encode_family(&labels)?;
+            family.encode_histogram::<[(&str, &str); 0]>(histogram.sum_s, histogram.count, &histogram.buckets, None)?;
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use protocol::{CavId, DropReason, ProcessId, Stream, Topic};
+
+    use super::*;
+
+    fn books() -> Books {
+        let books = Books::new(ProcessId::new("agent-4279").unwrap());
+        let cav = CavId::new("4279").unwrap();
+        let [lidar, bev] = [Stream::Lidar, Stream::Bev].map(|stream| Topic::Stream { cav: cav.clone(), stream });
+        books.subscribed(&lidar);
+        for _ in 0..5 {
+            books.arrived(&lidar);
+        }
+        books.received(&lidar);
+        books.received(&lidar);
+        books.dropped(&lidar, DropReason::Superseded);
+        books.offered(&bev);
+        for milliseconds in [0.2, 3.0, 4.0, 40.0, 9_000.0] {
+            books.timed("encode \"x\"", Duration::from_secs_f64(milliseconds / 1e3));
+        }
+        books
+    }
+
+    #[test]
+    fn counters_and_histograms_are_those_of_the_books() {
+        let text = exposition(&books());
+        let process = "process=\"agent-4279\"";
+        for line in [
+            format!("v2vloc_messages_sent_total{{{process},topic=\"4279/bev\"}} 1"),
+            format!("v2vloc_messages_received_total{{{process},topic=\"4279/lidar\"}} 2"),
+            format!(
+                "v2vloc_messages_dropped_total{{{process},topic=\"4279/lidar\",side=\"receiver\",reason=\"superseded\"}} 1"
+            ),
+            format!("v2vloc_messages_in_flight{{{process},topic=\"4279/lidar\",side=\"receiver\"}} 2"),
+            "# TYPE v2vloc_stage_seconds histogram".into(),
+            "# EOF".into(),
+        ] {
+            assert!(text.lines().any(|found| found == line), "{line}\nis not in\n{text}");
+        }
+        let bucket = |le: &str| {
+            let line = text.lines().find(|line| line.contains("_bucket") && line.contains(&format!("le=\"{le}\"")));
+            line.and_then(|line| line.rsplit(' ').next()).and_then(|count| count.parse::<u64>().ok())
+        };
+        assert_eq!(
+            [bucket("0.0025"), bucket("0.005"), bucket("0.05"), bucket("+Inf")],
+            [Some(1), Some(3), Some(4), Some(5)]
+        );
+    }
+
+    #[test]
+    fn they_can_be_fetched() {
+        let server = MetricsServer::start("127.0.0.1:0".parse().unwrap(), &books()).unwrap();
+        let (status, body) = crate::web::fetch(server.address(), "/metrics").unwrap();
+        assert_eq!(status, "HTTP/1.1 200 OK");
+        assert_eq!(String::from_utf8(body).unwrap(), exposition(&books()));
+        assert!(crate::web::fetch(server.address(), "/").unwrap().0.contains("404"));
+    }
+}

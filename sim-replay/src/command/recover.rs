@@ -1,0 +1,47 @@
+//! `sim-replay recover`: an indexed recording from what is left of one.
+
+use std::path::PathBuf;
+
+use sim_replay::bus::log_to_stderr;
+use sim_replay::recording::{RecordingOptions, recover};
+
+use crate::cli::Outcome;
+
+/// Copy what is whole of a recording that was cut short (power, disk, kill) into a new, indexed file.
+///
+/// `stream` plays a cut recording as it is; other programs want the index.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// The recording that was cut.
+    from: PathBuf,
+    /// The new file.
+    to: PathBuf,
+    /// Leave out the channels for ROS 2 tools.
+    #[arg(long)]
+    plain: bool,
+    /// Print a JSON summary.
+    #[arg(long)]
+    json: bool,
+}
+
+/// Copies and says what was lost.
+pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
+    log_to_stderr();
+    let options = RecordingOptions { with_ros: !args.plain, ..RecordingOptions::default() };
+    let report = match recover(&args.from, &args.to, options) {
+        Ok(report) => report,
+        Err(error) => {
+            eprintln!("error: {error}");
+            return Ok(Outcome::BadInput);
+        }
+    };
+    if args.json {
+        println!("{}", serde_json::to_string(&report)?);
+    } else {
+        println!("{} messages in {}", report.messages, args.to.display());
+        if let Some(damage) = &report.damage {
+            println!("{} bytes behind byte {} are lost: {}", damage.lost_bytes, damage.whole_bytes, damage.reason);
+        }
+    }
+    Ok(if report.damage.is_some() { Outcome::DataLost } else { Outcome::Done })
+}

@@ -1,0 +1,350 @@
+//! Recordings written, read back, cut and filled up.
+
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex};
+
+use proptest::prelude::*;
+use protocol::message::AgentTruth;
+use protocol::{
+    CavId, DetectionsReport, Gnss, GnssSource, Key, Lidar, PointCloud, Pose, RunId, Stamp, Stream, TrueObject, Truth,
+    wire,
+};
+
+use super::*;
+use crate::dataset::{self, LoadOptions};
+
+const AGENTS: [&str; 2] = ["4279", "4288"];
+
+fn stamp(cav: &str, tick: u64) -> Stamp {
+    let cav = CavId::new(cav).unwrap();
+    Stamp { cav, epoch: 1, sequence: tick, capture_nanos: 100_000_000 * (tick + 1), publish_nanos: 7 }
+}
+
+fn cloud(tick: u64, points: usize) -> PointCloud {
+    PointCloud { xyzi: (0..points).map(|k| [k as f32, tick as f32, 0.5, 0.25]).collect() }
+}
+
+fn pose(tick: u64) -> Pose {
+    Pose::from_xyz_yaw([tick as f64 + 0.1, -2.0, 1.9], 0.3)
+}
+
+fn truth(tick: u64) -> Truth {
+    let object = TrueObject {
+        id: 7,
+        class: "truck".into(),
+        world_from_object: Pose::from_xyz_yaw([20.0, 3.0, 0.8], 0.1),
+        size_m: [4.0, 1.8, 1.6],
+        speed_mps: Some(3.5),
+    };
+    let agent = |cav: &str| AgentTruth {
+        cav: CavId::new(cav).unwrap(),
+        world_from_lidar: pose(tick),
+        objects: vec![object.clone()],
+    };
+    Truth { frame_index: tick, agents: AGENTS.map(agent).into() }
+}
+
+/// The messages of one tick, as they come from the network.
+fn tick_messages(tick: u64, points: usize) -> Vec<(Key, Vec<u8>)> {
+    let run = RunId::new("test").unwrap();
+    let mut messages = Vec::new();
+    for cav in AGENTS {
+        let key = |stream| Key::stream(&run, &CavId::new(cav).unwrap(), stream);
+        let gnss = Gnss {
+            world_from_lidar: pose(tick),
+            position_std_m: 0.0,
+            heading_std_rad: 0.0,
+            source: GnssSource::Recorded,
+        };
+        messages.push((key(Stream::Gnss), wire::encode(&stamp(cav, tick), gnss).unwrap().to_vec()));
+        let lidar = Lidar { points: cloud(tick, points) };
+        messages.push((key(Stream::Lidar), wire::encode(&stamp(cav, tick), lidar).unwrap().to_vec()));
+    }
+    messages.push((Key::truth(&run), wire::encode(&stamp("replay", tick), truth(tick)).unwrap().to_vec()));
+    messages
+}
+
+/// Memory that is full at some point.
+#[derive(Clone)]
+struct Disk {
+    bytes: Arc<Mutex<Vec<u8>>>,
+    capacity: usize,
+}
+
+impl Disk {
+    fn new(capacity: usize) -> Self {
+        Self { bytes: Arc::default(), capacity }
+    }
+
+    fn bytes(&self) -> Vec<u8> {
+        self.bytes.lock().unwrap().clone()
+    }
+}
+
+impl Write for Disk {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        let mut held = self.bytes.lock().unwrap();
+        let take = bytes.len().min(self.capacity - held.len());
+        if take == 0 && !bytes.is_empty() {
+            return Err(io::ErrorKind::StorageFull.into());
+        }
+        held.extend(&bytes[..take]);
+        Ok(take)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+impl Store for Disk {
+    fn cut(&mut self, len: u64) -> io::Result<()> {
+        self.bytes.lock().unwrap().truncate(len as usize);
+        Ok(())
+    }
+}
+
+/// A recording of `ticks` ticks, a chunk each.
+fn recorded(ticks: u64, points: usize, options: RecordingOptions) -> Vec<u8> {
+    let disk = Disk::new(usize::MAX);
+    let mut writer = RecordingWriter::over(disk.clone(), Path::new("test.mcap"), options).unwrap();
+    for tick in 0..ticks {
+        for (key, payload) in tick_messages(tick, points) {
+            writer.write(&key, 1_000 + tick, &payload).unwrap();
+        }
+        writer.flush().unwrap();
+    }
+    writer.finish().unwrap();
+    disk.bytes()
+}
+
+/// Every message of every channel: topic, encoding, data.
+fn messages_of(recording: &Recording) -> Vec<(String, String, Vec<u8>)> {
+    let mut messages = Vec::new();
+    let walked = recording.for_each(|topic, encoding, _, data| {
+        messages.push((topic.to_owned(), encoding.to_owned(), data.to_vec()));
+        Ok(())
+    });
+    walked.unwrap();
+    messages
+}
+
+fn has_index(path: &Path) -> bool {
+    std::fs::read(path).unwrap().ends_with(mcap::MAGIC)
+}
+
+fn write(folder: &Path, bytes: &[u8]) -> PathBuf {
+    let path = folder.join("recording.mcap");
+    std::fs::write(&path, bytes).unwrap();
+    path
+}
+
+#[test]
+fn what_is_read_is_what_was_written() {
+    for zstd_level in [None, Some(1)] {
+        let folder = tempfile::tempdir().unwrap();
+        let options = RecordingOptions { zstd_level, with_ros: true };
+        let path = write(folder.path(), &recorded(3, 100, options));
+        let recording = Recording::open(&path).unwrap();
+        assert_eq!(recording.damage(), None);
+        let expected: Vec<_> = (0..3).flat_map(|tick| tick_messages(tick, 100)).collect();
+        assert_eq!(recording.entries().len(), expected.len());
+        for (entry, (key, payload)) in recording.entries().iter().zip(&expected) {
+            assert_eq!((&entry.key, &recording.read(entry).unwrap()), (key, payload));
+            assert_eq!(entry.arrived_nanos, 1_000 + entry.header.stamp.sequence);
+        }
+        let names: Vec<_> = AGENTS.map(|cav| format!("/{cav}/points")).into();
+        let topics: Vec<String> = messages_of(&recording).into_iter().map(|(topic, _, _)| topic).collect();
+        assert!(names.iter().all(|name| topics.contains(name)), "{topics:?}");
+        assert!(has_index(&path));
+    }
+}
+
+#[test]
+fn a_recording_is_a_scene() {
+    let folder = tempfile::tempdir().unwrap();
+    write(folder.path(), &recorded(3, 50, RecordingOptions::default()));
+    // The run folder names it as well as the file does.
+    let scenario = dataset::open(folder.path()).unwrap().scenarios.remove(0);
+    assert_eq!(scenario.agents, AGENTS.map(|cav| CavId::new(cav).unwrap()));
+    let captures: Vec<u64> = scenario.ticks.iter().map(|tick| tick.capture_nanos).collect();
+    assert_eq!(captures, [100_000_000, 200_000_000, 300_000_000]);
+    let frame = scenario.load(1, 2, &LoadOptions::default()).unwrap();
+    assert_eq!((frame.points, frame.world_from_lidar), (cloud(2, 50), Some(pose(2))));
+    let object = &frame.objects[0];
+    assert_eq!((object.id, object.class, object.speed_mps), (7, crate::frame::ObjectClass::Truck, Some(3.5)));
+}
+
+#[test]
+fn a_recovered_recording_has_an_index_and_the_same_messages() {
+    let folder = tempfile::tempdir().unwrap();
+    let whole = recorded(4, 100, RecordingOptions::default());
+    let path = write(folder.path(), &whole[..whole.len() / 2]);
+    let to = folder.path().join("whole.mcap");
+    let report = recover(&path, &to, RecordingOptions::default()).unwrap();
+    assert!(report.damage.is_some());
+    let (cut, recovered) = (Recording::open(&path).unwrap(), Recording::open(&to).unwrap());
+    assert_eq!(recovered.damage(), None);
+    assert_eq!(report.messages as usize, cut.entries().len());
+    assert!(has_index(&to) && !has_index(&path));
+    for (left, right) in cut.entries().iter().zip(recovered.entries()) {
+        assert_eq!(cut.read(left).unwrap(), recovered.read(right).unwrap());
+        assert_eq!(left.arrived_nanos, right.arrived_nanos);
+    }
+    assert_eq!(cut.entries().len(), recovered.entries().len());
+}
+
+#[test]
+fn json_stands_beside_our_own_messages() {
+    let disk = Disk::new(usize::MAX);
+    let mut writer = RecordingWriter::over(disk.clone(), Path::new("t"), RecordingOptions::default()).unwrap();
+    let key: Key = "v2v/test/4279/detections/json".parse().unwrap();
+    let text = br#"{"frame_index": 0}"#;
+    assert!(serde_json::from_slice::<DetectionsReport>(text).is_err(), "any JSON will do");
+    writer.write(&key, 5, text).unwrap();
+    for (key, payload) in tick_messages(0, 1) {
+        writer.write(&key, 6, &payload).unwrap();
+    }
+    writer.finish().unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let recording = Recording::open(&write(folder.path(), &disk.bytes())).unwrap();
+    assert_eq!(recording.entries().len(), 5, "JSON is no message of ours");
+    assert_eq!(messages_of(&recording)[0], (key.to_string(), "json".to_owned(), text.to_vec()));
+}
+
+#[test]
+fn a_full_disk_leaves_what_is_whole() {
+    let folder = tempfile::tempdir().unwrap();
+    let one = recorded(1, 2_000, RecordingOptions::default()).len();
+    let disk = Disk::new(5 * one / 2);
+    let mut writer = RecordingWriter::over(disk.clone(), Path::new("full.mcap"), RecordingOptions::default()).unwrap();
+    let mut failures = Vec::new();
+    for tick in 0..6 {
+        for (key, payload) in tick_messages(tick, 2_000) {
+            failures.extend(writer.write(&key, tick, &payload).err());
+        }
+        failures.extend(writer.flush().err());
+    }
+    let said: Vec<String> = failures.iter().map(ToString::to_string).collect();
+    assert!(matches!(failures[0], RecordingError::Io { .. }), "{said:?}");
+    assert!(said[0].contains("full.mcap") && said[0].contains("storage"), "{said:?}");
+    assert!(failures[1..].iter().all(|error| matches!(error, RecordingError::Ended { .. })), "{said:?}");
+    assert!(writer.finish().is_err());
+    let recording = Recording::open(&write(folder.path(), &disk.bytes())).unwrap();
+    assert_eq!(recording.entries().len(), 2 * 5, "two ticks were whole");
+    assert_eq!(recording.damage().map(|damage| damage.lost_bytes), Some(0), "only the index is missing");
+}
+
+#[test]
+fn what_is_no_recording_is_refused_with_a_reason() {
+    let folder = tempfile::tempdir().unwrap();
+    for bytes in
+        [b"".as_slice(), b"\x89MCAP", b"hello, hello, hello", &recorded(1, 1, RecordingOptions::default())[..8]]
+    {
+        let error = Recording::open(&write(folder.path(), bytes)).unwrap_err();
+        assert!(matches!(error, RecordingError::NotOurs { .. }), "{error}");
+    }
+    // A file of someone else: whole, but without a channel of ours.
+    let empty = RecordingWriter::over(Disk::new(usize::MAX), Path::new("t"), RecordingOptions::default()).unwrap();
+    let foreign = empty.finish().unwrap().bytes();
+    let error = Recording::open(&write(folder.path(), &foreign)).unwrap_err();
+    assert!(error.to_string().contains("no channel of encoding"), "{error}");
+}
+
+/// The public reader and a decoder of ROS 2 messages, where Python has them.
+fn public_reader(path: &Path) -> Option<serde_json::Value> {
+    let script = concat!(env!("CARGO_MANIFEST_DIR"), "/../deploy/tools/check_recording.py");
+    let python = std::env::var("V2V_PYTHON").unwrap_or_else(|_| "python3".into());
+    let output = match std::process::Command::new(&python).arg(script).arg(path).output() {
+        Ok(output) => output,
+        Err(error) => {
+            eprintln!("skipped: {python}: {error} (V2V_PYTHON names another)");
+            return None;
+        }
+    };
+    let said = String::from_utf8_lossy(&output.stderr);
+    if output.status.code() == Some(2) {
+        eprintln!("skipped: {}", said.trim());
+        return None;
+    }
+    assert!(output.status.success(), "{said}");
+    Some(serde_json::from_slice(&output.stdout).unwrap())
+}
+
+fn assert_near(found: &serde_json::Value, expected: &[f64]) {
+    let found: Vec<f64> = found.as_array().unwrap().iter().map(|number| number.as_f64().unwrap()).collect();
+    assert_eq!(found.len(), expected.len());
+    for (found, expected) in found.iter().zip(expected) {
+        assert!((found - expected).abs() < 1e-9 * expected.abs().max(1.0), "{found} is not {expected}");
+    }
+}
+
+#[test]
+fn the_public_reader_and_a_ros_decoder_find_the_same_numbers() {
+    for zstd_level in [None, Some(3)] {
+        let folder = tempfile::tempdir().unwrap();
+        let path = write(folder.path(), &recorded(3, 100, RecordingOptions { zstd_level, with_ros: true }));
+        let Some(found) = public_reader(&path) else { return };
+        // Of each tick: two sweeps, two recorded poses, a truth; for ROS two clouds, boxes and transforms.
+        assert_eq!(found["indexed"], serde_json::json!({"chunks": 3, "messages": 27}));
+        assert_eq!(found["messages"]["v2v/test/4279/lidar"], 3);
+        let points = &found["last"]["/4288/points"];
+        assert_eq!((&points["frame"], &points["points"]), (&"4288/lidar".into(), &100.into()));
+        assert_near(&serde_json::json!([points["stamp_s"]]), &[0.3]);
+        assert_near(&points["last"], &[99.0, 2.0, 0.5, 0.25]);
+        assert_near(&points["sums"], &[4950.0, 200.0, 50.0, 25.0]);
+        let object = &found["first"]["/truth"][0];
+        assert_eq!((&object["id"], &object["text"], &object["frame"]), (&7.into(), &"truck".into(), &"map".into()));
+        assert_near(&object["position"], &[20.0, 3.0, 0.8]);
+        assert_near(&object["size"], &[4.0, 1.8, 1.6]);
+        assert_near(&object["wxyz"], &[0.05_f64.cos(), 0.0, 0.0, 0.05_f64.sin()]);
+        let transform = &found["last"]["/tf"][1];
+        assert_eq!(transform["child"], "4288/truth");
+        assert_near(&transform["position"], &pose(2).translation_m);
+        assert_near(&transform["wxyz"], &pose(2).rotation_wxyz);
+    }
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(64))]
+
+    #[test]
+    fn a_cut_recording_reads_up_to_its_last_whole_chunk(at in 0.0_f64..1.0, packed: bool) {
+        let options = RecordingOptions { zstd_level: packed.then_some(1), with_ros: true };
+        let whole = recorded(4, 40, options);
+        let folder = tempfile::tempdir().unwrap();
+        let cut = (at * whole.len() as f64) as usize;
+        let all: Vec<_> = (0..4).flat_map(|tick| tick_messages(tick, 40)).collect();
+        match Recording::open(&write(folder.path(), &whole[..cut])) {
+            Err(error) => prop_assert!(matches!(error, RecordingError::NotOurs { .. }), "{}", error),
+            Ok(recording) => {
+                let count = recording.entries().len();
+                prop_assert_eq!(count % 5, 0, "whole chunks, which are whole ticks here");
+                for (entry, (key, payload)) in recording.entries().iter().zip(&all) {
+                    prop_assert_eq!(&entry.key, key);
+                    prop_assert_eq!(&recording.read(entry).unwrap(), payload);
+                }
+                if let Some(damage) = recording.damage() {
+                    prop_assert_eq!(damage.whole_bytes + damage.lost_bytes, cut as u64);
+                } else {
+                    prop_assert_eq!(count, 20);
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_damaged_recording_gives_what_was_written_or_nothing(at in 8_usize..4000, bit in 0_u8..8) {
+        let mut bytes = recorded(3, 40, RecordingOptions::default());
+        let at = at % bytes.len();
+        bytes[at] ^= 1 << bit;
+        let folder = tempfile::tempdir().unwrap();
+        let all: Vec<_> = (0..3).flat_map(|tick| tick_messages(tick, 40)).map(|(_, payload)| payload).collect();
+        if let Ok(recording) = Recording::open(&write(folder.path(), &bytes)) {
+            for entry in recording.entries() {
+                prop_assert!(all.contains(&recording.read(entry).unwrap()));
+            }
+        }
+    }
+}
