@@ -62,6 +62,9 @@ impl Provenance {
 
 /// What a run reads of a scene: all but images, in the order of names.
 fn scene_files(scene: &Path) -> io::Result<Vec<PathBuf>> {
+    if scene.is_file() {
+        return Ok(vec![scene.to_path_buf()]);
+    }
     let mut files = Vec::new();
     let mut folders = vec![scene.to_path_buf()];
     while let Some(folder) = folders.pop() {

@@ -1,5 +1,6 @@
 //! Which processes a scenario needs, and with which arguments.
 
+use std::collections::BTreeSet;
 use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
@@ -24,6 +25,8 @@ const COMM_RANGE_M: f64 = 70.0;
 
 /// Name of the process that plays the scene.
 pub const REPLAY: &str = "replay";
+/// Name of the process that writes everything down.
+pub const RECORDER: &str = "recorder";
 
 /// Why a scenario makes no fleet.
 #[derive(Debug, thiserror::Error)]
@@ -211,6 +214,26 @@ impl Fleet {
         specs
     }
 
+    /// The process that writes the run to `file`, where the scenario asks for one.
+    #[must_use]
+    pub fn recorder(&self, run: &RunId, endpoint: &str, programs: &Path, file: &Path) -> Option<ProcessSpec> {
+        let record = self.scenario.record.as_ref()?;
+        let shared_memory_mib = self.scenario.network.shared_memory_mib;
+        let meeting = Meeting { run, endpoint, programs, shared_memory_mib };
+        let mut args = Arguments::of("record", &meeting);
+        args.option("--out", file);
+        if !record.without.is_empty() {
+            let without: Vec<String> = record.without.iter().map(ToString::to_string).collect();
+            args.option("--without", &without.join(","));
+        }
+        if let Some(level) = record.zstd_level {
+            args.option("--zstd", &level.to_string());
+        }
+        args.flag("--json");
+        // A recording cannot be taken up in the middle.
+        Some(meeting.process(RECORDER.into(), "sim-replay", args, Life::Optional))
+    }
+
     /// The executables of a fleet.
     #[must_use]
     pub fn programs(programs: &Path) -> Vec<PathBuf> {
@@ -313,7 +336,7 @@ impl Fleet {
         if scene.lockstep {
             args.option("--lockstep", self.ego.as_str());
         }
-        for route in self.routes() {
+        for route in self.recorded(self.routes()) {
             args.option("--expect", &route.to_string());
         }
         args.option("--ready-timeout", &self.scenario.timeouts.ready_s.to_string());
@@ -353,6 +376,21 @@ impl Fleet {
         routes
     }
 
+    /// The routes, and where the run is recorded those of the same topics and of the sensors to the recorder: what is
+    /// published before it listens is lost to it.
+    fn recorded(&self, mut routes: Vec<Route>) -> Vec<Route> {
+        if self.scenario.record.is_some() {
+            let receiver = process_id(Role::Recorder, &recorder_cav());
+            let sensors = self
+                .agents
+                .iter()
+                .flat_map(|cav| [Stream::Lidar, Stream::Gnss].map(|stream| Topic::Stream { cav: cav.clone(), stream }));
+            let topics: BTreeSet<Topic> = routes.iter().map(|route| route.topic.clone()).chain(sensors).collect();
+            routes.extend(topics.into_iter().map(|topic| Route { topic, receiver: receiver.clone() }));
+        }
+        routes
+    }
+
     fn publish(&self, cav: &CavId) -> Publish {
         self.scenario.settings_of(cav).publish.unwrap_or(Publish::for_method(self.scenario.method))
     }
@@ -361,6 +399,11 @@ impl Fleet {
         args.option("--weights", &self.scenario.models.weights);
         args.option("--threads", &self.scenario.models.threads.to_string());
     }
+}
+
+/// The recorder's name in place of a vehicle's.
+fn recorder_cav() -> CavId {
+    CavId::new(RECORDER).expect("eight lower-case letters")
 }
 
 /// Where the processes of a run meet, and where their programs lie.

@@ -5,6 +5,7 @@
 //! - [`up`]: one run, with its [`network`], [`supervise`]d processes and [`score`].
 //! - [`stepped`]: the same in virtual time.
 //! - [`evaluation`]: the same numbers without a network; [`table`]: many of them; [`sweep`]: grids of them in virtual time.
+//! - [`view`]: a page to look at a run, live or recorded.
 //! - [`run_folder`], [`metrics`], [`ledger_report`], [`picture`]: what is kept of it.
 
 pub mod evaluation;
@@ -25,4 +26,5 @@ pub mod supervise;
 pub mod sweep;
 pub mod table;
 pub mod up;
+pub mod view;
 pub mod weights_choice;

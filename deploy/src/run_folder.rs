@@ -8,7 +8,7 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 use protocol::RunId;
 use serde::Serialize;
 
-use crate::score::FrameRecord;
+use crate::score::{FrameRecord, StageStamps};
 
 /// Why a run folder cannot be used.
 #[derive(Debug, thiserror::Error)]
@@ -101,7 +101,7 @@ impl RunFolder {
 fn frames_csv(records: &[FrameRecord]) -> String {
     let mut text = String::from(
         "frame_index,capture_nanos,latency_ms,detected,truth,found,fused,skipped,oldest_ms,stale,payload_bytes,wire_bytes,ego_error_m,\
-         ego_error_deg\n",
+         ego_error_deg,posed_ms,published_ms,arrived_ms,decided_ms,fused_ms,detected_ms\n",
     );
     let optional = |number: &Option<f64>| number.map_or(String::new(), |number| format!("{number:.4}"));
     for record in records {
@@ -110,6 +110,7 @@ fn frames_csv(records: &[FrameRecord]) -> String {
             frame_index,
             capture_nanos,
             latency_ms,
+            stamps,
             detected,
             truth,
             found,
@@ -124,11 +125,13 @@ fn frames_csv(records: &[FrameRecord]) -> String {
         } = record;
         let [latency_ms, oldest_ms, error_m, error_deg] =
             [latency_ms, oldest_ms, ego_error_m, ego_error_deg].map(optional);
+        let StageStamps { posed_ms, published_ms, arrived_ms, decided_ms, fused_ms, detected_ms } = stamps;
+        let stamps = [posed_ms, published_ms, arrived_ms, decided_ms, fused_ms, detected_ms].map(optional).join(",");
         // Writing to a string cannot fail.
         let _ = writeln!(
             text,
             "{frame_index},{capture_nanos},{latency_ms},{detected},{truth},{found},{fused},{skipped},\
-             {oldest_ms},{stale},{payload_bytes},{wire_bytes},{error_m},{error_deg}"
+             {oldest_ms},{stale},{payload_bytes},{wire_bytes},{error_m},{error_deg},{stamps}"
         );
     }
     text

@@ -48,6 +48,8 @@ pub enum Life {
     Service,
     /// It has one job, which cannot be taken up in the middle; when it fails, it stays down.
     Task,
+    /// Like a task, but the run goes on without it.
+    Optional,
 }
 
 /// What happened to a process.
@@ -78,6 +80,8 @@ pub enum Happening {
     GaveUp {
         /// How it ended, in words, with the last line of its log.
         how: String,
+        /// Whether the run can go on without it.
+        is_optional: bool,
     },
     /// It ended by itself, as it should.
     Done {
@@ -257,7 +261,7 @@ impl Watcher {
                 self.falls = 0;
             }
             self.falls += 1;
-            if self.spec.life == Life::Task || self.falls > self.restarts {
+            if self.spec.life != Life::Service || self.falls > self.restarts {
                 return self.give_up(&how);
             }
             let pause = LONGEST_PAUSE.min(FIRST_PAUSE * (1 << (self.falls - 1).min(5)));
@@ -283,7 +287,8 @@ impl Watcher {
 
     fn give_up(&self, how: &str) -> bool {
         let said = self.log.last_line().map_or(String::new(), |line| format!(": {line}"));
-        self.tell(Happening::GaveUp { how: format!("{how}{said}") });
+        let is_optional = self.spec.life == Life::Optional;
+        self.tell(Happening::GaveUp { how: format!("{how}{said}"), is_optional });
         false
     }
 
@@ -376,7 +381,7 @@ mod tests {
         let (_supervisor, events, _folder) = start(shell("car", Life::Service, "echo no engine >&2; exit 1"), 1);
         let happenings: Vec<_> = (0..4).map(|_| next(&events)).collect();
         assert!(matches!(&happenings[1], Happening::Fell { again_after, .. } if *again_after == FIRST_PAUSE));
-        assert_eq!(happenings[3], Happening::GaveUp { how: "ended with code 1: no engine".into() });
+        assert_eq!(happenings[3], Happening::GaveUp { how: "ended with code 1: no engine".into(), is_optional: false });
     }
 
     #[test]
@@ -398,7 +403,7 @@ mod tests {
     fn bad_input_is_not_tried_again() {
         let (_supervisor, events, _folder) = start(shell("car", Life::Service, "echo bad map; exit 2"), 5);
         assert!(matches!(next(&events), Happening::Started { .. }));
-        assert_eq!(next(&events), Happening::GaveUp { how: "ended with code 2: bad map".into() });
+        assert_eq!(next(&events), Happening::GaveUp { how: "ended with code 2: bad map".into(), is_optional: false });
     }
 
     #[test]

@@ -1,5 +1,6 @@
 //! One run from beginning to end: plan, start, watch, end, score, write.
 
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
 use std::thread::JoinHandle;
@@ -11,7 +12,7 @@ use sim_replay::bus::shutdown::Stop;
 use sim_replay::bus::{BusError, Endpoint};
 
 use crate::fingerprint::Provenance;
-use crate::fleet::{Fleet, FleetError, REPLAY};
+use crate::fleet::{Fleet, FleetError, RECORDER, REPLAY};
 use crate::metrics::{Messages, Metrics};
 use crate::network::MeetingPlace;
 use crate::progress::Display;
@@ -26,6 +27,9 @@ const BEAT: Duration = Duration::from_millis(100);
 const REPLAY_SHARE: f64 = 0.25;
 /// Of the time for ending: until the last results must have come.
 const DRAIN_SHARE: f64 = 0.5;
+
+/// For writing the index of a recording, after all others have ended.
+const RECORDER_SHARE: Duration = Duration::from_millis(800);
 
 /// What a run needs beside its scenario.
 #[derive(Debug, Clone)]
@@ -142,7 +146,10 @@ pub fn up(scenario: &Scenario, options: &UpOptions) -> Result<RunResult, UpError
     let place = MeetingPlace::open(&fleet.scenario.network)?;
     let board = Board::new(fleet.ego.clone(), fleet.ground_truth_rule(), fleet.map_values());
     let detections = folder.file("detections.jsonl");
-    let scorer = ScorerNode::start(place.session.clone(), &run, &fleet.agents, &fleet.ego, board, detections)?;
+    let mut scorer = ScorerNode::start(place.session.clone(), &run, &fleet.agents, &fleet.ego, board, detections)?;
+    if let Some(address) = fleet.scenario.network.metrics {
+        scorer.serve_metrics(address)?;
+    }
     let watched = watch(&fleet, &run, &place.endpoint, &options.programs, &folder, &scorer, &stop);
     let scored = scorer.finish();
     if let Err(overdue) = place.close() {
@@ -172,9 +179,16 @@ fn watch(
     stop: &Stop,
 ) -> Result<(Ending, Vec<String>), UpError> {
     let (events, happened) = channel();
-    let specs = fleet.processes(run, endpoint.as_str(), programs);
-    let restarts = fleet.scenario.timeouts.restarts;
+    let mut specs = fleet.processes(run, endpoint.as_str(), programs);
+    specs.extend(fleet.recorder(run, endpoint.as_str(), programs, &folder.file("recording.mcap")));
     let mut display = Display::new(fleet.ticks);
+    if let Some(first) = fleet.scenario.network.metrics {
+        for (spec, address) in specs.iter_mut().zip(ports_behind(first)) {
+            spec.args.push(format!("--metrics={address}").into());
+            display.say(&format!("metrics of {} at http://{address}/metrics", spec.name));
+        }
+    }
+    let restarts = fleet.scenario.timeouts.restarts;
     display.say(&format!("run {run} at {endpoint}: {} processes, logs in {}", specs.len(), folder.log_dir().display()));
     let mut supervisor = Supervisor::start(specs, &folder.log_dir(), restarts, &events)?;
     let ending = follow(&happened, scorer, stop, &mut display);
@@ -182,9 +196,16 @@ fn watch(
     let mut killed = supervisor.end(|name| name == REPLAY, limits.replay).killed;
     drain(&supervisor, scorer, limits.drain, &mut display);
     killed.extend(supervisor.end(|name| name.starts_with("agent"), limits.all).killed);
-    killed.extend(supervisor.end(|_| true, limits.all).killed);
+    // The recorder hears everyone's last words.
+    killed.extend(supervisor.end(|name| name != RECORDER, limits.all).killed);
+    killed.extend(supervisor.end(|_| true, limits.all + RECORDER_SHARE).killed);
     display.finish();
     Ok((ending, killed))
+}
+
+/// The ports behind that of `first`, on the same address.
+fn ports_behind(first: SocketAddr) -> impl Iterator<Item = SocketAddr> {
+    (first.port()..u16::MAX).map(move |port| SocketAddr::new(first.ip(), port + 1))
 }
 
 /// Shows what happens until the scene is over, someone asks to end, or a process stays down.
@@ -206,7 +227,10 @@ fn follow(happened: &Receiver<ProcessEvent>, scorer: &ScorerNode, stop: &Stop, d
             Happening::Fell { how, again_after } => {
                 display.say(&format!("{name} {how}; starting it again in {:.1} s", again_after.as_secs_f64()));
             }
-            Happening::GaveUp { how } => return Ending::Failed { process: name, how },
+            Happening::GaveUp { how, is_optional: true } => {
+                display.say(&format!("{name} {how}; the run goes on without it"));
+            }
+            Happening::GaveUp { how, is_optional: false } => return Ending::Failed { process: name, how },
             Happening::Done { data_lost } => {
                 if data_lost {
                     display.say(&format!("{name} says that data were lost; see its log"));

@@ -22,6 +22,7 @@ use sim_replay::bus::mailbox::Taken;
 use sim_replay::bus::shutdown::Stop;
 use sim_replay::bus::{Bus, Event, Inbox, PublisherOptions, Route, Subscription, process_id};
 use sim_replay::dataset::{self, LoadOptions, Scenario};
+use sim_replay::recording::{self, RecordReport, RecorderOptions, Recording, RecordingOptions};
 use sim_replay::stream::{Replay, StreamOptions};
 use tch::Device;
 use tch::nn::VarStore;
@@ -138,11 +139,36 @@ fn taking_part(method: Method) -> &'static [&'static str] {
 
 /// Plays the scene in step with the ego; gives what the ego told and everyone's books added up.
 fn play_in_lockstep(dir: &Path, method: Method) -> (Vec<(u64, Detections)>, Ledger) {
+    play_and_record(dir, method, None)
+}
+
+/// Writes a run down until `stop`.
+fn record<'scope>(
+    scope: &'scope Scope<'scope, '_>,
+    router: &'scope TestRouter,
+    file: &Path,
+    stop: &Stop,
+) -> ScopedJoinHandle<'scope, RecordReport> {
+    let (out, stop) = (file.to_path_buf(), stop.clone());
+    scope.spawn(move || {
+        let bus = router.join("recorder", "recorder");
+        let recording = RecordingOptions::default();
+        let options = RecorderOptions { out, recording, without: Vec::new(), keeps_running: true };
+        let report = recording::record(&bus, &options, &stop).unwrap();
+        bus.leave(PATIENCE).unwrap();
+        report
+    })
+}
+
+/// [`play_in_lockstep`], with everything that is said written to a file.
+fn play_and_record(dir: &Path, method: Method, file: Option<&Path>) -> (Vec<(u64, Detections)>, Ledger) {
     let scenario = dataset::open(dir).unwrap().scenarios.remove(0);
     let (router, stop) = (TestRouter::open(), Stop::new());
     let stream = published(method);
     std::thread::scope(|scope| {
         let listening = listen(scope, &router, "10");
+        let (recorded, ending) = (Stop::new(), Stop::new());
+        let recorder = file.map(|file| record(scope, &router, file, &recorded));
         let start = |cav_id: &&'static str| run_agent(scope, &router, cav_id, stream, &stop);
         let agents: Vec<_> = taking_part(method).iter().map(start).collect();
         let ego = scope.spawn(|| {
@@ -157,12 +183,12 @@ fn play_in_lockstep(dir: &Path, method: Method) -> (Vec<(u64, Detections)>, Ledg
         let expect = taking_part(method).iter().map(route);
         let scorer = Route { topic: topic("10", Stream::Detections), receiver: "scorer".parse().unwrap() };
         let options = StreamOptions {
-            expect: expect.chain([scorer]).collect(),
+            expect: expect.chain([scorer]).chain(file.iter().flat_map(|_| to_recorder(method, stream))).collect(),
             lockstep: vec![cav("10")],
             agents: taking_part(method).iter().map(|cav_id| cav(cav_id)).collect(),
             ..StreamOptions::default()
         };
-        let playing = Replay::prepare(&replay, &scenario, options, &Stop::new()).unwrap();
+        let playing = Replay::prepare(&replay, &scenario, options, &ending).unwrap();
         playing.wait_until_ready().unwrap();
         let report = playing.play();
         assert!(report.is_complete() && report.ticks == TICKS as u64, "{report:?}");
@@ -171,8 +197,42 @@ fn play_in_lockstep(dir: &Path, method: Method) -> (Vec<(u64, Detections)>, Ledg
         ledger.merge(&ego.join().unwrap());
         let (results, books) = listening.join().unwrap();
         ledger.merge(&books);
+        recorded.request();
+        if let Some(report) = recorder.map(|recorder| recorder.join().unwrap()) {
+            assert!(report.is_complete() && report.messages > 0, "{report:?}");
+        }
         (results, ledger)
     })
+}
+
+/// The routes to a recorder that has to hear everything from the beginning.
+fn to_recorder(method: Method, stream: Stream) -> Vec<Route> {
+    let streams = [Stream::Lidar, Stream::Gnss, Stream::Pose, stream];
+    let vehicles = taking_part(method).iter().flat_map(|cav_id| streams.map(|stream| topic(cav_id, stream)));
+    let topics = vehicles.chain([Topic::Truth, topic("10", Stream::Detections)]);
+    topics.map(|topic| Route { topic, receiver: "recorder".parse().unwrap() }).collect()
+}
+
+#[test]
+fn a_recorded_run_replayed_gives_the_same_detections() {
+    let folder = tempfile::tempdir().unwrap();
+    scene::write(folder.path(), &AGENTS, TICKS);
+    for method in [Method::Max, Method::Late] {
+        let file = folder.path().join(format!("{method}.mcap"));
+        let (live, ledger) = play_and_record(folder.path(), method, Some(&file));
+        assert!(ledger.balance().is_exact(), "{method}: a recorder is in nobody's books");
+        let recording = Recording::open(&file).unwrap();
+        assert_eq!(recording.damage(), None);
+        let told = |stream| recording.entries().iter().filter(|entry| entry.key.topic == topic("10", stream)).count();
+        assert_eq!([Stream::Lidar, Stream::Pose, Stream::Detections].map(told), [TICKS; 3], "{method}");
+        let (again, _) = play_in_lockstep(&file, method);
+        assert_eq!(live.len(), again.len(), "{method}");
+        assert!(live.iter().any(|(_, result)| !result.detections.is_empty()), "{method}: nothing to compare");
+        for ((capture, live), (again_capture, again)) in live.iter().zip(&again) {
+            assert_eq!((capture, live.pose), (again_capture, again.pose), "{method}");
+            assert_eq!(live.detections, again.detections, "{method} at {capture}");
+        }
+    }
 }
 
 /// The same pipelines without any network.

@@ -4,6 +4,7 @@ mod demo;
 mod eval;
 mod sweep;
 mod up;
+mod view;
 
 use std::path::PathBuf;
 use std::process::ExitCode;
@@ -28,6 +29,8 @@ pub(crate) enum Command {
     Sweep(sweep::Arguments),
     /// Start a fleet: processes, scene, models, network; Ctrl-C ends it.
     Up(up::Arguments),
+    /// Look at a run in a browser: the scene from above, the links, where the time goes.
+    View(view::Arguments),
 }
 
 impl Command {
@@ -39,6 +42,7 @@ impl Command {
             Self::Eval(arguments) => arguments.run(),
             Self::Sweep(arguments) => arguments.run(),
             Self::Up(arguments) => arguments.run(),
+            Self::View(arguments) => arguments.run(),
         }
     }
 }

@@ -29,6 +29,12 @@ pub(crate) struct Arguments {
     /// Ticks to play in place of the scenario's.
     #[arg(long)]
     frames: Option<usize>,
+    /// Write everything that is said to recording.mcap in the run folder; the scenario may say what to leave out.
+    #[arg(long)]
+    record: bool,
+    /// Serve counters and times to Prometheus: the scorer here, the other processes on the ports behind it.
+    #[arg(long, value_name = "HOST:PORT")]
+    metrics: Option<std::net::SocketAddr>,
     /// Print metrics.json instead of a table.
     #[arg(long)]
     json: bool,
@@ -44,6 +50,10 @@ impl Arguments {
         scenario.run = self.name.or(scenario.run);
         scenario.method = self.method.unwrap_or(scenario.method);
         scenario.scene.frames = self.frames.or(scenario.scene.frames);
+        if self.record {
+            scenario.record.get_or_insert_default();
+        }
+        scenario.network.metrics = self.metrics.or(scenario.network.metrics);
         scenario.check(&self.scenario)?;
         let result = up(&scenario, &UpOptions { runs: self.runs, programs: programs()?, prefix: "up" })?;
         if self.json {

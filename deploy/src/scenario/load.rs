@@ -137,6 +137,11 @@ impl Scenario {
         {
             return Err(value("ego.id", ego.to_string(), "must be one of scene.agents"));
         }
+        if let Some(level) = self.record.as_ref().and_then(|record| record.zstd_level)
+            && !(1..=22).contains(&level)
+        {
+            return Err(value("record.zstd_level", level.to_string(), "must be 1 to 22"));
+        }
         for endpoint in std::iter::once(&self.network.listen).chain(&self.network.connect) {
             if !endpoint.starts_with("tcp/")
                 || endpoint.rsplit_once(':').is_none_or(|(_, port)| port.parse::<u16>().is_err())

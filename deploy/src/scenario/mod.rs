@@ -6,6 +6,7 @@
 mod load;
 
 use std::collections::BTreeMap;
+use std::net::SocketAddr;
 use std::path::PathBuf;
 
 use ego_fuser::evaluate::stepped::ComputeTimes;
@@ -49,6 +50,9 @@ pub struct Scenario {
     /// The emulated air between the neighbours and the ego; absent: they hear each other directly.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub link: Option<Link>,
+    /// Whether everything that is said is written to `recording.mcap`, and how; absent: it is not.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub record: Option<Record>,
     /// Where the processes meet.
     #[serde(default)]
     pub network: Network,
@@ -107,6 +111,16 @@ pub struct Link {
     /// Same seed, same losses and delays.
     #[serde(default)]
     pub seed: u64,
+}
+
+/// What is recorded of a run.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Record {
+    /// Streams to leave out: feature maps (`bev`) are most of the bytes.
+    pub without: Vec<Stream>,
+    /// zstd level, 1 to 22; not packed when absent.
+    pub zstd_level: Option<i32>,
 }
 
 /// Which clock a run keeps.
@@ -372,11 +386,14 @@ pub struct Network {
     pub connect: Option<String>,
     /// Shared memory for large messages between processes of one machine, MiB; 0: everything takes the socket.
     pub shared_memory_mib: usize,
+    /// Where the scorer serves its counters to Prometheus; the other processes take the ports behind it, in the order in
+    /// which they are started. Not served when absent.
+    pub metrics: Option<SocketAddr>,
 }
 
 impl Default for Network {
     fn default() -> Self {
-        Self { listen: "tcp/127.0.0.1:0".into(), connect: None, shared_memory_mib: 0 }
+        Self { listen: "tcp/127.0.0.1:0".into(), connect: None, shared_memory_mib: 0, metrics: None }
     }
 }
 

@@ -6,6 +6,7 @@ use sim_replay::ground_truth::GroundTruthRule;
 
 use super::frame_record::{FrameRecord, JudgedFrame};
 use super::open_ticks::{OpenTicks, Part, Tick};
+use super::stage_stamps::StageStamps;
 use super::true_boxes::true_boxes;
 use crate::metrics::{ByIou, Communication, Latencies, Percentiles, PoseError, PoseErrors};
 
@@ -159,8 +160,10 @@ impl Board {
             return;
         };
         let boxes = true_boxes(&truth, &self.ego, &self.rule);
-        let latency_ms = (done_nanos as f64 - began_nanos as f64) / 1e6;
-        self.judge_result((truth.frame_index, capture_nanos), Some(latency_ms), result, boxes, world_from_lidar);
+        let ego = tick.poses.iter().position(|(cav, _)| *cav == self.ego);
+        let posed_nanos = ego.and_then(|ego| tick.posed_nanos.get(ego).copied());
+        let stamps = StageStamps::of(began_nanos, posed_nanos, done_nanos, &result.stages);
+        self.judge_result((truth.frame_index, capture_nanos), stamps, result, boxes, world_from_lidar);
     }
 
     /// Judges a frame whose truth is known already, at once; `poses` are everyone's estimates. Nothing that
@@ -175,13 +178,14 @@ impl Board {
         world_from_lidar: Vec<(CavId, Pose)>,
     ) {
         self.judge_poses(poses, &world_from_lidar);
-        self.judge_result((result.frame_index, capture_nanos), latency_ms, result, boxes, world_from_lidar);
+        let stamps = StageStamps { detected_ms: latency_ms, ..StageStamps::default() };
+        self.judge_result((result.frame_index, capture_nanos), stamps, result, boxes, world_from_lidar);
     }
 
     fn judge_result(
         &mut self,
         (frame_index, capture_nanos): (u64, u64),
-        latency_ms: Option<f64>,
+        stamps: StageStamps,
         result: Detections,
         boxes: Vec<Box3d>,
         world_from_lidar: Vec<(CavId, Pose)>,
@@ -195,7 +199,8 @@ impl Board {
         self.records.push(FrameRecord {
             frame_index,
             capture_nanos,
-            latency_ms,
+            latency_ms: stamps.detected_ms,
+            stamps,
             detected: result.detections.len(),
             truth: boxes.len(),
             found,

@@ -3,6 +3,8 @@
 use protocol::{Box3d, CavId, Detections, Pose};
 use serde::Serialize;
 
+use super::StageStamps;
+
 /// One line of `frames.csv`.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct FrameRecord {
@@ -12,6 +14,8 @@ pub struct FrameRecord {
     pub capture_nanos: u64,
     /// From the publication of the tick to that of its detections, milliseconds; none where nothing was published.
     pub latency_ms: Option<f64>,
+    /// When the frame passed each stage; all open where nothing was published.
+    pub stamps: StageStamps,
     /// Boxes detected.
     pub detected: usize,
     /// Boxes there were.

@@ -4,9 +4,11 @@ mod board;
 mod frame_record;
 mod node;
 mod open_ticks;
+mod stage_stamps;
 mod true_boxes;
 
 pub use board::Board;
 pub use frame_record::{FrameRecord, JudgedFrame};
 pub use node::{ProcessBooks, Progress, Scored, ScorerError, ScorerNode, scorer_cav};
+pub use stage_stamps::StageStamps;
 pub use true_boxes::true_boxes;

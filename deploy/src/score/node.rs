@@ -151,6 +151,15 @@ impl ScorerNode {
         Ok(Self { bus, inbox, progress, thread, _subscriptions: subscriptions, _presence: presence })
     }
 
+    /// Serves the scorer's own counters to Prometheus.
+    ///
+    /// # Errors
+    /// [`ScorerError::Bus`] when the address cannot be listened at.
+    pub fn serve_metrics(&mut self, address: std::net::SocketAddr) -> Result<(), ScorerError> {
+        self.bus.serve_metrics(address)?;
+        Ok(())
+    }
+
     /// How it goes.
     #[must_use]
     pub fn progress(&self) -> Progress {

@@ -16,6 +16,8 @@ pub(super) struct Tick {
     pub(super) result: Option<(u64, Detections)>,
     /// Where the vehicles believe to be.
     pub(super) poses: Vec<(CavId, PoseEstimate)>,
+    /// When these were published, nanoseconds.
+    pub(super) posed_nanos: Vec<u64>,
 }
 
 /// What comes of a tick.
@@ -53,6 +55,7 @@ impl OpenTicks {
             Part::Pose(estimate) => {
                 if tick.poses.iter().all(|(known, _)| *known != stamp.cav) {
                     tick.poses.push((stamp.cav.clone(), estimate));
+                    tick.posed_nanos.push(stamp.publish_nanos);
                 }
             }
         }

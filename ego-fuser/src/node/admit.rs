@@ -23,13 +23,15 @@ impl Node<'_> {
         let began = Instant::now();
         let Some((pose, content)) = self.decode(arrival) else { return };
         self.bus.books().timed("decode", began.elapsed());
-        let transport = unix_nanos().saturating_sub(arrival.header.stamp.publish_nanos);
-        self.bus.books().timed(&format!("{} transport", self.stream), Duration::from_nanos(transport));
+        let transport = Duration::from_nanos(unix_nanos().saturating_sub(arrival.header.stamp.publish_nanos));
+        // Decoding, which lies between arrival and now, is part of the wait.
+        let transport = transport.saturating_sub(arrival.at.elapsed());
+        self.bus.books().timed(&format!("{} transport", self.stream), transport);
         let capture_nanos = arrival.header.stamp.capture_nanos;
         let view = View { cav: cav.clone(), pose, capture_nanos, content };
         if *cav == self.cav {
             let frame_index = arrival.header.stamp.sequence;
-            self.frames.push_back(OwnFrame { frame_index, capture_nanos, begun: arrival.at, view });
+            self.frames.push_back(OwnFrame { frame_index, capture_nanos, transport, begun: arrival.at, view });
             return;
         }
         if let Some(neighbourhood) = &mut self.neighbourhood {

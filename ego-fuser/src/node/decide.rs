@@ -3,7 +3,8 @@
 use std::time::Duration;
 
 use protocol::message::{DetectionsReport, FusedNeighbour, SkippedNeighbour, StageTiming};
-use protocol::{Body, CavId, Detections, DropReason, Encoded};
+use protocol::{Body, CavId, Detections, DropReason, Encoded, wire};
+use sim_replay::bus::unix_nanos;
 
 use super::{Node, OwnFrame};
 use crate::ego::{EgoOutput, Skipped, View};
@@ -54,7 +55,7 @@ impl Node<'_> {
     }
 
     fn fuse(&mut self, frame: OwnFrame) {
-        let OwnFrame { frame_index, capture_nanos, begun, view: own } = frame;
+        let OwnFrame { frame_index, capture_nanos, transport, begun, view: own } = frame;
         let waited = begun.elapsed();
         let mut choice = self.choose(capture_nanos);
         let own_topic = self.topic(&self.cav);
@@ -63,7 +64,8 @@ impl Node<'_> {
                 self.bus.books().received(&own_topic);
                 self.leave_out(&skipped, &mut choice);
                 let fused = self.take_in(&own, &fused, &choice);
-                let stages = std::iter::once(StageTiming::new("wait", waited)).chain(stages).collect();
+                let before = [StageTiming::new("transport", transport), StageTiming::new("wait", waited)];
+                let stages = before.into_iter().chain(stages).collect();
                 let result = Detections {
                     ego: self.cav.clone(),
                     frame_index,
@@ -152,11 +154,18 @@ impl Node<'_> {
     }
 
     fn publish(&mut self, capture_nanos: u64, result: Detections) {
-        for stage in &result.stages {
+        // The own message's transport is in the books already.
+        for stage in result.stages.iter().filter(|stage| stage.stage != "transport") {
             self.bus.books().timed(&stage.stage, Duration::from_nanos(stage.nanos));
         }
         self.report.frames += 1;
-        self.detections.offer(capture_nanos, result.clone());
+        let (fused, binary) = (unix_nanos(), result.clone());
+        self.detections.offer_encoded(capture_nanos, move |stamp| {
+            let mut result = binary;
+            let sending = Duration::from_nanos(stamp.publish_nanos.saturating_sub(fused));
+            result.stages.push(StageTiming::new("send", sending));
+            wire::encode(stamp, result)
+        });
         self.json.offer_encoded(capture_nanos, move |stamp| {
             let head = DetectionsReport::new(stamp, result).to_json().into_bytes();
             Ok(Encoded { head, body: Body::Empty })

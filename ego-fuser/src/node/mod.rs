@@ -102,6 +102,8 @@ struct OwnFrame {
     /// Sequence of the own agent's message.
     frame_index: u64,
     capture_nanos: u64,
+    /// From its publication to its arrival.
+    transport: Duration,
     begun: Instant,
     view: View,
 }

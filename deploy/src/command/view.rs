@@ -1,0 +1,72 @@
+//! `v2vloc view`.
+
+use std::net::SocketAddr;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use deploy::view::{LiveRun, RecordedRun, ViewError, serve_live, serve_recorded};
+use protocol::{CavId, Role, RunId};
+use sim_replay::bus::shutdown::Stop;
+use sim_replay::bus::{Bus, BusOptions, Endpoint, Identity, process_id};
+use sim_replay::web::WebServer;
+
+use super::{BadInput, Outcome};
+
+#[derive(Debug, clap::Args)]
+pub(crate) struct Arguments {
+    /// Folder of a recorded run (`v2vloc up --record`), or its recording.mcap.
+    #[arg(required_unless_present = "live", conflicts_with = "live")]
+    run: Option<PathBuf>,
+    /// Show a run that goes on now; --name and --connect say which.
+    #[arg(long, requires_all = ["name", "connect"])]
+    live: bool,
+    /// Name of the live run.
+    #[arg(long)]
+    name: Option<RunId>,
+    /// The router of the live run, tcp/HOST:PORT; `v2vloc up` says it.
+    #[arg(long)]
+    connect: Option<Endpoint>,
+    /// Where to serve the page.
+    #[arg(long, value_name = "HOST:PORT", default_value = "127.0.0.1:8088")]
+    listen: SocketAddr,
+}
+
+impl Arguments {
+    /// Serves the page until Ctrl-C.
+    pub(crate) fn run(self) -> anyhow::Result<Outcome> {
+        let stop = Stop::new();
+        stop.on_signals()?;
+        let server = match (&self.run, &self.name, self.connect) {
+            (Some(path), _, _) => {
+                let run = RecordedRun::open(path).map_err(|error| match error {
+                    ViewError::NotRecorded(_) | ViewError::Empty(_) => BadInput(error.to_string()).into(),
+                    ViewError::Recording(_) => anyhow::Error::from(error),
+                })?;
+                eprintln!("{} moments of run {}", run.len(), run.name());
+                serve_recorded(self.listen, Arc::new(run))
+            }
+            (None, Some(name), Some(router)) => {
+                let cav = CavId::new("viewer")?;
+                let identity = Identity { run: name.clone(), process: process_id(Role::Viewer, &cav), cav };
+                let bus = Bus::join(&BusOptions::client(router), identity)?;
+                serve_live(self.listen, Arc::new(LiveRun::start(bus)?))
+            }
+            (None, _, _) => {
+                return Err(BadInput("name a run folder, or --live --name RUN --connect ROUTER".into()).into());
+            }
+        };
+        let server = server.map_err(|error| BadInput(format!("cannot serve at {}: {error}", self.listen)))?;
+        eprintln!("http://{}/ (Ctrl-C ends it)", server.address());
+        while !stop.wait_until(Instant::now() + Duration::from_secs(3600)) {}
+        say_dropped(&server);
+        Ok(Outcome::Done)
+    }
+}
+
+fn say_dropped(server: &WebServer) {
+    let dropped = server.readers().dropped();
+    if dropped > 0 {
+        eprintln!("{dropped} readers did not read and were dropped");
+    }
+}

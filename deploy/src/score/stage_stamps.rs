@@ -1,0 +1,80 @@
+//! When a frame passed each stage, from the capture to the detections.
+
+use protocol::StageTiming;
+
+/// Milliseconds after the publication of the tick; each is `None` where it is not known.
+#[derive(Debug, Clone, Copy, PartialEq, Default, serde::Serialize)]
+pub struct StageStamps {
+    /// The ego's agent knew where it was and said so.
+    pub posed_ms: Option<f64>,
+    /// It handed its map, boxes or points to the network.
+    pub published_ms: Option<f64>,
+    /// These reached the ego-fuser.
+    pub arrived_ms: Option<f64>,
+    /// The ego-fuser stopped waiting for neighbours.
+    pub decided_ms: Option<f64>,
+    /// It had its detections.
+    pub fused_ms: Option<f64>,
+    /// It handed them to the network.
+    pub detected_ms: Option<f64>,
+}
+
+impl StageStamps {
+    /// Stamps of a tick that was published at `began_nanos`, of which the ego's pose was published at `posed_nanos` and its
+    /// detections, with their `stages`, at `detected_nanos`.
+    #[must_use]
+    pub fn of(began_nanos: u64, posed_nanos: Option<u64>, detected_nanos: u64, stages: &[StageTiming]) -> Self {
+        let since = |nanos: u64| (nanos as f64 - began_nanos as f64) / 1e6;
+        let took =
+            |name: &str| stages.iter().find(|timing| timing.stage == name).map(|timing| timing.nanos as f64 / 1e6);
+        let fusing: f64 = stages
+            .iter()
+            .filter(|timing| !["transport", "wait", "send"].contains(&timing.stage.as_str()))
+            .map(|timing| timing.nanos as f64 / 1e6)
+            .sum();
+        let detected = since(detected_nanos);
+        // The ego's stages follow each other without a gap: counted back from the end.
+        let fused = took("send").map(|send| detected - send);
+        let decided = fused.map(|fused| fused - fusing);
+        let arrived = decided.zip(took("wait")).map(|(decided, wait)| decided - wait);
+        let published = arrived.zip(took("transport")).map(|(arrived, transport)| arrived - transport);
+        Self {
+            posed_ms: posed_nanos.map(since),
+            published_ms: published,
+            arrived_ms: arrived,
+            decided_ms: decided,
+            fused_ms: fused,
+            detected_ms: Some(detected),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use super::*;
+
+    #[test]
+    fn stages_are_laid_out_from_the_end() {
+        let timing = |name, ms| StageTiming::new(name, Duration::from_millis(ms));
+        let stages =
+            [timing("transport", 4), timing("wait", 20), timing("warp", 3), timing("fuse", 7), timing("send", 1)];
+        let stamps = StageStamps::of(1_000_000_000, Some(1_030_000_000), 1_100_000_000, &stages);
+        let expected = StageStamps {
+            posed_ms: Some(30.0),
+            published_ms: Some(65.0),
+            arrived_ms: Some(69.0),
+            decided_ms: Some(89.0),
+            fused_ms: Some(99.0),
+            detected_ms: Some(100.0),
+        };
+        assert_eq!(stamps, expected);
+    }
+
+    #[test]
+    fn what_an_ego_does_not_tell_stays_open() {
+        let stamps = StageStamps::of(0, None, 5_000_000, &[]);
+        assert_eq!(stamps, StageStamps { detected_ms: Some(5.0), ..StageStamps::default() });
+    }
+}

@@ -1,0 +1,316 @@
+//! From messages, in whatever order they come, to moments.
+
+use std::collections::BTreeMap;
+
+use protocol::{
+    Box3d, Boxes, CavId, Detection, Detections, Header, Ledger, Lidar, Limits, Payload, Pose, PoseEstimate,
+    StageSummary, Stats, Stream, Topic, TrueObject, Truth, wire,
+};
+
+use super::scene_frame::{Link, Messages, Planar, Process, SceneFrame, ShownBox, Vehicle, rows, thinned};
+
+/// Moments that may still be waiting for something.
+const MOST_OPEN: usize = 16;
+
+/// A message that was seen somewhere.
+#[derive(Debug, Clone, Copy)]
+pub struct Seen<'a> {
+    /// Where it was published.
+    pub topic: &'a Topic,
+    /// Its header.
+    pub header: &'a Header,
+    /// When it was seen, nanoseconds on the Unix clock.
+    pub arrived_nanos: u64,
+    /// All of it, where its content is wanted.
+    pub payload: Option<&'a [u8]>,
+}
+
+/// What has come so far, by capture time.
+#[derive(Default)]
+pub struct Assembly {
+    open: BTreeMap<u64, Moment>,
+    shown_until: Option<u64>,
+    books: BTreeMap<String, (Ledger, Vec<StageSummary>)>,
+}
+
+/// What has come of one moment.
+#[derive(Default)]
+struct Moment {
+    truth: Option<(u64, Truth)>,
+    result: Option<(u64, Detections)>,
+    poses: BTreeMap<CavId, PoseEstimate>,
+    sweeps: BTreeMap<CavId, Vec<u8>>,
+    own_boxes: BTreeMap<CavId, Boxes>,
+    /// Latest arrival from a vehicle: behind the link where there is one.
+    arrivals: BTreeMap<CavId, Arrival>,
+}
+
+/// How a message from a vehicle came.
+struct Arrival {
+    /// The larger, the more it says about the link: behind the air before ahead of it, data before poses.
+    rank: u8,
+    stream: Stream,
+    latency_ms: f64,
+}
+
+impl Assembly {
+    /// Takes a message in. A result completes its moment, which is returned; so does a moment of which no result has come
+    /// when too many wait. Unsound messages are left to those they are for.
+    pub fn add(&mut self, seen: &Seen<'_>) -> Option<SceneFrame> {
+        if let Topic::Stats(_) = seen.topic {
+            if let Some(Stats { process, ledger, stages }) = decode(seen) {
+                self.books.insert(process.to_string(), (ledger, stages));
+            }
+            return None;
+        }
+        let at = seen.header.stamp.capture_nanos;
+        if self.shown_until.is_some_and(|shown| at <= shown) {
+            return None;
+        }
+        if self.fill(at, seen) {
+            return self.show(at);
+        }
+        if self.open.len() > MOST_OPEN {
+            let oldest = *self.open.keys().next()?;
+            return self.show(oldest);
+        }
+        None
+    }
+
+    /// The moment at `capture_nanos` as far as it has come; older ones are given up.
+    pub fn show(&mut self, capture_nanos: u64) -> Option<SceneFrame> {
+        let moment = self.open.remove(&capture_nanos)?;
+        self.open.retain(|at, _| *at > capture_nanos);
+        self.shown_until = Some(capture_nanos);
+        Some(moment.frame(capture_nanos, &self.books))
+    }
+
+    /// Forgets which moments were shown: a recording is looked at in any order.
+    pub fn rewind(&mut self) {
+        self.open.clear();
+        self.shown_until = None;
+        self.books.clear();
+    }
+
+    /// Lays a message into its moment; tells whether that is complete now.
+    fn fill(&mut self, at: u64, seen: &Seen<'_>) -> bool {
+        let published = seen.header.stamp.publish_nanos;
+        match seen.topic {
+            Topic::Truth => {
+                if let Some(truth) = decode(seen) {
+                    self.moment(at).truth = Some((published, truth));
+                }
+            }
+            Topic::Stream { stream: Stream::Detections, .. } => {
+                if let Some(result) = decode(seen) {
+                    self.moment(at).result = Some((published, result));
+                    return true;
+                }
+            }
+            Topic::Stream { cav, stream: Stream::Lidar } => {
+                if let Some(Lidar { points }) = decode(seen) {
+                    self.moment(at).sweeps.insert(cav.clone(), thinned(&points.xyzi));
+                }
+            }
+            Topic::Stream { cav, stream } => {
+                match stream {
+                    Stream::Pose => {
+                        if let Some(estimate) = decode(seen) {
+                            self.moment(at).poses.insert(cav.clone(), estimate);
+                        }
+                    }
+                    Stream::Boxes => {
+                        if let Some(boxes) = decode(seen) {
+                            self.moment(at).own_boxes.insert(cav.clone(), boxes);
+                        }
+                    }
+                    _ => {}
+                }
+                self.arrived(at, cav, *stream, 0, seen);
+            }
+            Topic::Received { cav, stream, .. } => self.arrived(at, cav, *stream, 2, seen),
+            Topic::Control(_) | Topic::Stats(_) | Topic::Alive { .. } => {}
+        }
+        false
+    }
+
+    fn arrived(&mut self, at: u64, cav: &CavId, stream: Stream, rank: u8, seen: &Seen<'_>) {
+        let rank = match stream {
+            Stream::Bev | Stream::Boxes | Stream::Points => rank + 1,
+            Stream::Pose => rank,
+            _ => return,
+        };
+        let latency_ms = (seen.arrived_nanos as f64 - seen.header.stamp.publish_nanos as f64) / 1e6;
+        let arrivals = &mut self.moment(at).arrivals;
+        if arrivals.get(cav).is_none_or(|known| known.rank <= rank) {
+            arrivals.insert(cav.clone(), Arrival { rank, stream, latency_ms });
+        }
+    }
+
+    fn moment(&mut self, at: u64) -> &mut Moment {
+        self.open.entry(at).or_default()
+    }
+}
+
+fn decode<M: Payload>(seen: &Seen<'_>) -> Option<M> {
+    wire::decode([seen.payload?], &Limits::DEFAULT).map(|(_, message)| message).ok()
+}
+
+impl Moment {
+    fn frame(&self, capture_nanos: u64, books: &BTreeMap<String, (Ledger, Vec<StageSummary>)>) -> SceneFrame {
+        let result = self.result.as_ref().map(|(_, result)| result);
+        let (vehicles, points) = self.vehicles();
+        let latency = self.truth.as_ref().zip(self.result.as_ref());
+        SceneFrame {
+            capture_s: capture_nanos as f64 / 1e9,
+            frame_index: self.truth.as_ref().map(|(_, truth)| truth.frame_index),
+            ego: result.map(|result| result.ego.clone()),
+            method: result.map(|result| result.method.clone()),
+            latency_ms: latency.map(|((began, _), (done, _))| (*done as f64 - *began as f64) / 1e6),
+            vehicles,
+            truth: self.true_boxes(),
+            detections: self.detections(),
+            single: self.single(),
+            links: self.links(),
+            stages: result.map_or(Vec::new(), |result| result.stages.clone()),
+            processes: books
+                .iter()
+                .map(|(process, (_, stages))| Process { process: process.clone(), stages: stages.clone() })
+                .collect(),
+            messages: messages(books.values().map(|(ledger, _)| ledger)),
+            points,
+        }
+    }
+
+    /// Everyone, the ego first, and their points.
+    fn vehicles(&self) -> (Vec<Vehicle>, Vec<u8>) {
+        let ego = self.result.as_ref().map(|(_, result)| &result.ego);
+        let told = self.truth.iter().flat_map(|(_, truth)| truth.agents.iter().map(|agent| &agent.cav));
+        let mut cavs: Vec<&CavId> = Vec::new();
+        for cav in ego.into_iter().chain(told).chain(self.poses.keys()).chain(self.sweeps.keys()) {
+            if !cavs.contains(&cav) {
+                cavs.push(cav);
+            }
+        }
+        let mut points = Vec::new();
+        let vehicles = cavs.into_iter().map(|cav| self.vehicle(cav, &mut points)).collect();
+        (vehicles, points)
+    }
+
+    fn vehicle(&self, cav: &CavId, points: &mut Vec<u8>) -> Vehicle {
+        let agents = self.truth.iter().flat_map(|(_, truth)| &truth.agents);
+        let truth = agents.into_iter().find(|agent| agent.cav == *cav).map(|agent| &agent.world_from_lidar);
+        let estimate = self.poses.get(cav).or_else(|| {
+            self.result
+                .as_ref()
+                .map(|(_, result)| result)
+                .filter(|result| result.ego == *cav)
+                .map(|result| &result.pose)
+        });
+        let pose = estimate.and_then(PoseEstimate::world_from_cav);
+        let sweep = self.sweeps.get(cav).map_or(&[][..], Vec::as_slice);
+        points.extend(sweep);
+        let distance = |found: &Pose, truth: &Pose| {
+            found.translation_m.iter().zip(truth.translation_m).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt()
+        };
+        Vehicle {
+            cav: cav.clone(),
+            pose: pose.map(Planar::of),
+            confidence: pose.and(estimate).map(PoseEstimate::confidence),
+            no_pose: match estimate {
+                Some(PoseEstimate::NoPose { reason, .. }) => Some(*reason),
+                _ => None,
+            },
+            truth: truth.map(Planar::of),
+            error_m: pose.zip(truth).map(|(found, truth)| distance(found, truth)),
+            world_from_lidar: pose.or(truth).map(rows),
+            points: sweep.len() / 6,
+        }
+    }
+
+    fn true_boxes(&self) -> Vec<ShownBox> {
+        let mut objects: BTreeMap<i64, &TrueObject> = BTreeMap::new();
+        for object in self.truth.iter().flat_map(|(_, truth)| truth.agents.iter().flat_map(|agent| &agent.objects)) {
+            objects.entry(object.id).or_insert(object);
+        }
+        let shown = |object: &TrueObject| ShownBox {
+            box3d: Box3d {
+                center_m: object.world_from_object.translation_m,
+                size_m: object.size_m,
+                heading_rad: object.world_from_object.yaw_rad(),
+            },
+            score: None,
+            source: None,
+            class: Some(object.class.clone()),
+        };
+        objects.into_values().map(shown).collect()
+    }
+
+    /// The ego's detections, where it believes to be.
+    fn detections(&self) -> Vec<ShownBox> {
+        let Some((_, result)) = &self.result else { return Vec::new() };
+        self.placed(&result.ego, &result.pose, &result.detections, None)
+    }
+
+    /// What vehicles sent as their own detections.
+    fn single(&self) -> Vec<ShownBox> {
+        let each = |(cav, boxes): (&CavId, &Boxes)| self.placed(cav, &boxes.pose, &boxes.detections, Some(cav));
+        self.own_boxes.iter().flat_map(each).collect()
+    }
+
+    /// Detections in the frame of a vehicle, which are where it believes to be, or else where it is.
+    fn placed(&self, cav: &CavId, pose: &PoseEstimate, found: &[Detection], source: Option<&CavId>) -> Vec<ShownBox> {
+        let truth = self.truth.iter().flat_map(|(_, truth)| &truth.agents).find(|agent| agent.cav == *cav);
+        let pose = pose.world_from_cav().or(truth.map(|agent| &agent.world_from_lidar));
+        let Some(world_from_cav) = pose.map(Pose::isometry) else { return Vec::new() };
+        let shown = |detection: &Detection| ShownBox {
+            box3d: detection.box3d.transformed(&world_from_cav),
+            score: Some(detection.score),
+            source: source.or(detection.source.as_ref()).cloned(),
+            class: None,
+        };
+        found.iter().map(shown).collect()
+    }
+
+    fn links(&self) -> Vec<Link> {
+        let Some((_, result)) = &self.result else { return Vec::new() };
+        let mut links: BTreeMap<String, Link> = BTreeMap::new();
+        let to = result.ego.to_string();
+        for (cav, arrival) in self.arrivals.iter().filter(|(cav, _)| **cav != result.ego) {
+            let (latency_ms, stream) = (Some(arrival.latency_ms), Some(arrival.stream.to_string()));
+            let link = Link { from: cav.to_string(), to: to.clone(), latency_ms, stream, ..Link::default() };
+            links.insert(link.from.clone(), link);
+        }
+        let mut link = |cav: &CavId| {
+            let new = || Link { from: cav.to_string(), to: to.clone(), ..Link::default() };
+            links.remove(cav.as_str()).unwrap_or_else(new)
+        };
+        let fused: Vec<Link> = result
+            .fused
+            .iter()
+            .map(|neighbour| Link {
+                wire_bytes: Some(neighbour.wire_bytes),
+                age_ms: Some(neighbour.age_nanos as f64 / 1e6),
+                is_fused: true,
+                ..link(&neighbour.cav)
+            })
+            .collect();
+        let skipped: Vec<Link> =
+            result.skipped.iter().map(|neighbour| Link { skipped: neighbour.reason, ..link(&neighbour.cav) }).collect();
+        fused.into_iter().chain(skipped).chain(links.into_values()).collect()
+    }
+}
+
+/// Everyone's books added up.
+fn messages<'a>(ledgers: impl Iterator<Item = &'a Ledger>) -> Vec<Messages> {
+    let mut sum = Ledger::default();
+    ledgers.for_each(|ledger| sum.merge(ledger));
+    let line = |(account, counts): (&protocol::Account, &protocol::Counts)| Messages {
+        topic: account.topic.to_string(),
+        to: account.to.as_ref().map(ToString::to_string),
+        sent: counts.sent,
+        received: counts.received,
+        dropped: counts.dropped.clone(),
+    };
+    sum.iter().map(line).collect()
+}

@@ -1,0 +1,202 @@
+//! A recorded run, moment by moment, in any order.
+
+use std::path::{Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
+
+use protocol::{Detections, Limits, PoseEstimate, Stream, Topic, Truth, wire};
+use serde::Serialize;
+use sim_replay::recording::{Entry, Recording, RecordingError};
+
+use super::assembly::{Assembly, Seen};
+use super::scene_frame::SceneFrame;
+
+/// Why a run cannot be shown.
+#[derive(Debug, thiserror::Error)]
+pub enum ViewError {
+    /// The run was not recorded.
+    #[error("{}: there is no recording.mcap in it; record a run with `v2vloc up --record`", .0.display())]
+    NotRecorded(PathBuf),
+    /// The recording cannot be read.
+    #[error(transparent)]
+    Recording(#[from] RecordingError),
+    /// There is nothing to show.
+    #[error("{}: no truth and no detections in it", .0.display())]
+    Empty(PathBuf),
+}
+
+/// A run in a file.
+pub struct RecordedRun {
+    recording: Recording,
+    name: String,
+    moments: Vec<Moment>,
+    /// Where every process tells of its books.
+    stats: Vec<usize>,
+    assembly: Mutex<Assembly>,
+}
+
+/// One moment: its messages in the recording, and what the timeline shows of it.
+struct Moment {
+    capture_nanos: u64,
+    entries: Vec<usize>,
+    summary: MomentSummary,
+}
+
+/// What the timeline shows of a moment.
+#[derive(Debug, Clone, Default, PartialEq, Serialize)]
+pub struct MomentSummary {
+    /// Capture time on the scene's clock, seconds.
+    pub capture_s: f64,
+    /// From the publication of the tick to that of its detections, milliseconds; `None`: there are none.
+    pub latency_ms: Option<f64>,
+    /// Boxes detected.
+    pub detected: usize,
+    /// Neighbours fused.
+    pub fused: usize,
+    /// Distance of the ego's pose from the truth, metres.
+    pub ego_error_m: Option<f64>,
+}
+
+impl RecordedRun {
+    /// Opens the recording at `path`, or that of the run folder `path`, and looks through it once.
+    ///
+    /// # Errors
+    /// [`ViewError`] when there is none, or nothing to show in it.
+    pub fn open(path: &Path) -> Result<Self, ViewError> {
+        let file = if path.is_dir() { path.join("recording.mcap") } else { path.to_path_buf() };
+        if !file.is_file() {
+            return Err(ViewError::NotRecorded(path.into()));
+        }
+        let recording = Recording::open(&file)?;
+        if let Some(damage) = recording.damage() {
+            tracing::warn!("{}: {} bytes at its end are lost: {}", file.display(), damage.lost_bytes, damage.reason);
+        }
+        let name = recording.entries().first().map_or(String::new(), |entry| entry.key.run.to_string());
+        let mut moments = std::collections::BTreeMap::<u64, Vec<usize>>::new();
+        let mut stats = Vec::new();
+        for (index, entry) in recording.entries().iter().enumerate() {
+            match &entry.key.topic {
+                Topic::Stats(_) => stats.push(index),
+                Topic::Stream { stream: Stream::Descriptor, .. }
+                | Topic::Received { stream: Stream::Descriptor, .. } => {}
+                Topic::Stream { .. } | Topic::Received { .. } | Topic::Truth => {
+                    moments.entry(entry.header.stamp.capture_nanos).or_default().push(index);
+                }
+                Topic::Control(_) | Topic::Alive { .. } => {}
+            }
+        }
+        let mut run = Self { recording, name, moments: Vec::new(), stats, assembly: Mutex::default() };
+        for (capture_nanos, entries) in moments {
+            if let Some(summary) = run.summary(capture_nanos, &entries)? {
+                run.moments.push(Moment { capture_nanos, entries, summary });
+            }
+        }
+        if run.moments.is_empty() { Err(ViewError::Empty(file)) } else { Ok(run) }
+    }
+
+    /// Name of the run.
+    #[must_use]
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// How many moments there are.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.moments.len()
+    }
+
+    /// Never: there is something to show.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.moments.is_empty()
+    }
+
+    /// What the timeline shows.
+    pub fn timeline(&self) -> impl Iterator<Item = &MomentSummary> {
+        self.moments.iter().map(|moment| &moment.summary)
+    }
+
+    /// A moment, counted from 0; `None` behind the last.
+    ///
+    /// # Errors
+    /// [`RecordingError`] when the file has changed.
+    pub fn frame(&self, index: usize) -> Result<Option<SceneFrame>, RecordingError> {
+        let Some(moment) = self.moments.get(index) else { return Ok(None) };
+        let mut assembly = self.assembly.lock().unwrap_or_else(PoisonError::into_inner);
+        assembly.rewind();
+        let until = moment.entries.iter().map(|entry| self.entry(*entry).arrived_nanos).max().unwrap_or(0);
+        // Results come last, and show the moment.
+        let (results, others): (Vec<usize>, Vec<usize>) =
+            moment.entries.iter().partition(|entry| is_result(&self.entry(**entry).key.topic));
+        for index in self.books_until(until).into_iter().chain(others).chain(results) {
+            let entry = self.entry(index);
+            let payload = if is_wanted(&entry.key.topic) { Some(self.recording.read(entry)?) } else { None };
+            let Entry { key, header, arrived_nanos, .. } = entry;
+            let (topic, payload) = (&key.topic, payload.as_deref());
+            let shown = assembly.add(&Seen { topic, header, arrived_nanos: *arrived_nanos, payload });
+            if shown.is_some() {
+                return Ok(shown);
+            }
+        }
+        Ok(assembly.show(moment.capture_nanos))
+    }
+
+    fn entry(&self, index: usize) -> &Entry {
+        &self.recording.entries()[index]
+    }
+
+    /// The last word of every process until `nanos`.
+    fn books_until(&self, nanos: u64) -> Vec<usize> {
+        let mut last = std::collections::BTreeMap::new();
+        for index in self.stats.iter().copied().filter(|index| self.entry(*index).arrived_nanos <= nanos) {
+            last.insert(&self.entry(index).key.topic, index);
+        }
+        last.into_values().collect()
+    }
+
+    /// `None` where there is neither truth nor result: nothing happened then.
+    fn summary(&self, capture_nanos: u64, entries: &[usize]) -> Result<Option<MomentSummary>, RecordingError> {
+        let mut summary = MomentSummary { capture_s: capture_nanos as f64 / 1e9, ..MomentSummary::default() };
+        let (mut truth, mut result) = (None, None);
+        for entry in entries.iter().map(|index| self.entry(*index)) {
+            let is_truth = entry.key.topic == Topic::Truth;
+            if !is_truth && !is_result(&entry.key.topic) {
+                continue;
+            }
+            let bytes = self.recording.read(entry)?;
+            let published = entry.header.stamp.publish_nanos;
+            if is_truth {
+                truth = wire::decode::<Truth>([bytes.as_slice()], &Limits::DEFAULT).ok().map(|(_, it)| (published, it));
+            } else {
+                result = wire::decode::<Detections>([bytes.as_slice()], &Limits::DEFAULT)
+                    .ok()
+                    .map(|(_, it)| (published, it));
+            }
+        }
+        if let Some((done, result)) = &result {
+            summary.detected = result.detections.len();
+            summary.fused = result.fused.len();
+            if let Some((began, truth)) = &truth {
+                summary.latency_ms = Some((*done as f64 - *began as f64) / 1e6);
+                summary.ego_error_m = ego_error_m(&result.pose, truth, result);
+            }
+        }
+        Ok((truth.is_some() || result.is_some()).then_some(summary))
+    }
+}
+
+fn ego_error_m(pose: &PoseEstimate, truth: &Truth, result: &Detections) -> Option<f64> {
+    let agent = truth.agents.iter().find(|agent| agent.cav == result.ego)?;
+    Some(agent::pose_error::PoseError::between(pose.world_from_cav()?, &agent.world_from_lidar).distance_m)
+}
+
+fn is_result(topic: &Topic) -> bool {
+    matches!(topic, Topic::Stream { stream: Stream::Detections, .. })
+}
+
+/// Whether a message's content is shown, and not only how it came.
+fn is_wanted(topic: &Topic) -> bool {
+    const SHOWN: [Stream; 4] = [Stream::Lidar, Stream::Pose, Stream::Boxes, Stream::Detections];
+    matches!(topic, Topic::Truth | Topic::Stats(_))
+        || matches!(topic, Topic::Stream { stream, .. } if SHOWN.contains(stream))
+}

@@ -1,0 +1,68 @@
+//! The page and what it asks for.
+
+use std::io;
+use std::net::SocketAddr;
+use std::sync::Arc;
+
+use serde_json::json;
+use sim_replay::web::{Answer, Request, WebServer};
+
+use super::{LiveRun, RecordedRun};
+
+const HTML: &str = include_str!("page/index.html");
+const STYLE: &str = include_str!("page/style.css");
+const SCRIPT: &str = include_str!("page/view.js");
+
+/// A moment, or a stream of them.
+const BINARY: &str = "application/octet-stream";
+
+/// Serves the page of a live run until dropped.
+///
+/// # Errors
+/// When the address cannot be listened at.
+pub fn serve_live(address: SocketAddr, run: Arc<LiveRun>) -> io::Result<WebServer> {
+    WebServer::start(address, move |request| match request.path.as_str() {
+        "/run" => document(&json!({"mode": "live", "run": run.name()})),
+        "/live" => Answer::Stream { content_type: BINARY, write: Box::new(run.writer(limit(&request.query))) },
+        _ => asset(request),
+    })
+}
+
+/// Serves the page of a recorded run until dropped.
+///
+/// # Errors
+/// When the address cannot be listened at.
+pub fn serve_recorded(address: SocketAddr, run: Arc<RecordedRun>) -> io::Result<WebServer> {
+    WebServer::start(address, move |request| {
+        if request.path == "/run" {
+            let timeline: Vec<_> = run.timeline().collect();
+            return document(&json!({"mode": "recorded", "run": run.name(), "timeline": timeline}));
+        }
+        let Some(index) = request.path.strip_prefix("/frame/") else { return asset(request) };
+        match index.parse().map(|index| run.frame(index)) {
+            Ok(Ok(Some(frame))) => Answer::Page { content_type: BINARY, body: frame.to_bytes() },
+            Ok(Ok(None)) => Answer::NotFound(format!("there are {} moments, counted from 0", run.len())),
+            Ok(Err(error)) => Answer::NotFound(error.to_string()),
+            Err(error) => Answer::NotFound(format!("{index:?} is no number: {error}")),
+        }
+    })
+}
+
+fn asset(request: &Request) -> Answer {
+    let (content_type, text) = match request.path.as_str() {
+        "/" => ("text/html; charset=utf-8", HTML),
+        "/style.css" => ("text/css; charset=utf-8", STYLE),
+        "/view.js" => ("text/javascript; charset=utf-8", SCRIPT),
+        other => return Answer::NotFound(format!("there is no {other}")),
+    };
+    Answer::Page { content_type, body: text.as_bytes().to_vec() }
+}
+
+fn document(value: &serde_json::Value) -> Answer {
+    Answer::Page { content_type: "application/json", body: value.to_string().into_bytes() }
+}
+
+/// `frames=N`: end after so many moments.
+fn limit(query: &str) -> Option<u64> {
+    query.split('&').find_map(|pair| pair.strip_prefix("frames="))?.parse().ok()
+}

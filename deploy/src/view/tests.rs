@@ -1,0 +1,298 @@
+//! The page over a recorded and a live run that a test makes up.
+
+use std::io::{Read, Write};
+use std::net::{SocketAddr, TcpListener, TcpStream};
+use std::path::{Path, PathBuf};
+use std::process::Command;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+use protocol::message::{AgentTruth, FusedNeighbour, StageTiming};
+use protocol::{
+    Box3d, CavId, Detection, Detections, Key, Lidar, PointCloud, Pose, PoseEstimate, RunId, Stamp, Stream, Topic,
+    TrueObject, Truth, wire,
+};
+use serde_json::Value;
+use sim_replay::bus::{Bus, BusOptions, Endpoint, Identity, PublisherOptions};
+use sim_replay::recording::{RecordingOptions, RecordingWriter};
+use sim_replay::web::fetch;
+
+use super::*;
+
+const EGO: &str = "4279";
+const OTHER: &str = "4288";
+const TICKS: u64 = 5;
+const PATIENCE: Duration = Duration::from_secs(120);
+
+fn cav(text: &str) -> CavId {
+    CavId::new(text).unwrap()
+}
+
+fn pose_of(cav_id: &str, tick: u64) -> Pose {
+    Pose::from_xyz_yaw([tick as f64, if cav_id == EGO { 0.0 } else { 15.0 }, 1.9], 0.2)
+}
+
+fn cloud(tick: u64) -> PointCloud {
+    PointCloud {
+        xyzi: (0..30_000)
+            .map(|k| [(k % 173) as f32 * 0.4 - 34.0, (k / 173) as f32 * 0.4 - 34.0, tick as f32, 0.5])
+            .collect(),
+    }
+}
+
+fn truth(tick: u64) -> Truth {
+    let object = TrueObject {
+        id: 7,
+        class: "car".into(),
+        world_from_object: Pose::from_xyz_yaw([20.0, 3.0, 0.8], 0.1),
+        size_m: [4.0, 1.8, 1.6],
+        speed_mps: None,
+    };
+    let agent = |cav_id: &str| AgentTruth {
+        cav: cav(cav_id),
+        world_from_lidar: pose_of(cav_id, tick),
+        objects: vec![object.clone()],
+    };
+    Truth { frame_index: tick, agents: [EGO, OTHER].map(agent).into() }
+}
+
+fn detections(tick: u64) -> Detections {
+    let box3d = Box3d { center_m: [10.0, 0.0, -1.0], size_m: [4.0, 1.8, 1.6], heading_rad: 0.0 };
+    Detections {
+        ego: cav(EGO),
+        frame_index: tick,
+        method: "max".into(),
+        pose: PoseEstimate::new(pose_of(EGO, tick), 0.9),
+        detections: vec![Detection { box3d, score: 0.8, source: None }],
+        fused: vec![FusedNeighbour {
+            cav: cav(OTHER),
+            age_nanos: 0,
+            confidence: 0.7,
+            payload_bytes: 1_000,
+            wire_bytes: 1_250,
+        }],
+        skipped: Vec::new(),
+        stages: vec![
+            StageTiming::new("wait", Duration::from_millis(12)),
+            StageTiming::new("fuse", Duration::from_millis(8)),
+        ],
+    }
+}
+
+/// The messages of a tick, published at `now`; the result half a tick later.
+fn messages(tick: u64, now: u64) -> Vec<(Topic, Vec<u8>)> {
+    let stamp = |who: &str, late_ms: u64| Stamp {
+        cav: cav(who),
+        epoch: 1,
+        sequence: tick,
+        capture_nanos: 100_000_000 * (tick + 1),
+        publish_nanos: now + 1_000_000 * late_ms,
+    };
+    let stream = |who: &str, stream| Topic::Stream { cav: cav(who), stream };
+    let mut all = vec![(Topic::Truth, wire::encode(&stamp("replay", 0), truth(tick)).unwrap().to_vec())];
+    for who in [EGO, OTHER] {
+        let lidar = Lidar { points: cloud(tick) };
+        all.push((stream(who, Stream::Lidar), wire::encode(&stamp(who, 0), lidar).unwrap().to_vec()));
+        let estimate = PoseEstimate::new(pose_of(who, tick), 0.9);
+        all.push((stream(who, Stream::Pose), wire::encode(&stamp(who, 20), estimate).unwrap().to_vec()));
+    }
+    all.push((stream(EGO, Stream::Detections), wire::encode(&stamp(EGO, 50), detections(tick)).unwrap().to_vec()));
+    all
+}
+
+fn record(folder: &Path) -> RecordedRun {
+    let file = folder.join("recording.mcap");
+    let mut writer = RecordingWriter::create(&file, RecordingOptions::default()).unwrap();
+    let run = RunId::new("test").unwrap();
+    for tick in 0..TICKS {
+        for (topic, payload) in messages(tick, 1_000_000_000 * tick) {
+            let key: Key = topic.in_run(&run);
+            writer.write(&key, 1_000_000_000 * tick + 60_000_000, &payload).unwrap();
+        }
+    }
+    writer.finish().unwrap();
+    RecordedRun::open(folder).unwrap()
+}
+
+/// The JSON document of a moment, and how many points follow.
+fn parsed(bytes: &[u8]) -> (Value, usize) {
+    let (len, rest) = bytes.split_at(4);
+    let (json, points) = rest.split_at(u32::from_le_bytes(len.try_into().unwrap()) as usize);
+    (serde_json::from_slice(json).unwrap(), points.len() / 6)
+}
+
+fn check(frame: &Value, points: usize) {
+    assert_eq!((&frame["ego"], &frame["method"]), (&EGO.into(), &"max".into()));
+    assert_eq!(frame["truth"].as_array().unwrap().len(), 1, "everyone lists it, and it is shown once");
+    // 10 m ahead of an ego at (tick, 0) that looks 0.2 rad to the left.
+    let tick = frame["frame_index"].as_u64().unwrap() as f64;
+    let x = frame["detections"][0]["center_m"][0].as_f64().unwrap();
+    assert!((x - (tick + 10.0 * 0.2_f64.cos())).abs() < 1e-9, "{x}");
+    assert!((frame["latency_ms"].as_f64().unwrap() - 50.0).abs() < 1.0, "{}", frame["latency_ms"]);
+    let vehicles = frame["vehicles"].as_array().unwrap();
+    assert_eq!(vehicles.len(), 2);
+    assert!((vehicles[0]["confidence"].as_f64().unwrap() - 0.9).abs() < 1e-6 && vehicles[0]["error_m"] == 0.0);
+    let counted: u64 = vehicles.iter().map(|vehicle| vehicle["points"].as_u64().unwrap()).sum();
+    assert!(counted as usize == points && points <= 24_000, "{counted} and {points}");
+    let link = &frame["links"][0];
+    assert_eq!((&link["from"], &link["wire_bytes"], &link["is_fused"]), (&OTHER.into(), &1_250.into(), &true.into()));
+}
+
+#[test]
+fn a_recorded_run_is_shown_in_any_order() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = record(folder.path());
+    assert_eq!((run.len(), run.name()), (TICKS as usize, "test"));
+    for index in [3, 0, 4, 3] {
+        let (frame, points) = parsed(&run.frame(index).unwrap().unwrap().to_bytes());
+        assert_eq!(frame["frame_index"], index);
+        check(&frame, points);
+        assert!(points > 10_000, "two sweeps");
+    }
+    assert!(run.frame(5).unwrap().is_none());
+    let server = serve_recorded("127.0.0.1:0".parse().unwrap(), Arc::new(run)).unwrap();
+    let about: Value = serde_json::from_slice(&fetch(server.address(), "/run").unwrap().1).unwrap();
+    assert_eq!((&about["mode"], about["timeline"].as_array().unwrap().len()), (&"recorded".into(), 5));
+    assert_eq!(about["timeline"][1]["latency_ms"], 50.0);
+    let (status, body) = fetch(server.address(), "/frame/2").unwrap();
+    assert!(status.contains("200"));
+    check(&parsed(&body).0, parsed(&body).1);
+    for path in ["/frame/99", "/frame/x", "/nothing"] {
+        assert!(fetch(server.address(), path).unwrap().0.contains("404"), "{path}");
+    }
+    assert!(matches!(RecordedRun::open(&folder.path().join("none")), Err(ViewError::NotRecorded(_))));
+    shows_without_an_error(server.address(), "?at=4", "recorded");
+}
+
+/// A run that goes on at 10 Hz until dropped.
+struct Traffic {
+    endpoint: Endpoint,
+    ending: Arc<AtomicBool>,
+}
+
+impl Traffic {
+    fn start() -> Self {
+        let endpoint = Endpoint::loopback(TcpListener::bind("127.0.0.1:0").unwrap().local_addr().unwrap().port());
+        let ending = Arc::<AtomicBool>::default();
+        let bus = join(&BusOptions::router(endpoint.clone()), "replay");
+        std::thread::spawn({
+            let ending = Arc::clone(&ending);
+            move || publish(bus, &ending)
+        });
+        Self { endpoint, ending }
+    }
+}
+
+impl Drop for Traffic {
+    fn drop(&mut self) {
+        self.ending.store(true, Ordering::Relaxed);
+    }
+}
+
+fn join(options: &BusOptions, name: &str) -> Bus {
+    let identity =
+        Identity { run: RunId::new("test").unwrap(), process: name.parse().unwrap(), cav: CavId::new(name).unwrap() };
+    Bus::join(options, identity).unwrap()
+}
+
+fn publish(bus: Bus, ending: &AtomicBool) {
+    let mut publishers = std::collections::BTreeMap::new();
+    for tick in 0.. {
+        for (topic, payload) in messages(tick, sim_replay::bus::unix_nanos()) {
+            let publisher = publishers
+                .entry(topic.clone())
+                .or_insert_with(|| bus.publisher(topic, PublisherOptions::SENSOR).unwrap());
+            // As it is: stamp and all.
+            publisher.offer_encoded(0, move |_| Ok(protocol::Encoded { head: payload, body: protocol::Body::Empty }));
+        }
+        std::thread::sleep(Duration::from_millis(100));
+        if ending.load(Ordering::Relaxed) {
+            return;
+        }
+    }
+}
+
+#[test]
+fn a_live_run_is_shown_as_it_goes_and_nobody_waits_for_a_page() {
+    let traffic = Traffic::start();
+    let run = Arc::new(LiveRun::start(join(&BusOptions::client(traffic.endpoint.clone()), "viewer")).unwrap());
+    let server = serve_live("127.0.0.1:0".parse().unwrap(), Arc::clone(&run)).unwrap();
+
+    // Sweeps are listened to only once somebody looks.
+    let moments = moments_of(server.address(), 12);
+    let (frame, points) = parsed(moments.last().unwrap());
+    check(&frame, points);
+    assert!(points > 10_000, "{points}");
+    let indices: Vec<u64> = moments.iter().map(|bytes| parsed(bytes).0["frame_index"].as_u64().unwrap()).collect();
+    assert!(indices.windows(2).all(|pair| pair[0] < pair[1]), "the newest only: {indices:?}");
+    wait_for("nobody looks any more", || run.watchers() == 0);
+
+    // A browser that never reads.
+    let mut asleep = TcpStream::connect(server.address()).unwrap();
+    asleep.write_all(b"GET /live HTTP/1.1\r\n\r\n").unwrap();
+    wait_for("it is counted as a watcher", || run.watchers() == 1);
+    // Others are served all the while.
+    assert_eq!(moments_of(server.address(), 3).len(), 3);
+    wait_for("it is dropped", || server.readers().dropped() == 1);
+    wait_for("and no watcher any more", || run.watchers() == 0);
+    shows_without_an_error(server.address(), "?frames=12", "live");
+}
+
+/// `count` moments of a live run.
+fn moments_of(address: SocketAddr, count: u64) -> Vec<Vec<u8>> {
+    let mut connection = TcpStream::connect(address).unwrap();
+    connection.set_read_timeout(Some(PATIENCE)).unwrap();
+    write!(connection, "GET /live?frames={count} HTTP/1.1\r\n\r\n").unwrap();
+    let mut answer = Vec::new();
+    connection.read_to_end(&mut answer).unwrap();
+    let mut rest = &answer[answer.windows(4).position(|bytes| bytes == b"\r\n\r\n").unwrap() + 4..];
+    let mut moments = Vec::new();
+    while let Some((len, behind)) = rest.split_at_checked(4) {
+        let (moment, next) = behind.split_at(u32::from_le_bytes(len.try_into().unwrap()) as usize);
+        if !moment.is_empty() {
+            moments.push(moment.to_vec());
+        }
+        rest = next;
+    }
+    moments
+}
+
+fn wait_for(what: &str, condition: impl Fn() -> bool) {
+    let deadline = Instant::now() + PATIENCE;
+    while !condition() {
+        assert!(Instant::now() < deadline, "{what}");
+        std::thread::sleep(Duration::from_millis(10));
+    }
+}
+
+/// Opens the page in Chromium, on a laptop's and a phone's screen, where there is one.
+fn shows_without_an_error(address: SocketAddr, query: &str, mode: &str) {
+    let Some(browser) = ["chromium", "chromium-browser", "google-chrome"].into_iter().find_map(in_path) else {
+        eprintln!("skipped: no Chromium here to open the page with");
+        return;
+    };
+    for (width, height) in [(1280, 800), (390, 844)] {
+        let profile = tempfile::tempdir().unwrap();
+        let output = Command::new(&browser)
+            .args(["--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"])
+            .args(["--disable-background-networking", "--disable-component-update", "--disable-sync"])
+            .arg(format!("--user-data-dir={}", profile.path().display()))
+            .arg(format!("--window-size={width},{height}"))
+            .args(["--enable-logging=stderr", "--virtual-time-budget=20000", "--dump-dom"])
+            .arg(format!("http://{address}/{query}"))
+            .output()
+            .unwrap();
+        let page = String::from_utf8_lossy(&output.stdout);
+        let said = String::from_utf8_lossy(&output.stderr);
+        assert!(page.contains("data-errors=\"0\""), "{page}\n{said}");
+        assert!(!page.contains("data-frames=\"0\""), "{page}\n{said}");
+        assert!(page.contains(&format!("data-mode=\"{mode}\"")) || page.contains("live, stopped"), "{page}");
+        assert!(!said.contains("Uncaught"), "{said}");
+    }
+}
+
+fn in_path(program: &str) -> Option<PathBuf> {
+    let path = std::env::var_os("PATH")?;
+    std::env::split_paths(&path).map(|folder| folder.join(program)).find(|file| file.is_file())
+}
