@@ -185,6 +185,7 @@ mod tests {
             frame_index: 3,
             capture_nanos: 300_000_000,
             latency_ms: Some(81.25),
+            stamps: StageStamps { posed_ms: Some(40.5), detected_ms: Some(81.25), ..StageStamps::default() },
             detected: 20,
             truth: 22,
             found: 18,
@@ -199,7 +200,7 @@ mod tests {
         };
         let text = frames_csv(&[record]);
         let lines: Vec<&str> = text.lines().collect();
-        assert_eq!(lines[1], "3,300000000,81.2500,20,22,18,1,0,100.0000,1,1000,1300,0.2500,");
+        assert_eq!(lines[1], "3,300000000,81.2500,20,22,18,1,0,100.0000,1,1000,1300,0.2500,,40.5000,,,,,81.2500");
         assert_eq!(lines[0].matches(',').count(), lines[1].matches(',').count());
     }
 

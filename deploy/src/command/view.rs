@@ -40,7 +40,7 @@ impl Arguments {
         let server = match (&self.run, &self.name, self.connect) {
             (Some(path), _, _) => {
                 let run = RecordedRun::open(path).map_err(|error| match error {
-                    ViewError::NotRecorded(_) | ViewError::Empty(_) => BadInput(error.to_string()).into(),
+                    ViewError::NotRecorded(_) | ViewError::Empty(_) => anyhow::Error::from(BadInput(error.to_string())),
                     ViewError::Recording(_) => anyhow::Error::from(error),
                 })?;
                 eprintln!("{} moments of run {}", run.len(), run.name());

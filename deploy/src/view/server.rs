@@ -3,6 +3,7 @@
 use std::io;
 use std::net::SocketAddr;
 use std::sync::Arc;
+use std::time::Duration;
 
 use serde_json::json;
 use sim_replay::web::{Answer, Request, WebServer};
@@ -16,6 +17,9 @@ const SCRIPT: &str = include_str!("page/view.js");
 /// A moment, or a stream of them.
 const BINARY: &str = "application/octet-stream";
 
+/// A page is not put off for longer than this.
+const LONGEST_HOLD: Duration = Duration::from_secs(10);
+
 /// Serves the page of a live run until dropped.
 ///
 /// # Errors
@@ -23,9 +27,22 @@ const BINARY: &str = "application/octet-stream";
 pub fn serve_live(address: SocketAddr, run: Arc<LiveRun>) -> io::Result<WebServer> {
     WebServer::start(address, move |request| match request.path.as_str() {
         "/run" => document(&json!({"mode": "live", "run": run.name()})),
-        "/live" => Answer::Stream { content_type: BINARY, write: Box::new(run.writer(limit(&request.query))) },
+        "/live" => {
+            Answer::Stream { content_type: BINARY, write: Box::new(run.writer(number("frames", &request.query))) }
+        }
+        "/hold" => hold(&request.query),
         _ => asset(request),
     })
+}
+
+/// An empty script that takes its time, by which a page puts off being loaded.
+fn hold(query: &str) -> Answer {
+    let time = Duration::from_millis(number("ms", query).unwrap_or(0)).min(LONGEST_HOLD);
+    let wait = move |_: &mut dyn io::Write| -> io::Result<()> {
+        std::thread::sleep(time);
+        Ok(())
+    };
+    Answer::Stream { content_type: "text/javascript", write: Box::new(wait) }
 }
 
 /// Serves the page of a recorded run until dropped.
@@ -62,7 +79,7 @@ fn document(value: &serde_json::Value) -> Answer {
     Answer::Page { content_type: "application/json", body: value.to_string().into_bytes() }
 }
 
-/// `frames=N`: end after so many moments.
-fn limit(query: &str) -> Option<u64> {
-    query.split('&').find_map(|pair| pair.strip_prefix("frames="))?.parse().ok()
+/// The number that a query gives for `name`.
+fn number(name: &str, query: &str) -> Option<u64> {
+    query.split('&').find_map(|pair| pair.strip_prefix(name)?.strip_prefix('='))?.parse().ok()
 }

@@ -200,13 +200,17 @@ fn publish(bus: Bus, ending: &AtomicBool) {
     let mut publishers = std::collections::BTreeMap::new();
     for tick in 0.. {
         for (topic, payload) in messages(tick, sim_replay::bus::unix_nanos()) {
+            if matches!(topic, Topic::Stream { stream: Stream::Detections, .. }) {
+                // As long as perception takes: sweeps are far ahead of what comes of them.
+                std::thread::sleep(Duration::from_millis(50));
+            }
             let publisher = publishers
                 .entry(topic.clone())
                 .or_insert_with(|| bus.publisher(topic, PublisherOptions::SENSOR).unwrap());
             // As it is: stamp and all.
             publisher.offer_encoded(0, move |_| Ok(protocol::Encoded { head: payload, body: protocol::Body::Empty }));
         }
-        std::thread::sleep(Duration::from_millis(100));
+        std::thread::sleep(Duration::from_millis(50));
         if ending.load(Ordering::Relaxed) {
             return;
         }
@@ -220,12 +224,14 @@ fn a_live_run_is_shown_as_it_goes_and_nobody_waits_for_a_page() {
     let server = serve_live("127.0.0.1:0".parse().unwrap(), Arc::clone(&run)).unwrap();
 
     // Sweeps are listened to only once somebody looks.
-    let moments = moments_of(server.address(), 12);
-    let (frame, points) = parsed(moments.last().unwrap());
-    check(&frame, points);
-    assert!(points > 10_000, "{points}");
-    let indices: Vec<u64> = moments.iter().map(|bytes| parsed(bytes).0["frame_index"].as_u64().unwrap()).collect();
-    assert!(indices.windows(2).all(|pair| pair[0] < pair[1]), "the newest only: {indices:?}");
+    let moments: Vec<_> = moments_of(server.address(), 12).iter().map(|bytes| parsed(bytes)).collect();
+    let captures: Vec<f64> = moments.iter().map(|(frame, _)| frame["capture_s"].as_f64().unwrap()).collect();
+    assert!(captures.windows(2).all(|pair| pair[0] < pair[1]), "always a newer one: {captures:?}");
+    // On a busy machine the tap drops parts of some moments, but hardly ever of all.
+    let whole =
+        |frame: &Value, points: usize| !frame["ego"].is_null() && !frame["truth"][0].is_null() && points > 10_000;
+    let (frame, points) = moments.iter().find(|(frame, points)| whole(frame, *points)).expect("a whole moment");
+    check(frame, *points);
     wait_for("nobody looks any more", || run.watchers() == 0);
 
     // A browser that never reads.
@@ -279,7 +285,9 @@ fn shows_without_an_error(address: SocketAddr, query: &str, mode: &str) {
             .args(["--disable-background-networking", "--disable-component-update", "--disable-sync"])
             .arg(format!("--user-data-dir={}", profile.path().display()))
             .arg(format!("--window-size={width},{height}"))
-            .args(["--enable-logging=stderr", "--virtual-time-budget=20000", "--dump-dom"])
+            // A live page holds itself back until moments have come; time that is made up would not wait for them.
+            .args((mode == "recorded").then_some("--virtual-time-budget=20000"))
+            .args(["--enable-logging=stderr", "--dump-dom"])
             .arg(format!("http://{address}/{query}"))
             .output()
             .unwrap();

@@ -13,6 +13,14 @@ function fail(words) {
   root.dataset.error = words;
 }
 
+// A picture of a live run (`?frames=N`): the page counts as loaded only when so many moments have had time to come.
+const still = /frames=(\d+)/.exec(location.search);
+if (still) {
+  const hold = document.createElement("script");
+  hold.src = `hold?ms=${100 * Number(still[1]) + 1500}`;
+  document.body.append(hold);
+}
+
 // ---- numbers for people ----
 
 const number = (value, digits = 1) => (value === null || value === undefined ? "–" : value.toFixed(digits));
@@ -129,11 +137,11 @@ function table(id, heads, rows, empty) {
 
 const STAGE_COLOURS = ["--cav5", "--cav0", "--cav1", "--cav3", "--cav2", "--cav4", "--detection"];
 
-/// The time from capture to detections: what the ego tells of, and before it the replay, the agent and its sensors.
+/// The time from capture to detections: what the ego tells of, and before it what its agent took, sensors included.
 function stages(frame) {
   const told = frame.stages.map(({ stage, nanos }) => [stage, nanos / 1e6]);
   const rest = frame.latency_ms === null ? null : frame.latency_ms - told.reduce((sum, [, time]) => sum + time, 0);
-  const parts = (rest !== null && rest > 0 ? [["sensors and agent", rest]] : []).concat(told).filter(([, time]) => time >= 0.05);
+  const parts = (rest !== null && rest > 0 ? [["agent", rest]] : []).concat(told).filter(([, time]) => time >= 0.05);
   if (!parts.length) return $("stages").replaceChildren(element("p", { class: "empty" }, "No detections of this moment."));
   const sum = parts.reduce((total, [, time]) => total + time, 0);
   const shade = (index) => `var(${STAGE_COLOURS[index % STAGE_COLOURS.length]})`;
@@ -381,11 +389,10 @@ async function live() {
 }
 
 async function watch() {
-  const once = location.search.includes("frames=");
   for (;;) {
     await live().catch(() => {});
-    state("ended", once ? "live, stopped" : "the run is gone; trying again");
-    if (once) return;
+    state("ended", still ? "live, stopped" : "the run is gone; trying again");
+    if (still) return;
     await new Promise((resolve) => setTimeout(resolve, 2000));
   }
 }
