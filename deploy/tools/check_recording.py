@@ -70,11 +70,13 @@ def main(path):
         for channel in summary.channels.values():
             found["messages"][channel.topic] = summary.statistics.channel_message_counts.get(channel.id, 0)
         counted = {}
+        file.seek(0)
         reader = make_reader(file, validate_crcs=True)
         for _, channel, _ in reader.iter_messages(log_time_order=True):
             counted[channel.topic] = counted.get(channel.topic, 0) + 1
         assert counted == {topic: n for topic, n in found["messages"].items() if n}, (counted, found["messages"])
         ros = [channel.topic for channel in summary.channels.values() if channel.message_encoding == "cdr"]
+        file.seek(0)
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
         for schema, channel, _, message in reader.iter_decoded_messages(topics=ros):
             read = READERS[schema.name](message)

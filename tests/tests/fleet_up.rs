@@ -4,7 +4,9 @@ use std::fs;
 use std::time::{Duration, Instant};
 
 use deploy::scenario::Scenario;
+use protocol::{Stream, Topic};
 use serde_json::Value;
+use sim_replay::recording::Recording;
 use tests::fleet::{PATIENCE, Up, alone, fused, is_running, results, signal, write_scenario};
 
 fn json(path: &std::path::Path) -> Value {
@@ -15,7 +17,7 @@ fn json(path: &std::path::Path) -> Value {
 fn a_fleet_plays_its_scene_and_accounts_for_every_message() {
     let _alone = alone();
     let folder = tempfile::tempdir().unwrap();
-    let scenario = write_scenario(folder.path(), 6, "lockstep: true", "");
+    let scenario = write_scenario(folder.path(), 6, "lockstep: true", "record: {without: [bev]}");
     let mut up = Up::start(folder.path(), &scenario);
     let status = up.wait();
     let run = &up.folder;
@@ -36,7 +38,14 @@ fn a_fleet_plays_its_scene_and_accounts_for_every_message() {
     assert!(results.iter().all(|result| fused(result) == 1), "in lockstep nobody is late");
     assert_eq!(fs::read_to_string(run.join("frames.csv")).unwrap().lines().count(), 7);
     assert!(fs::metadata(run.join("frame.png")).unwrap().len() > 1_000);
-    for process in ["agent-4279", "agent-4288", "ego-4279", "replay"] {
+    let recording = Recording::open(&run.join("recording.mcap")).unwrap();
+    assert_eq!(recording.damage(), None);
+    let told = |stream| {
+        let is_it = |topic: &Topic| matches!(topic, Topic::Stream { stream: known, .. } if *known == stream);
+        recording.entries().iter().filter(|entry| is_it(&entry.key.topic)).count()
+    };
+    assert_eq!([Stream::Lidar, Stream::Detections, Stream::Bev].map(told), [12, 6, 0]);
+    for process in ["agent-4279", "agent-4288", "ego-4279", "replay", "recorder"] {
         assert!(run.join(format!("log/{process}.log")).exists(), "{process}");
     }
     let resolved = Scenario::load(&run.join("scenario.yaml")).unwrap();

@@ -39,6 +39,7 @@ struct Moment {
     truth: Option<(u64, Truth)>,
     result: Option<(u64, Detections)>,
     poses: BTreeMap<CavId, PoseEstimate>,
+    /// As they came: most moments of a busy run are never shown, and decoding is what costs.
     sweeps: BTreeMap<CavId, Vec<u8>>,
     own_boxes: BTreeMap<CavId, Boxes>,
     /// Latest arrival from a vehicle: behind the link where there is one.
@@ -108,8 +109,8 @@ impl Assembly {
                 }
             }
             Topic::Stream { cav, stream: Stream::Lidar } => {
-                if let Some(Lidar { points }) = decode(seen) {
-                    self.moment(at).sweeps.insert(cav.clone(), thinned(&points.xyzi));
+                if let Some(payload) = seen.payload {
+                    self.moment(at).sweeps.insert(cav.clone(), payload.to_vec());
                 }
             }
             Topic::Stream { cav, stream } => {
@@ -208,8 +209,8 @@ impl Moment {
                 .map(|result| &result.pose)
         });
         let pose = estimate.and_then(PoseEstimate::world_from_cav);
-        let sweep = self.sweeps.get(cav).map_or(&[][..], Vec::as_slice);
-        points.extend(sweep);
+        let sweep = self.sweep(cav);
+        points.extend(&sweep);
         let distance = |found: &Pose, truth: &Pose| {
             found.translation_m.iter().zip(truth.translation_m).map(|(a, b)| (a - b).powi(2)).sum::<f64>().sqrt()
         };
@@ -226,6 +227,12 @@ impl Moment {
             world_from_lidar: pose.or(truth).map(rows),
             points: sweep.len() / 6,
         }
+    }
+
+    fn sweep(&self, cav: &CavId) -> Vec<u8> {
+        let payload = self.sweeps.get(cav).map(Vec::as_slice);
+        let decoded = payload.and_then(|payload| wire::decode::<Lidar>([payload], &Limits::DEFAULT).ok());
+        decoded.map_or(Vec::new(), |(_, Lidar { points })| thinned(&points.xyzi))
     }
 
     fn true_boxes(&self) -> Vec<ShownBox> {
