@@ -73,8 +73,8 @@ pub(crate) struct Arguments {
     /// Same seed, same losses and delays (--link).
     #[arg(long, default_value_t = 0, requires = "link")]
     seed: u64,
-    /// The ego fuses what has arrived so long after its sweep, milliseconds (--link).
-    #[arg(long, value_name = "MS", default_value_t = 100, requires = "link")]
+    /// The ego fuses what has arrived so long after its sweep, but not before its own map is there, milliseconds (--link).
+    #[arg(long, value_name = "MS", default_value_t = 0, requires = "link")]
     deadline: u64,
     /// Oldest map that is still fused, by capture time, milliseconds (--link).
     #[arg(long, value_name = "MS", default_value_t = 300, requires = "link")]
