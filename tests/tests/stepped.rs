@@ -16,7 +16,7 @@ use protocol::{CodecConfig, DropReason, Dtype};
 use serde_json::Value;
 use sim_replay::dataset;
 use sim_replay::link::{DelayLaw, LinkConfig, LossLaw};
-use tests::fleet::{programs, results, write_scenario, write_weights};
+use tests::fleet::{programs, results, write_scenario, write_sighted_weights};
 
 const TICKS: usize = 8;
 const MS: u64 = 1_000_000;
@@ -67,7 +67,7 @@ fn evaluate(folder: &Path, stepped: Option<SteppedConfig>) -> (Vec<EvaluatedFram
 fn scene() -> tempfile::TempDir {
     let folder = tempfile::tempdir().unwrap();
     tests::scene::write(folder.path(), &["4279", "4288", "4297"], TICKS);
-    write_weights(&folder.path().join("weights.safetensors"));
+    write_sighted_weights(&folder.path().join("weights.safetensors"));
     folder
 }
 

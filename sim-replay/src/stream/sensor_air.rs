@@ -133,7 +133,7 @@ mod tests {
             ..LinkConfig::default()
         };
         let mut air = SensorAir::new(&link, 1).unwrap();
-        let at = |ms| air_time(ms);
+        let at = Duration::from_millis;
         let began = air.began;
         air.offer(&cav, held(&cav, 0), began);
         air.offer(&cav, held(&cav, 1), began);
@@ -153,9 +153,5 @@ mod tests {
         assert!((70..130).contains(&arrived), "{arrived}");
         assert_eq!((report.offered, report.arrived), (200, arrived));
         assert_eq!(report.dropped.get(&DropReason::LinkLoss), Some(&(200 - arrived)));
-    }
-
-    fn air_time(ms: u64) -> Duration {
-        Duration::from_millis(ms)
     }
 }
