@@ -99,7 +99,6 @@ impl Tap {
     }
 
     /// A function that makes the tap take no more; what is inside can still be taken.
-    #[must_use]
     pub fn closer(&self) -> impl FnOnce() + Send + 'static {
         let shared = Arc::clone(&self.shared);
         move || shared.mailbox.close()
