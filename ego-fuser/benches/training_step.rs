@@ -67,7 +67,7 @@ fn training_step(criterion: &mut Criterion) {
         group.bench_function(name, |bencher| {
             bencher.iter(|| {
                 let output = model.forward(&batch, &facts, true).expect("views and facts add up");
-                let loss = detection_loss(&output.scores, &output.offsets, &labels, &LossConfig::default());
+                let loss = detection_loss(&output.head.scores, &output.head.offsets, &labels, &LossConfig::default());
                 optimizer.zero_grad();
                 loss.expect("labels fit").total().backward();
                 black_box(optimizer.step(1e-3).expect("gradients are finite"));

@@ -93,7 +93,7 @@ mod tests {
             let pairs: Vec<Correspondence> = (0..200)
                 .map(|k| {
                     let source_m = [(k % 10) as f32 * 4.0 - 18.0, (k / 10) as f32 * 3.0 - 28.0, (k % 7) as f32];
-                    let sign = |bit: i32| if k * 2_654_435 >> bit & 1 == 0 { -1.0 } else { 1.0 };
+                    let sign = |bit: i32| if ((k * 2_654_435) >> bit) & 1 == 0 { -1.0 } else { 1.0 };
                     let target_m =
                         std::array::from_fn(|axis| source_m[axis] + (sign(axis as i32 + 4) * noise_m[axis]) as f32);
                     Correspondence { source_m, target_m, weight: 1.0 }

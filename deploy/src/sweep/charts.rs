@@ -116,7 +116,7 @@ fn chart(
 ) -> Option<Chart> {
     let dimension = &DIMENSIONS[place];
     // Along bytes the cells of a codec's every value make one line.
-    let mut series: Vec<(String, BTreeMap<Key, Vec<(f64, f64)>>)> = Vec::new();
+    let mut series: Vec<(String, Points)> = Vec::new();
     for cell in cells {
         let (Some(x), Some(y)) = ((dimension.value)(cell), precision(&cell.metrics)) else { continue };
         let point = &cell.key.point;
@@ -146,6 +146,9 @@ fn chart(
     Some(Chart { title, x, y: Axis::linear("AP, ordered by score", [0.0, 1.0]), series })
 }
 
+/// The points of a line by what is averaged over seeds.
+type Points = BTreeMap<Key, Vec<(f64, f64)>>;
+
 /// What is averaged over seeds.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 enum Key {
@@ -153,7 +156,7 @@ enum Key {
     Text(String),
 }
 
-fn line(name: String, points: BTreeMap<Key, Vec<(f64, f64)>>) -> Series {
+fn line(name: String, points: Points) -> Series {
     let mean =
         |values: &[(f64, f64)], of: fn(&(f64, f64)) -> f64| values.iter().map(of).sum::<f64>() / values.len() as f64;
     let mut points: Vec<(f64, f64)> =
