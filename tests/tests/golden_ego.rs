@@ -249,6 +249,7 @@ fn golden_c7_loss() {
         score_weight: number(&golden, "cls_weight"),
         box_weight: number(&golden, "reg"),
         unassigned: Unassigned::Background,
+        ..LossConfig::default()
     };
     let labels = LabelTensors::gather(&labels, config.unassigned, Device::Cpu);
     let loss = detection_loss(&scores, &boxes, &labels, &config).unwrap();

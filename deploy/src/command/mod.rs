@@ -22,13 +22,13 @@ use deploy::up::UpError;
 #[derive(Debug, clap::Subcommand)]
 pub(crate) enum Command {
     /// Generate a scene if there is none, run a fleet over it, print what came of it.
-    Demo(demo::Arguments),
+    Demo(Box<demo::Arguments>),
     /// Judge methods on recorded scenes without a network: AP, pose errors, bytes.
-    Eval(eval::Arguments),
+    Eval(Box<eval::Arguments>),
     /// Run a grid of experiments in virtual time: one CSV, charts, a report.
     Sweep(sweep::Arguments),
     /// Start a fleet: processes, scene, models, network; Ctrl-C ends it.
-    Up(up::Arguments),
+    Up(Box<up::Arguments>),
     /// Look at a run in a browser: the scene from above, the links, where the time goes.
     View(view::Arguments),
 }
