@@ -13,6 +13,9 @@ use sim_replay::web::WebServer;
 
 use super::{BadInput, Outcome};
 
+/// How far behind the processes of a run its viewer stands for the processor.
+const VIEWER_NICENESS: i32 = 15;
+
 #[derive(Debug, clap::Args)]
 pub(crate) struct Arguments {
     /// Folder of a recorded run (`v2vloc up --record`), or its recording.mcap.
@@ -47,6 +50,8 @@ impl Arguments {
                 serve_recorded(self.listen, Arc::new(run))
             }
             (None, Some(name), Some(router)) => {
+                // On the machine of the run, the run comes first.
+                let _ = rustix::process::nice(VIEWER_NICENESS);
                 let cav = CavId::new("viewer")?;
                 let identity = Identity { run: name.clone(), process: process_id(Role::Viewer, &cav), cav };
                 let bus = Bus::join(&BusOptions::client(router), identity)?;

@@ -79,8 +79,8 @@ function facts(frame) {
   $("time").textContent = `${number(frame.capture_s, 1)} s`;
   $("method").textContent = frame.method || "–";
   $("latency").textContent = ms(frame.latency_ms);
-  $("detected").textContent = `${frame.detections.length} of ${frame.truth.length}`;
-  $("detected").title = "boxes detected, of all that vehicles annotate";
+  $("detected").textContent = `${frame.detections.length} detected, ${frame.truth.length} there`;
+  $("detected").title = "boxes detected; all that vehicles annotate, in range or not";
 }
 
 // ---- panels ----
