@@ -229,8 +229,10 @@ fn a_sweep_is_the_same_csv_in_one_process_and_in_many() {
         lines[line][place]
     };
     assert_eq!((column(1, "method"), column(1, "sent"), column(1, "frames_used")), ("none", "0", "0"));
-    let dense = (17..25).find(|&line| column(line, "dtype") == "f16" && !column(line, "payload_bytes").is_empty()).unwrap();
-    let sparse = (17..25).find(|&line| column(line, "keep") == "0.25" && !column(line, "payload_bytes").is_empty()).unwrap();
+    let dense =
+        (17..25).find(|&line| column(line, "dtype") == "f16" && !column(line, "payload_bytes").is_empty()).unwrap();
+    let sparse =
+        (17..25).find(|&line| column(line, "keep") == "0.25" && !column(line, "payload_bytes").is_empty()).unwrap();
     let bytes = |line| column(line, "payload_bytes").parse::<f64>().unwrap();
     assert!(bytes(sparse) < 0.2 * bytes(dense), "{} {}", bytes(sparse), bytes(dense));
     for name in ["ap_latency.svg", "ap_latency.png", "ap_bandwidth.svg", "ap_bytes.png", "report.html"] {
