@@ -4,12 +4,15 @@
 
 use std::time::{Duration, Instant};
 
-use protocol::{BevFeatures, CavId, Detection, PointCloud, Pose, PoseEstimate, StageTiming};
+use protocol::{
+    BevFeatures, CavId, CodecConfig, Detection, EncodedFeatures, PointCloud, Pose, PoseEstimate, StageTiming, WireError,
+};
 use tch::Tensor;
 
 use crate::detector::{Detector, DetectorError, EncodeTimes};
 use crate::pose_source::{PoseInput, PoseSource};
 use crate::postprocess::{AgentBoxes, PostprocessConfig, postprocess};
+use crate::rate::{RateConfig, RateControl};
 
 /// Everything known about one sweep.
 #[derive(Debug, Clone, Copy)]
@@ -84,6 +87,7 @@ pub struct Agent {
     pose_source: Box<dyn PoseSource>,
     detector: Detector,
     postprocess: PostprocessConfig,
+    rate: RateControl,
 }
 
 impl Agent {
@@ -91,13 +95,19 @@ impl Agent {
     #[must_use]
     pub fn new(cav: CavId, pose_source: Box<dyn PoseSource>, detector: Detector) -> Self {
         let postprocess = PostprocessConfig::for_late_fusion(detector.config());
-        Self { cav, pose_source, detector, postprocess }
+        Self { cav, pose_source, detector, postprocess, rate: RateControl::default() }
     }
 
     /// The same with another clean-up of its own detections.
     #[must_use]
     pub fn with_postprocess(self, postprocess: PostprocessConfig) -> Self {
         Self { postprocess, ..self }
+    }
+
+    /// The same with maps that keep within `rate`, where [`Self::write_map`] writes them.
+    #[must_use]
+    pub fn within(self, rate: RateConfig) -> Self {
+        Self { rate: RateControl::new(rate), ..self }
     }
 
     /// Who it is.
@@ -120,6 +130,21 @@ impl Agent {
             cloud: input.cloud,
             measured: input.measured_pose,
         })
+    }
+
+    /// Last step where there is no queue: the map as `codec` wants it, or smaller where it has to be. A live agent does this
+    /// on its sending thread, with a [`RateControl`] of its own that watches the queue.
+    ///
+    /// # Errors
+    /// As [`RateControl::encode`].
+    pub fn write_map(
+        &mut self,
+        features: BevFeatures,
+        confidence: &[f32],
+        codec: &CodecConfig,
+        capture_nanos: u64,
+    ) -> Result<EncodedFeatures, WireError> {
+        self.rate.encode(features, codec, confidence, capture_nanos, None)
     }
 
     /// Where the time of the last pose went, for pose sources that compute.

@@ -25,6 +25,7 @@ pub mod pose_error;
 pub mod pose_source;
 pub mod postprocess;
 pub mod process;
+pub mod rate;
 pub mod registration;
 pub mod residual;
 pub mod rotated_iou;

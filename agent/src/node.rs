@@ -3,18 +3,21 @@
 //! It subscribes to the sensors of its own vehicle and to nothing else; the truth in particular it cannot see. One
 //! thread receives, computes and offers; encoding and sending have threads of their own.
 
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
 use protocol::codec::CodecConfig;
 use protocol::message::{Bev, Boxes, Descriptor, Points};
-use protocol::{DropReason, Dtype, Gnss, Lidar, Limits, PoseEstimate, Role, Stream, Topic, encode_features, wire};
+use protocol::{DropReason, Dtype, Gnss, Lidar, Limits, PoseEstimate, Role, Stream, Topic, wire};
 use sim_replay::bus::mailbox::Taken;
 use sim_replay::bus::shutdown::Stop;
-use sim_replay::bus::{Arrival, Bus, BusError, Event, Inbox, Publisher, PublisherOptions, Subscription, unix_nanos};
+use sim_replay::bus::{
+    Arrival, Books, Bus, BusError, Event, Inbox, Publisher, PublisherOptions, Subscription, unix_nanos,
+};
 
 use crate::agent::{Agent, AgentInput, Perception};
 use crate::crop::Crop;
+use crate::rate::{RateConfig, RateControl, Turn};
 use crate::sweep_pairing::{PairedSweep, SweepPairing};
 
 /// How long a sweep waits for its pose, which was sent before it.
@@ -31,6 +34,8 @@ pub struct NodeOptions {
     pub publish: Vec<Stream>,
     /// How it writes its maps.
     pub codec: CodecConfig,
+    /// How it fits them to what the air takes.
+    pub rate: RateConfig,
     /// Whether to go on when the replay has ended, for the next one.
     pub keeps_running: bool,
     /// What it takes from the bus.
@@ -43,6 +48,7 @@ impl Default for NodeOptions {
         Self {
             publish: vec![Stream::Bev],
             codec: CodecConfig { dtype: Dtype::F32, ..CodecConfig::default() },
+            rate: RateConfig::default(),
             keeps_running: false,
             limits: Limits::DEFAULT,
         }
@@ -175,7 +181,7 @@ impl<'a> Node<'a> {
                 }
                 books.timed("agent", began.elapsed());
                 self.report.sweeps += 1;
-                self.outlet.offer(input, pose, perception);
+                self.outlet.offer(input, pose, perception, books);
             }
             Err(error) => {
                 self.report.failed += 1;
@@ -193,6 +199,10 @@ struct Outlet {
     points: Option<Publisher>,
     descriptor: Publisher,
     codec: CodecConfig,
+    /// Shared with the sending thread, which is where maps are written.
+    rate: Arc<Mutex<RateControl>>,
+    /// Maps offered so far.
+    offered: u64,
     crop: Crop,
     description: Descriptor,
     next_descriptor: Instant,
@@ -219,6 +229,8 @@ impl Outlet {
             points: wanted(Stream::Points)?,
             descriptor: publisher(Stream::Descriptor, PublisherOptions::POSE)?,
             codec: options.codec,
+            rate: Arc::new(Mutex::new(RateControl::new(options.rate))),
+            offered: 0,
             crop: *detector.crop(),
             description,
             next_descriptor: Instant::now(),
@@ -233,13 +245,20 @@ impl Outlet {
         }
     }
 
-    fn offer(&self, input: &AgentInput<'_>, pose: PoseEstimate, perception: Perception) {
+    fn offer(&mut self, input: &AgentInput<'_>, pose: PoseEstimate, perception: Perception, books: &Books) {
         let Perception { features, confidence, detections, .. } = perception;
         if let Some(bev) = &self.bev {
-            let codec = self.codec;
-            // Selecting, quantising and packing happen on the sending thread.
-            bev.offer_encoded(input.capture_nanos, move |stamp| {
-                let features = encode_features(features, &codec, Some(&confidence))?;
+            let (codec, rate, books, topic) = (self.codec, Arc::clone(&self.rate), books.clone(), bev.topic().clone());
+            let (number, offered, capture_nanos) = (self.offered, Instant::now(), input.capture_nanos);
+            self.offered += 1;
+            // Choosing, selecting, quantising and packing happen on the sending thread, when it is the map's turn.
+            bev.offer_encoded(capture_nanos, move |stamp| {
+                let turn = Turn { number, offered, begun: Instant::now() };
+                let mut rate = rate.lock().unwrap_or_else(PoisonError::into_inner);
+                let features = rate.encode(features, &codec, &confidence, capture_nanos, Some(&turn))?;
+                if let Some(choice) = features.rate {
+                    books.adapted(&topic, choice.reason);
+                }
                 wire::encode(stamp, Bev { pose, features })
             });
         }

@@ -7,6 +7,7 @@ use std::sync::Arc;
 use std::time::Instant;
 
 use agent::pose_source::PoseSourceConfig;
+use agent::rate::RateConfig;
 use agent::weights::Weights;
 use ego_fuser::evaluate::stepped::SteppedConfig;
 use ego_fuser::evaluate::{EvaluateConfig, EvaluateError, EvaluatedFrame, Evaluator};
@@ -30,6 +31,8 @@ pub struct EvaluationOptions {
     pub pose_source: PoseSourceConfig,
     /// How feature maps are written.
     pub codec: CodecConfig,
+    /// How neighbours fit them to what the air takes.
+    pub rate: RateConfig,
     /// How long messages of neighbours are under way, nanoseconds.
     pub delay_nanos: u64,
     /// Where maps of encoders are kept, so that each is computed once for many evaluations.
@@ -127,6 +130,7 @@ pub(crate) fn judged(
         method: Some(method),
         pose_source: options.pose_source.clone(),
         codec: options.codec,
+        rate: options.rate,
         rule: None,
         delay_nanos: options.delay_nanos,
     })?;

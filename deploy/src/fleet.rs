@@ -6,6 +6,7 @@ use std::path::{Path, PathBuf};
 
 use agent::localizer::{EndToEndLocalizer, Localizer, LocalizerError};
 use agent::model_config::DetectorConfig;
+use agent::rate::RateConfig;
 use agent::weights::{Weights, WeightsError};
 use ego_fuser::Exchange;
 use protocol::{CavId, Dtype, ProcessId, Role, RunId, Smoothing, Stream, Topic};
@@ -273,6 +274,10 @@ impl Fleet {
         if let Some(level) = settings.codec.zstd_level {
             args.option("--zstd", &level.to_string());
         }
+        // Nor does that map cross the air.
+        if *cav != self.ego {
+            rate_options(&mut args, &settings.rate);
+        }
         meeting.process(format!("agent-{cav}"), "agent", args, Life::Service)
     }
 
@@ -453,6 +458,19 @@ fn dtype(dtype: Dtype) -> &'static str {
         Dtype::F32 => "f32",
         Dtype::F16 => "f16",
         Dtype::I8 => "i8",
+    }
+}
+
+fn rate_options(args: &mut Arguments, rate: &RateConfig) {
+    let RateConfig { message_bytes, bytes_per_second, watch_queue } = rate;
+    if let Some(bytes) = message_bytes {
+        args.option("--message-bytes", &bytes.to_string());
+    }
+    if let Some(bytes) = bytes_per_second {
+        args.option("--bytes-per-second", &bytes.to_string());
+    }
+    if *watch_queue {
+        args.flag("--watch-queue");
     }
 }
 

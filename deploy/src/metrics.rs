@@ -129,7 +129,7 @@ impl Messages {
     /// The totals of a ledger.
     #[must_use]
     pub fn of(total: &Counts) -> Self {
-        let Counts { sent, received, in_flight, dropped } = total.clone();
+        let Counts { sent, received, in_flight, dropped, adapted: _ } = total.clone();
         Self { sent, received, in_flight, dropped }
     }
 }

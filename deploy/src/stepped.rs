@@ -64,6 +64,7 @@ fn evaluate_config(fleet: &Fleet) -> EvaluateConfig {
         method: Some(scenario.method),
         pose_source: pose_source(scenario, &scenario.agents.pose),
         codec: scenario.agents.codec,
+        rate: scenario.agents.rate,
         rule: Some(fleet.ground_truth_rule()),
         delay_nanos: 0,
     }
@@ -97,7 +98,7 @@ fn stepped_config(fleet: &Fleet, compute: ComputeTimes) -> Result<SteppedConfig,
 
 fn vehicle(scenario: &Scenario, cav: &CavId) -> VehicleConfig {
     let settings = scenario.settings_of(cav);
-    VehicleConfig { pose_source: pose_source(scenario, &settings.pose), codec: settings.codec }
+    VehicleConfig { pose_source: pose_source(scenario, &settings.pose), codec: settings.codec, rate: settings.rate }
 }
 
 /// The source that an agent's process would set up for these settings.

@@ -14,10 +14,12 @@ use agent::agent::{Agent, AgentInput, Perception};
 use agent::detector::{Detector, DetectorError};
 use agent::model_config::DetectorConfig;
 use agent::pose_source::{NoiseMode, PoseSourceConfig, PoseSourceError};
+use agent::rate::RateConfig;
 use agent::weights::{Weights, WeightsError};
-use protocol::codec::encode_features;
 use protocol::message::{Bev, Boxes, Detections, FusedNeighbour, Payload, Points, SkippedNeighbour};
-use protocol::{Box3d, CavId, CodecConfig, HEADER_LEN, Header, Ledger, Limits, PoseEstimate, Stamp, WireError, wire};
+use protocol::{
+    Box3d, CavId, CodecConfig, HEADER_LEN, Header, Ledger, Limits, PoseEstimate, RateChoice, Stamp, WireError, wire,
+};
 use sim_replay::dataset::{LoadOptions, ReadError, Scenario};
 use sim_replay::frame::Frame;
 use sim_replay::ground_truth::{self, GroundTruthRule};
@@ -41,6 +43,8 @@ pub struct EvaluateConfig {
     pub pose_source: PoseSourceConfig,
     /// How maps are encoded; without a gate the method's own holds.
     pub codec: CodecConfig,
+    /// What neighbours fit theirs to. There is no queue to watch here.
+    pub rate: RateConfig,
     /// Which objects count; absent: those wholly over the area of the network, of all vehicles within 70 m.
     pub rule: Option<GroundTruthRule>,
     /// How long messages of neighbours are under way, nanoseconds: the ego fuses the newest that are at least so old.
@@ -210,8 +214,10 @@ impl Evaluator {
             None if is_ego => source_of_ego(all),
             None => all.clone(),
         };
+        // What the ego's own vehicle tells it does not cross the air.
+        let rate = if is_ego { RateConfig::default() } else { own.map_or(self.config.rate, |own| own.rate) };
         let detector = Detector::from_weights(&self.weights, &self.weights.config()?)?;
-        Ok(Agent::new(cav.clone(), source.for_scenario(&scenario.name).build()?, detector))
+        Ok(Agent::new(cav.clone(), source.for_scenario(&scenario.name).build()?, detector).within(rate))
     }
 
     /// Whether sweeps have to be read at all.
@@ -353,6 +359,8 @@ struct Sent {
     wire_bytes: u64,
     /// Of these, the pose's own message.
     pose_bytes: u64,
+    /// Why a map is written as it is, where it had to keep within a limit.
+    rate: Option<RateChoice>,
 }
 
 impl Sent {
@@ -391,6 +399,7 @@ fn view(
         payload_bytes,
         wire_bytes,
         pose_bytes,
+        rate: None,
     };
     let (content, bytes) = match exchange {
         None => return Ok(sent(None, 0, 0)),
@@ -406,9 +415,12 @@ fn view(
         }
         Some(Exchange::Features | Exchange::Nothing) => {
             let Perception { features, confidence, .. } = perceive(agent, frame, map)?;
-            let features = encode_features(features, codec, Some(&confidence))?;
+            let features = agent.write_map(features, &confidence, codec, frame.capture_nanos)?;
             let (message, bytes) = through_the_wire(&stamp, Bev { pose, features })?;
-            (Content::Features(message.features.decode(&Limits::default())?), bytes)
+            let rate = message.features.rate;
+            let content = Content::Features(message.features.decode(&Limits::default())?);
+            let sent = sent(Some(content), bytes - HEADER_LEN as u64, bytes + pose_bytes);
+            return Ok(Sent { rate, ..sent });
         }
     };
     Ok(sent(Some(content), bytes - HEADER_LEN as u64, bytes + pose_bytes))

@@ -1,9 +1,9 @@
 //! The maps of a frozen encoder, computed once and kept on disk.
 //!
 //! Methods that share an encoder differ in what they make of its maps; what takes the time, the encoder, need not run
-//! again for each of them, nor for each pass over the data. The file belongs to one encoder and one listing of data: both
-//! hashes are in its name. It holds one packed message per sweep, as on the wire, each after its length: what is cut off
-//! or changed is found out.
+//! again for each of them, nor for each pass over the data. The file belongs to one encoder, one listing of data and one
+//! wire version: all are in its name. It holds one packed message per sweep, as on the wire, each after its length: what
+//! is cut off or changed is found out.
 
 use std::fs::{self, File, OpenOptions};
 use std::io::{self, Write};
@@ -16,7 +16,8 @@ use agent::weights::{Weights, WeightsError};
 use protocol::codec::encode_features;
 use protocol::message::Bev;
 use protocol::{
-    BevFeatures, CavId, CodecConfig, Dtype, Header, Limits, NoPoseReason, PoseEstimate, Stamp, WireError, wire,
+    BevFeatures, CavId, CodecConfig, Dtype, Header, Limits, NoPoseReason, PoseEstimate, Stamp, WIRE_VERSION, WireError,
+    wire,
 };
 use sim_replay::dataset::{self, LoadOptions, ReadError, Scenario};
 use tch::{TchError, Tensor};
@@ -107,7 +108,7 @@ impl FeatureStore {
     ) -> Result<Self, FeatureStoreError> {
         let [encoder, data] = [weights.sha256_of(is_encoder), dataset::listing_sha256(scenarios)];
         let dtype = format!("{:?}", kept.dtype).to_lowercase();
-        let name = format!("{}-{}-{dtype}.maps", &encoder[..HASH_DIGITS], &data[..HASH_DIGITS]);
+        let name = format!("{}-{}-{dtype}-wire{WIRE_VERSION}.maps", &encoder[..HASH_DIGITS], &data[..HASH_DIGITS]);
         let path = kept.folder.join(name);
         let io = |source| FeatureStoreError::Io { path: path.clone(), source };
         fs::create_dir_all(&kept.folder).map_err(io)?;

@@ -17,7 +17,7 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use crate::{Balance, DropReason, ProcessId, Topic};
+use crate::{Balance, DropReason, ProcessId, RateReason, Topic};
 
 /// What is counted separately: a topic, and who receives it (`None`: whoever does).
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -62,6 +62,8 @@ pub struct Counts {
     pub in_flight: u64,
     /// Messages lost, by reason.
     pub dropped: BTreeMap<DropReason, u64>,
+    /// Maps that had to keep within a limit, by what was chosen for them. They are among those sent.
+    pub adapted: BTreeMap<RateReason, u64>,
 }
 
 impl Counts {
@@ -73,20 +75,25 @@ impl Counts {
 
     /// Adds another's counters. Numbers from a hostile peer saturate.
     pub fn add(&mut self, other: &Self) {
-        let Self { sent, received, in_flight, dropped } = other;
+        let Self { sent, received, in_flight, dropped, adapted } = other;
         self.sent = self.sent.saturating_add(*sent);
         self.received = self.received.saturating_add(*received);
         self.in_flight = self.in_flight.saturating_add(*in_flight);
-        for (reason, count) in dropped {
-            let sum = self.dropped.entry(*reason).or_default();
-            *sum = sum.saturating_add(*count);
-        }
+        add_each(&mut self.dropped, dropped);
+        add_each(&mut self.adapted, adapted);
     }
 
     /// Sent less everything that is accounted for; 0 where the books balance.
     pub(crate) fn missing(&self) -> i128 {
         let accounted = [self.received, self.in_flight].into_iter().chain(self.dropped.values().copied());
         i128::from(self.sent) - accounted.map(i128::from).sum::<i128>()
+    }
+}
+
+fn add_each<K: Ord + Copy>(sums: &mut BTreeMap<K, u64>, counts: &BTreeMap<K, u64>) {
+    for (key, count) in counts {
+        let sum = sums.entry(*key).or_default();
+        *sum = sum.saturating_add(*count);
     }
 }
 
@@ -106,13 +113,15 @@ struct Line {
     received: u64,
     in_flight: u64,
     dropped: BTreeMap<DropReason, u64>,
+    #[serde(default)]
+    adapted: BTreeMap<RateReason, u64>,
 }
 
 impl From<Vec<Line>> for Ledger {
     fn from(lines: Vec<Line>) -> Self {
         let mut ledger = Self::default();
-        for Line { topic, to, sent, received, in_flight, dropped } in lines {
-            ledger.counts(&Account { topic, to }).add(&Counts { sent, received, in_flight, dropped });
+        for Line { topic, to, sent, received, in_flight, dropped, adapted } in lines {
+            ledger.counts(&Account { topic, to }).add(&Counts { sent, received, in_flight, dropped, adapted });
         }
         ledger
     }
@@ -120,13 +129,9 @@ impl From<Vec<Line>> for Ledger {
 
 impl From<Ledger> for Vec<Line> {
     fn from(ledger: Ledger) -> Self {
-        let line = |(Account { topic, to }, Counts { sent, received, in_flight, dropped })| Line {
-            topic,
-            to,
-            sent,
-            received,
-            in_flight,
-            dropped,
+        let line = |(Account { topic, to }, counts)| {
+            let Counts { sent, received, in_flight, dropped, adapted } = counts;
+            Line { topic, to, sent, received, in_flight, dropped, adapted }
         };
         ledger.accounts.into_iter().map(line).collect()
     }
@@ -153,6 +158,12 @@ impl Ledger {
     /// One more message lost.
     pub fn dropped(&mut self, account: &Account, reason: DropReason) {
         let count = self.counts(account).dropped.entry(reason).or_default();
+        *count = count.saturating_add(1);
+    }
+
+    /// One more map written so that it keeps within a limit.
+    pub fn adapted(&mut self, account: &Account, reason: RateReason) {
+        let count = self.counts(account).adapted.entry(reason).or_default();
         *count = count.saturating_add(1);
     }
 
@@ -318,9 +329,10 @@ mod tests {
         let json = serde_json::to_string(&ledger).unwrap();
         assert_eq!(
             json,
-            r#"[{"topic":"4288/bev","to":null,"sent":10,"received":0,"in_flight":0,"dropped":{}},"#.to_owned()
+            r#"[{"topic":"4288/bev","to":null,"sent":10,"received":0,"in_flight":0,"dropped":{},"adapted":{}},"#
+                .to_owned()
                 + r#"{"topic":"4288/bev","to":"ego-4279","sent":1,"received":6,"in_flight":1,"#
-                + r#""dropped":{"link_loss":1,"link_queue":1,"stale":1,"duplicate":1}}]"#
+                + r#""dropped":{"link_loss":1,"link_queue":1,"stale":1,"duplicate":1},"adapted":{}}]"#
         );
         assert_eq!(serde_json::from_str::<Ledger>(&json).unwrap(), ledger);
     }

@@ -102,8 +102,8 @@ pub use bev::{BevFeatures, BevGrid};
 pub use body::{Body, BodyShape};
 pub use box3d::{Box3d, Detection};
 pub use codec::{
-    Codec, CodecConfig, ConfidenceGate, DecodedFeatures, Dtype, EncodedFeatures, Packing, Selection, Smoothing,
-    encode_features,
+    ByteLimit, Codec, CodecConfig, ConfidenceGate, DecodedFeatures, Dtype, EncodedFeatures, LimitedBy, Packing,
+    RateChoice, RateReason, Selection, Smoothing, encode_features, encode_within,
 };
 pub use drop_reason::DropReason;
 pub use error::WireError;

@@ -57,7 +57,7 @@ pub(crate) use {named, written_as_text};
 
 #[cfg(test)]
 mod tests {
-    use crate::{DropReason, Role, Verb};
+    use crate::{DropReason, RateReason, Role, Verb};
 
     #[test]
     fn values_are_written_by_name_and_the_names_differ() {
@@ -69,6 +69,7 @@ mod tests {
             }
         }
         check(&DropReason::ALL);
+        check(&RateReason::ALL);
         check(&Role::ALL);
         check(&Verb::ALL);
         assert_eq!(DropReason::LinkLoss.as_str(), "link_loss");

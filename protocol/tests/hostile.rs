@@ -101,7 +101,7 @@ fn absurd_lengths_in_the_header_are_refused() {
 
 fn absurd_map(grid: BevGrid, channels: u32, selection: Selection, packing: Packing) -> WireError {
     let codec = Codec { dtype: Dtype::I8, selection, packing };
-    let features = EncodedFeatures { grid, channels, codec, body: Body::Bytes(vec![0; 15]) };
+    let features = EncodedFeatures { grid, channels, codec, rate: None, body: Body::Bytes(vec![0; 15]) };
     features.decode(&Limits::DEFAULT).unwrap_err()
 }
 

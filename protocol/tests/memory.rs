@@ -22,7 +22,8 @@ fn resident(field: &str) -> u64 {
 /// `[1024, 32, 64]`: 8 MiB as `f32`, the most the limits allow.
 fn largest_map(dtype: Dtype, selection: Selection, packing: Packing, body: Vec<u8>) -> EncodedFeatures {
     let grid = BevGrid { width: 64, height: 32, ..sample::grid() };
-    EncodedFeatures { grid, channels: 1024, codec: Codec { dtype, selection, packing }, body: Body::Bytes(body) }
+    let codec = Codec { dtype, selection, packing };
+    EncodedFeatures { grid, channels: 1024, codec, rate: None, body: Body::Bytes(body) }
 }
 
 /// A zstd frame of zeros, written in small parts so that making it takes no memory.

@@ -12,12 +12,15 @@ use agent::model_config::DetectorConfig;
 use agent::node as agent_node;
 use agent::point_pillars::PointPillars;
 use agent::pose_source::RecordedPose;
+use agent::rate::RateConfig;
 use ego_fuser::Method;
 use ego_fuser::ego::{Content, Ego, View, own_content};
 use ego_fuser::node as ego_node;
 use ego_fuser::{Exchange, pairing::PairingConfig};
 use protocol::message::{Descriptor, ModelHash};
-use protocol::{Account, CavId, DecodedFeatures, Detection, Detections, DropReason, Ledger, Limits, Stream, Topic};
+use protocol::{
+    Account, CavId, DecodedFeatures, Detection, Detections, DropReason, Ledger, Limits, RateReason, Stream, Topic,
+};
 use sim_replay::bus::mailbox::Taken;
 use sim_replay::bus::shutdown::Stop;
 use sim_replay::bus::{Bus, Event, Inbox, PublisherOptions, Route, Subscription, process_id};
@@ -87,12 +90,13 @@ fn run_agent<'scope>(
     router: &'scope TestRouter,
     cav_id: &'static str,
     stream: Stream,
+    rate: RateConfig,
     stop: &Stop,
 ) -> ScopedJoinHandle<'scope, Ledger> {
     let stop = stop.clone();
     scope.spawn(move || {
         let bus = router.join(&format!("agent-{cav_id}"), cav_id);
-        let options = agent_node::NodeOptions { publish: vec![stream], ..agent_node::NodeOptions::default() };
+        let options = agent_node::NodeOptions { publish: vec![stream], rate, ..agent_node::NodeOptions::default() };
         let report = agent_node::run(&bus, agent(cav_id), &options, &stop).unwrap();
         assert_eq!(report.failed, 0);
         leave(bus)
@@ -137,9 +141,10 @@ fn taking_part(method: Method) -> &'static [&'static str] {
     if method == Method::None { &AGENTS[..1] } else { &AGENTS }
 }
 
-/// Plays the scene in step with the ego; gives what the ego told and everyone's books added up.
-fn play_in_lockstep(dir: &Path, method: Method) -> (Vec<(u64, Detections)>, Ledger) {
-    play_and_record(dir, method, None)
+/// Plays the scene in step with the ego, whose neighbours keep within `rate`; gives what the ego told and everyone's books
+/// added up.
+fn play_in_lockstep(dir: &Path, method: Method, rate: RateConfig) -> (Vec<(u64, Detections)>, Ledger) {
+    play_and_record(dir, method, rate, None)
 }
 
 /// Writes a run down until `stop`.
@@ -161,7 +166,12 @@ fn record<'scope>(
 }
 
 /// [`play_in_lockstep`], with everything that is said written to a file.
-fn play_and_record(dir: &Path, method: Method, file: Option<&Path>) -> (Vec<(u64, Detections)>, Ledger) {
+fn play_and_record(
+    dir: &Path,
+    method: Method,
+    rate: RateConfig,
+    file: Option<&Path>,
+) -> (Vec<(u64, Detections)>, Ledger) {
     let scenario = dataset::open(dir).unwrap().scenarios.remove(0);
     let (router, stop) = (TestRouter::open(), Stop::new());
     let stream = published(method);
@@ -169,7 +179,10 @@ fn play_and_record(dir: &Path, method: Method, file: Option<&Path>) -> (Vec<(u64
         let listening = listen(scope, &router, "10");
         let (recorded, ending) = (Stop::new(), Stop::new());
         let recorder = file.map(|file| record(scope, &router, file, &recorded));
-        let start = |cav_id: &&'static str| run_agent(scope, &router, cav_id, stream, &stop);
+        let start = |cav_id: &&'static str| {
+            let rate = if *cav_id == "10" { RateConfig::default() } else { rate };
+            run_agent(scope, &router, cav_id, stream, rate, &stop)
+        };
         let agents: Vec<_> = taking_part(method).iter().map(start).collect();
         let ego = scope.spawn(|| {
             let bus = router.join("ego-10", "10");
@@ -219,13 +232,13 @@ fn a_recorded_run_replayed_gives_the_same_detections() {
     scene::write(folder.path(), &AGENTS, TICKS);
     for method in [Method::Max, Method::Late] {
         let file = folder.path().join(format!("{method}.mcap"));
-        let (live, ledger) = play_and_record(folder.path(), method, Some(&file));
+        let (live, ledger) = play_and_record(folder.path(), method, RateConfig::default(), Some(&file));
         assert!(ledger.balance().is_exact(), "{method}: a recorder is in nobody's books");
         let recording = Recording::open(&file).unwrap();
         assert_eq!(recording.damage(), None);
         let told = |stream| recording.entries().iter().filter(|entry| entry.key.topic == topic("10", stream)).count();
         assert_eq!([Stream::Lidar, Stream::Pose, Stream::Detections].map(told), [TICKS; 3], "{method}");
-        let (again, _) = play_in_lockstep(&file, method);
+        let (again, _) = play_in_lockstep(&file, method, RateConfig::default());
         assert_eq!(live.len(), again.len(), "{method}");
         assert!(live.iter().any(|(_, result)| !result.detections.is_empty()), "{method}: nothing to compare");
         for ((capture, live), (again_capture, again)) in live.iter().zip(&again) {
@@ -272,7 +285,7 @@ fn live_in_lockstep_equals_offline_bit_by_bit_and_the_books_balance() {
     scene::write(folder.path(), &AGENTS, TICKS);
     let scenario = dataset::open(folder.path()).unwrap().scenarios.remove(0);
     for method in Method::ALL {
-        let (live, ledger) = play_in_lockstep(folder.path(), method);
+        let (live, ledger) = play_in_lockstep(folder.path(), method, RateConfig::default());
         let offline = play_offline(&scenario, method);
         assert!(offline.iter().any(|(_, detections)| !detections.is_empty()), "{method}: nothing to compare");
         assert_eq!(live.len(), offline.len(), "{method}");
@@ -293,6 +306,30 @@ fn live_in_lockstep_equals_offline_bit_by_bit_and_the_books_balance() {
         assert_eq!(total.in_flight, 0, "{method}: {ledger:?}");
         assert_eq!(total.dropped_total(), 0, "{method}: {ledger:?}");
     }
+}
+
+#[test]
+fn maps_that_keep_within_a_limit_are_fused_and_booked_with_the_reason() {
+    let folder = tempfile::tempdir().unwrap();
+    scene::write(folder.path(), &AGENTS, TICKS);
+    let values: i64 = detector().map_shape().iter().product();
+    // Half of what the map takes at a byte per value.
+    let limit = values as u64 / 2;
+    let rate = RateConfig { message_bytes: Some(limit), ..RateConfig::default() };
+    let (live, ledger) = play_in_lockstep(folder.path(), Method::Max, rate);
+    assert!(live.iter().all(|(_, result)| result.fused.len() == AGENTS.len() - 1 && result.skipped.is_empty()));
+    for fused in live.iter().flat_map(|(_, result)| &result.fused) {
+        let bytes = fused.payload_bytes + protocol::HEADER_LEN as u64;
+        assert!(bytes <= limit && bytes > limit / 2, "{bytes} of {limit}");
+    }
+    assert!(ledger.balance().is_exact());
+    let adapted = |cav_id: &str| {
+        let account = Account::published(topic(cav_id, Stream::Bev));
+        ledger.get(&account).unwrap().adapted.clone()
+    };
+    assert!(adapted("10").is_empty(), "what the ego's own agent sends does not cross the air");
+    let fewer = BTreeMap::from([(RateReason::SizeFewerCells, TICKS as u64)]);
+    assert!(AGENTS.iter().filter(|cav_id| **cav_id != "10").all(|cav_id| adapted(cav_id) == fewer), "{ledger:?}");
 }
 
 /// Sends a fleet's maps by hand, so that the test decides who is late, wrong or gone.
@@ -501,7 +538,7 @@ fn an_agent_hears_its_own_sensors_only_and_says_so_when_it_has_no_pose() {
     let scenario = dataset::open(folder.path()).unwrap().scenarios.remove(0);
     let (router, stop) = (TestRouter::open(), Stop::new());
     let ledger = std::thread::scope(|scope| {
-        let running = run_agent(scope, &router, "20", Stream::Bev, &stop);
+        let running = run_agent(scope, &router, "20", Stream::Bev, RateConfig::default(), &stop);
         let replay = router.join("replay", "replay");
         let lidar =
             |cav_id| replay.publisher(topic(cav_id, Stream::Lidar), PublisherOptions::SENSOR.lossless(8)).unwrap();

@@ -8,6 +8,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use agent::model_config::DetectorConfig;
 use agent::pose_source::{CachedPoseConfig, NoiseMode, NoisyPoseConfig, PoseRow, PoseSourceConfig, PoseTable};
+use agent::rate::RateConfig;
 use agent::training::{Length, RunConfig};
 use agent::weights::Weights;
 use deploy::table::{self, TableObserver, TableSpec};
@@ -118,6 +119,7 @@ fn evaluate(weights: &Path, data: &Path, poses: PoseSourceConfig, delay_nanos: u
         method: Some(Method::Pastat),
         pose_source: poses,
         codec,
+        rate: RateConfig::default(),
         rule: None,
         delay_nanos,
     };

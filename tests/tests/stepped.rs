@@ -6,6 +6,7 @@ use std::path::Path;
 use std::process::{Command, Output};
 
 use agent::pose_source::PoseSourceConfig;
+use agent::rate::RateConfig;
 use deploy::scenario::Scenario;
 use deploy::up::{RunResult, UpOptions, up};
 use ego_fuser::Method;
@@ -45,6 +46,7 @@ fn evaluate(folder: &Path, stepped: Option<SteppedConfig>) -> (Vec<EvaluatedFram
         method: Some(Method::Max),
         pose_source: PoseSourceConfig::Recorded,
         codec: CodecConfig { dtype: Dtype::F16, ..CodecConfig::default() },
+        rate: RateConfig::default(),
         rule: None,
         delay_nanos: 0,
     };

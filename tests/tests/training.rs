@@ -6,6 +6,7 @@ use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use agent::model_config::DetectorConfig;
 use agent::pose_source::PoseSourceConfig;
+use agent::rate::RateConfig;
 use agent::training::{Length, RunConfig};
 use ego_fuser::Method;
 use ego_fuser::evaluate::{EvaluateConfig, EvaluatedFrame, Evaluator};
@@ -87,7 +88,8 @@ fn run(config: &TrainConfig) -> (Summary, Ear) {
 fn evaluate(weights: PathBuf, scene: &Path, method: Method, dtype: Dtype) -> Vec<EvaluatedFrame> {
     let codec = CodecConfig { dtype, ..CodecConfig::default() };
     let pose_source = PoseSourceConfig::Recorded;
-    let config = EvaluateConfig { weights, method: Some(method), pose_source, codec, rule: None, delay_nanos: 0 };
+    let rate = RateConfig::default();
+    let config = EvaluateConfig { weights, method: Some(method), pose_source, codec, rate, rule: None, delay_nanos: 0 };
     let mut evaluator = Evaluator::new(config).unwrap();
     let mut frames = Vec::new();
     for scenario in &dataset::open(scene).unwrap().scenarios {

@@ -8,6 +8,7 @@ use agent::detector::Detector;
 use agent::node::{self, NodeOptions};
 use agent::pose_source::sanity::SanityConfig;
 use agent::pose_source::{EndToEndPoseConfig, NoiseMode, NoisyPoseConfig, PgcConfig, PoseSource, PoseSourceConfig};
+use agent::rate::RateConfig;
 use anyhow::Context;
 use clap::ValueEnum;
 use protocol::{CavId, CodecConfig, ConfidenceGate, Dtype, Role, Smoothing, Stream};
@@ -54,6 +55,8 @@ pub(crate) struct Args {
     /// zstd level, 1 to 22 [default: maps are not packed].
     #[arg(long, value_name = "LEVEL", visible_alias = "zstd-level", value_parser = clap::value_parser!(i32).range(1..=22))]
     zstd: Option<i32>,
+    #[command(flatten)]
+    rate: RateArgs,
     /// Threads to compute with; the same number gives the same bits.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
     threads: u16,
@@ -63,6 +66,21 @@ pub(crate) struct Args {
     /// Print a JSON summary at the end.
     #[arg(long)]
     json: bool,
+}
+
+/// What feature maps are fitted to: first in coarser numbers, then with fewer cells, the most confident ones.
+#[derive(Debug, clap::Args)]
+#[command(next_help_heading = "Fitting feature maps to the air")]
+struct RateArgs {
+    /// Most bytes of a message with a map, header and metadata included.
+    #[arg(long, value_name = "BYTES")]
+    message_bytes: Option<u64>,
+    /// Most bytes per second of such messages.
+    #[arg(long, value_name = "BYTES")]
+    bytes_per_second: Option<u64>,
+    /// Send less while maps wait for earlier ones to leave, and more again when they do not.
+    #[arg(long)]
+    watch_queue: bool,
 }
 
 /// Error on the recorded pose, with --pose-source noisy.
@@ -221,9 +239,17 @@ impl Args {
         NodeOptions {
             publish: self.publish.iter().map(stream).collect(),
             codec: CodecConfig { dtype, gate, budget_bytes: self.budget, zstd_level: self.zstd },
+            rate: self.rate.config(),
             keeps_running: self.keep_running || self.bus.supervised,
             ..NodeOptions::default()
         }
+    }
+}
+
+impl RateArgs {
+    fn config(&self) -> RateConfig {
+        let Self { message_bytes, bytes_per_second, watch_queue } = *self;
+        RateConfig { message_bytes, bytes_per_second, watch_queue }
     }
 }
 

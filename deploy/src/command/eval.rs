@@ -7,6 +7,7 @@ use agent::pose_source::sanity::SanityConfig;
 use agent::pose_source::{
     CachedPoseConfig, EndToEndPoseConfig, NoiseMode, NoisyPoseConfig, PgcConfig, PoseSourceConfig,
 };
+use agent::rate::RateConfig;
 use clap::ValueEnum;
 use deploy::evaluation::{EvaluationOptions, Part, evaluate, frame_count};
 use deploy::report;
@@ -94,6 +95,12 @@ pub(crate) struct Arguments {
     /// zstd level, 1 to 22 [default: maps are not packed].
     #[arg(long, value_name = "LEVEL", value_parser = clap::value_parser!(i32).range(1..=22))]
     zstd: Option<i32>,
+    /// Most bytes of a neighbour's message with a map: coarser numbers, then the most confident cells [default: any size].
+    #[arg(long, value_name = "BYTES")]
+    message_bytes: Option<u64>,
+    /// Most bytes per second of a neighbour's messages with maps, in the same way [default: any].
+    #[arg(long, value_name = "BYTES")]
+    bytes_per_second: Option<u64>,
     /// Frames to judge at most, over all scenarios [default: all].
     #[arg(long, value_parser = clap::value_parser!(u64).range(1..))]
     frames: Option<u64>,
@@ -185,6 +192,11 @@ impl Arguments {
                 gate: self.gate.map(|threshold| ConfidenceGate { threshold, ..ConfidenceGate::default() }),
                 budget_bytes: self.budget,
                 zstd_level: self.zstd,
+            },
+            rate: RateConfig {
+                message_bytes: self.message_bytes,
+                bytes_per_second: self.bytes_per_second,
+                watch_queue: false,
             },
             delay_nanos: self.delay * 1_000_000,
             maps: None,

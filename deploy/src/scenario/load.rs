@@ -269,6 +269,22 @@ mod tests {
     }
 
     #[test]
+    fn what_maps_are_fitted_to_is_said_for_all_or_for_one() {
+        let text = format!(
+            "{SMALL}agents: {{rate: {{bytes_per_second: 750000, watch_queue: true}}}}\nvehicles:\n  4288: {{rate: {{message_bytes: 75000}}}}\n"
+        );
+        let scenario = parse(&text).unwrap();
+        let rate_of = |cav| scenario.settings_of(&CavId::new(cav).unwrap()).rate;
+        let rate = rate_of("4279");
+        assert_eq!((rate.message_bytes, rate.bytes_per_second, rate.watch_queue), (None, Some(750_000), true));
+        let rate = rate_of("4288");
+        assert_eq!((rate.message_bytes, rate.bytes_per_second, rate.watch_queue), (Some(75_000), None, false));
+        assert_eq!(parse(&scenario.to_yaml()).unwrap(), scenario);
+        let message = parse(&format!("{SMALL}agents: {{rate: {{bytes: 3}}}}\n")).unwrap_err().to_string();
+        assert!(message.contains("bytes_per_second"), "{message}");
+    }
+
+    #[test]
     fn one_vehicle_may_find_its_pose_itself() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("s.yaml");

@@ -9,6 +9,7 @@ use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
+use agent::rate::RateConfig;
 use ego_fuser::evaluate::stepped::ComputeTimes;
 use ego_fuser::{Exchange, Method};
 use protocol::{CavId, CodecConfig, RunId, Stream};
@@ -291,6 +292,8 @@ pub struct AgentSettings {
     pub pose: PoseSource,
     /// How feature maps are written: number format, byte budget, packing.
     pub codec: CodecConfig,
+    /// How they are fitted to what the air takes: a size, a byte rate, the vehicle's own queue.
+    pub rate: RateConfig,
     /// What goes on the air; what the method needs when absent.
     pub publish: Option<Publish>,
     /// Who starts the process.
@@ -316,6 +319,8 @@ pub struct AgentOverrides {
     pub pose: Option<PoseSource>,
     /// See [`AgentSettings::codec`]; replaces it as a whole.
     pub codec: Option<CodecConfig>,
+    /// See [`AgentSettings::rate`]; replaces it as a whole.
+    pub rate: Option<RateConfig>,
     /// See [`AgentSettings::publish`].
     pub publish: Option<Publish>,
     /// See [`AgentSettings::launch`].
@@ -352,6 +357,7 @@ impl Scenario {
         AgentSettings {
             pose: own.pose.unwrap_or(base.pose),
             codec: own.codec.unwrap_or(base.codec),
+            rate: own.rate.unwrap_or(base.rate),
             publish: own.publish.or(base.publish),
             launch: own.launch.unwrap_or(base.launch),
         }

@@ -80,7 +80,7 @@ pub struct MessageCounts {
 
 impl From<Counts> for MessageCounts {
     fn from(counts: Counts) -> Self {
-        let Counts { sent, received, in_flight, dropped } = counts;
+        let Counts { sent, received, in_flight, dropped, adapted: _ } = counts;
         Self { sent, received, in_flight, dropped }
     }
 }
@@ -177,6 +177,7 @@ pub(super) fn options(experiment: &Experiment, point: &Point, maps: &Path) -> Re
         weights,
         pose_source: point.poses(experiment),
         codec: point.codec(config.feature_grid(), channels),
+        rate: point.rate(),
         maps: (point.method.exchange() != Exchange::Points).then(|| kept_maps(experiment, maps)),
         stepped: Some(grid::stepped(point.link(experiment)?, point, experiment.ego, experiment.compute)),
         part: experiment.part(),

@@ -77,8 +77,8 @@ fn codec(point: &Point) -> Option<String> {
     if point.method.exchange() != Exchange::Features {
         return None;
     }
-    let dtype = format!("{:?}", point.codec.dtype).to_lowercase();
-    Some(point.codec.keep.map_or(dtype.clone(), |keep| format!("{dtype} {} %", 100.0 * keep)))
+    let name = point.codec.name();
+    Some(point.codec.keep.map_or(name.clone(), |keep| format!("{name} {} %", 100.0 * keep)))
 }
 
 /// A figure for each field with several values, AP at 0.5 and at 0.7 side by side; means over seeds.

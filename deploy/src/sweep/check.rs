@@ -56,12 +56,13 @@ pub(super) fn check_scenes(experiment: &Experiment, scenarios: &[Scenario]) -> R
 fn axes(grid: &Grid) -> Result<(), String> {
     let Grid { method, codec, latency_ms, jitter_ms, bandwidth_mbps, loss, pose_noise, agents, seed } = grid;
     values("grid.method", Some(method), |_| Ok(()))?;
-    values("grid.codec", codec.as_ref(), |CodecSpec { keep, zstd, .. }| {
+    values("grid.codec", codec.as_ref(), |CodecSpec { keep, zstd, fit, .. }| {
         if let Some(keep) = keep
             && !(*keep > 0.0 && *keep <= 1.0)
         {
             return Err(format!("grid.codec: keep is {keep}, must be above 0 and at most 1"));
         }
+        number("grid.codec: fit", fit.unwrap_or(1.0), 0.01, 1.0)?;
         number("grid.codec: zstd", f64::from(zstd.unwrap_or(1)), 1.0, 22.0)
     })?;
     values("grid.latency_ms", latency_ms.as_ref(), |ms| number("grid.latency_ms", *ms, 0.0, 600_000.0))?;
@@ -177,6 +178,7 @@ mod tests {
             ("grid: {method: [max], loss: [0.1, 0.1]}", "grid.loss names 0.1 twice"),
             ("grid: {method: [max], bandwidth_mbps: [0]}", "grid.bandwidth_mbps is 0"),
             ("grid: {method: [max], codec: [{dtype: f16, keep: 0}]}", "keep is 0"),
+            ("grid: {method: [max], codec: [{dtype: f32, fit: 2}]}", "grid.codec: fit is 2"),
             ("grid: {method: [max], jitter_ms: [5]}", "grid.latency_ms, which is left out"),
             ("link: dsrc\ngrid: {method: [max], bandwidth_mbps: [6]}", "capacity of link dsrc"),
             ("link: nowhere\ngrid: {method: [max]}", "nowhere"),

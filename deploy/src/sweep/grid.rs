@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use agent::pose_source::{self, NoisyPoseConfig, PoseSourceConfig};
+use agent::rate::RateConfig;
 use ego_fuser::Method;
 use ego_fuser::evaluate::stepped::{ComputeTimes, Crew, SteppedConfig};
 use ego_fuser::pairing::PairingConfig;
@@ -140,7 +141,7 @@ impl Point {
     /// How maps of `channels` on `grid` are written.
     #[must_use]
     pub fn codec(&self, grid: BevGrid, channels: u64) -> CodecConfig {
-        let CodecSpec { dtype, keep, zstd } = self.codec;
+        let CodecSpec { dtype, keep, zstd, fit: _ } = self.codec;
         let cells = grid.cells() as u64;
         let budget = |keep: f64| {
             let kept = (keep * cells as f64).ceil() as u64;
@@ -150,6 +151,16 @@ impl Point {
         // All cells need no budget, and a mask would only cost bytes.
         let budget_bytes = keep.filter(|keep| *keep < 1.0).map(budget);
         CodecConfig { dtype, gate: None, budget_bytes, zstd_level: zstd }
+    }
+
+    /// What maps are fitted to: nothing where they are not, or where the link takes anything.
+    #[must_use]
+    pub fn rate(&self) -> RateConfig {
+        let share = self.codec.fit.zip(self.bandwidth_mbps);
+        RateConfig {
+            bytes_per_second: share.map(|(share, mbps)| (share * mbps * 1e6 / 8.0) as u64),
+            ..RateConfig::default()
+        }
     }
 }
 
@@ -209,6 +220,17 @@ mod tests {
         assert_eq!(last.delay, DelayLaw::Normal { mean_ms: 50.0, std_ms: 10.0 });
         assert_eq!(last.capacity, CapacityConfig::TokenBucket { rate_mbps: 6.0, burst_bytes: 0 });
         assert_eq!(last.loss, LossLaw::Bernoulli(0.1));
+    }
+
+    #[test]
+    fn a_share_of_the_link_is_a_rate_of_bytes() {
+        let text = "{method: [max], codec: [{dtype: f32}, {dtype: f32, fit: 0.5}], bandwidth_mbps: [6, .inf]}";
+        let points = points(&experiment(text).grid);
+        let rates: Vec<_> = points.iter().map(|point| (point.codec.name(), point.rate().bytes_per_second)).collect();
+        let name = |text: &str| text.to_owned();
+        let fitted = name("f32 fitted to 0.5");
+        let expected = [(name("f32"), None), (name("f32"), None), (fitted.clone(), Some(375_000)), (fitted, None)];
+        assert_eq!(rates, expected);
     }
 
     #[test]

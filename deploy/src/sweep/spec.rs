@@ -140,11 +140,23 @@ pub struct CodecSpec {
     /// zstd level; not packed where absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub zstd: Option<i32>,
+    /// Share of the link's rate that maps are fitted to, in coarser numbers and then with fewer cells; not fitted where absent.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub fit: Option<f64>,
 }
 
 impl Default for CodecSpec {
     fn default() -> Self {
-        Self { dtype: Dtype::F16, keep: None, zstd: None }
+        Self { dtype: Dtype::F16, keep: None, zstd: None, fit: None }
+    }
+}
+
+impl CodecSpec {
+    /// What tables and charts call it: its numbers, and the share of the link that maps are fitted to.
+    #[must_use]
+    pub fn name(&self) -> String {
+        let fitted = self.fit.map_or(String::new(), |share| format!(" fitted to {share}"));
+        format!("{:?}{fitted}", self.dtype).to_lowercase()
     }
 }
 

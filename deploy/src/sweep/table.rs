@@ -69,7 +69,7 @@ fn line(experiment: &Experiment, cell: &Cell) -> Vec<String> {
         mbps => plain(mbps),
     };
     let mut fields = vec![point.method.name().to_owned()];
-    fields.push(if sends_maps { format!("{:?}", point.codec.dtype).to_lowercase() } else { String::new() });
+    fields.push(if sends_maps { point.codec.name() } else { String::new() });
     fields.push(if sends_maps { plain(point.codec.keep) } else { String::new() });
     fields.push(point.codec.zstd.filter(|_| sends_maps).map_or(String::new(), |level| level.to_string()));
     fields.extend([plain(point.latency_ms), plain(point.jitter_ms), bandwidth, plain(point.loss)]);

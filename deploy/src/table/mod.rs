@@ -12,6 +12,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use agent::rate::RateConfig;
 use sim_replay::dataset::{self, ReadError};
 
 pub use cell::{Cell, CellKey};
@@ -160,6 +161,7 @@ impl Run<'_> {
             weights: weights.to_owned(),
             pose_source: poses,
             codec: self.spec.codec(),
+            rate: RateConfig::default(),
             delay_nanos: column.delay_ms.saturating_mul(1_000_000),
             maps: self.spec.maps.as_ref().map(|folder| KeptMaps {
                 folder: folder.clone(),

@@ -4,6 +4,7 @@ use std::ops::ControlFlow;
 use std::path::PathBuf;
 
 use agent::pose_source::PoseSourceConfig;
+use agent::rate::RateConfig;
 use agent::weights::{KIND_KEY, Weights};
 use anyhow::Result;
 use ego_fuser::Method;
@@ -59,6 +60,7 @@ impl Arguments {
                 method,
                 pose_source: PoseSourceConfig::Recorded,
                 codec: CodecConfig::default(),
+                rate: RateConfig::default(),
                 rule: None,
                 delay_nanos: 0,
             };

@@ -13,7 +13,8 @@ use std::path::PathBuf;
 
 use agent::agent::Agent;
 use agent::pose_source::PoseSourceConfig;
-use protocol::{CavId, CodecConfig, DropReason, PoseEstimate, SkippedNeighbour, StageTiming, Stream};
+use agent::rate::RateConfig;
+use protocol::{CavId, CodecConfig, DropReason, PoseEstimate, RateChoice, SkippedNeighbour, StageTiming, Stream};
 use sim_replay::dataset::{LoadOptions, Scenario};
 use sim_replay::frame::Frame;
 use sim_replay::ground_truth;
@@ -70,6 +71,8 @@ pub struct VehicleConfig {
     pub pose_source: PoseSourceConfig,
     /// How it writes its maps.
     pub codec: CodecConfig,
+    /// What it fits them to. There is no queue to watch.
+    pub rate: RateConfig,
 }
 
 /// Runs a scenario; `on_frame` may end it. Each frame's stamp says when the ego published it.
@@ -331,6 +334,9 @@ fn post(courier: &mut Courier, compute: &ComputeTimes, tick: usize, sent: Sent, 
         Some(Exchange::Points) => Stream::Points,
         _ => Stream::Bev,
     };
+    if let Some(RateChoice { reason, .. }) = sent.rate {
+        courier.adapted(&cav, stream, reason);
+    }
     if let Some(view) = sent.into_view() {
         let letter = Letter { view, payload_bytes, wire_bytes };
         courier.post(stream, sequence, wire_bytes - pose_bytes, sent_nanos, distance_m, letter);

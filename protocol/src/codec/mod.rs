@@ -16,6 +16,7 @@ mod compression;
 mod dtype;
 mod gate;
 mod layout;
+mod rate;
 mod selection;
 
 use serde::{Deserialize, Serialize};
@@ -27,6 +28,9 @@ use layout::Layout;
 
 pub use dtype::Dtype;
 pub use gate::{ConfidenceGate, Smoothing};
+pub use rate::{
+    ByteLimit, HEAD_BYTES, LimitedBy, RateChoice, RateReason, encode_within, largest_message, smallest_message,
+};
 
 /// How an agent encodes its maps.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
@@ -85,6 +89,8 @@ pub struct EncodedFeatures {
     pub channels: u32,
     /// What the body is.
     pub codec: Codec,
+    /// Why it is that, where the message had to keep within a limit.
+    pub rate: Option<RateChoice>,
     /// The values, as the codec says.
     pub body: Body,
 }
@@ -164,9 +170,9 @@ fn encode_selected(
     Ok(match packed {
         Some(packed) => {
             let codec = Codec { packing: Packing::Zstd, ..codec };
-            EncodedFeatures { grid, channels, codec, body: Body::Bytes(packed) }
+            EncodedFeatures { grid, channels, codec, rate: None, body: Body::Bytes(packed) }
         }
-        None => EncodedFeatures { grid, channels, codec, body },
+        None => EncodedFeatures { grid, channels, codec, rate: None, body },
     })
 }
 
@@ -229,7 +235,7 @@ impl EncodedFeatures {
     /// [`WireError`] when sizes exceed `limits`, the body is not what shape and codec demand, or a value or scale is not
     /// finite. The values of a dense `f32` body were checked when it was received.
     pub fn decode(self, limits: &Limits) -> Result<DecodedFeatures, WireError> {
-        let Self { grid, channels, codec, body } = self;
+        let Self { grid, channels, codec, rate: _, body } = self;
         let layout = Layout::new(&grid, channels, &codec, limits)?;
         let body = match (body, codec) {
             (Body::Floats(values), Codec { dtype: Dtype::F32, selection: Selection::Dense, packing: Packing::Raw }) => {

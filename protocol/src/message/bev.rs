@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::{Payload, PoseEstimate, private};
-use crate::{BevGrid, Body, BodyShape, Codec, EncodedFeatures, Kind, Limits, WireError};
+use crate::{BevGrid, Body, BodyShape, Codec, EncodedFeatures, Kind, Limits, RateChoice, WireError};
 
 /// A BEV feature map: agent to ego, for intermediate fusion.
 ///
@@ -27,6 +27,8 @@ pub struct BevMetadata {
     pub channels: u32,
     /// What the body is.
     pub codec: Codec,
+    /// Why it is that, where the message had to keep within a limit.
+    pub rate: Option<RateChoice>,
 }
 
 impl private::Sealed for Bev {}
@@ -36,8 +38,8 @@ impl Payload for Bev {
     type Metadata = BevMetadata;
 
     fn into_parts(self) -> (BevMetadata, Body) {
-        let Self { pose, features: EncodedFeatures { grid, channels, codec, body } } = self;
-        (BevMetadata { pose, grid, channels, codec }, body)
+        let Self { pose, features: EncodedFeatures { grid, channels, codec, rate, body } } = self;
+        (BevMetadata { pose, grid, channels, codec, rate }, body)
     }
 
     fn check(metadata: &BevMetadata, limits: &Limits) -> Result<BodyShape, WireError> {
@@ -46,7 +48,7 @@ impl Payload for Bev {
     }
 
     fn from_parts(metadata: BevMetadata, body: Body) -> Result<Self, WireError> {
-        let BevMetadata { pose, grid, channels, codec } = metadata;
-        Ok(Self { pose, features: EncodedFeatures { grid, channels, codec, body } })
+        let BevMetadata { pose, grid, channels, codec, rate } = metadata;
+        Ok(Self { pose, features: EncodedFeatures { grid, channels, codec, rate, body } })
     }
 }

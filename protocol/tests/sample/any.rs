@@ -98,9 +98,11 @@ pub(crate) fn any_map() -> impl Strategy<Value = (BevFeatures, Vec<f32>, CodecCo
 }
 
 fn any_bev() -> impl Strategy<Value = Bev> {
-    (any_estimate(), any_map()).prop_map(|(pose, (features, confidence, config))| Bev {
-        pose,
-        features: encode_features(features, &config, Some(&confidence)).unwrap(),
+    let choice = (select(RateReason::ALL.to_vec()), any::<u64>())
+        .prop_map(|(reason, limit_bytes)| RateChoice { reason, limit_bytes });
+    (any_estimate(), any_map(), option::of(choice)).prop_map(|(pose, (features, confidence, config), rate)| {
+        let features = encode_features(features, &config, Some(&confidence)).unwrap();
+        Bev { pose, features: EncodedFeatures { rate, ..features } }
     })
 }
 
@@ -178,12 +180,13 @@ fn any_control() -> impl Strategy<Value = Control> {
 
 fn any_stats() -> impl Strategy<Value = Stats> {
     let account = (any_topic(), option::of(any_process())).prop_map(|(topic, to)| Account { topic, to });
-    let line = (account, select(DropReason::ALL.to_vec()), 0..1000u64);
+    let line = (account, select(DropReason::ALL.to_vec()), select(RateReason::ALL.to_vec()), 0..1000u64);
     let ledger = vec(line, 0..8).prop_map(|lines| {
         let mut ledger = Ledger::default();
-        for (account, reason, in_flight) in &lines {
+        for (account, reason, rate, in_flight) in &lines {
             ledger.sent(account);
             ledger.dropped(account, *reason);
+            ledger.adapted(account, *rate);
             ledger.set_in_flight(account, *in_flight);
         }
         ledger

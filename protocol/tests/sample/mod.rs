@@ -64,6 +64,13 @@ pub(crate) fn bev(config: &CodecConfig) -> Bev {
     Bev { pose: pose(), features: encode_features(features(), config, Some(&confidence())).unwrap() }
 }
 
+/// A map that had to keep within a limit.
+pub(crate) fn adapted_bev() -> Bev {
+    let limit = ByteLimit { bytes: 600, by: LimitedBy::Queue };
+    let features = encode_within(features(), &CodecConfig::default(), &limit, Some(&confidence())).unwrap();
+    Bev { pose: pose(), features }
+}
+
 pub(crate) fn ledger() -> Ledger {
     let mut ledger = Ledger::default();
     let topic: Topic = "4279/bev".parse().unwrap();
@@ -72,6 +79,7 @@ pub(crate) fn ledger() -> Ledger {
     ledger.received(&account);
     ledger.dropped(&account, DropReason::Stale);
     ledger.set_in_flight(&account, 2);
+    ledger.adapted(&account, RateReason::QueueFewerCells);
     ledger
 }
 
@@ -153,6 +161,7 @@ pub(crate) fn every_kind() -> Vec<Message> {
         }),
     ];
     messages.extend(every_codec().iter().map(|config| Message::Bev(bev(config))));
+    messages.push(Message::Bev(adapted_bev()));
     let controls = [
         Control::Start { rate: 1.0 },
         Control::Pause,

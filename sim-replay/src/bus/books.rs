@@ -4,7 +4,7 @@ use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use protocol::{Account, DropReason, Ledger, ProcessId, StageSummary, Topic, WireError};
+use protocol::{Account, DropReason, Ledger, ProcessId, RateReason, StageSummary, Topic, WireError};
 
 /// Timings kept per stage: at 10 Hz the last three minutes.
 const KEPT_TIMINGS: usize = 2048;
@@ -79,6 +79,11 @@ impl Books {
     /// A message that was offered will not be sent.
     pub fn withheld(&self, topic: &Topic, reason: DropReason) {
         self.note(topic, |state| state.ledger.dropped(&Account::published(topic.clone()), reason));
+    }
+
+    /// A map that is offered was written so that it keeps within a limit.
+    pub fn adapted(&self, topic: &Topic, reason: RateReason) {
+        self.note(topic, |state| state.ledger.adapted(&Account::published(topic.clone()), reason));
     }
 
     /// This process listens to `topic` from now on.

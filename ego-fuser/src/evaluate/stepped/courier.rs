@@ -3,7 +3,7 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use protocol::{Account, CavId, DropReason, Ledger, ProcessId, Role, Stream, Topic};
+use protocol::{Account, CavId, DropReason, Ledger, ProcessId, RateReason, Role, Stream, Topic};
 use sim_replay::bus::process_id;
 use sim_replay::link::{Air, Fate, Outcome, Parcel};
 
@@ -81,6 +81,11 @@ impl Courier {
         self.stream = stream;
         let from = letter.view.cav.clone();
         self.hand_over(&from, stream, sequence, bytes, nanos, distance_m, Some(letter));
+    }
+
+    /// A map that is handed over was written so that it keeps within a limit.
+    pub(super) fn adapted(&mut self, from: &CavId, stream: Stream, reason: RateReason) {
+        self.ledger.adapted(&Account::published(topic(from, stream)), reason);
     }
 
     #[expect(clippy::too_many_arguments, reason = "the fields of a parcel")]

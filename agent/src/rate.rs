@@ -1,0 +1,296 @@
+//! How large a map may be: what the air takes, or what an agent's own queue lets through.
+//!
+//! A map that does not leave before the next one is offered is lost to it: a slot that keeps the newest stands before every
+//! publisher. A smaller map that arrives is worth more than a whole one that does not, so an agent can be told to keep
+//! within a size or a byte rate, or to find out by itself from how long its maps wait for their turn. What gives way is
+//! decided in [`protocol::codec::encode_within`]: first the numbers get coarser, then the least confident cells are left
+//! out.
+
+use std::time::{Duration, Instant};
+
+use protocol::codec::{HEAD_BYTES, encode_within, largest_message, smallest_message};
+use protocol::{BevFeatures, ByteLimit, CodecConfig, EncodedFeatures, LimitedBy, WireError, encode_features};
+use serde::{Deserialize, Serialize};
+
+/// Longest that a message may occupy the air at a byte rate, nanoseconds: the period of a LiDAR. More would arrive later than
+/// the map after it could have.
+const LONGEST_ON_AIR_NANOS: u64 = 100_000_000;
+/// Share of the time between two maps that one may wait for its turn before the queue counts as blocked.
+const PATIENCE: f64 = 0.25;
+/// Share of what went through while the queue was blocked that is tried next: below one, so that the queue empties.
+const BACK_OFF: f64 = 0.8;
+/// Growth from map to map while the queue is free.
+const GROWTH: f64 = 1.1;
+/// However blocked the queue, this share of the largest message is tried.
+const SMALLEST_SHARE: f64 = 1.0 / 128.0;
+
+/// What maps have to keep within. Nothing by default.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct RateConfig {
+    /// Most bytes of a message with a map, header and metadata included.
+    pub message_bytes: Option<u64>,
+    /// Most bytes per second of such messages, each of which may take up to 100 ms of them.
+    pub bytes_per_second: Option<u64>,
+    /// Whether to send less while maps wait for earlier ones to leave, and more again when they do not.
+    pub watch_queue: bool,
+}
+
+/// A map whose turn to be sent has come.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub struct Turn {
+    /// How many maps were offered before it. Those between the last turn and this one were superseded.
+    pub number: u64,
+    /// When it was offered.
+    pub offered: Instant,
+    /// When those before it had left.
+    pub begun: Instant,
+}
+
+/// Decides map by map, from the past ones.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct RateControl {
+    config: RateConfig,
+    /// Capture time of the last map, nanoseconds.
+    last_capture_nanos: Option<u64>,
+    queue: QueueWatch,
+}
+
+impl RateControl {
+    /// Nothing was sent yet.
+    #[must_use]
+    pub fn new(config: RateConfig) -> Self {
+        Self { config, ..Self::default() }
+    }
+
+    /// Encodes a map as `codec` wants it, or smaller where it has to be; the message says which and why. `turn` is known
+    /// where there is a queue. Calls follow each other in the order of sending.
+    ///
+    /// # Errors
+    /// As [`encode_within`].
+    pub fn encode(
+        &mut self,
+        features: BevFeatures,
+        codec: &CodecConfig,
+        confidence: &[f32],
+        capture_nanos: u64,
+        turn: Option<&Turn>,
+    ) -> Result<EncodedFeatures, WireError> {
+        let Some(limit) = self.limit(&features, codec, capture_nanos, turn)? else {
+            return encode_features(features, codec, Some(confidence));
+        };
+        let encoded = encode_within(features, codec, &limit, Some(confidence))?;
+        self.queue.last_bytes = HEAD_BYTES + encoded.body.len() as u64;
+        Ok(encoded)
+    }
+
+    /// The tightest of all limits; nothing where there is none.
+    fn limit(
+        &mut self,
+        features: &BevFeatures,
+        codec: &CodecConfig,
+        capture_nanos: u64,
+        turn: Option<&Turn>,
+    ) -> Result<Option<ByteLimit>, WireError> {
+        let RateConfig { message_bytes, bytes_per_second, watch_queue } = self.config;
+        let size = message_bytes.map(|bytes| ByteLimit { bytes, by: LimitedBy::MessageSize });
+        let on_air_nanos = self.nanos_since_last(capture_nanos);
+        let rate =
+            bytes_per_second.map(|rate| ByteLimit { bytes: bytes_within(rate, on_air_nanos), by: LimitedBy::ByteRate });
+        let queue = match turn.filter(|_| watch_queue) {
+            Some(turn) => {
+                let (smallest, largest) = (smallest_message(features)?, largest_message(features, codec)?);
+                Some(ByteLimit { bytes: self.queue.allow(turn, smallest, largest), by: LimitedBy::Queue })
+            }
+            None => None,
+        };
+        Ok([size, rate, queue].into_iter().flatten().min_by_key(|limit| limit.bytes))
+    }
+
+    /// The time of the air that belongs to a map; also where the clock of the scene jumps.
+    fn nanos_since_last(&mut self, capture_nanos: u64) -> u64 {
+        let last = self.last_capture_nanos.replace(capture_nanos);
+        let since = last.and_then(|last| capture_nanos.checked_sub(last)).filter(|nanos| *nanos > 0);
+        since.map_or(LONGEST_ON_AIR_NANOS, |nanos| nanos.min(LONGEST_ON_AIR_NANOS))
+    }
+}
+
+/// What `bytes_per_second` come to in some nanoseconds.
+fn bytes_within(bytes_per_second: u64, nanos: u64) -> u64 {
+    let bytes = u128::from(bytes_per_second) * u128::from(nanos) / 1_000_000_000;
+    u64::try_from(bytes).unwrap_or(u64::MAX)
+}
+
+/// Finds out what the own queue lets through.
+///
+/// While a map waits, the time from the last one's turn to its own is the time that the last one took to leave: what went
+/// through in it, less a reserve, is tried next. While none waits, the size grows until maps are whole again.
+#[derive(Debug, Clone, PartialEq, Default)]
+struct QueueWatch {
+    last: Option<Turn>,
+    /// Of the last message.
+    last_bytes: u64,
+    /// What was allowed last; nothing while maps are whole.
+    allowed: Option<f64>,
+}
+
+impl QueueWatch {
+    /// Bytes that the next message may have.
+    fn allow(&mut self, turn: &Turn, smallest: u64, largest: u64) -> u64 {
+        let floor = (largest as f64 * SMALLEST_SHARE).max(2.0 * smallest as f64);
+        if let Some(last) = self.last.replace(*turn) {
+            let offers = turn.number.saturating_sub(last.number).max(1);
+            let period = turn.offered.saturating_duration_since(last.offered).div_f64(offers as f64);
+            let waited = turn.begun.saturating_duration_since(turn.offered);
+            self.allowed = if offers > 1 || waited > period.mul_f64(PATIENCE) {
+                let took = turn.begun.saturating_duration_since(last.begun);
+                Some(self.backed_off(period, took).max(floor))
+            } else {
+                self.allowed.map(|bytes| bytes * GROWTH)
+            };
+        }
+        self.allowed = self.allowed.filter(|bytes| *bytes < largest as f64);
+        self.allowed.map_or(largest, |bytes| bytes as u64)
+    }
+
+    fn backed_off(&self, period: Duration, took: Duration) -> f64 {
+        let went_through = period.as_secs_f64() / took.as_secs_f64().max(1e-6);
+        BACK_OFF * self.last_bytes as f64 * went_through.min(1.0)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use protocol::{BevGrid, Dtype, RateReason, Selection};
+
+    use super::*;
+
+    const GRID: BevGrid = BevGrid { x_min_m: -25.6, y_min_m: -19.2, cell_m: 0.8, width: 64, height: 48 };
+    const CHANNELS: u32 = 16;
+    /// `[16, 48, 64]` as `f32`.
+    const WHOLE_BYTES: u64 = 4 * 16 * 48 * 64;
+
+    fn map() -> (BevFeatures, Vec<f32>) {
+        let values = (0..CHANNELS as usize * GRID.cells()).map(|n| (n as f32 * 0.31).cos()).collect();
+        let confidence = (0..GRID.cells()).map(|cell| (cell * 101 % 997) as f32 / 997.0).collect();
+        (BevFeatures { grid: GRID, channels: CHANNELS, values }, confidence)
+    }
+
+    fn encode(control: &mut RateControl, capture_nanos: u64, turn: Option<&Turn>) -> EncodedFeatures {
+        let (features, confidence) = map();
+        control.encode(features, &CodecConfig::default(), &confidence, capture_nanos, turn).unwrap()
+    }
+
+    /// Maps at 10 Hz over a sender that takes `bytes_per_second(second)`; each sent one with how long it waited.
+    struct Road {
+        control: RateControl,
+        start: Instant,
+        free: Instant,
+        number: u64,
+        waiting: Option<(u64, Instant)>,
+    }
+
+    impl Road {
+        fn new() -> Self {
+            let control = RateControl::new(RateConfig { watch_queue: true, ..RateConfig::default() });
+            let start = Instant::now();
+            Self { control, start, free: start, number: 0, waiting: None }
+        }
+
+        /// Drives on for `frames`; sizes and waits of the maps that were sent, and how many were superseded.
+        fn drive(&mut self, frames: u64, bytes_per_second: f64) -> (Vec<(u64, Duration)>, u64) {
+            let (mut sent, mut superseded) = (Vec::new(), 0);
+            for _ in 0..frames {
+                let offered = self.start + Duration::from_millis(100 * self.number);
+                if self.free <= offered {
+                    self.send(bytes_per_second, &mut sent);
+                }
+                superseded += u64::from(self.waiting.replace((self.number, offered)).is_some());
+                self.number += 1;
+                if self.free <= offered {
+                    self.send(bytes_per_second, &mut sent);
+                }
+            }
+            (sent, superseded)
+        }
+
+        fn send(&mut self, bytes_per_second: f64, sent: &mut Vec<(u64, Duration)>) {
+            let Some((number, offered)) = self.waiting.take() else { return };
+            let begun = self.free.max(offered);
+            let turn = Turn { number, offered, begun };
+            let bytes = HEAD_BYTES + encode(&mut self.control, 100_000_000 * number, Some(&turn)).body.len() as u64;
+            self.free = begun + Duration::from_secs_f64(bytes as f64 / bytes_per_second);
+            sent.push((bytes, begun - offered));
+        }
+    }
+
+    #[test]
+    fn without_a_limit_maps_are_written_as_they_are() {
+        let encoded = encode(&mut RateControl::default(), 0, None);
+        assert_eq!((encoded.codec.selection, encoded.rate), (Selection::Dense, None));
+        let mut watching = RateControl::new(RateConfig { watch_queue: true, ..RateConfig::default() });
+        assert_eq!(encode(&mut watching, 0, None).rate, None, "there is no queue to watch");
+    }
+
+    #[test]
+    fn a_byte_rate_is_shared_out_by_capture_time() {
+        let config = RateConfig { bytes_per_second: Some(1_000_000), ..RateConfig::default() };
+        let mut control = RateControl::new(config);
+        let limits: Vec<u64> = [500, 550, 650, 5000, 100]
+            .map(|ms: u64| encode(&mut control, ms * 1_000_000, None).rate.unwrap().limit_bytes)
+            .into();
+        // The first has a period to itself, a later one what has passed, none more than a period; a scene may start anew.
+        assert_eq!(limits, [100_000, 50_000, 100_000, 100_000, 100_000]);
+    }
+
+    #[test]
+    fn the_tightest_limit_holds() {
+        let config =
+            RateConfig { message_bytes: Some(60_000), bytes_per_second: Some(1_000_000), ..RateConfig::default() };
+        let mut control = RateControl::new(config);
+        let choice = |encoded: EncodedFeatures| (encoded.codec.dtype, encoded.rate.unwrap().reason);
+        assert_eq!(choice(encode(&mut control, 0, None)), (Dtype::I8, RateReason::SizeCoarser));
+        let closer = encode(&mut control, 40_000_000, None);
+        assert!(matches!(closer.codec.selection, Selection::TopK { .. }) && closer.body.len() <= 40_000);
+        assert_eq!(choice(closer), (Dtype::I8, RateReason::RateFewerCells));
+    }
+
+    #[test]
+    fn a_slow_link_makes_maps_smaller_and_a_fast_one_whole_again() {
+        let mut road = Road::new();
+        let (sent, superseded) = road.drive(20, 20e6);
+        assert!(superseded == 0 && sent.iter().all(|(bytes, _)| *bytes == WHOLE_BYTES + HEAD_BYTES), "{sent:?}");
+
+        // 200 kB a second: 20 kB a period, a tenth of a whole map.
+        let (sent, superseded) = road.drive(100, 200e3);
+        // The last whole map takes a second to leave, and none is lost after it.
+        assert!((5..12).contains(&superseded), "{superseded}");
+        let settled = &sent[20..];
+        let mean = settled.iter().map(|(bytes, _)| *bytes).sum::<u64>() / settled.len() as u64;
+        assert!((14_000..21_000).contains(&mean), "{mean}");
+        assert!(settled.iter().all(|(_, waited)| *waited < Duration::from_millis(80)), "{settled:?}");
+
+        let (sent, superseded) = road.drive(60, 20e6);
+        assert_eq!(superseded, 0);
+        assert_eq!(sent.last().unwrap().0, WHOLE_BYTES + HEAD_BYTES);
+        // Not at once: what the link takes is found out step by step.
+        assert!(sent[5].0 < WHOLE_BYTES / 2, "{sent:?}");
+    }
+
+    #[test]
+    fn a_link_that_takes_nothing_is_still_tried() {
+        let mut road = Road::new();
+        let (sent, _) = road.drive(600, 20e3);
+        let smallest = sent.iter().map(|(bytes, _)| *bytes).min().unwrap();
+        assert!(smallest > WHOLE_BYTES / 150 && smallest < WHOLE_BYTES / 50, "{smallest}");
+    }
+
+    #[test]
+    fn the_same_past_gives_the_same_choice() {
+        let drive = || Road::new().drive(80, 300e3);
+        assert_eq!(
+            drive().0.iter().map(|(b, _)| *b).collect::<Vec<_>>(),
+            drive().0.iter().map(|(b, _)| *b).collect::<Vec<_>>()
+        );
+    }
+}
