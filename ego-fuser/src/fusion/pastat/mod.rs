@@ -175,9 +175,13 @@ impl Pastat {
         let entries = self.align(maps, mask, &told, grid)?;
         let ego = self.transform(&entries)?;
         let fused = self.strongest(&entries, &ego, &told.newest)? + self.decoder.forward(&ego)?;
-        let fused =
-            self.refiner.as_ref().map_or_else(|| Ok(fused.shallow_clone()), |refiner| refiner.forward(&fused))?;
-        Ok((fused.f_narrow(1, 0, height)?.f_narrow(2, 0, width)?.f_to_kind(maps.kind())?, entries.deltas))
+        // What was padded on is off before convolutions look around: nothing is known there.
+        let fused = fused.f_narrow(1, 0, height)?.f_narrow(2, 0, width)?;
+        let fused = match &self.refiner {
+            Some(refiner) => refiner.forward(&fused)?,
+            None => fused,
+        };
+        Ok((fused.f_to_kind(maps.kind())?, entries.deltas))
     }
 }
 
