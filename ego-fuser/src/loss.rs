@@ -140,7 +140,7 @@ pub fn detection_loss(
 
 /// How far corrections are from what would undo the errors put on poses: smooth L1 per view, mean over views and samples.
 ///
-/// A metre counts as much as [`METRES_PER_RADIAN`] say a turn does. No true pose takes part: an error that was put on top is
+/// A turn by a radian counts as a shift by 20 m. No true pose takes part: an error that was put on top is
 /// known whatever lies below.
 ///
 /// # Errors
