@@ -254,7 +254,7 @@ impl Sweep {
         cell::compute(&self.experiment, point, key, &self.maps(), on_frame)?.write(&self.cells())
     }
 
-    /// Does as another process asks, see [`workers`].
+    /// Does as another process asks.
     ///
     /// # Errors
     /// [`SweepError::Io`] when the other end is gone.
