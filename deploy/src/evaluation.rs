@@ -182,20 +182,10 @@ pub(crate) fn judge(board: &mut Board, frame: EvaluatedFrame, is_stepped: bool) 
 }
 
 pub(crate) fn metrics(board: &Board, evaluator: &Evaluator, options: &EvaluationOptions, began: Instant) -> Metrics {
-    let (ap_global, ap_frame_order) = board.average_precision();
-    let is_stepped = options.stepped.is_some();
-    Metrics {
-        frames: board.records().len() as u64,
-        seconds: if is_stepped { board.seconds() } else { began.elapsed().as_secs_f64() },
-        clock: if is_stepped { "stepped" } else { "offline" }.into(),
-        method: evaluator.ego().method().name().into(),
-        pose_source: options.pose_source.name().into(),
-        ap_global,
-        ap_frame_order,
-        pose: board.pose_errors(),
-        latency_ms: board.latencies(),
-        age_ms: board.ages(),
-        comm: board.communication(),
-        messages: Messages::of(&evaluator.ledger().total()),
-    }
+    let (clock, seconds) = match options.stepped {
+        Some(_) => ("stepped", board.seconds()),
+        None => ("offline", began.elapsed().as_secs_f64()),
+    };
+    let names = [evaluator.ego().method().name(), options.pose_source.name()];
+    Metrics::of(board, clock, names, seconds, Messages::of(&evaluator.ledger().total()))
 }

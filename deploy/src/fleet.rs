@@ -1,22 +1,23 @@
 //! Which processes a scenario needs, and with which arguments.
 
+mod arguments;
+
 use std::collections::BTreeSet;
-use std::ffi::OsString;
 use std::path::{Path, PathBuf};
 
 use agent::localizer::{EndToEndLocalizer, Localizer, LocalizerError};
 use agent::model_config::DetectorConfig;
-use agent::rate::RateConfig;
 use agent::weights::{Weights, WeightsError};
 use ego_fuser::Exchange;
-use protocol::{CavId, Dtype, ProcessId, Role, RunId, Smoothing, Stream, Topic};
+use protocol::{CavId, ProcessId, Role, RunId, Stream, Topic};
 use sim_replay::bus::{Route, process_id};
 use sim_replay::dataset::{self, ReadError};
 use sim_replay::ground_truth::GroundTruthRule;
 use sim_replay::link::{Air, LinkError};
 use tch::Device;
 
-use crate::scenario::{Launch, NoiseMode, PoseSource, Publish, Scenario};
+use self::arguments::{Arguments, Meeting, dtype, noise_mode, rate_options, smoothing};
+use crate::scenario::{Launch, PoseSource, Publish, Scenario};
 use crate::score::scorer_cav;
 use crate::supervise::{Life, ProcessSpec};
 use crate::weights_choice::{WeightsChoiceError, weights_of};
@@ -409,79 +410,4 @@ impl Fleet {
 /// The recorder's name in place of a vehicle's.
 fn recorder_cav() -> CavId {
     CavId::new(RECORDER).expect("eight lower-case letters")
-}
-
-/// Where the processes of a run meet, and where their programs lie.
-struct Meeting<'a> {
-    run: &'a RunId,
-    endpoint: &'a str,
-    programs: &'a Path,
-    shared_memory_mib: usize,
-}
-
-impl Meeting<'_> {
-    fn process(&self, name: String, program: &str, args: Arguments, life: Life) -> ProcessSpec {
-        ProcessSpec { name, program: self.programs.join(program), args: args.0, life }
-    }
-}
-
-struct Arguments(Vec<OsString>);
-
-impl Arguments {
-    /// What every process of a fleet is told.
-    fn of(command: &str, meeting: &Meeting<'_>) -> Self {
-        let mut args = Self(vec![command.into()]);
-        args.option("--connect", meeting.endpoint);
-        args.option("--run", meeting.run.as_str());
-        args.flag("--supervised");
-        if meeting.shared_memory_mib > 0 {
-            args.option("--shm-mib", &meeting.shared_memory_mib.to_string());
-        }
-        args
-    }
-
-    /// One argument, so that a value that begins with `-` (a roadside unit's id) is not taken for a flag.
-    fn option<V: AsRef<std::ffi::OsStr> + ?Sized>(&mut self, name: &str, value: &V) {
-        let mut argument = OsString::from(name);
-        argument.push("=");
-        argument.push(value);
-        self.0.push(argument);
-    }
-
-    fn flag(&mut self, name: &str) {
-        self.0.push(name.into());
-    }
-}
-
-fn dtype(dtype: Dtype) -> &'static str {
-    match dtype {
-        Dtype::F32 => "f32",
-        Dtype::F16 => "f16",
-        Dtype::I8 => "i8",
-    }
-}
-
-fn rate_options(args: &mut Arguments, rate: &RateConfig) {
-    let RateConfig { message_bytes, bytes_per_second, watch_queue } = rate;
-    if let Some(bytes) = message_bytes {
-        args.option("--message-bytes", &bytes.to_string());
-    }
-    if let Some(bytes) = bytes_per_second {
-        args.option("--bytes-per-second", &bytes.to_string());
-    }
-    if *watch_queue {
-        args.flag("--watch-queue");
-    }
-}
-
-fn smoothing(smoothing: Option<Smoothing>) -> String {
-    smoothing.map_or_else(|| "none".to_owned(), |Smoothing { kernel, sigma }| format!("{kernel},{sigma}"))
-}
-
-fn noise_mode(mode: NoiseMode) -> &'static str {
-    match mode {
-        NoiseMode::Fixed => "fixed",
-        NoiseMode::Independent => "independent",
-        NoiseMode::Autoregressive => "autoregressive",
-    }
 }

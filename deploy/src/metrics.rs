@@ -7,6 +7,8 @@ use agent::statistics::{quantile, sorted};
 use protocol::{Counts, DropReason};
 use serde::{Deserialize, Serialize};
 
+use crate::score::Board;
+
 /// A pose nearer to the truth than this is a success, metres.
 const SUCCESS_M: f64 = 3.0;
 
@@ -39,6 +41,33 @@ pub struct Metrics {
     pub comm: Communication,
     /// The ledger's totals.
     pub messages: Messages,
+}
+
+impl Metrics {
+    /// What a board has seen of a run of `seconds`.
+    pub(crate) fn of(
+        board: &Board,
+        clock: &str,
+        [method, pose_source]: [&str; 2],
+        seconds: f64,
+        messages: Messages,
+    ) -> Self {
+        let (ap_global, ap_frame_order) = board.average_precision();
+        Self {
+            frames: board.records().len() as u64,
+            seconds,
+            clock: clock.into(),
+            method: method.into(),
+            pose_source: pose_source.into(),
+            ap_global,
+            ap_frame_order,
+            pose: board.pose_errors(),
+            latency_ms: board.latencies(),
+            age_ms: board.ages(),
+            comm: board.communication(),
+            messages,
+        }
+    }
 }
 
 /// One number per IoU threshold; `null` where there was nothing to find.

@@ -160,21 +160,8 @@ fn write(
 ) -> Result<RunResult, UpError> {
     let ledger = evaluator.ledger();
     let balance = ledger.balance();
-    let (ap_global, ap_frame_order) = board.average_precision();
-    let metrics = Metrics {
-        frames: board.records().len() as u64,
-        seconds: board.seconds(),
-        clock: "stepped".into(),
-        method: fleet.scenario.method.name().into(),
-        pose_source: fleet.pose_source().into(),
-        ap_global,
-        ap_frame_order,
-        pose: board.pose_errors(),
-        latency_ms: board.latencies(),
-        age_ms: board.ages(),
-        comm: board.communication(),
-        messages: Messages::of(&ledger.total()),
-    };
+    let names = [fleet.scenario.method.name(), fleet.pose_source()];
+    let metrics = Metrics::of(board, "stepped", names, board.seconds(), Messages::of(&ledger.total()));
     folder.write_json("metrics.json", &metrics)?;
     folder.write_frames(board.records())?;
     folder.write_json("ledger.json", &LedgerReport::new(&[], ledger, &balance))?;

@@ -331,19 +331,7 @@ fn write(
 }
 
 fn metrics(fleet: &Fleet, board: &Board, progress: &Progress, sum: &Ledger) -> Metrics {
-    let (ap_global, ap_frame_order) = board.average_precision();
-    Metrics {
-        frames: board.records().len() as u64,
-        seconds: progress.span.map_or(0.0, |(first, last)| last.duration_since(first).as_secs_f64()),
-        clock: "wall".into(),
-        method: fleet.scenario.method.name().into(),
-        pose_source: fleet.pose_source().into(),
-        ap_global,
-        ap_frame_order,
-        pose: board.pose_errors(),
-        latency_ms: board.latencies(),
-        age_ms: board.ages(),
-        comm: board.communication(),
-        messages: Messages::of(&sum.total()),
-    }
+    let seconds = progress.span.map_or(0.0, |(first, last)| last.duration_since(first).as_secs_f64());
+    let names = [fleet.scenario.method.name(), fleet.pose_source()];
+    Metrics::of(board, "wall", names, seconds, Messages::of(&sum.total()))
 }

@@ -14,7 +14,7 @@ use std::path::PathBuf;
 use agent::agent::Agent;
 use agent::pose_source::PoseSourceConfig;
 use agent::rate::RateConfig;
-use protocol::{CavId, CodecConfig, DropReason, PoseEstimate, RateChoice, SkippedNeighbour, StageTiming, Stream};
+use protocol::{CavId, CodecConfig, PoseEstimate, RateChoice, SkippedNeighbour, StageTiming, Stream};
 use sim_replay::dataset::{LoadOptions, Scenario};
 use sim_replay::frame::Frame;
 use sim_replay::ground_truth;
@@ -361,14 +361,3 @@ fn distance_m(one: &Frame, other: &Frame) -> f64 {
         _ => 0.0,
     }
 }
-
-/// Reasons by which messages leave the air, for tables with a column for each.
-pub const DROP_REASONS: [DropReason; 7] = [
-    DropReason::LinkLoss,
-    DropReason::LinkQueue,
-    DropReason::Superseded,
-    DropReason::Stale,
-    DropReason::Duplicate,
-    DropReason::NoPose,
-    DropReason::OutOfRange,
-];

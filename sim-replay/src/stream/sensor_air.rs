@@ -107,19 +107,8 @@ mod tests {
     use crate::link::{CapacityConfig, DelayLaw, LossLaw};
 
     fn held(cav: &CavId, tick: u64) -> Held {
-        let frame = Frame {
-            cav: cav.clone(),
-            capture_nanos: tick,
-            points: PointCloud { xyzi: vec![[0.0; 4]; 1000] },
-            dropped_points: 0,
-            radar: None,
-            world_from_lidar: None,
-            world_from_vehicle: None,
-            gnss_world_from_vehicle: None,
-            speed_mps: None,
-            objects: Vec::new(),
-            source_handedness: Handedness::Right,
-        };
+        let points = PointCloud { xyzi: vec![[0.0; 4]; 1000] };
+        let frame = Frame { points, ..Frame::empty(cav.clone(), tick, Handedness::Right) };
         Held { agent: 0, capture_nanos: tick, frame }
     }
 
