@@ -11,10 +11,13 @@ use zenoh::bytes::{Encoding, ZBytes};
 use zenoh::qos::{CongestionControl, Priority};
 
 use super::mailbox::{Mailbox, Pushed, Taken};
+use super::session::LONGEST_MESSAGE;
 use super::{Arrival, Books, BusError};
 
 /// Between two probes of a publisher that has sent nothing yet.
 const PROBE_PERIOD: Duration = Duration::from_millis(50);
+/// Messages of fewer bytes wait for nobody: asking whether they have come costs about as much as they do.
+const SMALL_BYTES: usize = 16 << 10;
 
 /// What happens to a message offered while the network still takes an earlier one.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -71,6 +74,9 @@ struct Offer {
 /// `put` is called under `CongestionControl::Block`, so that zenoh never drops: with its default it loses, without an
 /// error, every message that takes longer than 50 ms. The price is that `put` waits for the network, for seconds on a
 /// slow one, which is why neither a clock nor a network thread nor an async task may call it.
+///
+/// Where the newest wins, the next large message is taken only when the router has the one before: `put` is content with
+/// a place in the buffers of zenoh and of the system, a megabyte of them, in which maps would grow old on a slow link.
 pub struct Publisher {
     topic: Topic,
     overflow: Overflow,
@@ -113,6 +119,8 @@ impl Publisher {
             queue: Arc::clone(&queue),
             books: books.clone(),
             publisher,
+            receipt: Receipt { session: session.clone(), key: format!("{key}/receipt"), priority },
+            is_one_at_a_time: matches!(overflow, Overflow::KeepNewest(_)),
         };
         let thread = thread::Builder::new()
             .name(format!("send {topic}"))
@@ -189,6 +197,35 @@ struct Sender {
     queue: Arc<Mailbox<(), Offer>>,
     books: Books,
     publisher: zenoh::pubsub::Publisher<'static>,
+    receipt: Receipt,
+    /// Whether the router must have a large message before the next one is taken from the queue.
+    is_one_at_a_time: bool,
+}
+
+/// Tells when the router has everything that was put before.
+struct Receipt {
+    session: zenoh::Session,
+    /// Nobody answers there.
+    key: String,
+    priority: Priority,
+}
+
+impl Receipt {
+    /// Waits for it. A question that nobody answers comes back from the router at once, and has to go through the same
+    /// queue as the messages before it. A connection that is lost ends the waiting too.
+    fn wait(&self) {
+        let asked = self
+            .session
+            .get(&self.key)
+            .priority(self.priority)
+            .congestion_control(CongestionControl::Block)
+            .timeout(LONGEST_MESSAGE)
+            .wait();
+        match asked {
+            Ok(answers) => while answers.recv().is_ok() {},
+            Err(cause) => tracing::debug!(key = self.key, "nobody to ask for a receipt: {cause}"),
+        }
+    }
 }
 
 impl Sender {
@@ -208,6 +245,8 @@ impl Sender {
             let sent = vec![TopicCount { topic: self.topic.clone(), messages: self.sequence }];
             self.notify(Control::End { ticks: self.sequence, sent });
         }
+        // A session that closes throws away what still lies in its buffers.
+        self.receipt.wait();
     }
 
     fn send(&mut self, Offer { capture_nanos, encode }: Offer) {
@@ -216,8 +255,12 @@ impl Sender {
             Ok(bytes) => {
                 self.books.timed("encode", began.elapsed());
                 self.sequence += 1;
+                let is_large = bytes.len() >= SMALL_BYTES;
                 if self.put(bytes) {
                     self.books.handed_over(&self.topic);
+                    if is_large && self.is_one_at_a_time {
+                        self.receipt.wait();
+                    }
                 }
             }
             Err(error) => {

@@ -14,6 +14,12 @@ const RETRY_LONGEST: Duration = Duration::from_secs(1);
 /// lie before the newest message: an eighth of what a socket's buffer grows to anyway.
 const TENSOR_BATCHES: usize = 8;
 
+/// How long a client may take to hand over one message: 8 MiB at 1 Mbit/s, and then some. A router that hangs is noticed
+/// much sooner, by its silence.
+pub(super) const LONGEST_MESSAGE: Duration = Duration::from_secs(120);
+/// The same for a router, whose other messages of the same sender wait meanwhile.
+const LONGEST_DELIVERY: Duration = Duration::from_secs(5);
+
 /// Which end of the star a process is.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Role {
@@ -93,8 +99,8 @@ pub struct BusOptions {
     pub shared_memory_pool: Option<usize>,
     /// Largest message accepted from outside, in bytes; larger ones close the connection they came on.
     pub max_message_bytes: usize,
-    /// How long one connection may refuse to take another byte before it is closed. While it does, a router delivers
-    /// nothing else that the same sender sends, so this bounds what one stuck receiver costs the others.
+    /// How long handing over one message may take before the connection is closed. Meanwhile a router delivers nothing
+    /// else that the same sender sends, so this bounds what one stuck receiver costs the others.
     pub stall_limit: Duration,
 }
 
@@ -102,23 +108,23 @@ impl BusOptions {
     /// A router that listens at `listen`.
     #[must_use]
     pub fn router(listen: Endpoint) -> Self {
-        Self::with_role(Role::Router { listen })
+        Self::with_role(Role::Router { listen }, LONGEST_DELIVERY)
     }
 
     /// A client of the router at `connect`.
     #[must_use]
     pub fn client(connect: Endpoint) -> Self {
-        Self::with_role(Role::Client { connect })
+        Self::with_role(Role::Client { connect }, LONGEST_MESSAGE)
     }
 
-    fn with_role(role: Role) -> Self {
+    fn with_role(role: Role, stall_limit: Duration) -> Self {
         Self {
             role,
             patience: Duration::from_secs(10),
             shared_memory_pool: None,
             // Twice a full map of OpenCOOD's size (256 x 48 x 176 cells of f32 at stride 4 are 8.7 MB) and every cloud.
             max_message_bytes: 32 << 20,
-            stall_limit: Duration::from_secs(5),
+            stall_limit,
         }
     }
 
