@@ -31,13 +31,23 @@ struct Crossing {
     ledger: Ledger,
 }
 
+/// The link between agent 7 and the ego 9.
+fn options() -> NodeOptions {
+    NodeOptions::new(cav("9"), vec![Stream::Points])
+}
+
+/// Waits until a topic of the bus's process reaches a receiver.
+fn wait_for_route(bus: &Bus, topic: &Topic, receiver: &str) {
+    let route = Route { topic: topic.clone(), receiver: receiver.parse().unwrap() };
+    Barrier::new([route]).attend(bus).unwrap().wait(PATIENCE).unwrap();
+}
+
 /// Sends all sweeps at once through a link.
-fn cross(config: LinkConfig) -> Crossing {
+fn cross(config: LinkConfig, options: &NodeOptions) -> Crossing {
     let router = TestRouter::open();
     let [agent, link, ego] =
         [("agent-7", "7"), ("link-9", "9"), ("ego-9", "9")].map(|(name, id)| router.join(name, id));
     let air = Air::new(config, Path::new("."), 1).unwrap();
-    let options = NodeOptions { ego: cav("9"), streams: vec![Stream::Points], keeps_running: false };
     let (sent, received) = (
         Topic::Stream { cav: cav("7"), stream: Stream::Points },
         Topic::Received { ego: cav("9"), cav: cav("7"), stream: Stream::Points },
@@ -46,15 +56,11 @@ fn cross(config: LinkConfig) -> Crossing {
     let _subscription = ego.subscribe(received.clone(), &inbox).unwrap();
     let stop = Stop::new();
     let (arrivals, report) = std::thread::scope(|scope| {
-        let carrying = scope.spawn(|| node::run(&link, air, &options, &stop).unwrap());
+        let carrying = scope.spawn(|| node::run(&link, air, options, &stop).unwrap());
         let presence = agent.announce(Role::Agent).unwrap();
         let publisher = agent.publisher(sent.clone(), PublisherOptions::FEATURES.lossless(16)).unwrap();
-        let wait = |bus: &Bus, topic: &Topic, receiver: &str| {
-            let route = Route { topic: topic.clone(), receiver: receiver.parse().unwrap() };
-            Barrier::new([route]).attend(bus).unwrap().wait(PATIENCE).unwrap();
-        };
-        wait(&agent, &sent, "link-9");
-        wait(&agent, &received, "ego-9");
+        wait_for_route(&agent, &sent, "link-9");
+        wait_for_route(&agent, &received, "ego-9");
         let began = std::time::Instant::now();
         (0..COUNT).for_each(|tick| publisher.offer(tick, points(tick)));
         publisher.finish();
@@ -81,7 +87,7 @@ fn cross(config: LinkConfig) -> Crossing {
 fn messages_come_late_in_order_and_unchanged() {
     let capacity = CapacityConfig::TokenBucket { rate_mbps: 8.0, burst_bytes: 0 };
     let config = LinkConfig { capacity, delay: DelayLaw::ConstantMs(30.0), ..LinkConfig::default() };
-    let Crossing { arrivals, report, ledger } = cross(config);
+    let Crossing { arrivals, report, ledger } = cross(config, &options());
     assert_eq!(arrivals.iter().map(|(tick, _)| *tick).collect::<Vec<_>>(), (0..COUNT).collect::<Vec<_>>());
     for (tick, late) in &arrivals {
         // 16 kB at 1,000 bytes a millisecond, one after the other, then 30 ms.
@@ -95,8 +101,62 @@ fn messages_come_late_in_order_and_unchanged() {
 #[test]
 fn what_the_air_loses_is_booked_and_never_arrives() {
     let Crossing { arrivals, report, ledger } =
-        cross(LinkConfig { loss: LossLaw::Bernoulli(1.0), ..LinkConfig::default() });
+        cross(LinkConfig { loss: LossLaw::Bernoulli(1.0), ..LinkConfig::default() }, &options());
     assert_eq!((arrivals.len(), report.arrived), (0, 0));
     assert_eq!(report.dropped, [(DropReason::LinkLoss, COUNT)].into());
     assert_eq!(ledger.total().dropped[&DropReason::LinkLoss], COUNT);
+}
+
+#[test]
+fn a_long_delay_keeps_no_more_than_it_may() {
+    // Without a rate there is no queue that could be full. All are sent long before the first arrives.
+    let config = LinkConfig { delay: DelayLaw::ConstantMs(4000.0), ..LinkConfig::default() };
+    let room_for_two = NodeOptions { max_kept_bytes: 40_000, ..options() };
+    let Crossing { arrivals, report, ledger } = cross(config, &room_for_two);
+    assert_eq!(arrivals.iter().map(|(tick, _)| *tick).collect::<Vec<_>>(), [0, 1]);
+    assert_eq!((report.offered, report.arrived), (COUNT, 2));
+    assert_eq!(report.dropped, [(DropReason::LinkQueue, COUNT - 2)].into());
+    assert_eq!(ledger.total().dropped[&DropReason::LinkQueue], COUNT - 2);
+}
+
+#[test]
+fn an_agent_that_comes_back_is_carried_again() {
+    let router = TestRouter::open();
+    let [link, ego, other] =
+        [("link-9", "9"), ("ego-9", "9"), ("agent-8", "8")].map(|(name, id)| router.join(name, id));
+    let received = Topic::Received { ego: cav("9"), cav: cav("7"), stream: Stream::Points };
+    let sent = Topic::Stream { cav: cav("7"), stream: Stream::Points };
+    let inbox = ego.inbox(64, 1);
+    let _subscription = ego.subscribe(received.clone(), &inbox).unwrap();
+    let (stop, options) = (Stop::new(), options());
+    let mut ledger = Ledger::default();
+    std::thread::scope(|scope| {
+        // While another agent is there the link does not end.
+        let presence = other.announce(Role::Agent).unwrap();
+        let air = Air::new(LinkConfig::default(), Path::new("."), 1).unwrap();
+        let carrying = scope.spawn(|| node::run(&link, air, &options, &stop).unwrap());
+        for ticks in [0..3, 3..6] {
+            let agent = router.join("agent-7", "7");
+            let presence = agent.announce(Role::Agent).unwrap();
+            let publisher = agent.publisher(sent.clone(), PublisherOptions::FEATURES.lossless(16)).unwrap();
+            wait_for_route(&agent, &sent, "link-9");
+            wait_for_route(&agent, &received, "ego-9");
+            ticks.clone().for_each(|tick| publisher.offer(tick, points(tick)));
+            publisher.finish();
+            for tick in ticks {
+                let (_, Event::Message(arrival)) = next_event(&inbox) else { panic!("{tick} does not come") };
+                assert_eq!(inbox.decode::<Points>(&arrival, &Limits::DEFAULT).unwrap(), points(tick));
+                ego.books().received(&received);
+            }
+            presence.withdraw().unwrap();
+            ledger.merge(&agent.books().ledger());
+            agent.leave(PATIENCE).unwrap();
+        }
+        presence.withdraw().unwrap();
+        let report = carrying.join().unwrap();
+        assert_eq!((report.offered, report.arrived, report.under_way), (6, 6, 0));
+        assert!(matches!(next_event(&inbox).1, Event::End { sent: 6, .. }));
+    });
+    [&link, &ego].iter().for_each(|bus| ledger.merge(&bus.books().ledger()));
+    assert!(ledger.balance().is_exact(), "{:?}", ledger.balance());
 }

@@ -51,9 +51,8 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     let stop = args.bus.stop().context("installing signal handlers")?;
     let bus = args.bus.join(Role::Link, &args.ego)?;
     let options = NodeOptions {
-        ego: args.ego.clone(),
-        streams: args.streams.clone(),
         keeps_running: args.keep_running || args.bus.supervised,
+        ..NodeOptions::new(args.ego.clone(), args.streams.clone())
     };
     let report = node::run(&bus, air, &options, &stop)?;
     print(&report, args.json)?;

@@ -19,8 +19,6 @@ use crate::bus::{Arrival, Bus, BusError, Event, Inbox, Publisher, PublisherOptio
 const PLACES: usize = 64;
 /// Vehicles that a link carries at most.
 const MAX_VEHICLES: usize = 64;
-/// Bytes of messages that are kept at most: under a long delay the air itself has no bound.
-const MAX_KEPT_BYTES: u64 = 1 << 30;
 /// How often the node looks for newcomers though nothing happens.
 const LOOK_ROUND: Duration = Duration::from_millis(20);
 
@@ -33,6 +31,16 @@ pub struct NodeOptions {
     pub streams: Vec<Stream>,
     /// Whether to go on when all agents have ended, for the next ones.
     pub keeps_running: bool,
+    /// Bytes of messages that are kept at most: under a long delay the air itself has no bound.
+    pub max_kept_bytes: u64,
+}
+
+impl NodeOptions {
+    /// Until all agents of a run have ended, with at most 1 GiB on the way.
+    #[must_use]
+    pub const fn new(ego: CavId, streams: Vec<Stream>) -> Self {
+        Self { ego, streams, keeps_running: false, max_kept_bytes: 1 << 30 }
+    }
 }
 
 /// What became of the messages.
@@ -195,8 +203,12 @@ impl<'a> Node<'a> {
     fn admit(&mut self, from: CavId, stream: Stream, arrival: Arrival) {
         let began = *self.began.get_or_insert(arrival.at);
         let distance_m = self.distance_m(&from);
+        if let Some(vehicle) = self.vehicles.get_mut(&from) {
+            // The end that was heard was that of an earlier life, which can come after the news of the next one.
+            vehicle.ended.remove(&stream);
+        }
         self.report.offered += 1;
-        if self.kept_bytes.saturating_add(arrival.wire_bytes()) > MAX_KEPT_BYTES {
+        if self.kept_bytes.saturating_add(arrival.wire_bytes()) > self.options.max_kept_bytes {
             *self.report.dropped.entry(DropReason::LinkQueue).or_default() += 1;
             self.bus.books().dropped(&arrival.topic, DropReason::LinkQueue);
             return;
