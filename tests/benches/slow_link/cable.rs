@@ -1,0 +1,167 @@
+//! A real slow link: two network namespaces, a cable between them, a token bucket at the agent's end.
+//!
+//! The ego's host runs the router and the ego, the agent's host the agent alone; each is a process of this program.
+
+use std::io::{BufRead, BufReader, Read, Write};
+use std::process::{Child, Command, Stdio};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::thread;
+use std::time::Duration;
+
+use anyhow::{Context, Result, bail};
+use protocol::{ProcessId, RunId};
+use sim_replay::bus::{Bus, BusOptions, Endpoint, Identity, open};
+use zenoh::{Config, Session, Wait};
+
+use super::ends::{self, Seen};
+use super::{Cell, Way};
+
+const AGENT: &str = "v2v-slow-agent";
+const EGO: &str = "v2v-slow-ego";
+const ROUTER: &str = "tcp/10.77.1.1:7447";
+
+/// One run over the cable.
+pub(crate) fn over_cable(cell: &Cell, way: Way) -> Result<Seen> {
+    let _cable = Cable::lay(cell.rate_mbps)?;
+    let mut ego = start(EGO, way, cell)?;
+    let mut from_ego = BufReader::new(ego.stdout.take().context("a pipe")?);
+    let mut ready = String::new();
+    from_ego.read_line(&mut ready)?;
+    let agent = start(AGENT, way, cell)?.wait_with_output()?;
+    // The end of its input tells the ego that the agent is gone.
+    drop(ego.stdin.take());
+    let mut text = String::new();
+    from_ego.read_to_string(&mut text)?;
+    if !ego.wait()?.success() || !agent.status.success() {
+        bail!("an end of the cable failed: see above");
+    }
+    let ego: Seen = serde_json::from_str(&text)?;
+    let mut seen: Seen = serde_json::from_slice(&agent.stdout)?;
+    seen.arrivals = ego.arrivals;
+    seen.ledger.merge(&ego.ledger);
+    Ok(seen)
+}
+
+fn start(host: &str, way: Way, cell: &Cell) -> Result<Child> {
+    let numbers = [cell.rate_mbps.to_string(), cell.bytes.to_string(), cell.duration.as_secs_f64().to_string()];
+    let mut command = Command::new("ip");
+    command.args(["netns", "exec", host]).arg(std::env::current_exe()?).args(["end", host, way.name()]).args(numbers);
+    Ok(command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn()?)
+}
+
+/// What a process at one end does: prints what it saw.
+pub(crate) fn run_end(arguments: &[String]) -> Result<()> {
+    let [host, way, rate_mbps, bytes, seconds] = arguments else { bail!("end HOST WAY RATE BYTES SECONDS") };
+    let cell = Cell::new(rate_mbps.parse()?, bytes.parse()?, Some(seconds.parse()?));
+    let seen = match (host == EGO, way == Way::Plain.name()) {
+        (true, true) => plain_ego()?,
+        (true, false) => ego()?,
+        (false, true) => {
+            let session = plain_session("client")?;
+            let offers = ends::send_plain(&session, &cell)?;
+            // Time for what lies in buffers.
+            thread::sleep(Duration::from_secs_f64((cell.on_the_wire_ms() / 1e3).min(20.0)));
+            session.close().wait().map_err(anyhow::Error::from_boxed)?;
+            Seen { offers, ..Seen::default() }
+        }
+        (false, false) => {
+            let agent = join("agent-7", "7")?;
+            let offers = ends::send(&agent, &cell, &[(ends::sent_topic(), "ego-9")])?;
+            let ledger = agent.books().ledger();
+            agent.leave(Duration::from_secs(20))?;
+            Seen { offers, ledger, ..Seen::default() }
+        }
+    };
+    println!("{}", serde_json::to_string(&seen)?);
+    Ok(())
+}
+
+fn ego() -> Result<Seen> {
+    let _router = open(&BusOptions::router(Endpoint::new(ROUTER)?))?;
+    let ego = join("ego-9", "9")?;
+    say_ready()?;
+    let arrivals = ends::receive(&ego, &ends::sent_topic())?;
+    Ok(Seen { arrivals, ledger: ego.books().ledger(), ..Seen::default() })
+}
+
+fn plain_ego() -> Result<Seen> {
+    let _router = plain_session("router")?;
+    let session = plain_session("client")?;
+    say_ready()?;
+    let is_over = Arc::new(AtomicBool::new(false));
+    let over = Arc::clone(&is_over);
+    thread::spawn(move || {
+        let _ = std::io::stdin().read_to_end(&mut Vec::new());
+        over.store(true, Ordering::Relaxed);
+    });
+    Ok(Seen { arrivals: ends::receive_plain(&session, || is_over.load(Ordering::Relaxed))?, ..Seen::default() })
+}
+
+fn say_ready() -> Result<()> {
+    let mut out = std::io::stdout();
+    writeln!(out, "ready")?;
+    Ok(out.flush()?)
+}
+
+fn join(process: &str, cav: &str) -> Result<Bus> {
+    let identity = Identity { run: RunId::new("slow-link")?, process: ProcessId::new(process)?, cav: ends::cav(cav) };
+    Ok(Bus::join(&BusOptions::client(Endpoint::new(ROUTER)?), identity)?)
+}
+
+/// zenoh as it comes, apart from where it meets and that it does so over TCP alone.
+fn plain_session(mode: &str) -> Result<Session> {
+    let (listen, connect) = if mode == "router" { (vec![ROUTER], vec![]) } else { (vec![], vec![ROUTER]) };
+    let mut config = Config::default();
+    for (key, value) in [
+        ("mode", serde_json::json!(mode)),
+        ("listen/endpoints", serde_json::json!(listen)),
+        ("connect/endpoints", serde_json::json!(connect)),
+        ("scouting/multicast/enabled", serde_json::json!(false)),
+        ("transport/shared_memory/enabled", serde_json::json!(false)),
+    ] {
+        config.insert_json5(key, &value.to_string()).map_err(anyhow::Error::from_boxed)?;
+    }
+    zenoh::open(config).wait().map_err(anyhow::Error::from_boxed)
+}
+
+/// Two hosts and their cable; gone with this.
+struct Cable;
+
+impl Cable {
+    fn lay(rate_mbps: f64) -> Result<Self> {
+        // Left behind by one that was killed.
+        drop(Self);
+        let cable = Self;
+        for host in [AGENT, EGO] {
+            ip(&format!("netns add {host}"))?;
+            ip(&format!("-n {host} link set lo up"))?;
+        }
+        ip(&format!("link add slow0 netns {EGO} type veth peer name slow1 netns {AGENT}"))?;
+        for (host, end, address) in [(EGO, "slow0", "10.77.1.1/24"), (AGENT, "slow1", "10.77.1.2/24")] {
+            ip(&format!("-n {host} address add {address} dev {end}"))?;
+            ip(&format!("-n {host} link set {end} up"))?;
+        }
+        // A queue of 50 ms, as routers have it; the burst is what a token bucket needs at 1 Gbit/s.
+        let shape =
+            format!("netns exec {AGENT} tc qdisc add dev slow1 root tbf rate {rate_mbps}mbit burst 64kb latency 50ms");
+        ip(&shape)?;
+        Ok(cable)
+    }
+}
+
+impl Drop for Cable {
+    fn drop(&mut self) {
+        for host in [AGENT, EGO] {
+            let _ = Command::new("ip").args(["netns", "del", host]).stderr(Stdio::null()).status();
+        }
+    }
+}
+
+fn ip(arguments: &str) -> Result<()> {
+    let output = Command::new("ip").args(arguments.split(' ')).output().context("iproute2 is needed")?;
+    if !output.status.success() {
+        bail!("ip {arguments}: {}", String::from_utf8_lossy(&output.stderr).trim());
+    }
+    Ok(())
+}

@@ -1,0 +1,194 @@
+//! The two ends of a way: an agent that offers maps, an ego that takes them.
+
+use std::path::Path;
+use std::sync::Mutex;
+use std::thread;
+use std::time::{Duration, Instant};
+
+use anyhow::Result;
+use protocol::message::Bev;
+use protocol::{
+    BevFeatures, BevGrid, CavId, CodecConfig, Ledger, Limits, Pose, PoseEstimate, Role, Stream, Topic, encode_features,
+};
+use serde::{Deserialize, Serialize};
+use sim_replay::bus::shutdown::Stop;
+use sim_replay::bus::{Barrier, Bus, Event, PublisherOptions, Route, unix_nanos};
+use sim_replay::link::node::{self, NodeOptions};
+use sim_replay::link::{Air, CapacityConfig, LinkConfig, QueueConfig};
+use tests::bus::{PATIENCE, TestRouter};
+use zenoh::bytes::ZBytes;
+use zenoh::{Session, Wait};
+
+use super::{Cell, PERIOD};
+
+/// Without news for so long, nothing comes any more.
+const SILENCE: Duration = Duration::from_secs(3);
+
+/// What both ends saw of a run.
+#[derive(Debug, Default, Serialize, Deserialize)]
+pub(crate) struct Seen {
+    pub(crate) offers: Vec<Offer>,
+    pub(crate) arrivals: Vec<Arrived>,
+    /// Of all processes; empty where nobody keeps books.
+    pub(crate) ledger: Ledger,
+}
+
+/// A call of the publisher.
+#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
+pub(crate) struct Offer {
+    /// When it began; goes along as the capture time.
+    pub(crate) capture_nanos: u64,
+    /// How long it took.
+    pub(crate) waited_nanos: u64,
+}
+
+/// A map in the ego's hands.
+#[derive(Debug, Clone, Copy, Serialize, Deserialize)]
+pub(crate) struct Arrived {
+    pub(crate) capture_nanos: u64,
+    pub(crate) nanos: u64,
+    pub(crate) bytes: u64,
+}
+
+/// The agent's map.
+pub(crate) fn sent_topic() -> Topic {
+    Topic::Stream { cav: cav("7"), stream: Stream::Bev }
+}
+
+pub(crate) fn cav(text: &str) -> CavId {
+    CavId::new(text).expect("an identifier")
+}
+
+/// Agent, link and ego over one router on loopback.
+pub(crate) fn over_link(cell: &Cell) -> Result<Seen> {
+    let router = TestRouter::open();
+    let [agent, link, ego] =
+        [("agent-7", "7"), ("link-9", "9"), ("ego-9", "9")].map(|(name, cav)| router.join(name, cav));
+    let config = LinkConfig {
+        capacity: CapacityConfig::TokenBucket { rate_mbps: cell.rate_mbps, burst_bytes: 0 },
+        queue: QueueConfig { keep_newest: true, ..QueueConfig::default() },
+        ..LinkConfig::default()
+    };
+    let air = Air::new(config, Path::new("."), 1)?;
+    let options = NodeOptions::new(cav("9"), vec![Stream::Bev]);
+    let received = Topic::Received { ego: cav("9"), cav: cav("7"), stream: Stream::Bev };
+    let stop = Stop::new();
+    let (offers, arrivals) = thread::scope(|scope| {
+        let carrying = scope.spawn(|| node::run(&link, air, &options, &stop));
+        let receiving = scope.spawn(|| receive(&ego, &received));
+        let offers = send(&agent, cell, &[(sent_topic(), "link-9"), (received.clone(), "ego-9")]);
+        // What is under way now is booked as such; nobody waits for it.
+        stop.request();
+        carrying.join().expect("no panic")?;
+        anyhow::Ok((offers?, receiving.join().expect("no panic")?))
+    })?;
+    let mut ledger = Ledger::default();
+    [&agent, &link, &ego].iter().for_each(|bus| ledger.merge(&bus.books().ledger()));
+    Ok(Seen { offers, arrivals, ledger })
+}
+
+/// Offers maps until the time is over, as an agent does, and waits until they are sent.
+pub(crate) fn send(agent: &Bus, cell: &Cell, routes: &[(Topic, &str)]) -> Result<Vec<Offer>> {
+    let presence = agent.announce(Role::Agent)?;
+    let publisher = agent.publisher(sent_topic(), PublisherOptions::FEATURES)?;
+    let routes = routes.iter().map(|(topic, receiver)| Ok(Route { topic: topic.clone(), receiver: receiver.parse()? }));
+    Barrier::new(routes.collect::<Result<Vec<_>>>()?).attend(agent)?.wait(PATIENCE)?;
+    let map = features(cell.bytes);
+    let offers = at_10_hz(
+        cell,
+        || map.clone(),
+        |capture_nanos, map| {
+            publisher.offer_encoded(capture_nanos, move |stamp| {
+                let features = encode_features(map, &CodecConfig::default(), None)?;
+                protocol::wire::encode(stamp, Bev { pose: PoseEstimate::new(Pose::IDENTITY, 1.0), features })
+            });
+        },
+    );
+    publisher.finish();
+    presence.withdraw()?;
+    Ok(offers)
+}
+
+/// Takes maps, decodes them, and notes when that was done.
+pub(crate) fn receive(ego: &Bus, topic: &Topic) -> Result<Vec<Arrived>> {
+    let inbox = ego.inbox(64, 1);
+    let _subscription = ego.subscribe(topic.clone(), &inbox)?;
+    let mut arrivals = Vec::new();
+    while let sim_replay::bus::mailbox::Taken::Item(_, Event::Message(arrival)) = inbox.take(None) {
+        if inbox.decode::<Bev>(&arrival, &Limits::DEFAULT).is_some() {
+            ego.books().received(topic);
+            let capture_nanos = arrival.header.stamp.capture_nanos;
+            arrivals.push(Arrived { capture_nanos, nanos: unix_nanos(), bytes: arrival.wire_bytes() });
+        }
+    }
+    Ok(arrivals)
+}
+
+const PLAIN_KEY: &str = "v2v/plain";
+
+/// The same with zenoh alone: the capture time and zeros.
+pub(crate) fn send_plain(session: &Session, cell: &Cell) -> Result<Vec<Offer>> {
+    let publisher = session.declare_publisher(PLAIN_KEY).wait().map_err(anyhow::Error::from_boxed)?;
+    tests::bus::wait_for("a route", || publisher.matching_status().wait().is_ok_and(|status| status.matching()));
+    let bytes = cell.bytes;
+    let offers = at_10_hz(
+        cell,
+        || vec![0_u8; bytes],
+        |capture_nanos, mut map| {
+            map[..8].copy_from_slice(&capture_nanos.to_le_bytes());
+            // It says Ok also of what it drops.
+            if let Err(cause) = publisher.put(ZBytes::from(map)).wait() {
+                eprintln!("zenoh refuses a message: {cause}");
+            }
+        },
+    );
+    Ok(offers)
+}
+
+/// Takes what comes until `is_over` and nothing has come for a while.
+pub(crate) fn receive_plain(session: &Session, is_over: impl Fn() -> bool) -> Result<Vec<Arrived>> {
+    let arrivals = std::sync::Arc::new(Mutex::new(Vec::new()));
+    let heard = std::sync::Arc::clone(&arrivals);
+    let subscriber = session.declare_subscriber(PLAIN_KEY).callback(move |sample| {
+        let nanos = unix_nanos();
+        let payload = sample.payload().to_bytes();
+        let Some(capture) = payload.first_chunk() else { return };
+        let arrived = Arrived { capture_nanos: u64::from_le_bytes(*capture), nanos, bytes: payload.len() as u64 };
+        heard.lock().expect("no panic").push(arrived);
+    });
+    let _subscriber = subscriber.wait().map_err(anyhow::Error::from_boxed)?;
+    let (mut count, mut since) = (0, Instant::now());
+    while !is_over() || since.elapsed() < SILENCE {
+        thread::sleep(Duration::from_millis(50));
+        let now = arrivals.lock().expect("no panic").len();
+        if now != count || !is_over() {
+            (count, since) = (now, Instant::now());
+        }
+    }
+    let arrivals = arrivals.lock().expect("no panic").clone();
+    Ok(arrivals)
+}
+
+/// Calls `offer` at the rate of a LiDAR, with a map made before its time.
+fn at_10_hz<M>(cell: &Cell, make: impl Fn() -> M, mut offer: impl FnMut(u64, M)) -> Vec<Offer> {
+    let began = Instant::now();
+    let count = (cell.duration.as_secs_f64() / PERIOD.as_secs_f64()).round() as u32;
+    let ticks = (0..count).map(|tick| {
+        let map = make();
+        thread::sleep((began + tick * PERIOD).saturating_duration_since(Instant::now()));
+        let (capture_nanos, called) = (unix_nanos(), Instant::now());
+        offer(capture_nanos, map);
+        Offer { capture_nanos, waited_nanos: called.elapsed().as_nanos() as u64 }
+    });
+    ticks.collect()
+}
+
+/// A map of `bytes`: 64 channels of f32.
+fn features(bytes: usize) -> BevFeatures {
+    let (channels, cells) = (64, bytes / 4 / 64);
+    let width = cells.isqrt().next_power_of_two();
+    let grid =
+        BevGrid { x_min_m: -51.2, y_min_m: -38.4, cell_m: 0.8, width: width as u32, height: (cells / width) as u32 };
+    let values = (0..channels * cells).map(|index| (index % 1009) as f32 * 0.01).collect();
+    BevFeatures { grid, channels: channels as u32, values }
+}

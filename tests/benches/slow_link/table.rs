@@ -1,0 +1,204 @@
+//! What a run comes to.
+
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+use std::fs;
+use std::path::Path;
+use std::process::Command;
+
+use anyhow::Result;
+use protocol::DropReason;
+
+use super::ends::Seen;
+use super::{Cell, Way};
+
+/// How long the caller may wait for a publisher, milliseconds.
+const OFFER_TARGET_MS: f64 = 5.0;
+
+/// One line of the table. Times in milliseconds.
+pub(crate) struct Row {
+    pub(crate) way: &'static str,
+    rate_mbps: f64,
+    bytes: usize,
+    seconds: f64,
+    offered: usize,
+    arrived: usize,
+    /// By reason, and how many nobody can tell of.
+    dropped: BTreeMap<DropReason, u64>,
+    unexplained: i64,
+    offer_max_ms: f64,
+    transport_p50_ms: f64,
+    age_p50_ms: f64,
+    age_p95_ms: f64,
+    age_target_ms: f64,
+    throughput_mbps: f64,
+}
+
+impl Row {
+    pub(crate) fn of(cell: &Cell, way: Way, seen: &Seen) -> Self {
+        let ages = ages_ms(seen);
+        let took = seen.arrivals.iter().map(|arrival| millis(arrival.capture_nanos, arrival.nanos));
+        let dropped = seen.ledger.total().dropped;
+        let on_the_way: u64 =
+            seen.ledger.iter().filter(|(account, _)| account.to.is_none()).map(|(_, c)| c.in_flight).sum();
+        let unexplained = if seen.ledger.is_empty() {
+            // zenoh tells nobody what it drops.
+            seen.offers.len() as i64 - seen.arrivals.len() as i64
+        } else if seen.ledger.balance().is_exact() {
+            on_the_way as i64
+        } else {
+            i64::MAX
+        };
+        Self {
+            way: way.name(),
+            rate_mbps: cell.rate_mbps,
+            bytes: cell.bytes,
+            seconds: cell.duration.as_secs_f64(),
+            offered: seen.offers.len(),
+            arrived: seen.arrivals.len(),
+            dropped,
+            unexplained,
+            offer_max_ms: seen.offers.iter().map(|offer| offer.waited_nanos as f64 / 1e6).fold(0.0, f64::max),
+            transport_p50_ms: quantile(took.collect(), 0.5),
+            age_p50_ms: quantile(ages.clone(), 0.5),
+            age_p95_ms: quantile(ages, 0.95),
+            age_target_ms: cell.age_target_ms(),
+            throughput_mbps: throughput_mbps(seen),
+        }
+    }
+
+    /// Whether nothing is missing, nobody waited and the newest map is new enough.
+    pub(crate) fn is_on_target(&self) -> bool {
+        self.unexplained == 0 && self.offer_max_ms <= OFFER_TARGET_MS && self.age_p95_ms <= self.age_target_ms
+    }
+
+    pub(crate) fn markdown(&self) -> String {
+        let reasons: Vec<String> = self.dropped.iter().map(|(reason, count)| format!("{reason} {count}")).collect();
+        let unexplained = match self.unexplained {
+            0 => String::new(),
+            i64::MAX => "**ledger does not balance**".to_owned(),
+            count => format!("**unknown {count}**"),
+        };
+        let reasons: Vec<String> =
+            reasons.into_iter().chain(Some(unexplained).filter(|text| !text.is_empty())).collect();
+        format!(
+            "| {} | {} | {} | {:.0} | {} of {} | {} | {:.2} | {:.1} | {:.1} | {:.1} | {:.1} | {:.2} | {} |",
+            self.rate_mbps,
+            size(self.bytes),
+            self.way,
+            self.seconds,
+            self.arrived,
+            self.offered,
+            if reasons.is_empty() { "-".to_owned() } else { reasons.join(", ") },
+            self.offer_max_ms,
+            self.transport_p50_ms,
+            self.age_p50_ms,
+            self.age_p95_ms,
+            self.age_target_ms,
+            self.throughput_mbps,
+            if self.is_on_target() { "yes" } else { "no" },
+        )
+    }
+
+    fn csv(&self) -> String {
+        let dropped = |reason| self.dropped.get(&reason).copied().unwrap_or(0);
+        let in_books = |reason: &&DropReason| ![DropReason::Superseded, DropReason::Stale].contains(reason);
+        let other: u64 = self.dropped.keys().filter(in_books).map(|reason| dropped(*reason)).sum();
+        format!(
+            "{},{},{},{:.1},{},{},{},{},{},{},{:.3},{:.1},{:.1},{:.1},{:.1},{:.3},{}",
+            self.way,
+            self.rate_mbps,
+            self.bytes,
+            self.seconds,
+            self.offered,
+            self.arrived,
+            dropped(DropReason::Superseded),
+            dropped(DropReason::Stale),
+            other,
+            self.unexplained,
+            self.offer_max_ms,
+            self.transport_p50_ms,
+            self.age_p50_ms,
+            self.age_p95_ms,
+            self.age_target_ms,
+            self.throughput_mbps,
+            self.is_on_target(),
+        )
+    }
+}
+
+/// Writes both tables.
+pub(crate) fn write(folder: &Path, arguments: &str, rows: &[Row]) -> Result<()> {
+    fs::create_dir_all(folder)?;
+    let mut csv =
+        "way,rate_mbps,bytes,seconds,offered,arrived,superseded,under_way_at_end,dropped_otherwise,unexplained,\
+        offer_max_ms,transport_p50_ms,age_p50_ms,age_p95_ms,age_target_ms,throughput_mbps,on_target\n"
+            .to_owned();
+    let mut markdown = format!(
+        "`cargo bench -p tests --bench slow_link -- {arguments}`\n\n{}, {}\n\n\
+        | Mbit/s | size | way | s | arrived | not arrived | call max ms | on the way p50 ms | age p50 ms | age p95 ms | \
+        target ms | Mbit/s arrived | on target |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|\n",
+        first_line("git", &["describe", "--always", "--dirty", "--exclude=*"]),
+        machine(),
+    );
+    for row in rows {
+        writeln!(csv, "{}", row.csv())?;
+        writeln!(markdown, "{}", row.markdown())?;
+    }
+    fs::write(folder.join("slow_link.csv"), csv)?;
+    fs::write(folder.join("slow_link.md"), markdown)?;
+    Ok(())
+}
+
+/// The age of the newest map at every millisecond from the first arrival to the last offer.
+fn ages_ms(seen: &Seen) -> Vec<f64> {
+    let end_nanos = seen.offers.last().map_or(0, |offer| offer.capture_nanos);
+    let mut arrivals = seen.arrivals.iter().peekable();
+    let mut newest_nanos = 0;
+    let mut ages = Vec::new();
+    let mut nanos = seen.arrivals.first().map_or(u64::MAX, |arrival| arrival.nanos);
+    while nanos <= end_nanos {
+        while let Some(arrival) = arrivals.next_if(|arrival| arrival.nanos <= nanos) {
+            newest_nanos = newest_nanos.max(arrival.capture_nanos);
+        }
+        ages.push(millis(newest_nanos, nanos));
+        nanos += 1_000_000;
+    }
+    ages
+}
+
+/// Between the first arrival and the last.
+fn throughput_mbps(seen: &Seen) -> f64 {
+    let [Some(first), Some(last)] = [seen.arrivals.first(), seen.arrivals.last()] else { return 0.0 };
+    let bytes: u64 = seen.arrivals[1..].iter().map(|arrival| arrival.bytes).sum();
+    let ms = millis(first.nanos, last.nanos);
+    if ms > 0.0 { bytes as f64 * 8e-3 / ms } else { 0.0 }
+}
+
+fn millis(from_nanos: u64, to_nanos: u64) -> f64 {
+    (to_nanos as f64 - from_nanos as f64) / 1e6
+}
+
+/// Not a number where there are no values: nothing is on target then.
+fn quantile(mut values: Vec<f64>, quantile: f64) -> f64 {
+    values.sort_unstable_by(f64::total_cmp);
+    let place = (values.len() as f64 * quantile).ceil() as usize;
+    values.get(place.saturating_sub(1)).copied().unwrap_or(f64::NAN)
+}
+
+fn size(bytes: usize) -> String {
+    if bytes >= 1 << 20 { format!("{} MiB", bytes >> 20) } else { format!("{} KiB", bytes >> 10) }
+}
+
+fn first_line(program: &str, arguments: &[&str]) -> String {
+    let output = Command::new(program).args(arguments).output().map(|output| output.stdout).unwrap_or_default();
+    String::from_utf8_lossy(&output).lines().next().unwrap_or("unknown").to_owned()
+}
+
+/// Cores and their name.
+fn machine() -> String {
+    let text = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
+    let names: Vec<&str> =
+        text.lines().filter_map(|line| line.strip_prefix("model name")?.split(": ").nth(1)).collect();
+    format!("{} cores of {}", names.len(), names.first().unwrap_or(&"an unknown processor"))
+}
