@@ -26,8 +26,8 @@ pub(crate) struct Args {
     #[arg(long)]
     plain: bool,
     /// zstd level, 1 to 22 [default: not packed; clouds and maps hardly shrink].
-    #[arg(long, value_name = "LEVEL", value_parser = clap::value_parser!(i32).range(1..=22))]
-    zstd: Option<i32>,
+    #[arg(long, value_name = "LEVEL", value_parser = clap::value_parser!(u32).range(1..=22))]
+    zstd: Option<u32>,
     /// Go on when the replay ends, for the next one; always so with --supervised.
     #[arg(long)]
     keep_running: bool,

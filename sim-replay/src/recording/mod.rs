@@ -15,25 +15,19 @@
 //! of a chunk (power, disk, `kill -9`) reads up to its last whole chunk ([`Recording::damage`] says what is lost), and
 //! [`recover`] makes an indexed file of it again.
 
-mod cdr;
-mod chunk;
 mod error;
-mod mcap;
 mod reader;
 mod recorder;
 mod recover;
 mod ros;
 mod ros_schema;
 mod sink;
-mod summary;
 mod writer;
 
-pub use cdr::CdrWriter;
 pub use error::RecordingError;
 pub use reader::{Damage, Entry, Recording};
 pub use recorder::{RecordReport, RecorderError, RecorderOptions, record};
 pub use recover::{RecoverReport, recover};
-pub use ros::RosMessage;
 pub use sink::Store;
 pub use writer::{RecordingOptions, RecordingWriter};
 

@@ -1,16 +1,29 @@
 //! Reading a recording, whole or cut.
 
-use std::collections::BTreeMap;
+use std::collections::VecDeque;
 use std::fs::File;
+use std::io::{BufReader, ErrorKind, Read};
+use std::ops::ControlFlow;
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 
+use mcap::read::ChannelAccumulator;
+use mcap::records::{Record, op};
+use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
+use mcap::{McapError, McapResult, Message, parse_record};
 use protocol::{Header, Key, wire};
 
-use super::chunk::{self, MAX_CHUNK_BYTES};
-use super::mcap::{Channel, MAGIC, RECORD_HEAD, op};
 use super::{OWN_ENCODING, RecordingError};
+
+/// A chunk that claims more than this, packed or not, is not ours: we close them at a few MiB and one message.
+const MAX_CHUNK_BYTES: usize = 256 << 20;
+/// Bytes taken from a file at once: a length that is wrong costs no more memory than what is there.
+const READ_BYTES: usize = 1 << 20;
+/// Chunks that are kept unpacked: neighbours in time are neighbours in the file.
+const KEPT_CHUNKS: usize = 4;
+/// Opcode and length before every record.
+const RECORD_HEAD: u64 = 9;
 
 /// A message of a recording, where it lies and what its header says.
 #[derive(Debug, Clone)]
@@ -22,8 +35,8 @@ pub struct Entry {
     /// When it reached the recorder, nanoseconds on the Unix clock.
     pub arrived_nanos: u64,
     chunk: usize,
-    begin: usize,
-    end: usize,
+    /// Which message of the chunk.
+    place: usize,
 }
 
 /// What is wrong with the end of a recording.
@@ -37,12 +50,20 @@ pub struct Damage {
     pub reason: String,
 }
 
+/// Where a chunk's record begins, and how long its body is.
 #[derive(Debug, Clone, Copy)]
 struct ChunkPlace {
     begin: u64,
     len: usize,
-    /// Where the records begin in the body, where they are not packed.
-    records: Option<usize>,
+}
+
+type Messages = Arc<Vec<Message<'static>>>;
+
+/// All channels, and the chunks that were read last.
+#[derive(Debug)]
+struct Unpacked {
+    channels: ChannelAccumulator<'static>,
+    chunks: VecDeque<(usize, Messages)>,
 }
 
 /// A recording whose messages can be read in any order.
@@ -53,8 +74,7 @@ pub struct Recording {
     chunks: Vec<ChunkPlace>,
     entries: Vec<Entry>,
     damage: Option<Damage>,
-    /// The packed chunk that was read last: neighbours in time are neighbours in the file.
-    last: Mutex<Option<(usize, Arc<Vec<u8>>)>>,
+    unpacked: Mutex<Unpacked>,
 }
 
 impl Recording {
@@ -64,16 +84,27 @@ impl Recording {
     /// # Errors
     /// [`RecordingError`] when the file cannot be read or is no recording of ours.
     pub fn open(path: &Path) -> Result<Self, RecordingError> {
-        let file = File::open(path).map_err(|source| RecordingError::io(path, source))?;
-        let recording = Self {
-            path: path.into(),
-            file,
-            chunks: Vec::new(),
-            entries: Vec::new(),
-            damage: None,
-            last: Mutex::new(None),
+        let io = |source| RecordingError::io(path, source);
+        let file = File::open(path).map_err(io)?;
+        let size = file.metadata().map_err(io)?.len();
+        let mut contents = Contents { whole_bytes: mcap::MAGIC.len() as u64, ..Contents::default() };
+        let options = LinearReaderOptions::default().with_emit_chunks(true);
+        let read = for_each_record(BufReader::new(&file), options, |opcode, body| contents.take(opcode, body));
+        let not_ours = |reason| RecordingError::NotOurs { path: path.into(), reason };
+        let reason = match read {
+            Err(McapError::BadMagic) => return Err(not_ours("not an MCAP file".into())),
+            Err(error) => Some(error.to_string()),
+            Ok(()) => (!contents.has_end).then(|| "the file ends without an index".into()),
         };
-        recording.scan()
+        let Contents { channels, has_own, chunks, entries, whole_bytes, has_end: _ } = contents;
+        if !has_own {
+            let what = reason.map_or(String::new(), |reason| format!("; {reason}"));
+            return Err(not_ours(format!("no channel of encoding {OWN_ENCODING:?} in it{what}")));
+        }
+        let lost_bytes = size.saturating_sub(whole_bytes);
+        let damage = reason.map(|reason| Damage { whole_bytes, lost_bytes, reason });
+        let unpacked = Mutex::new(Unpacked { channels, chunks: VecDeque::new() });
+        Ok(Self { path: path.into(), file, chunks, entries, damage, unpacked })
     }
 
     /// The file.
@@ -99,141 +130,138 @@ impl Recording {
     /// # Errors
     /// [`RecordingError`] when the file has changed since it was opened.
     pub fn read(&self, entry: &Entry) -> Result<Vec<u8>, RecordingError> {
-        let place = self.chunks[entry.chunk];
-        if let Some(records) = place.records {
-            let mut bytes = vec![0; entry.end - entry.begin];
-            let offset = place.begin + (records + entry.begin) as u64;
-            self.file.read_exact_at(&mut bytes, offset).map_err(|source| RecordingError::io(&self.path, source))?;
-            return Ok(bytes);
-        }
-        let records = self.unpacked(entry.chunk)?;
-        match records.get(entry.begin..entry.end) {
-            Some(bytes) => Ok(bytes.to_vec()),
-            None => Err(RecordingError::malformed(&self.path, place.begin, "the file has changed")),
-        }
+        let messages = self.messages(entry.chunk)?;
+        let changed = || RecordingError::malformed(&self.path, self.chunks[entry.chunk].begin, "the file has changed");
+        messages.get(entry.place).map(|message| message.data.to_vec()).ok_or_else(changed)
     }
 
-    /// Every message of whatever channel, in order: topic, encoding, and the record's body. For [`super::recover`].
-    pub(super) fn for_each(
-        &self,
-        mut visit: impl FnMut(&str, &str, u64, &[u8]) -> Result<(), RecordingError>,
-    ) -> Result<(), RecordingError> {
-        let mut channels = BTreeMap::new();
-        for (index, place) in self.chunks.iter().enumerate() {
-            let records = self.unpacked(index)?;
-            let mut failed = None;
-            let walked = chunk::for_each_message(&records, &mut channels, |channel, head, data| {
-                visit(&channel.topic, &channel.encoding, head.log_time, &records[data]).map_err(|error| {
-                    failed = Some(error);
-                    String::new()
-                })
-            });
-            match (failed, walked) {
-                (Some(error), _) => return Err(error),
-                (None, Err(reason)) => return Err(RecordingError::malformed(&self.path, place.begin, reason)),
-                (None, Ok(())) => {}
+    /// The messages of whatever channel, chunk by chunk. For [`super::recover`].
+    pub(super) fn chunks(&self) -> impl Iterator<Item = Result<Messages, RecordingError>> {
+        (0..self.chunks.len()).map(|chunk| self.messages(chunk))
+    }
+
+    fn messages(&self, chunk: usize) -> Result<Messages, RecordingError> {
+        let mut unpacked = self.unpacked.lock().unwrap_or_else(PoisonError::into_inner);
+        if let Some((_, messages)) = unpacked.chunks.iter().find(|(known, _)| *known == chunk) {
+            return Ok(Arc::clone(messages));
+        }
+        let ChunkPlace { begin, len } = self.chunks[chunk];
+        let mut body = vec![0; len];
+        let read = self.file.read_exact_at(&mut body, begin + RECORD_HEAD);
+        read.map_err(|source| RecordingError::io(&self.path, source))?;
+        let messages = unpack(&body, &mut unpacked.channels);
+        let messages = messages.map_err(|error| RecordingError::malformed(&self.path, begin, error.to_string()))?;
+        let messages = Arc::new(messages);
+        unpacked.chunks.truncate(KEPT_CHUNKS - 1);
+        unpacked.chunks.push_front((chunk, Arc::clone(&messages)));
+        Ok(messages)
+    }
+}
+
+/// What a first look through a file finds.
+#[derive(Default)]
+struct Contents {
+    channels: ChannelAccumulator<'static>,
+    /// Whether one of the channels is ours.
+    has_own: bool,
+    chunks: Vec<ChunkPlace>,
+    entries: Vec<Entry>,
+    /// Where the last whole record ends.
+    whole_bytes: u64,
+    /// Whether the data end where they were meant to.
+    has_end: bool,
+}
+
+impl Contents {
+    /// Takes the next record of the file in.
+    fn take(&mut self, opcode: u8, body: &[u8]) -> McapResult<ControlFlow<()>> {
+        match opcode {
+            op::DATA_END => {
+                self.has_end = true;
+                return Ok(ControlFlow::Break(()));
+            }
+            op::CHUNK => self.take_chunk(body)?,
+            _ => {}
+        }
+        self.whole_bytes += RECORD_HEAD + body.len() as u64;
+        Ok(ControlFlow::Continue(()))
+    }
+
+    fn take_chunk(&mut self, body: &[u8]) -> McapResult<()> {
+        let messages = unpack(body, &mut self.channels)?;
+        let chunk = self.chunks.len();
+        self.chunks.push(ChunkPlace { begin: self.whole_bytes, len: body.len() });
+        for (place, message) in messages.iter().enumerate() {
+            if message.channel.message_encoding != OWN_ENCODING {
+                continue;
+            }
+            self.has_own = true;
+            // What was no sound message when it was recorded is none now.
+            let header = wire::decode_header([message.data.as_ref()]).ok();
+            if let Some((key, header)) = message.channel.topic.parse().ok().zip(header) {
+                self.entries.push(Entry { key, header, arrived_nanos: message.log_time, chunk, place });
             }
         }
         Ok(())
     }
+}
 
-    fn unpacked(&self, index: usize) -> Result<Arc<Vec<u8>>, RecordingError> {
-        let mut last = self.last.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some((known, records)) = last.as_ref()
-            && *known == index
-        {
-            return Ok(Arc::clone(records));
+/// The messages of a chunk, once it has been compared with its checksum; its channels are added to `channels`.
+fn unpack(body: &[u8], channels: &mut ChannelAccumulator<'static>) -> McapResult<Vec<Message<'static>>> {
+    let head = [[op::CHUNK].as_slice(), &(body.len() as u64).to_le_bytes()].concat();
+    let options = LinearReaderOptions::default().with_skip_start_magic(true).with_prevalidate_chunk_crcs(true);
+    let (mut messages, mut unpacked_bytes) = (Vec::new(), 0);
+    for_each_record(head.chain(body), options, |opcode, data| {
+        unpacked_bytes += data.len();
+        if unpacked_bytes > MAX_CHUNK_BYTES {
+            return Err(McapError::ChunkTooLarge(unpacked_bytes as u64));
         }
-        let place = self.chunks[index];
-        let mut body = vec![0; place.len];
-        self.file.read_exact_at(&mut body, place.begin).map_err(|source| RecordingError::io(&self.path, source))?;
-        let unpacked =
-            chunk::unpack(&body).map_err(|reason| RecordingError::malformed(&self.path, place.begin, reason))?;
-        let records = Arc::new(unpacked.records);
-        *last = Some((index, Arc::clone(&records)));
-        Ok(records)
-    }
-
-    /// Goes through the file record by record as long as they are whole.
-    fn scan(mut self) -> Result<Self, RecordingError> {
-        let size = self.file.metadata().map_err(|source| RecordingError::io(&self.path, source))?.len();
-        let magic = self.bytes_at(0, 8.min(size as usize))?;
-        if magic != MAGIC {
-            return Err(self.not_ours(format!("not an MCAP file: it begins with {magic:02x?}")));
+        // Others have no place in a chunk, and the parser trusts the lengths in some of them.
+        if !matches!(opcode, op::SCHEMA | op::CHANNEL | op::MESSAGE) {
+            return Ok(ControlFlow::Continue(()));
         }
-        let mut channels = BTreeMap::new();
-        let mut at = MAGIC.len() as u64;
-        let reason = loop {
-            match self.scan_record(at, size, &mut channels) {
-                Ok(Some(next)) => at = next,
-                Ok(None) => break None,
-                Err(reason) => break Some(reason),
-            }
-        };
-        self.damage = reason.map(|reason| Damage { whole_bytes: at, lost_bytes: size - at, reason });
-        if !channels.values().any(|channel: &Channel| channel.encoding == OWN_ENCODING) {
-            let what = self.damage.as_ref().map_or(String::new(), |damage| format!("; {}", damage.reason));
-            return Err(self.not_ours(format!("no channel of encoding {OWN_ENCODING:?} in it{what}")));
-        }
-        Ok(self)
-    }
-
-    /// Takes the record at `at` in and says where the next one begins; `None` behind the last one of the data.
-    fn scan_record(
-        &mut self,
-        at: u64,
-        size: u64,
-        channels: &mut BTreeMap<u16, Channel>,
-    ) -> Result<Option<u64>, String> {
-        let left = size - at;
-        if left < RECORD_HEAD as u64 {
-            return Err(format!("the file ends without an index, {left} bytes behind a record"));
-        }
-        let head: [u8; RECORD_HEAD] = self
-            .bytes_at(at, RECORD_HEAD)
-            .map_err(|error| error.to_string())?
-            .try_into()
-            .map_err(|_| "a short read".to_owned())?;
-        let (opcode, len) = chunk::record_head(&head);
-        let begin = at + RECORD_HEAD as u64;
-        let next = begin.checked_add(len).filter(|next| *next <= size);
-        let next = next.ok_or_else(|| format!("a record of {len} bytes where {} are left", size - begin))?;
-        match opcode {
-            op::DATA_END | op::FOOTER => return Ok(None),
-            op::CHUNK if len > MAX_CHUNK_BYTES => return Err(format!("a chunk of {len} bytes")),
-            op::CHUNK => {
-                let body = self.bytes_at(begin, len as usize).map_err(|error| error.to_string())?;
-                self.take_chunk(begin, &body, channels)?;
+        match parse_record(opcode, data)? {
+            Record::Schema { header, data } => channels.add_schema_from_slice(header, &data)?,
+            Record::Channel(channel) => channels.add_channel(channel)?,
+            Record::Message { header, data } => {
+                if let Some(channel) = channels.get(header.channel_id) {
+                    messages.push(Message {
+                        channel,
+                        sequence: header.sequence,
+                        log_time: header.log_time,
+                        publish_time: header.publish_time,
+                        data: data.into_owned().into(),
+                    });
+                }
             }
             _ => {}
         }
-        Ok(Some(next))
-    }
+        Ok(ControlFlow::Continue(()))
+    })?;
+    Ok(messages)
+}
 
-    fn take_chunk(&mut self, begin: u64, body: &[u8], channels: &mut BTreeMap<u16, Channel>) -> Result<(), String> {
-        let unpacked = chunk::unpack(body)?;
-        let chunk = self.chunks.len();
-        chunk::for_each_message(&unpacked.records, channels, |channel, head, data| {
-            let key = channel.topic.parse().ok().filter(|_| channel.encoding == OWN_ENCODING);
-            // What was no sound message when it was recorded is none now.
-            let header = wire::decode_header([&unpacked.records[data.clone()]]).ok();
-            if let Some((key, header)) = key.zip(header) {
-                let arrived_nanos = head.log_time;
-                self.entries.push(Entry { key, header, arrived_nanos, chunk, begin: data.start, end: data.end });
+/// Gives the records of `source` to `visit`, one after the other, until it has had enough or there are no more.
+fn for_each_record(
+    mut source: impl Read,
+    options: LinearReaderOptions,
+    mut visit: impl FnMut(u8, &[u8]) -> McapResult<ControlFlow<()>>,
+) -> McapResult<()> {
+    let options = options.with_record_length_limit(MAX_CHUNK_BYTES).with_skip_end_magic(true);
+    let mut reader = LinearReader::new_with_options(options);
+    while let Some(event) = reader.next_event() {
+        match event? {
+            LinearReadEvent::ReadRequest(wanted) => match source.read(reader.insert(wanted.min(READ_BYTES))) {
+                Ok(count) => reader.notify_read(count),
+                Err(error) if error.kind() == ErrorKind::Interrupted => {}
+                Err(error) => return Err(error.into()),
+            },
+            LinearReadEvent::Record { opcode, data } => {
+                if visit(opcode, data)?.is_break() {
+                    return Ok(());
+                }
             }
-            Ok::<(), String>(())
-        })?;
-        self.chunks.push(ChunkPlace { begin, len: body.len(), records: unpacked.offset });
-        Ok(())
+        }
     }
-
-    fn bytes_at(&self, offset: u64, len: usize) -> Result<Vec<u8>, RecordingError> {
-        let mut bytes = vec![0; len];
-        self.file.read_exact_at(&mut bytes, offset).map_err(|source| RecordingError::io(&self.path, source))?;
-        Ok(bytes)
-    }
-
-    fn not_ours(&self, reason: String) -> RecordingError {
-        RecordingError::NotOurs { path: self.path.clone(), reason }
-    }
+    Ok(())
 }

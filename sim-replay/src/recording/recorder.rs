@@ -38,11 +38,11 @@ pub struct RecordReport {
     pub file: PathBuf,
     /// Messages of the run that are in it.
     pub messages: u64,
-    /// Its size up to the last whole chunk, before the index.
+    /// Its size.
     pub bytes: u64,
     /// Messages that came faster than they could be written.
     pub overwritten: u64,
-    /// Messages that came after writing had failed.
+    /// Messages that came after writing had failed, or were in the chunk with which it did.
     pub not_written: u64,
     /// Why writing failed.
     pub failure: Option<String>,
@@ -90,6 +90,7 @@ pub fn record(bus: &Bus, options: &RecorderOptions, stop: &Stop) -> Result<Recor
         without: &options.without,
         run: &bus.identity().run,
         over: None,
+        taken: 0,
         report: RecordReport {
             file: options.out.clone(),
             messages: 0,
@@ -112,6 +113,8 @@ struct Recorder<'a> {
     run: &'a RunId,
     /// When the replay said that it was over.
     over: Option<Instant>,
+    /// Messages that were to be written.
+    taken: u64,
     report: RecordReport,
 }
 
@@ -149,18 +152,14 @@ impl Recorder<'_> {
         if run != self.run || stream.is_some_and(|stream| self.without.contains(stream)) {
             return;
         }
-        if self.writer.is_none() {
-            self.report.not_written += 1;
-            return;
-        }
-        self.report.messages += 1;
+        self.taken += 1;
         self.attempt(|writer| writer.write(&overheard.key, overheard.arrived_nanos, &overheard.bytes()));
     }
 
     fn attempt(&mut self, write: impl FnOnce(&mut RecordingWriter<std::fs::File>) -> Result<(), RecordingError>) {
         let Some(writer) = &mut self.writer else { return };
         let written = write(writer);
-        self.report.bytes = writer.whole_bytes();
+        self.report.messages = writer.whole_messages();
         if let Err(error) = written {
             tracing::error!("the recording ends here, the run goes on: {error}");
             self.report.failure = Some(error.to_string());
@@ -169,12 +168,12 @@ impl Recorder<'_> {
     }
 
     fn finish(mut self, overwritten: u64) -> RecordReport {
+        let has_file = self.writer.is_some() || self.report.messages > 0;
+        self.attempt(RecordingWriter::finish);
         self.report.overwritten = overwritten;
-        if let Some(writer) = self.writer.take()
-            && let Err(error) = writer.finish()
-        {
-            tracing::error!("the recording has no index: {error}");
-            self.report.failure = Some(error.to_string());
+        self.report.not_written = self.taken - self.report.messages;
+        if has_file && let Ok(file) = std::fs::metadata(&self.report.file) {
+            self.report.bytes = file.len();
         }
         if self.report.overwritten > 0 {
             tracing::error!(messages = self.report.overwritten, "the disk was too slow for the run");

@@ -23,13 +23,18 @@ pub fn recover(from: &Path, to: &Path, options: RecordingOptions) -> Result<Reco
     let recording = Recording::open(from)?;
     let mut writer = RecordingWriter::create(to, options)?;
     let mut messages = 0;
-    recording.for_each(|topic, encoding, arrived_nanos, data| {
-        // The channels for ROS 2 follow from ours.
-        let is_ours = encoding == OWN_ENCODING || encoding == "json";
-        let Some(key) = topic.parse().ok().filter(|_| is_ours) else { return Ok(()) };
-        messages += 1;
-        writer.write(&key, arrived_nanos, data)
-    })?;
+    for chunk in recording.chunks() {
+        for message in chunk?.iter() {
+            let (topic, encoding) = (&message.channel.topic, message.channel.message_encoding.as_str());
+            // The channels for ROS 2 follow from ours.
+            if matches!(encoding, OWN_ENCODING | "json")
+                && let Ok(key) = topic.parse()
+            {
+                messages += 1;
+                writer.write(&key, message.log_time, &message.data)?;
+            }
+        }
+    }
     writer.finish()?;
     Ok(RecoverReport { messages, damage: recording.damage().cloned() })
 }

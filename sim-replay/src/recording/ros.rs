@@ -3,8 +3,8 @@
 //! Frames: `map` is the world, `<cav>/lidar` a LiDAR at the pose that its vehicle believes in, `<cav>/truth` at the true one.
 
 use protocol::{Box3d, CavId, Detection, Message, PointCloud, Pose, Stream, Topic};
+use re_cdr::{CdrWriter, LittleEndian};
 
-use super::CdrWriter;
 use super::ros_schema::RosType;
 
 /// The world's frame.
@@ -22,14 +22,19 @@ const DELETE_ALL: i32 = 3;
 const DETECTION_RGB: [f32; 3] = [1.0, 0.37, 0.30];
 const TRUTH_RGB: [f32; 3] = [0.25, 0.81, 0.47];
 
+/// How ROS 2 writes its messages: classic CDR.
+type Cdr<'a> = CdrWriter<'a, LittleEndian>;
+/// What stands before it: plain, little-endian, no options.
+const CDR_HEADER: [u8; 4] = [0, 1, 0, 0];
+
 /// A message for ROS 2 tools.
 #[derive(Debug, Clone)]
-pub struct RosMessage {
+pub(super) struct RosMessage {
     /// Topic, for example `/4279/points`.
-    pub topic: String,
+    pub(super) topic: String,
     pub(super) ros_type: RosType,
     /// The message in CDR.
-    pub cdr: Vec<u8>,
+    pub(super) cdr: Vec<u8>,
 }
 
 /// Whether ROS 2 has a word for what is published on `topic`.
@@ -83,70 +88,77 @@ pub(super) fn translate(topic: &Topic, capture_nanos: u64, message: &Message) ->
     }
 }
 
+fn in_cdr(topic: String, ros_type: RosType, write: impl FnOnce(&mut Cdr<'_>)) -> RosMessage {
+    let mut cdr = CDR_HEADER.to_vec();
+    write(&mut CdrWriter::new(&mut cdr));
+    RosMessage { topic, ros_type, cdr }
+}
+
 fn frame(cav: &CavId) -> String {
     format!("{cav}/lidar")
 }
 
-fn header(cdr: &mut CdrWriter, nanos: u64, frame_id: &str) {
+fn header(cdr: &mut Cdr<'_>, nanos: u64, frame_id: &str) {
     time(cdr, nanos);
-    cdr.string(frame_id);
+    cdr.write_string(frame_id);
 }
 
-fn time(cdr: &mut CdrWriter, nanos: u64) {
+fn time(cdr: &mut Cdr<'_>, nanos: u64) {
     // Seconds beyond 2038 do not fit into the message.
-    cdr.i32(i32::try_from(nanos / 1_000_000_000).unwrap_or(i32::MAX));
-    cdr.u32((nanos % 1_000_000_000) as u32);
+    cdr.write_i32(i32::try_from(nanos / 1_000_000_000).unwrap_or(i32::MAX));
+    cdr.write_u32((nanos % 1_000_000_000) as u32);
 }
 
-fn xyz(cdr: &mut CdrWriter, values: [f64; 3]) {
-    values.into_iter().for_each(|value| cdr.f64(value));
+fn xyz(cdr: &mut Cdr<'_>, values: [f64; 3]) {
+    values.into_iter().for_each(|value| cdr.write_f64(value));
 }
 
-fn pose(cdr: &mut CdrWriter, pose: &Pose) {
+fn pose(cdr: &mut Cdr<'_>, pose: &Pose) {
     let [w, x, y, z] = pose.rotation_wxyz;
     xyz(cdr, pose.translation_m);
-    [x, y, z, w].into_iter().for_each(|value| cdr.f64(value));
+    [x, y, z, w].into_iter().for_each(|value| cdr.write_f64(value));
 }
 
 fn point_cloud(topic: String, frame_id: &str, nanos: u64, cloud: &PointCloud) -> RosMessage {
     let count = u32::try_from(cloud.len()).unwrap_or(u32::MAX);
-    let mut cdr = CdrWriter::with_capacity(cloud.len() * POINT_STEP as usize + 256);
-    header(&mut cdr, nanos, frame_id);
-    cdr.u32(1);
-    cdr.u32(count);
-    let fields = ["x", "y", "z", "intensity"];
-    cdr.len(fields.len());
-    for (offset, name) in (0..).step_by(4).zip(fields) {
-        cdr.string(name);
-        cdr.u32(offset);
-        cdr.u8(FLOAT32);
-        cdr.u32(1);
-    }
-    cdr.bool(false);
-    cdr.u32(POINT_STEP);
-    cdr.u32(count.saturating_mul(POINT_STEP));
-    // All machines this builds for are little-endian, as the header says.
-    cdr.bytes(bytemuck::cast_slice(&cloud.xyzi));
-    cdr.bool(true);
-    RosMessage { topic, ros_type: RosType::PointCloud2, cdr: cdr.finish() }
+    in_cdr(topic, RosType::PointCloud2, |cdr| {
+        cdr.buffer_mut().reserve(cloud.len() * POINT_STEP as usize + 256);
+        header(cdr, nanos, frame_id);
+        cdr.write_u32(1);
+        cdr.write_u32(count);
+        let fields = ["x", "y", "z", "intensity"];
+        cdr.write_sequence_length(fields.len());
+        for (offset, name) in (0..).step_by(4).zip(fields) {
+            cdr.write_string(name);
+            cdr.write_u32(offset);
+            cdr.write_u8(FLOAT32);
+            cdr.write_u32(1);
+        }
+        cdr.write_bool(false);
+        cdr.write_u32(POINT_STEP);
+        cdr.write_u32(count.saturating_mul(POINT_STEP));
+        // All machines this builds for are little-endian, as the header says.
+        cdr.write_bytes(bytemuck::cast_slice(&cloud.xyzi));
+        cdr.write_bool(true);
+    })
 }
 
 fn pose_stamped(topic: String, nanos: u64, world_from_cav: &Pose) -> RosMessage {
-    let mut cdr = CdrWriter::default();
-    header(&mut cdr, nanos, MAP);
-    pose(&mut cdr, world_from_cav);
-    RosMessage { topic, ros_type: RosType::PoseStamped, cdr: cdr.finish() }
+    in_cdr(topic, RosType::PoseStamped, |cdr| {
+        header(cdr, nanos, MAP);
+        pose(cdr, world_from_cav);
+    })
 }
 
 fn transforms(nanos: u64, children: &[(String, Pose)]) -> RosMessage {
-    let mut cdr = CdrWriter::default();
-    cdr.len(children.len());
-    for (child, world_from_child) in children {
-        header(&mut cdr, nanos, MAP);
-        cdr.string(child);
-        pose(&mut cdr, world_from_child);
-    }
-    RosMessage { topic: "/tf".into(), ros_type: RosType::TfMessage, cdr: cdr.finish() }
+    in_cdr("/tf".into(), RosType::TfMessage, |cdr| {
+        cdr.write_sequence_length(children.len());
+        for (child, world_from_child) in children {
+            header(cdr, nanos, MAP);
+            cdr.write_string(child);
+            pose(cdr, world_from_child);
+        }
+    })
 }
 
 /// A box and how to show it.
@@ -161,19 +173,19 @@ struct Marked {
 
 /// All boxes of a moment: first a marker that takes away those of the moment before.
 fn markers(topic: String, frame_id: &str, ns: &str, rgb: [f32; 3], nanos: u64, boxes: &[Marked]) -> RosMessage {
-    let mut cdr = CdrWriter::with_capacity(256 * (boxes.len() + 1));
-    cdr.len(boxes.len() + 1);
     let nothing = Box3d { center_m: [0.0; 3], size_m: [0.0; 3], heading_rad: 0.0 };
     let sweep = Marked { id: Some(0), box3d: nothing, alpha: 0.0, text: String::new() };
-    marker(&mut cdr, (frame_id, ns, nanos), (0, DELETE_ALL), rgb, &sweep);
-    for (place, marked) in (0..).zip(boxes) {
-        marker(&mut cdr, (frame_id, ns, nanos), (marked.id.unwrap_or(place), ADD), rgb, marked);
-    }
-    RosMessage { topic, ros_type: RosType::MarkerArray, cdr: cdr.finish() }
+    in_cdr(topic, RosType::MarkerArray, |cdr| {
+        cdr.write_sequence_length(boxes.len() + 1);
+        marker(cdr, (frame_id, ns, nanos), (0, DELETE_ALL), rgb, &sweep);
+        for (place, marked) in (0..).zip(boxes) {
+            marker(cdr, (frame_id, ns, nanos), (marked.id.unwrap_or(place), ADD), rgb, marked);
+        }
+    })
 }
 
 fn marker(
-    cdr: &mut CdrWriter,
+    cdr: &mut Cdr<'_>,
     (frame_id, ns, nanos): (&str, &str, u64),
     (id, action): (i32, i32),
     rgb: [f32; 3],
@@ -181,27 +193,44 @@ fn marker(
 ) {
     let Marked { id: _, box3d, alpha, text } = marked;
     header(cdr, nanos, frame_id);
-    cdr.string(ns);
-    cdr.i32(id);
-    cdr.i32(CUBE);
-    cdr.i32(action);
+    cdr.write_string(ns);
+    cdr.write_i32(id);
+    cdr.write_i32(CUBE);
+    cdr.write_i32(action);
     pose(cdr, &Pose::from_xyz_yaw(box3d.center_m, box3d.heading_rad));
     xyz(cdr, box3d.size_m);
-    rgb.into_iter().chain([*alpha]).for_each(|value| cdr.f32(value));
+    rgb.into_iter().chain([*alpha]).for_each(|value| cdr.write_f32(value));
     // Lifetime: until it is taken away.
-    cdr.i32(0);
-    cdr.u32(0);
-    cdr.bool(false);
-    cdr.len(0); // points
-    cdr.len(0); // colours
-    cdr.string(""); // texture
+    cdr.write_i32(0);
+    cdr.write_u32(0);
+    cdr.write_bool(false);
+    cdr.write_sequence_length(0); // points
+    cdr.write_sequence_length(0); // colours
+    cdr.write_string(""); // texture
     header(cdr, 0, "");
-    cdr.string("");
-    cdr.len(0);
-    cdr.len(0); // coordinates in it
-    cdr.string(text);
-    cdr.string(""); // mesh
-    cdr.string("");
-    cdr.len(0);
-    cdr.bool(false);
+    cdr.write_string("");
+    cdr.write_sequence_length(0);
+    cdr.write_sequence_length(0); // coordinates in it
+    cdr.write_string(text);
+    cdr.write_string(""); // mesh
+    cdr.write_string("");
+    cdr.write_sequence_length(0);
+    cdr.write_bool(false);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_transform_is_laid_out_as_ros_lays_it_out() {
+        let RosMessage { cdr, .. } =
+            transforms(1_000_000_002, &[("ab".into(), Pose::from_xyz_yaw([1.0, 2.0, 3.0], 0.0))]);
+        let mut expected = vec![0, 1, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 2, 0, 0, 0];
+        expected.extend(b"\x04\0\0\0map\0\x03\0\0\0ab\0");
+        // Numbers stand on multiples of their size, counted from behind the header.
+        expected.extend([0; 5]);
+        expected.extend([1.0, 2.0, 3.0, 0.0, 0.0, 0.0, 1.0].map(f64::to_le_bytes).as_flattened());
+        assert_eq!(cdr, expected);
+    }
 }

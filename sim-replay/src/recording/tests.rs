@@ -122,11 +122,12 @@ fn recorded(ticks: u64, points: usize, options: RecordingOptions) -> Vec<u8> {
 /// Every message of every channel: topic, encoding, data.
 fn messages_of(recording: &Recording) -> Vec<(String, String, Vec<u8>)> {
     let mut messages = Vec::new();
-    let walked = recording.for_each(|topic, encoding, _, data| {
-        messages.push((topic.to_owned(), encoding.to_owned(), data.to_vec()));
-        Ok(())
-    });
-    walked.unwrap();
+    for chunk in recording.chunks() {
+        for message in chunk.unwrap().iter() {
+            let channel = &message.channel;
+            messages.push((channel.topic.clone(), channel.message_encoding.clone(), message.data.to_vec()));
+        }
+    }
     messages
 }
 
@@ -231,8 +232,10 @@ fn a_full_disk_leaves_what_is_whole() {
     assert!(said[0].contains("full.mcap") && said[0].contains("storage"), "{said:?}");
     assert!(failures[1..].iter().all(|error| matches!(error, RecordingError::Ended { .. })), "{said:?}");
     assert!(writer.finish().is_err());
+    assert_eq!(writer.whole_messages(), 2 * 5, "two ticks were whole");
+    drop(writer);
     let recording = Recording::open(&write(folder.path(), &disk.bytes())).unwrap();
-    assert_eq!(recording.entries().len(), 2 * 5, "two ticks were whole");
+    assert_eq!(recording.entries().len(), 2 * 5);
     assert_eq!(recording.damage().map(|damage| damage.lost_bytes), Some(0), "only the index is missing");
 }
 
@@ -246,9 +249,9 @@ fn what_is_no_recording_is_refused_with_a_reason() {
         assert!(matches!(error, RecordingError::NotOurs { .. }), "{error}");
     }
     // A file of someone else: whole, but without a channel of ours.
-    let empty = RecordingWriter::over(Disk::new(usize::MAX), Path::new("t"), RecordingOptions::default()).unwrap();
-    let foreign = empty.finish().unwrap().bytes();
-    let error = Recording::open(&write(folder.path(), &foreign)).unwrap_err();
+    let disk = Disk::new(usize::MAX);
+    RecordingWriter::over(disk.clone(), Path::new("t"), RecordingOptions::default()).unwrap().finish().unwrap();
+    let error = Recording::open(&write(folder.path(), &disk.bytes())).unwrap_err();
     assert!(error.to_string().contains("no channel of encoding"), "{error}");
 }
 

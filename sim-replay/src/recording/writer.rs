@@ -1,16 +1,17 @@
 //! Writing a recording: messages in, whole chunks out.
 
+use std::collections::BTreeMap;
 use std::fs::File;
 use std::path::{Path, PathBuf};
 
+use mcap::records::MessageHeader;
+use mcap::write::NoSeek;
+use mcap::{Compression, McapError, McapResult, WriteOptions};
 use protocol::{Key, Limits, wire};
 
-use super::chunk::OpenChunk;
-use super::mcap::{Channel, Fields, MAGIC, MessageHead, op};
 use super::ros::{self, RosMessage};
 use super::ros_schema::RosType;
-use super::sink::Store;
-use super::summary::Summary;
+use super::sink::{Store, WholeChunks};
 use super::{OWN_ENCODING, RecordingError};
 
 /// A chunk is closed when it holds this much: what a crash costs, beside the last second.
@@ -20,7 +21,7 @@ const CHUNK_BYTES: usize = 4 << 20;
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct RecordingOptions {
     /// zstd level, 1 to 22; `None`: chunks are not packed. Clouds and maps hardly shrink, and packing costs a core.
-    pub zstd_level: Option<i32>,
+    pub zstd_level: Option<u32>,
     /// Whether to write the channels for ROS 2 tools too.
     pub with_ros: bool,
 }
@@ -38,11 +39,12 @@ impl Default for RecordingOptions {
 pub struct RecordingWriter<S: Store> {
     path: PathBuf,
     options: RecordingOptions,
-    store: S,
-    chunk: OpenChunk,
-    summary: Summary,
-    /// Bytes up to the end of the last whole chunk.
-    whole: u64,
+    mcap: mcap::Writer<NoSeek<WholeChunks<S>>>,
+    /// By topic.
+    channels: BTreeMap<String, u16>,
+    /// Messages and bytes of the chunk that is open.
+    open: (u64, usize),
+    whole_messages: u64,
     /// Why nothing more is written.
     ended: Option<String>,
 }
@@ -64,19 +66,27 @@ impl<S: Store> RecordingWriter<S> {
     /// # Errors
     /// [`RecordingError::Io`] when not even the header can be written.
     pub fn over(store: S, path: &Path, options: RecordingOptions) -> Result<Self, RecordingError> {
+        let format = WriteOptions::new()
+            .profile("ros2")
+            .library(concat!("v2vloc ", env!("CARGO_PKG_VERSION")))
+            .compression(options.zstd_level.map(|_| Compression::Zstd))
+            .compression_level(options.zstd_level.unwrap_or_default())
+            .compression_threads(0)
+            .chunk_size(None)
+            .disable_seeking(true)
+            // Each chunk has its own checksum.
+            .calculate_data_section_crc(false);
+        let begun = format.create(NoSeek::new(WholeChunks::new(store)));
         let mut writer = Self {
             path: path.into(),
             options,
-            store,
-            chunk: OpenChunk::default(),
-            summary: Summary::default(),
-            whole: 0,
+            mcap: begun.map_err(|error| failure(path, error))?,
+            channels: BTreeMap::new(),
+            open: (0, 0),
+            whole_messages: 0,
             ended: None,
         };
-        let mut head = MAGIC.to_vec();
-        let library = concat!("v2vloc ", env!("CARGO_PKG_VERSION"));
-        Fields::default().prefixed(b"ros2").prefixed(library.as_bytes()).append(op::HEADER, &mut head);
-        writer.put(&head)?;
+        writer.flush()?;
         Ok(writer)
     }
 
@@ -87,23 +97,30 @@ impl<S: Store> RecordingWriter<S> {
     /// [`RecordingError`] when the message, and with it the chunk that it would have gone into, is not written.
     pub fn write(&mut self, key: &Key, arrived_nanos: u64, payload: &[u8]) -> Result<(), RecordingError> {
         self.check_open()?;
+        let added = self.add(key, arrived_nanos, payload);
+        self.checked(added)?;
+        if self.open.1 > CHUNK_BYTES { self.flush() } else { Ok(()) }
+    }
+
+    fn add(&mut self, key: &Key, arrived_nanos: u64, payload: &[u8]) -> McapResult<()> {
         let header = wire::decode_header([payload]).ok();
         let encoding = if header.is_some() { OWN_ENCODING } else { "json" };
-        let channel_id = self.channel(&key.to_string(), encoding, None);
-        let head = MessageHead {
-            channel_id,
+        let head = MessageHeader {
+            channel_id: self.channel(&key.to_string(), encoding, None)?,
             sequence: header.as_ref().map_or(0, |header| header.stamp.sequence as u32),
             log_time: arrived_nanos,
             publish_time: header.as_ref().map_or(arrived_nanos, |header| header.stamp.publish_nanos),
         };
-        self.chunk.push(&head, payload);
+        self.mcap.write_to_known_channel(&head, payload)?;
+        self.open = (self.open.0 + 1, self.open.1 + payload.len());
         if self.options.with_ros {
             for RosMessage { topic, ros_type, cdr } in translated(key, payload) {
-                let channel_id = self.channel(&topic, "cdr", Some(ros_type));
-                self.chunk.push(&MessageHead { channel_id, ..head }, &cdr);
+                let channel_id = self.channel(&topic, "cdr", Some(ros_type))?;
+                self.mcap.write_to_known_channel(&MessageHeader { channel_id, ..head }, &cdr)?;
+                self.open.1 += cdr.len();
             }
         }
-        if self.chunk.len() > CHUNK_BYTES { self.flush() } else { Ok(()) }
+        Ok(())
     }
 
     /// Ends the chunk that is open: everything written so far will be there whatever becomes of this process.
@@ -112,60 +129,42 @@ impl<S: Store> RecordingWriter<S> {
     /// As [`Self::write`].
     pub fn flush(&mut self) -> Result<(), RecordingError> {
         self.check_open()?;
-        if self.chunk.is_empty() {
-            return Ok(());
-        }
-        let chunk = std::mem::take(&mut self.chunk).close(self.options.zstd_level);
-        let chunk = chunk.map_err(|source| RecordingError::io(&self.path, source))?;
-        let offset = self.whole;
-        self.put(&chunk.bytes)?;
-        self.summary.add(&chunk, offset);
+        let flushed = self.mcap.flush();
+        self.checked(flushed)?;
+        self.whole_messages += std::mem::take(&mut self.open).0;
         Ok(())
     }
 
-    /// Bytes up to the end of the last whole chunk.
+    /// Messages in whole chunks: those that can be read back. What is told to ROS 2 tools is not counted again.
     #[must_use]
-    pub fn whole_bytes(&self) -> u64 {
-        self.whole
+    pub fn whole_messages(&self) -> u64 {
+        self.whole_messages
     }
 
     /// Writes the index and ends the recording.
     ///
     /// # Errors
     /// As [`Self::write`].
-    pub fn finish(mut self) -> Result<S, RecordingError> {
+    pub fn finish(&mut self) -> Result<(), RecordingError> {
         self.flush()?;
-        let end = self.summary.bytes(self.whole);
-        self.put(&end)?;
-        Ok(self.store)
+        let finished = self.mcap.finish();
+        self.checked(finished)?;
+        self.ended = Some("it is complete".into());
+        Ok(())
     }
 
     /// The channel of a topic, declared when it is first needed.
-    fn channel(&mut self, topic: &str, encoding: &str, ros: Option<RosType>) -> u16 {
-        if let Some(id) = self.summary.channel(topic) {
-            return id;
+    fn channel(&mut self, topic: &str, encoding: &str, ros: Option<RosType>) -> McapResult<u16> {
+        if let Some(id) = self.channels.get(topic) {
+            return Ok(*id);
         }
-        let schema_id = ros.map_or(0, |ros| self.schema(ros));
-        let id = self.summary.next_channel();
-        let channel = Channel { id, schema_id, topic: topic.to_owned(), encoding: encoding.to_owned() };
-        self.chunk.declare(op::CHANNEL, &channel.fields());
-        self.summary.declare(channel);
-        id
-    }
-
-    fn schema(&mut self, ros: RosType) -> u16 {
-        if let Some((id, _)) = self.summary.schemas.get(&ros) {
-            return *id;
-        }
-        let id = self.summary.schemas.len() as u16 + 1;
-        let definition = ros.definition();
-        let fields = || {
-            let named = Fields::default().u16(id).prefixed(ros.name().as_bytes()).prefixed(b"ros2msg");
-            named.prefixed(definition.as_bytes())
+        let schema_id = match ros {
+            Some(ros) => self.mcap.add_schema(ros.name(), "ros2msg", ros.definition().as_bytes())?,
+            None => 0,
         };
-        self.chunk.declare(op::SCHEMA, &fields());
-        self.summary.schemas.insert(ros, (id, fields()));
-        id
+        let id = self.mcap.add_channel(schema_id, topic, encoding, &BTreeMap::new())?;
+        self.channels.insert(topic.to_owned(), id);
+        Ok(id)
     }
 
     fn check_open(&self) -> Result<(), RecordingError> {
@@ -175,23 +174,21 @@ impl<S: Store> RecordingWriter<S> {
         }
     }
 
-    /// Hands whole records to the store; what it takes only a part of is taken away again.
-    fn put(&mut self, bytes: &[u8]) -> Result<(), RecordingError> {
-        match self.store.write_all(bytes).and_then(|()| self.store.flush()) {
-            Ok(()) => {
-                self.whole += bytes.len() as u64;
-                Ok(())
-            }
-            Err(source) => {
-                let error = RecordingError::io(&self.path, source);
-                self.ended = Some(error.to_string());
-                if let Err(error) = self.store.cut(self.whole) {
-                    tracing::error!("{}: what was begun cannot be taken away: {error}", self.path.display());
-                }
-                Err(error)
-            }
-        }
+    fn checked<T>(&mut self, written: McapResult<T>) -> Result<T, RecordingError> {
+        written.map_err(|error| {
+            let error = failure(&self.path, error);
+            self.ended = Some(error.to_string());
+            error
+        })
     }
+}
+
+fn failure(path: &Path, error: McapError) -> RecordingError {
+    let source = match error {
+        McapError::Io(source) => source,
+        other => std::io::Error::other(other),
+    };
+    RecordingError::io(path, source)
 }
 
 fn translated(key: &Key, payload: &[u8]) -> Vec<RosMessage> {
