@@ -1,25 +1,48 @@
-//! A small web server for what a process has to show: pages, numbers, streams. GET only, plain HTTP/1.1, a thread for each of
-//! a few connections.
+//! A small web server for what a process has to show: pages, numbers, streams. GET only, HTTP/1.1.
 //!
-//! It stands beside work that must not wait for it, and faces browsers that never read: nothing is kept for a reader, every
-//! wait has a limit, and who exceeds it is dropped and counted. The frameworks for this bring an executor and some thirty
-//! crates; what is needed here is less than their glue.
+//! It stands beside work that must not wait for it, and faces browsers that never read: it has a thread of its own, nothing
+//! is kept for a reader, every wait has a limit, and who exceeds it is dropped and counted.
 
-use std::io::{self, BufRead, BufReader, Read, Write};
-use std::net::{SocketAddr, TcpListener, TcpStream};
+use std::convert::Infallible;
+use std::error::Error;
+use std::io::{self, Read, Write};
+use std::net::SocketAddr;
 use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering};
-use std::thread;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Duration;
+
+use bytes::Bytes;
+use futures_util::StreamExt;
+use futures_util::stream::BoxStream;
+use http_body_util::combinators::UnsyncBoxBody;
+use http_body_util::{BodyExt, Full, StreamBody};
+use hyper::body::{Frame, Incoming};
+use hyper::header::{CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, HeaderValue, X_CONTENT_TYPE_OPTIONS};
+use hyper::server::conn::http1;
+use hyper::service::service_fn;
+use hyper::{Method, Response, StatusCode};
+use hyper_util::rt::{TokioIo, TokioTimer};
+use tokio::net::{TcpListener, TcpStream};
+use tokio::runtime::{self, Runtime};
+use tokio::sync::Semaphore;
+use tokio_io_timeout::TimeoutStream;
 
 /// Connections at once; more are refused.
 const MAX_CONNECTIONS: usize = 24;
-/// Bytes of a request's head.
-const MAX_HEAD: u64 = 8 << 10;
+/// Documents that are put together at once.
+const MAX_HANDLERS: usize = 4;
+/// Bytes of a request's head, and of an answer that wait for its reader beside the system's own.
+const MAX_WAITING: usize = 16 << 10;
 /// How long a request may take to come.
 const READ_LIMIT: Duration = Duration::from_secs(5);
 /// How long a reader may take no byte.
 const WRITE_LIMIT: Duration = Duration::from_secs(2);
+/// How long to wait when the system has no room for another connection.
+const PAUSE: Duration = Duration::from_millis(100);
+
+/// A page may load nothing but what this server gives it.
+const POLICY: &str = "default-src 'self'; img-src 'self' data:; style-src 'self' 'unsafe-inline'";
+const TEXT: &str = "text/plain; charset=utf-8";
 
 /// What was asked for.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -30,9 +53,6 @@ pub struct Request {
     pub query: String,
 }
 
-/// Writes a stream to its reader until it has no more, or the reader is gone.
-pub type Streaming = Box<dyn FnOnce(&mut dyn Write) -> io::Result<()> + Send>;
-
 /// What is answered.
 pub enum Answer {
     /// A whole document.
@@ -40,25 +60,26 @@ pub enum Answer {
         /// For example `text/html; charset=utf-8`.
         content_type: &'static str,
         /// Its bytes.
-        body: Vec<u8>,
+        body: Bytes,
     },
-    /// Bytes as they come, until the connection closes.
+    /// Bytes as they come, asked for when the reader has taken those before.
     Stream {
         /// For example `application/octet-stream`.
         content_type: &'static str,
-        /// What writes them.
-        write: Streaming,
+        /// Where they come from.
+        pieces: BoxStream<'static, Bytes>,
     },
     /// There is no such thing, in words.
     NotFound(String),
 }
 
 type Handler = dyn Fn(&Request) -> Answer + Send + Sync;
+type Body = UnsyncBoxBody<Bytes, Infallible>;
 
 /// Readers of a server, for those who count.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub struct Readers {
-    open: AtomicUsize,
+    places: Arc<Semaphore>,
     dropped: AtomicU64,
 }
 
@@ -66,7 +87,7 @@ impl Readers {
     /// Connections right now.
     #[must_use]
     pub fn open(&self) -> usize {
-        self.open.load(Ordering::Relaxed)
+        MAX_CONNECTIONS - self.places.available_permits()
     }
 
     /// Readers that did not read, and connections beyond those there may be.
@@ -76,38 +97,32 @@ impl Readers {
     }
 }
 
-/// A server at work; ends when dropped.
+/// A server at work; ends when dropped, and all its connections with it.
 pub struct WebServer {
     address: SocketAddr,
     readers: Arc<Readers>,
-    ending: Arc<AtomicBool>,
+    runtime: Option<Runtime>,
 }
 
 impl WebServer {
-    /// Serves what `handler` answers at `address`; port 0 takes any free one.
+    /// Serves what `handler` answers at `address`; port 0 takes any free one. The handler may take its time: it has threads
+    /// of its own.
     ///
     /// # Errors
-    /// When the address cannot be listened at.
+    /// When the address cannot be listened at, or the system gives no thread.
     pub fn start(
         address: SocketAddr,
         handler: impl Fn(&Request) -> Answer + Send + Sync + 'static,
     ) -> io::Result<Self> {
-        let listener = TcpListener::bind(address)?;
+        let mut builder = runtime::Builder::new_multi_thread();
+        let runtime =
+            builder.worker_threads(1).max_blocking_threads(MAX_HANDLERS).thread_name("web").enable_all().build()?;
+        let listener = runtime.block_on(TcpListener::bind(address))?;
         let address = listener.local_addr()?;
-        let (readers, ending) = (Arc::<Readers>::default(), Arc::<AtomicBool>::default());
-        let server = Self { address, readers: Arc::clone(&readers), ending: Arc::clone(&ending) };
-        let handler: Arc<Handler> = Arc::new(handler);
-        thread::Builder::new().name("web".into()).spawn(move || {
-            for connection in listener.incoming() {
-                if ending.load(Ordering::Relaxed) {
-                    return;
-                }
-                if let Ok(connection) = connection {
-                    admit(connection, &handler, &readers);
-                }
-            }
-        })?;
-        Ok(server)
+        let readers =
+            Arc::new(Readers { places: Arc::new(Semaphore::new(MAX_CONNECTIONS)), dropped: AtomicU64::new(0) });
+        runtime.spawn(accept(listener, Arc::new(handler), Arc::clone(&readers)));
+        Ok(Self { address, readers, runtime: Some(runtime) })
     }
 
     /// Where it listens.
@@ -125,87 +140,91 @@ impl WebServer {
 
 impl Drop for WebServer {
     fn drop(&mut self) {
-        self.ending.store(true, Ordering::Relaxed);
-        // Wakes the thread that waits for connections; if it cannot be reached, the end of the process ends it.
-        let _ = TcpStream::connect_timeout(&self.address, Duration::from_millis(100));
-    }
-}
-
-/// Gives a connection a thread, where there are not too many.
-fn admit(connection: TcpStream, handler: &Arc<Handler>, readers: &Arc<Readers>) {
-    let (handler, counted) = (Arc::clone(handler), Arc::clone(readers));
-    if counted.open.fetch_add(1, Ordering::Relaxed) >= MAX_CONNECTIONS {
-        counted.open.fetch_sub(1, Ordering::Relaxed);
-        counted.dropped.fetch_add(1, Ordering::Relaxed);
-        return;
-    }
-    let serving = thread::Builder::new().name("reader".into()).spawn(move || {
-        if let Err(error) = serve(&connection, &*handler)
-            && matches!(error.kind(), io::ErrorKind::WouldBlock | io::ErrorKind::TimedOut)
-        {
-            counted.dropped.fetch_add(1, Ordering::Relaxed);
-            tracing::warn!("a reader that does not read is dropped");
-        }
-        counted.open.fetch_sub(1, Ordering::Relaxed);
-    });
-    if serving.is_err() {
-        readers.open.fetch_sub(1, Ordering::Relaxed);
-    }
-}
-
-fn serve(connection: &TcpStream, handler: &Handler) -> io::Result<()> {
-    connection.set_read_timeout(Some(READ_LIMIT))?;
-    connection.set_write_timeout(Some(WRITE_LIMIT))?;
-    connection.set_nodelay(true)?;
-    let mut out = connection;
-    // A connection without a request is no reader: browsers open some to be quick later.
-    let Ok(head) = read_head(connection) else { return Ok(()) };
-    let Some(request) = parse(&head) else {
-        return respond(&mut out, "405 Method Not Allowed", "text/plain", b"GET only");
-    };
-    match handler(&request) {
-        Answer::Page { content_type, body } => respond(&mut out, "200 OK", content_type, &body),
-        Answer::NotFound(words) => respond(&mut out, "404 Not Found", "text/plain; charset=utf-8", words.as_bytes()),
-        Answer::Stream { content_type, write } => {
-            out.write_all(head_of("200 OK", content_type, None).as_bytes())?;
-            write(&mut out)
+        if let Some(runtime) = self.runtime.take() {
+            // Waits for nobody: neither for readers nor for a handler at work.
+            runtime.shutdown_background();
         }
     }
 }
 
-/// The first line of a request; the other lines are read and forgotten.
-fn read_head(connection: &TcpStream) -> io::Result<String> {
-    let mut lines = BufReader::new(connection.take(MAX_HEAD));
-    let mut first = String::new();
-    lines.read_line(&mut first)?;
-    let mut line = String::new();
-    while lines.read_line(&mut line)? > 0 && line.trim() != "" {
-        line.clear();
+/// Gives every connection a task, where there are not too many.
+async fn accept(listener: TcpListener, handler: Arc<Handler>, readers: Arc<Readers>) {
+    loop {
+        let Ok((connection, _)) = listener.accept().await else {
+            tokio::time::sleep(PAUSE).await;
+            continue;
+        };
+        let Ok(place) = Arc::clone(&readers.places).try_acquire_owned() else {
+            readers.dropped.fetch_add(1, Ordering::Relaxed);
+            continue;
+        };
+        let (handler, readers) = (Arc::clone(&handler), Arc::clone(&readers));
+        tokio::spawn(async move {
+            if let Err(error) = serve(connection, handler).await
+                && was_not_read(&error)
+            {
+                readers.dropped.fetch_add(1, Ordering::Relaxed);
+                tracing::warn!("a reader that does not read is dropped");
+            }
+            drop(place);
+        });
     }
-    if first.is_empty() { Err(io::ErrorKind::UnexpectedEof.into()) } else { Ok(first) }
 }
 
-fn parse(line: &str) -> Option<Request> {
-    let mut words = line.split_ascii_whitespace();
-    let (Some("GET"), Some(target)) = (words.next(), words.next()) else { return None };
-    let (path, query) = target.split_once('?').unwrap_or((target, ""));
-    path.starts_with('/').then(|| Request { path: path.into(), query: query.into() })
+async fn serve(connection: TcpStream, handler: Arc<Handler>) -> hyper::Result<()> {
+    // What is late for want of it is late, and no more.
+    let _ = connection.set_nodelay(true);
+    let mut connection = TimeoutStream::new(connection);
+    connection.set_write_timeout(Some(WRITE_LIMIT));
+    let service = service_fn(move |request| answer(Arc::clone(&handler), request));
+    http1::Builder::new()
+        .timer(TokioTimer::new())
+        .header_read_timeout(READ_LIMIT)
+        .max_buf_size(MAX_WAITING)
+        .keep_alive(false)
+        .serve_connection(TokioIo::new(Box::pin(connection)), service)
+        .await
 }
 
-fn respond(out: &mut dyn Write, status: &str, content_type: &str, body: &[u8]) -> io::Result<()> {
-    out.write_all(head_of(status, content_type, Some(body.len())).as_bytes())?;
-    out.write_all(body)?;
-    out.flush()
+/// A request that does not come ends a connection too, but is no reader: browsers open some to be quick later.
+fn was_not_read(error: &hyper::Error) -> bool {
+    let cause = error.source().and_then(|cause| cause.downcast_ref::<io::Error>());
+    cause.is_some_and(|cause| cause.kind() == io::ErrorKind::TimedOut)
 }
 
-/// Nothing is cached, and a page may load nothing but what this server gives it.
-fn head_of(status: &str, content_type: &str, len: Option<usize>) -> String {
-    let len = len.map_or(String::new(), |len| format!("Content-Length: {len}\r\n"));
-    format!(
-        "HTTP/1.1 {status}\r\nContent-Type: {content_type}\r\n{len}Cache-Control: no-store\r\nConnection: close\r\n\
-         X-Content-Type-Options: nosniff\r\n\
-         Content-Security-Policy: default-src 'self'; img-src 'self' data:; style-src 'self' 'unsafe-inline'\r\n\r\n"
-    )
+async fn answer(handler: Arc<Handler>, request: hyper::Request<Incoming>) -> Result<Response<Body>, Infallible> {
+    if request.method() != Method::GET {
+        return Ok(respond(StatusCode::METHOD_NOT_ALLOWED, TEXT, whole("GET only".into())));
+    }
+    let (path, query) = (request.uri().path().to_owned(), request.uri().query().unwrap_or_default().to_owned());
+    let answer = tokio::task::spawn_blocking(move || handler(&Request { path, query })).await;
+    Ok(match answer {
+        Ok(Answer::Page { content_type, body }) => respond(StatusCode::OK, content_type, whole(body)),
+        Ok(Answer::Stream { content_type, pieces }) => {
+            let body = StreamBody::new(pieces.map(|piece| Ok(Frame::data(piece))));
+            respond(StatusCode::OK, content_type, body.boxed_unsync())
+        }
+        Ok(Answer::NotFound(words)) => respond(StatusCode::NOT_FOUND, TEXT, whole(words.into())),
+        Err(panicked) => respond(StatusCode::INTERNAL_SERVER_ERROR, TEXT, whole(panicked.to_string().into())),
+    })
+}
+
+fn whole(bytes: Bytes) -> Body {
+    Full::new(bytes).boxed_unsync()
+}
+
+/// Nothing is cached.
+fn respond(status: StatusCode, content_type: &'static str, body: Body) -> Response<Body> {
+    let mut response = Response::new(body);
+    *response.status_mut() = status;
+    let headers = [
+        (CONTENT_TYPE, content_type),
+        (CACHE_CONTROL, "no-store"),
+        (X_CONTENT_TYPE_OPTIONS, "nosniff"),
+        (CONTENT_SECURITY_POLICY, POLICY),
+    ];
+    response.headers_mut().extend(headers.map(|(name, value)| (name, HeaderValue::from_static(value))));
+    response
 }
 
 /// Fetches a document, for tests and tools: status line and body.
@@ -213,9 +232,10 @@ fn head_of(status: &str, content_type: &str, len: Option<usize>) -> String {
 /// # Errors
 /// When the server cannot be reached or does not answer within 5 s.
 pub fn fetch(address: SocketAddr, path: &str) -> io::Result<(String, Vec<u8>)> {
-    let mut connection = TcpStream::connect(address)?;
+    let mut connection = std::net::TcpStream::connect(address)?;
     connection.set_read_timeout(Some(READ_LIMIT))?;
-    write!(connection, "GET {path} HTTP/1.1\r\nHost: {address}\r\n\r\n")?;
+    // Version 1.0 asks for a body in one piece that ends with the connection.
+    write!(connection, "GET {path} HTTP/1.0\r\n\r\n")?;
     let mut answer = Vec::new();
     connection.read_to_end(&mut answer)?;
     let end = answer.windows(4).position(|bytes| bytes == b"\r\n\r\n").ok_or(io::ErrorKind::InvalidData)?;
@@ -225,8 +245,11 @@ pub fn fetch(address: SocketAddr, path: &str) -> io::Result<(String, Vec<u8>)> {
 
 #[cfg(test)]
 mod tests {
-    use super::*;
+    use std::net::TcpStream;
+    use std::thread;
     use std::time::Instant;
+
+    use super::*;
 
     fn server(handler: impl Fn(&Request) -> Answer + Send + Sync + 'static) -> WebServer {
         WebServer::start("127.0.0.1:0".parse().unwrap(), handler).unwrap()
@@ -243,19 +266,19 @@ mod tests {
     #[test]
     fn a_document_is_what_the_handler_answers() {
         let server = server(|request| match request.path.as_str() {
-            "/a" => Answer::Page { content_type: "text/plain", body: request.query.clone().into_bytes() },
+            "/a" => Answer::Page { content_type: "text/plain", body: request.query.clone().into() },
             other => Answer::NotFound(format!("no {other}")),
         });
-        assert_eq!(fetch(server.address(), "/a?b=1").unwrap(), ("HTTP/1.1 200 OK".into(), b"b=1".to_vec()));
+        assert_eq!(fetch(server.address(), "/a?b=1").unwrap(), ("HTTP/1.0 200 OK".into(), b"b=1".to_vec()));
         let (status, body) = fetch(server.address(), "/../etc").unwrap();
-        assert_eq!((status.as_str(), body.as_slice()), ("HTTP/1.1 404 Not Found", b"no /../etc".as_slice()));
+        assert_eq!((status.as_str(), body.as_slice()), ("HTTP/1.0 404 Not Found", b"no /../etc".as_slice()));
     }
 
     #[test]
     fn anything_but_a_get_is_refused() {
         let server = server(|_| Answer::NotFound(String::new()));
         let mut connection = TcpStream::connect(server.address()).unwrap();
-        connection.write_all(b"POST / HTTP/1.1\r\n\r\n").unwrap();
+        connection.write_all(b"POST / HTTP/1.1\r\nHost: x\r\n\r\n").unwrap();
         let mut answer = String::new();
         connection.read_to_string(&mut answer).unwrap();
         assert!(answer.starts_with("HTTP/1.1 405"), "{answer}");
@@ -265,11 +288,7 @@ mod tests {
     fn a_reader_that_never_reads_is_dropped_and_counted() {
         let server = server(|_| Answer::Stream {
             content_type: "application/octet-stream",
-            write: Box::new(|out| {
-                loop {
-                    out.write_all(&[0; 1 << 16])?;
-                }
-            }),
+            pieces: futures_util::stream::repeat(Bytes::from_static(&[0; 1 << 16])).boxed(),
         });
         let mut connection = TcpStream::connect(server.address()).unwrap();
         connection.write_all(b"GET / HTTP/1.1\r\n\r\n").unwrap();
@@ -285,5 +304,28 @@ mod tests {
         drop(crowd);
         wait_for("the others have gone", || server.readers().open() == 0);
         assert!(fetch(server.address(), "/").is_ok());
+    }
+
+    #[test]
+    fn a_handler_that_panics_and_one_that_takes_its_time_harm_nobody() {
+        let server = server(|request| match request.path.as_str() {
+            "/panic" => panic!("as it is meant to"),
+            "/slow" => {
+                thread::sleep(Duration::from_secs(600));
+                Answer::NotFound(String::new())
+            }
+            _ => Answer::Page { content_type: TEXT, body: Bytes::new() },
+        });
+        let address = server.address();
+        assert!(fetch(address, "/panic").unwrap().0.contains("500"));
+        let mut waiting = TcpStream::connect(address).unwrap();
+        waiting.write_all(b"GET /slow HTTP/1.1\r\n\r\n").unwrap();
+        wait_for("it is let in", || server.readers().open() == 1);
+        assert!(fetch(address, "/").unwrap().0.contains("200"));
+        let began = Instant::now();
+        drop(server);
+        // With an answer that nobody will give, or with none.
+        let _ = waiting.read_to_end(&mut Vec::new());
+        assert!(began.elapsed() < Duration::from_secs(60), "the connection ends with the server");
     }
 }

@@ -11,6 +11,8 @@ use super::scene_frame::{Link, Messages, Planar, Process, SceneFrame, ShownBox, 
 
 /// Moments that may still be waiting for something.
 const MOST_OPEN: usize = 16;
+/// Processes whose books are kept: more than a run of 65 vehicles has.
+const MOST_BOOKS: usize = 1024;
 
 /// A message that was seen somewhere.
 #[derive(Debug, Clone, Copy)]
@@ -30,6 +32,8 @@ pub struct Seen<'a> {
 pub struct Assembly {
     open: BTreeMap<u64, Moment>,
     shown_until: Option<u64>,
+    /// Which replay tells the truth.
+    replay_epoch: Option<u64>,
     books: BTreeMap<String, (Ledger, Vec<StageSummary>)>,
 }
 
@@ -59,10 +63,11 @@ impl Assembly {
     /// when too many wait. Unsound messages are left to those they are for.
     pub fn add(&mut self, seen: &Seen<'_>) -> Option<SceneFrame> {
         if let Topic::Stats(_) = seen.topic {
-            if let Some(Stats { process, ledger, stages }) = decode(seen) {
-                self.books.insert(process.to_string(), (ledger, stages));
-            }
+            self.keep_books(seen);
             return None;
+        }
+        if *seen.topic == Topic::Truth {
+            self.begin_again_with(seen.header.stamp.epoch);
         }
         let at = seen.header.stamp.capture_nanos;
         if self.shown_until.is_some_and(|shown| at <= shown) {
@@ -88,9 +93,23 @@ impl Assembly {
 
     /// Forgets which moments were shown: a recording is looked at in any order.
     pub fn rewind(&mut self) {
-        self.open.clear();
-        self.shown_until = None;
-        self.books.clear();
+        *self = Self::default();
+    }
+
+    fn keep_books(&mut self, seen: &Seen<'_>) {
+        let Some(Stats { process, ledger, stages }) = decode(seen) else { return };
+        let process = process.to_string();
+        if self.books.len() < MOST_BOOKS || self.books.contains_key(&process) {
+            self.books.insert(process, (ledger, stages));
+        }
+    }
+
+    /// Another replay of the same run begins at its own first moment, which those shown do not hide.
+    fn begin_again_with(&mut self, epoch: u64) {
+        if self.replay_epoch.replace(epoch).is_some_and(|known| known != epoch) {
+            self.open.clear();
+            self.shown_until = None;
+        }
     }
 
     /// Lays a message into its moment; tells whether that is complete now.

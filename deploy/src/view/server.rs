@@ -5,6 +5,8 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
+use bytes::Bytes;
+use futures_util::{StreamExt, stream};
 use serde_json::json;
 use sim_replay::web::{Answer, Request, WebServer};
 
@@ -12,7 +14,12 @@ use super::{LiveRun, RecordedRun};
 
 const HTML: &str = include_str!("page/index.html");
 const STYLE: &str = include_str!("page/style.css");
-const SCRIPT: &str = include_str!("page/view.js");
+/// In the order in which the page loads them.
+const SCRIPTS: [(&str, &str); 3] = [
+    ("/view.js", include_str!("page/view.js")),
+    ("/scene.js", include_str!("page/scene.js")),
+    ("/moments.js", include_str!("page/moments.js")),
+];
 
 /// A moment, or a stream of them.
 const BINARY: &str = "application/octet-stream";
@@ -28,7 +35,7 @@ pub fn serve_live(address: SocketAddr, run: Arc<LiveRun>) -> io::Result<WebServe
     WebServer::start(address, move |request| match request.path.as_str() {
         "/run" => document(&json!({"mode": "live", "run": run.name()})),
         "/live" => {
-            Answer::Stream { content_type: BINARY, write: Box::new(run.writer(number("frames", &request.query))) }
+            Answer::Stream { content_type: BINARY, pieces: run.moments(number("frames", &request.query)).boxed() }
         }
         "/hold" => hold(&request.query),
         _ => asset(request),
@@ -38,11 +45,11 @@ pub fn serve_live(address: SocketAddr, run: Arc<LiveRun>) -> io::Result<WebServe
 /// An empty script that takes its time, by which a page puts off being loaded.
 fn hold(query: &str) -> Answer {
     let time = Duration::from_millis(number("ms", query).unwrap_or(0)).min(LONGEST_HOLD);
-    let wait = move |_: &mut dyn io::Write| -> io::Result<()> {
-        std::thread::sleep(time);
-        Ok(())
+    let wait = async move {
+        tokio::time::sleep(time).await;
+        Bytes::new()
     };
-    Answer::Stream { content_type: "text/javascript", write: Box::new(wait) }
+    Answer::Stream { content_type: "text/javascript", pieces: stream::once(wait).boxed() }
 }
 
 /// Serves the page of a recorded run until dropped.
@@ -57,7 +64,7 @@ pub fn serve_recorded(address: SocketAddr, run: Arc<RecordedRun>) -> io::Result<
         }
         let Some(index) = request.path.strip_prefix("/frame/") else { return asset(request) };
         match index.parse().map(|index| run.frame(index)) {
-            Ok(Ok(Some(frame))) => Answer::Page { content_type: BINARY, body: frame.to_bytes() },
+            Ok(Ok(Some(frame))) => Answer::Page { content_type: BINARY, body: frame.to_bytes().into() },
             Ok(Ok(None)) => Answer::NotFound(format!("there are {} moments, counted from 0", run.len())),
             Ok(Err(error)) => Answer::NotFound(error.to_string()),
             Err(error) => Answer::NotFound(format!("{index:?} is no number: {error}")),
@@ -66,17 +73,18 @@ pub fn serve_recorded(address: SocketAddr, run: Arc<RecordedRun>) -> io::Result<
 }
 
 fn asset(request: &Request) -> Answer {
-    let (content_type, text) = match request.path.as_str() {
-        "/" => ("text/html; charset=utf-8", HTML),
-        "/style.css" => ("text/css; charset=utf-8", STYLE),
-        "/view.js" => ("text/javascript; charset=utf-8", SCRIPT),
-        other => return Answer::NotFound(format!("there is no {other}")),
+    let script = SCRIPTS.into_iter().find(|(path, _)| *path == request.path);
+    let (content_type, text) = match (request.path.as_str(), script) {
+        ("/", _) => ("text/html; charset=utf-8", HTML),
+        ("/style.css", _) => ("text/css; charset=utf-8", STYLE),
+        (_, Some((_, script))) => ("text/javascript; charset=utf-8", script),
+        (other, None) => return Answer::NotFound(format!("there is no {other}")),
     };
-    Answer::Page { content_type, body: text.as_bytes().to_vec() }
+    Answer::Page { content_type, body: Bytes::from_static(text.as_bytes()) }
 }
 
 fn document(value: &serde_json::Value) -> Answer {
-    Answer::Page { content_type: "application/json", body: value.to_string().into_bytes() }
+    Answer::Page { content_type: "application/json", body: value.to_string().into() }
 }
 
 /// The number that a query gives for `name`.

@@ -165,6 +165,25 @@ fn a_recorded_run_is_shown_in_any_order() {
     shows_without_an_error(server.address(), "?at=4", "recorded");
 }
 
+#[test]
+fn a_replay_that_begins_anew_is_shown_from_its_beginning() {
+    let mut assembly = Assembly::default();
+    let mut shown = |epoch: u64, tick: u64| {
+        let mut frames = Vec::new();
+        for (topic, payload) in messages(tick, 0) {
+            let mut header = wire::decode_header([payload.as_slice()]).unwrap();
+            header.stamp.epoch = epoch;
+            let seen = Seen { topic: &topic, header: &header, arrived_nanos: 0, payload: Some(&payload) };
+            frames.extend(assembly.add(&seen).and_then(|frame| frame.frame_index));
+        }
+        frames
+    };
+    assert_eq!(shown(1, 3), [3]);
+    assert_eq!(shown(1, 2), [0; 0], "never back in time");
+    assert_eq!(shown(2, 0), [0], "but another replay has a time of its own");
+    assert_eq!(shown(2, 1), [1]);
+}
+
 /// A run that goes on at 10 Hz until dropped.
 struct Traffic {
     endpoint: Endpoint,
@@ -249,7 +268,7 @@ fn a_live_run_is_shown_as_it_goes_and_nobody_waits_for_a_page() {
 fn moments_of(address: SocketAddr, count: u64) -> Vec<Vec<u8>> {
     let mut connection = TcpStream::connect(address).unwrap();
     connection.set_read_timeout(Some(PATIENCE)).unwrap();
-    write!(connection, "GET /live?frames={count} HTTP/1.1\r\n\r\n").unwrap();
+    write!(connection, "GET /live?frames={count} HTTP/1.0\r\n\r\n").unwrap();
     let mut answer = Vec::new();
     connection.read_to_end(&mut answer).unwrap();
     let mut rest = &answer[answer.windows(4).position(|bytes| bytes == b"\r\n\r\n").unwrap() + 4..];

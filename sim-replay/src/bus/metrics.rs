@@ -25,7 +25,7 @@ impl MetricsServer {
     pub fn start(address: SocketAddr, books: &Books) -> std::io::Result<Self> {
         let books = books.clone();
         let server = WebServer::start(address, move |request| match request.path.as_str() {
-            "/metrics" => Answer::Page { content_type: CONTENT_TYPE, body: exposition(&books).into_bytes() },
+            "/metrics" => Answer::Page { content_type: CONTENT_TYPE, body: exposition(&books).into() },
             other => Answer::NotFound(format!("{other} is not here, but /metrics is")),
         })?;
         Ok(Self(server))
@@ -165,7 +165,7 @@ mod tests {
     fn they_can_be_fetched() {
         let server = MetricsServer::start("127.0.0.1:0".parse().unwrap(), &books()).unwrap();
         let (status, body) = crate::web::fetch(server.address(), "/metrics").unwrap();
-        assert_eq!(status, "HTTP/1.1 200 OK");
+        assert_eq!(status, "HTTP/1.0 200 OK");
         assert_eq!(String::from_utf8(body).unwrap(), exposition(&books()));
         assert!(crate::web::fetch(server.address(), "/").unwrap().0.contains("404"));
     }
