@@ -4,7 +4,7 @@
 //! without a message seeming lost; it keeps its own count of that.
 
 use std::sync::Arc;
-use std::sync::atomic::{AtomicU64, Ordering};
+use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::time::Instant;
 
 use protocol::{Control, Key, Kind, Limits, Selector, Stream, Topic, wire};
@@ -19,6 +19,8 @@ use super::{BusError, unix_nanos};
 
 /// Topics that a tap keeps apart at most: more than a run of 65 vehicles has.
 const MAX_TOPICS: usize = 1024;
+/// Bytes that may wait in a tap, whatever their keys: a disk that stands still must not take the memory of the run.
+const MAX_WAITING: usize = 512 << 20;
 
 /// A message as it came by, unchecked but for its key.
 #[derive(Debug)]
@@ -64,6 +66,7 @@ pub struct Tap {
 
 struct Shared {
     mailbox: Mailbox<Topic, Overheard>,
+    waiting_bytes: AtomicUsize,
     overwritten: AtomicU64,
 }
 
@@ -76,7 +79,11 @@ impl Tap {
         places: usize,
         notices: &Notices,
     ) -> Result<Self, BusError> {
-        let shared = Arc::new(Shared { mailbox: Mailbox::new(places, MAX_TOPICS), overwritten: AtomicU64::new(0) });
+        let shared = Arc::new(Shared {
+            mailbox: Mailbox::new(places, MAX_TOPICS),
+            waiting_bytes: AtomicUsize::new(0),
+            overwritten: AtomicU64::new(0),
+        });
         let subscribe = |selector: &Selector| {
             let (shared, notices) = (Arc::clone(&shared), notices.clone());
             let subscriber = session.declare_subscriber(selector.as_str());
@@ -89,10 +96,14 @@ impl Tap {
 
     /// The message that has waited longest, waiting until `deadline` for one.
     pub fn take(&self, deadline: Option<Instant>) -> Taken<Topic, Overheard> {
-        self.shared.mailbox.take(deadline)
+        let taken = self.shared.mailbox.take(deadline);
+        if let Taken::Item(_, overheard) = &taken {
+            self.shared.waiting_bytes.fetch_sub(overheard.len(), Ordering::Relaxed);
+        }
+        taken
     }
 
-    /// Messages that newer ones of the same key have taken the place of.
+    /// Messages that newer ones of the same key have taken the place of, or for which there was no room.
     #[must_use]
     pub fn overwritten(&self) -> u64 {
         self.shared.overwritten.load(Ordering::Relaxed)
@@ -117,13 +128,23 @@ impl Shared {
                 Err(_) => {}
             }
         }
-        let topic = key.topic.clone();
-        let overheard = Overheard { key, arrived_nanos: unix_nanos(), payload: sample.payload().clone() };
-        match self.mailbox.push(topic, overheard) {
-            Pushed::Queued => {}
-            Pushed::Displaced(_) | Pushed::NoLane(_) | Pushed::Closed(_) => {
-                self.overwritten.fetch_add(1, Ordering::Relaxed);
+        self.keep(Overheard { key, arrived_nanos: unix_nanos(), payload: sample.payload().clone() });
+    }
+
+    fn keep(&self, overheard: Overheard) {
+        let len = overheard.len();
+        let waiting = self.waiting_bytes.fetch_add(len, Ordering::Relaxed);
+        let lost = if waiting + len > MAX_WAITING {
+            Some(len)
+        } else {
+            match self.mailbox.push(overheard.key.topic.clone(), overheard) {
+                Pushed::Queued => None,
+                Pushed::Displaced(lost) | Pushed::NoLane(lost) | Pushed::Closed(lost) => Some(lost.len()),
             }
+        };
+        if let Some(len) = lost {
+            self.waiting_bytes.fetch_sub(len, Ordering::Relaxed);
+            self.overwritten.fetch_add(1, Ordering::Relaxed);
         }
     }
 }
@@ -137,4 +158,38 @@ fn note(topic: &Topic, sample: &Sample, notices: &Notices) {
 
 fn is_json(topic: &Topic) -> bool {
     matches!(topic, Topic::Stream { stream: Stream::DetectionsJson, .. })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn tap(places: usize) -> Tap {
+        let shared = Shared {
+            mailbox: Mailbox::new(places, MAX_TOPICS),
+            waiting_bytes: AtomicUsize::new(0),
+            overwritten: AtomicU64::new(0),
+        };
+        Tap { shared: Arc::new(shared), _subscribers: Vec::new() }
+    }
+
+    fn overheard(vehicle: usize, payload: &ZBytes) -> Overheard {
+        let key = format!("v2v/test/{vehicle}/lidar").parse().unwrap();
+        Overheard { key, arrived_nanos: 0, payload: payload.clone() }
+    }
+
+    #[test]
+    fn what_waits_is_bounded_in_number_and_in_bytes() {
+        let tap = tap(2);
+        let payload = ZBytes::from(vec![0_u8; 64 << 20]);
+        (0..3).for_each(|_| tap.shared.keep(overheard(0, &payload)));
+        assert_eq!(tap.overwritten(), 1, "two places for a key");
+        (1..10).for_each(|vehicle| tap.shared.keep(overheard(vehicle, &payload)));
+        assert_eq!(tap.overwritten(), 1 + 3, "eight of them fill the tap");
+        let at_once = Some(Instant::now());
+        assert_eq!((0..9).filter(|_| matches!(tap.take(at_once), Taken::Item(..))).count(), 8);
+        assert_eq!(tap.shared.waiting_bytes.load(Ordering::Relaxed), 0);
+        tap.shared.keep(overheard(9, &payload));
+        assert_eq!(tap.overwritten(), 4, "there is room again");
+    }
 }
