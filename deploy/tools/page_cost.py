@@ -1,0 +1,123 @@
+#!/usr/bin/env python3
+"""Measures what an open page costs a run: the same fleet again and again, with and without somebody who reads the page's stream.
+
+    cargo build --release --workspace --bins
+    deploy/tools/page_cost.py [--rounds 4] [--frames 150] [--method max] [--scene DIR]
+
+A round is a run with and one without, in alternating order, so that whatever else the machine does falls on both. The reader
+takes every moment and throws it away, as a browser on another machine would; the server of the page runs on this one.
+Prints the 95th percentile of the latency from capture to detection of every run, of both sides pooled, and their ratio.
+"""
+
+import argparse
+import csv
+import http.client
+import os
+import pathlib
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+
+ROOT = pathlib.Path(__file__).resolve().parents[2]
+PROGRAMS = pathlib.Path(os.environ.get("CARGO_TARGET_DIR", ROOT / "target")) / "release"
+
+
+def arguments():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--rounds", type=int, default=4)
+    parser.add_argument("--frames", type=int, default=150)
+    parser.add_argument("--method", default="max")
+    parser.add_argument("--scenario", default=ROOT / "deploy/scenarios/demo.yaml")
+    parser.add_argument("--scene", help="data set, split or scenario; left out: two vehicles are generated")
+    return parser.parse_args()
+
+
+def generate(folder, frames):
+    """Two vehicles of seed 1000, as in the demo."""
+    command = [PROGRAMS / "sim-replay", "synth", "--out", folder, "--subset", "v2vdet", "--seed", "1000"]
+    subprocess.run([*command, "--frames", str(frames), "--agents", "2"], check=True, stdout=subprocess.DEVNULL)
+    return folder
+
+
+def line_with(stream, pattern):
+    """The first match among the lines of a process; the rest is read and thrown away, so that it never waits for us."""
+    for line in stream:
+        if match := re.search(pattern, line):
+            threading.Thread(target=lambda: all(stream), daemon=True).start()
+            return match
+    sys.exit(f"no line with {pattern!r}: it ended")
+
+
+class Page:
+    """A viewer, and somebody who reads what it streams."""
+
+    def __init__(self, name, router):
+        command = [PROGRAMS / "v2vloc", "view", "--live", "--name", name, "--connect", router, "--listen", "127.0.0.1:0"]
+        self.viewer = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+        self.address = line_with(self.viewer.stderr, r"http://([\d.:]+)/")[1]
+        self.moments = 0
+        self.reader = threading.Thread(target=self.read)
+        self.reader.start()
+
+    def read(self):
+        connection = http.client.HTTPConnection(self.address)
+        connection.request("GET", "/live")
+        answer = connection.getresponse()
+        try:
+            while len(length := answer.read(4)) == 4:
+                moment = answer.read(int.from_bytes(length, "little"))
+                self.moments += bool(moment)
+        except (http.client.HTTPException, OSError):
+            pass
+
+    def close(self):
+        self.viewer.send_signal(signal.SIGINT)
+        self.viewer.wait()
+        self.reader.join()
+
+
+def run(options, scene, folder, name, with_page):
+    """Latencies of one run, and how many moments the page was shown."""
+    command = [PROGRAMS / "v2vloc", "up", options.scenario, "--scene", scene, "--method", options.method]
+    command += ["--frames", str(options.frames), "--name", name, "--runs", folder, "--json"]
+    fleet = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    router = line_with(fleet.stderr, rf"run {name} at (\S+):")[1]
+    page = Page(name, router) if with_page else None
+    # 3: a machine too slow for live traffic drops frames and says so.
+    if fleet.wait() not in (0, 3):
+        sys.exit(f"the run ended with {fleet.returncode}: see {folder}/{name}/log")
+    if page:
+        page.close()
+    with open(folder / name / "frames.csv") as frames:
+        latencies = [float(row["latency_ms"]) for row in csv.DictReader(frames) if row["latency_ms"]]
+    return latencies, page.moments if page else 0
+
+
+def p95(latencies):
+    ordered = sorted(latencies)
+    return ordered[min(len(ordered) - 1, round(0.95 * (len(ordered) - 1)))]
+
+
+def main():
+    options = arguments()
+    with tempfile.TemporaryDirectory() as work:
+        work = pathlib.Path(work)
+        scene = options.scene or generate(work / "scene", options.frames)
+        run(options, scene, work, "warm-up", False)
+        pooled = {False: [], True: []}
+        for index in range(options.rounds):
+            for with_page in [False, True] if index % 2 == 0 else [True, False]:
+                name = f"round{index}-{'page' if with_page else 'alone'}"
+                latencies, moments = run(options, scene, work, name, with_page)
+                pooled[with_page] += latencies
+                shown = f", {moments} moments shown" if with_page else ""
+                print(f"{name}: p95 {p95(latencies):.1f} ms of {len(latencies)} frames{shown}", flush=True)
+        alone, page = p95(pooled[False]), p95(pooled[True])
+        print(f"all: p95 {alone:.1f} ms alone, {page:.1f} ms with the page, ratio {page / alone:.3f}")
+
+
+if __name__ == "__main__":
+    main()
