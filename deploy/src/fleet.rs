@@ -269,7 +269,7 @@ impl Fleet {
             args.option("--gate", &gate.threshold.to_string());
             args.option("--gate-smoothing", &smoothing(gate.smoothing));
         }
-        if let Some(bytes) = settings.codec.budget_bytes {
+        if let Some(bytes) = settings.codec.budget_bytes.filter(|_| *cav != self.ego) {
             args.option("--budget", &bytes.to_string());
         }
         if let Some(level) = settings.codec.zstd_level {
@@ -397,7 +397,7 @@ impl Fleet {
         routes
     }
 
-    fn publish(&self, cav: &CavId) -> Publish {
+    pub(crate) fn publish(&self, cav: &CavId) -> Publish {
         self.scenario.settings_of(cav).publish.unwrap_or(Publish::for_method(self.scenario.method))
     }
 

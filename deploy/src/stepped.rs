@@ -1,6 +1,7 @@
-//! `clock: stepped`: a scenario in virtual time, all of it in this process.
+//! `clock: stepped`: a scenario in virtual time, all of it in this process, or every agent in one of its own.
 //!
-//! The run folder is that of a live run. Nothing in it but `scenario.yaml` depends on machine, load or time of day.
+//! The run folder is that of a live run. Nothing in it but `scenario.yaml` and `log/` depends on machine, load, time of day
+//! or on how many processes there are.
 
 use std::fs::File;
 use std::io::{BufWriter, Write};
@@ -17,6 +18,7 @@ use protocol::{CavId, DetectionsReport};
 use sim_replay::dataset::{self, Scenario as Recorded};
 use sim_replay::link::LinkConfig;
 
+use crate::crew_processes::CrewProcesses;
 use crate::evaluation::judge;
 use crate::fingerprint::Provenance;
 use crate::fleet::{Fleet, FleetError};
@@ -41,12 +43,21 @@ pub fn up(scenario: &Scenario, options: &UpOptions) -> Result<RunResult, UpError
         None => evaluator.measure(&recorded)?,
     };
     // Written into the run's scenario, from where another run can take it.
-    fleet.scenario.stepped = Some(Stepped { compute: Some(compute) });
+    let processes = fleet.scenario.stepped.is_some_and(|stepped| stepped.processes);
+    fleet.scenario.stepped = Some(Stepped { compute: Some(compute), processes });
     let run = fleet.scenario.run.clone().unwrap_or_else(|| name_of_now(options.prefix));
     let folder = RunFolder::create(&options.runs, &run)?;
     let mut evaluator = evaluator.over_link(stepped_config(&fleet, compute)?);
+    let crew = processes.then(|| CrewProcesses::start(&fleet, &run, &folder, &options.programs)).transpose()?;
+    let processes = crew.map(|(processes, remote)| {
+        evaluator.set_processes(Some(remote));
+        processes
+    });
     let board = play(&fleet, &recorded, &mut evaluator, &folder)?;
-    write(&fleet, &evaluator, &board, folder, options)
+    evaluator.set_processes(None);
+    let killed = processes.map(CrewProcesses::end).unwrap_or_default();
+    let result = write(&fleet, &evaluator, &board, folder, options)?;
+    Ok(RunResult { killed, ..result })
 }
 
 /// The recorded scenario that the fleet plays.

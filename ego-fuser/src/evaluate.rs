@@ -30,7 +30,7 @@ use crate::ego::{Content, Ego, EgoError, EgoOutput, Skipped, View, own_content};
 use crate::feature_store::{FeatureStoreError, MapSource};
 use crate::method::{Exchange, Method};
 
-use stepped::{SteppedConfig, VehicleConfig};
+use stepped::{RemoteCrew, RemoteError, SteppedConfig, VehicleConfig};
 
 /// What to evaluate.
 #[derive(Debug, Clone)]
@@ -78,6 +78,9 @@ pub enum EvaluateError {
     /// The emulated air cannot be made.
     #[error(transparent)]
     Link(#[from] LinkError),
+    /// Vehicles in processes of their own do not answer.
+    #[error(transparent)]
+    Remote(#[from] Box<RemoteError>),
     /// A computer of the fleet does not keep up with the scene.
     #[error(
         "{what} takes {takes_ms} ms, but the scene has a frame every {period_ms} ms: choose a smaller time in `compute`"
@@ -119,6 +122,8 @@ pub struct Evaluator {
     maps: Option<MapSource>,
     /// How messages cross the air; absent: at once, or after a fixed delay.
     stepped: Option<SteppedConfig>,
+    /// Who computes what the vehicles see; absent: this process.
+    remote: Option<RemoteCrew>,
     ledger: Ledger,
 }
 
@@ -134,13 +139,21 @@ impl Evaluator {
         let config = EvaluateConfig { codec, ..config };
         let weights = Weights::load(&config.weights)?;
         let (under_way, ledger) = (VecDeque::new(), Ledger::default());
-        Ok(Self { weights, ego, rule, config, under_way, maps: None, stepped: None, ledger })
+        Ok(Self { weights, ego, rule, config, under_way, maps: None, stepped: None, remote: None, ledger })
     }
 
     /// The same with messages that cross the emulated air, in virtual time.
     #[must_use]
     pub fn over_link(self, stepped: SteppedConfig) -> Self {
         Self { stepped: Some(stepped), ..self }
+    }
+
+    /// Lets vehicles compute in processes of their own from now on, or in this one, where messages cross the emulated air.
+    /// Those of before get no more sweeps.
+    pub fn set_processes(&mut self, remote: Option<RemoteCrew>) {
+        if let Some(before) = std::mem::replace(&mut self.remote, remote) {
+            before.finish();
+        }
     }
 
     /// The books of all messages that crossed the air so far; empty without one.

@@ -17,7 +17,7 @@ use protocol::{CodecConfig, DropReason, Dtype};
 use serde_json::Value;
 use sim_replay::dataset;
 use sim_replay::link::{DelayLaw, LinkConfig, LossLaw};
-use tests::fleet::{programs, results, write_scenario, write_sighted_weights};
+use tests::fleet::{alone, programs, results, write_scenario, write_sighted_weights};
 
 const TICKS: usize = 8;
 const MS: u64 = 1_000_000;
@@ -145,6 +145,15 @@ fn losses_are_counted_and_come_from_the_seed() {
     assert_ne!(run(2).1, ledger);
 }
 
+const FILES: [&str; 4] = ["metrics.json", "frames.csv", "ledger.json", "detections.jsonl"];
+
+fn assert_same_bytes(one: &RunResult, other: &RunResult) {
+    for name in FILES {
+        let read = |run: &RunResult| fs::read(run.folder.file(name)).unwrap();
+        assert!(read(one) == read(other), "{name}");
+    }
+}
+
 fn run_up(folder: &Path, scenario: &Path, runs: &str) -> RunResult {
     let options = UpOptions { runs: folder.join(runs), programs: programs().to_owned(), prefix: "up" };
     up(&Scenario::load(scenario).unwrap(), &options).unwrap()
@@ -159,10 +168,7 @@ fn a_stepped_run_is_the_same_bytes_every_time() {
         link: {air: air.yaml, seed: 5}\nego: {max_age_ms: 500}\nvehicles: {\"4288\": {pose: {noisy: {std_m: 0.5}}}}";
     let scenario = write_scenario(folder.path(), TICKS, "seek: 1", rest);
     let (one, two) = (run_up(folder.path(), &scenario, "one"), run_up(folder.path(), &scenario, "two"));
-    for name in ["metrics.json", "frames.csv", "ledger.json", "detections.jsonl"] {
-        let read = |run: &RunResult| fs::read(run.folder.file(name)).unwrap();
-        assert!(read(&one) == read(&two), "{name}");
-    }
+    assert_same_bytes(&one, &two);
     assert!(one.balance.is_exact() && one.metrics.clock == "stepped" && one.metrics.frames == TICKS as u64 - 1);
     let latency = &one.metrics.latency_ms.capture_to_detection;
     assert_eq!((latency.p50, latency.p99), (Some(120.0), Some(120.0)), "the deadline, and the fusion");
@@ -170,6 +176,41 @@ fn a_stepped_run_is_the_same_bytes_every_time() {
     let frames = fs::read_to_string(one.folder.file("frames.csv")).unwrap();
     assert!(frames.starts_with("frame_index,") && frames.lines().nth(1).unwrap().starts_with("1,"), "{frames}");
     assert_eq!(results(one.folder.path()).len(), TICKS - 1);
+}
+
+#[test]
+fn agents_in_processes_of_their_own_give_the_same_bytes() {
+    let _alone = alone();
+    let folder = tempfile::tempdir().unwrap();
+    tests::scene::write(folder.path(), &["4279", "4288", "4297"], TICKS);
+    write_sighted_weights(&folder.path().join("weights.safetensors"));
+    let air = "capacity: {token_bucket: {rate_mbps: 20}}\ndelay: {normal: {mean_ms: 60, std_ms: 30}}\nloss: {bernoulli: 0.2}\n";
+    fs::write(folder.path().join("air.yaml"), air).unwrap();
+    // Everything that an agent's process has to be told: noise, codec, limits, one vehicle with settings of its own.
+    for (method, rest) in [
+        (
+            "max",
+            "agents: {codec: {dtype: i8, budget_bytes: 4000}}\nvehicles: {\"4288\": {pose: {noisy: {std_m: 0.5, mode: autoregressive}}}}",
+        ),
+        ("late", "agents: {pose: {noisy: {std_m: 0.3, std_deg: 1, mode: independent}}}"),
+        ("none", ""),
+    ] {
+        let run = |processes| {
+            let text = format!(
+                "run: test\nscene: {{dir: scene}}\nmodels: {{weights: weights.safetensors}}\nmethod: {method}\nclock: stepped\n\
+                 stepped: {{compute: {{pose_ms: 10, map_ms: 40, fuse_ms: 20}}, processes: {processes}}}\n\
+                 link: {{air: air.yaml, seed: 5}}\nego: {{max_age_ms: 500}}\n{rest}\n"
+            );
+            let path = folder.path().join("scenario.yaml");
+            fs::write(&path, text).unwrap();
+            run_up(folder.path(), &path, &format!("{method}-{processes}"))
+        };
+        let (one, many) = (run(false), run(true));
+        assert_same_bytes(&one, &many);
+        assert!(results(one.folder.path()).iter().any(|result| !result["detections"].as_array().unwrap().is_empty()));
+        let logs = fs::read_dir(many.folder.log_dir()).unwrap().count();
+        assert_eq!((logs, many.killed.len()), (3, 0), "one process a vehicle");
+    }
 }
 
 #[test]

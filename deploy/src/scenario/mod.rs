@@ -142,6 +142,9 @@ pub enum Clock {
 pub struct Stepped {
     /// How long everyone computes; absent: measured once, and written into the `scenario.yaml` of the run.
     pub compute: Option<ComputeTimes>,
+    /// Whether every agent is a process of its own, which gets its sweeps and sends what it sees over the network, all in
+    /// lockstep. Slower, and the same bytes.
+    pub processes: bool,
 }
 
 /// The networks.

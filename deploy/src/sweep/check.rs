@@ -35,7 +35,11 @@ pub(super) fn check(experiment: &Experiment) -> Result<(), String> {
     contradictions(experiment, &link)?;
     let runs = super::grid::count(grid);
     if runs > MOST_RUNS {
-        return Err(format!("the grid has {} = {runs} runs; more than {MOST_RUNS} are refused", product(grid)));
+        let hours = runs as f64 / 3600.0;
+        return Err(format!(
+            "the grid has {} = {runs} runs, {hours:.1} hours even at a second each; more than {MOST_RUNS} are refused",
+            product(grid)
+        ));
     }
     Ok(())
 }
@@ -198,6 +202,9 @@ mod tests {
         let many = (0..101).map(|k| k.to_string()).collect::<Vec<_>>().join(", ");
         let text = format!("grid: {{method: [max], latency_ms: [{many}], seed: [{many}], jitter_ms: [1]}}");
         let problem = problem(&text);
-        assert!(problem.contains("101 latency_ms x 101 seed = 10201 runs"), "{problem}");
+        assert!(
+            problem.contains("101 latency_ms x 101 seed = 10201 runs, 2.8 hours even at a second each"),
+            "{problem}"
+        );
     }
 }

@@ -6,6 +6,7 @@
 
 mod compute;
 mod courier;
+mod remote;
 
 use std::collections::{BTreeMap, VecDeque};
 use std::ops::{ControlFlow, Range};
@@ -22,6 +23,7 @@ use sim_replay::link::{Air, LinkConfig};
 use sim_replay::random::derive_seed;
 
 pub use compute::ComputeTimes;
+pub use remote::{RemoteCrew, RemoteError};
 
 use super::{EvaluateError, EvaluatedFrame, Evaluator, Sent, stamp, view};
 use crate::ego::{Skipped, View, own_content};
@@ -99,8 +101,15 @@ pub(super) fn run(
 struct Member {
     /// Its place among the scenario's.
     place: usize,
-    agent: Agent,
-    codec: CodecConfig,
+    cav: CavId,
+    pipeline: Pipeline,
+}
+
+/// Where a vehicle computes.
+enum Pipeline {
+    Here(Box<Agent>, CodecConfig),
+    /// In a process of its own.
+    Elsewhere,
 }
 
 /// A tick whose sweeps are computed.
@@ -142,6 +151,10 @@ impl<'a> Run<'a> {
         let mut crew = Vec::with_capacity(places.len());
         for &place in &places {
             let cav = &scenario.agents[place];
+            if evaluator.remote.is_some() {
+                crew.push(Member { place, cav: cav.clone(), pipeline: Pipeline::Elsewhere });
+                continue;
+            }
             let own = config.vehicles.get(cav);
             let codec = own.map_or(evaluator.config.codec, |own| own.codec);
             let gate = codec.gate.or(evaluator.ego.method().gate());
@@ -151,7 +164,8 @@ impl<'a> Run<'a> {
             } else {
                 CodecConfig { gate, ..codec }
             };
-            crew.push(Member { place, agent: evaluator.agent(scenario, cav, crew.is_empty(), own)?, codec });
+            let agent = evaluator.agent(scenario, cav, crew.is_empty(), own)?;
+            crew.push(Member { place, cav: cav.clone(), pipeline: Pipeline::Here(Box::new(agent), codec) });
         }
         let is_witness = |place: &usize| matches!(config.crew, Crew::First(_)) && !places.contains(place);
         let witnesses = (0..scenario.agents.len()).filter(is_witness).collect();
@@ -159,7 +173,7 @@ impl<'a> Run<'a> {
         let began_nanos = scenario.ticks.get(ticks.start).map_or(0, |tick| tick.capture_nanos);
         let letters: Vec<u64> = scenario.name.bytes().map(u64::from).collect();
         let air = Air::new(config.link.clone(), &config.link_folder, derive_seed(config.seed, &letters))?;
-        let ego = crew.first().map_or_else(|| scenario.agents[0].clone(), |ego| ego.agent.cav().clone());
+        let ego = crew.first().map_or_else(|| scenario.agents[0].clone(), |ego| ego.cav.clone());
         Ok(Self {
             courier: Courier::new(air, &ego, began_nanos),
             evaluator,
@@ -182,28 +196,18 @@ impl<'a> Run<'a> {
         self.next += 1;
         let method = self.evaluator.ego.method();
         let load = self.load_options();
-        let mut frames = Vec::with_capacity(self.scenario.agents.len());
+        let load_frame = |member: &Member| self.scenario.load(member.place, tick, &load);
+        let mut frames: Vec<Frame> = self.crew.iter().map(load_frame).collect::<Result<_, _>>()?;
         let mut poses = Vec::with_capacity(self.crew.len());
         let mut own = None;
-        for member in &mut self.crew {
-            let frame = self.scenario.load(member.place, tick, &load)?;
-            let is_ego = frames.is_empty();
-            let map = if is_ego || method != Method::None {
-                self.evaluator.map_of(self.scenario, member.place, tick)?
-            } else {
-                None
-            };
-            // Without an exchange, neighbours have nothing to encode; where they are is still asked.
-            let exchange = (is_ego || method != Method::None).then(|| own_content(method));
-            let sent = view(&mut member.agent, &frame, map.as_ref(), exchange, &member.codec)?;
+        for (place, sent) in self.perceive(tick, &frames)?.into_iter().enumerate() {
             poses.push(sent.pose);
-            if is_ego {
+            if place == 0 {
                 own = sent.view();
-            } else if sent.content.is_some() {
-                let distance_m = distance_m(&frames[0], &frame);
+            } else if sent.content.is_some() && method != Method::None {
+                let distance_m = distance_m(&frames[0], &frames[place]);
                 post(&mut self.courier, &self.config.compute, tick, sent, distance_m);
             }
-            frames.push(frame);
         }
         let blind = LoadOptions { points: false, ..load };
         for &place in &self.witnesses {
@@ -214,9 +218,28 @@ impl<'a> Run<'a> {
         Ok(())
     }
 
+    /// What everyone makes of the sweeps of a tick.
+    fn perceive(&mut self, tick: usize, frames: &[Frame]) -> Result<Vec<Sent>, EvaluateError> {
+        if let Some(remote) = &self.evaluator.remote {
+            return Ok(remote.ask(frames).map_err(Box::new)?);
+        }
+        let method = self.evaluator.ego.method();
+        let mut all = Vec::with_capacity(frames.len());
+        for (member, frame) in self.crew.iter_mut().zip(frames) {
+            // Without an exchange, neighbours have nothing to encode; where they are is still asked.
+            let is_needed = all.is_empty() || method != Method::None;
+            let map = if is_needed { self.evaluator.map_of(self.scenario, member.place, tick)? } else { None };
+            let exchange = is_needed.then(|| own_content(method));
+            if let Pipeline::Here(agent, codec) = &mut member.pipeline {
+                all.push(view(agent, frame, map.as_ref(), exchange, codec)?);
+            }
+        }
+        Ok(all)
+    }
+
     fn load_options(&self) -> LoadOptions {
         let own = self.config.vehicles.values().any(|own| own.pose_source.looks_at_sweeps());
-        let points = own || self.evaluator.needs_points();
+        let points = own || self.evaluator.remote.is_some() || self.evaluator.needs_points();
         LoadOptions { points, lidar_variant: self.config.lidar_variant.clone(), ..LoadOptions::default() }
     }
 
@@ -273,7 +296,7 @@ impl<'a> Run<'a> {
         let of_tick = |(time, _): &&(u64, u64)| time.abs_diff(capture_nanos) <= self.config.pairing.max_lead_nanos;
         let mut complete_nanos = capture_nanos;
         for member in &self.crew[1..] {
-            let arrivals = self.arrivals.get(member.agent.cav())?;
+            let arrivals = self.arrivals.get(&member.cav)?;
             complete_nanos = complete_nanos.max(arrivals.iter().filter(of_tick).map(|(_, nanos)| *nanos).min()?);
         }
         Some(complete_nanos)
@@ -301,7 +324,7 @@ impl<'a> Run<'a> {
         }
         let mut result = self.evaluator.report(tick, own, &views, &bytes, output);
         if self.evaluator.ego.method() != Method::None {
-            let silent = self.crew[1..].iter().map(|member| member.agent.cav());
+            let silent = self.crew[1..].iter().map(|member| &member.cav);
             for cav in silent.filter(|cav| views.iter().all(|view| view.cav != **cav)) {
                 let reason = dropped.iter().rev().find(|lost| lost.cav == *cav).map(|lost| lost.reason);
                 result.skipped.push(SkippedNeighbour { cav: cav.clone(), reason });
@@ -313,7 +336,7 @@ impl<'a> Run<'a> {
     /// Closes the books: what is still on its way or waits for a tick that will not come is in flight.
     fn close(&mut self) {
         for member in self.crew.iter().skip(1) {
-            let cav = member.agent.cav();
+            let cav = &member.cav;
             let waiting = self.pairing.forget(cav) as u64;
             self.courier.close(cav, waiting);
         }

@@ -1,0 +1,86 @@
+//! The agents of a run in virtual time as processes of their own.
+
+use std::path::Path;
+use std::sync::mpsc::channel;
+use std::thread;
+use std::time::Duration;
+
+use ego_fuser::evaluate::EvaluateError;
+use ego_fuser::evaluate::stepped::RemoteCrew;
+use protocol::{CavId, ProcessId, RunId};
+use sim_replay::bus::shutdown::Stop;
+use sim_replay::bus::{Bus, Identity};
+
+use crate::fleet::Fleet;
+use crate::network::MeetingPlace;
+use crate::run_folder::RunFolder;
+use crate::supervise::{Happening, Supervisor};
+use crate::up::UpError;
+
+/// What the process that hands out the sweeps is called on the bus.
+const NAME: &str = "stepped";
+/// How long the session may take to close.
+const LEAVE_LIMIT: Duration = Duration::from_secs(2);
+
+/// The processes, and where they meet.
+pub(crate) struct CrewProcesses {
+    supervisor: Supervisor,
+    bus: Bus,
+    place: MeetingPlace,
+    grace: Duration,
+}
+
+impl CrewProcesses {
+    /// Starts an agent for each vehicle and waits until all are there.
+    ///
+    /// # Errors
+    /// [`UpError`] when they cannot meet.
+    pub(crate) fn start(
+        fleet: &Fleet,
+        run: &RunId,
+        folder: &RunFolder,
+        programs: &Path,
+    ) -> Result<(Self, RemoteCrew), UpError> {
+        let place = MeetingPlace::open(&fleet.scenario.network)?;
+        let mut specs = fleet.processes(run, place.endpoint.as_str(), programs);
+        specs.retain(|spec| spec.program.ends_with("agent"));
+        let identity = Identity {
+            run: run.clone(),
+            process: ProcessId::new(NAME).expect("lower-case letters"),
+            cav: CavId::new(NAME).expect("lower-case letters"),
+        };
+        let bus = Bus::over(place.session.clone(), identity)?;
+        let (events, happened) = channel();
+        // Who starts anew has forgotten what came before, and the result would depend on when it fell.
+        let supervisor = Supervisor::start(specs, &folder.log_dir(), 0, &events)?;
+        let stop = Stop::new();
+        thread::spawn({
+            let stop = stop.clone();
+            move || {
+                for event in happened {
+                    if let Happening::GaveUp { how, .. } = event.what {
+                        tracing::error!("{} {how}", event.name);
+                        stop.request();
+                    }
+                }
+            }
+        });
+        let vehicles: Vec<_> = fleet.agents.iter().map(|cav| (cav.clone(), fleet.publish(cav).stream())).collect();
+        let timeouts = &fleet.scenario.timeouts;
+        let remote = RemoteCrew::meet(&bus, &vehicles, Duration::from_secs_f64(timeouts.ready_s), &stop)
+            .map_err(|error| EvaluateError::from(Box::new(error)))?;
+        Ok((Self { supervisor, bus, place, grace: Duration::from_secs_f64(timeouts.stop_s) }, remote))
+    }
+
+    /// Ends all; the names of those that had to be killed.
+    pub(crate) fn end(self) -> Vec<String> {
+        let Self { supervisor, bus, place, grace } = self;
+        let killed = supervisor.stop(grace).killed;
+        for closed in [bus.leave(LEAVE_LIMIT), place.close()] {
+            if let Err(overdue) = closed {
+                tracing::warn!("{overdue}");
+            }
+        }
+        killed
+    }
+}
