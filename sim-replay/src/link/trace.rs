@@ -170,9 +170,14 @@ mod tests {
     #[test]
     fn what_is_wrong_is_named_with_its_line() {
         let header = "time_s,rate_mbps,delay_ms,loss\n";
-        for (text, line) in
-            [("1,2,3,0\n", 2), ("0,2,3,0\n0,2,3,0\n", 3), ("0,2,3\n", 2), ("0,-1,0,0\n", 2), ("0,1,0,nan\n", 2)]
-        {
+        for (text, line) in [
+            ("1,2,3,0\n", 2),
+            ("0,2,3,0\n0,2,3,0\n", 3),
+            ("0,2,3,0\n5,2,3,0\n4.9,2,3,0\n", 4),
+            ("0,2,3\n", 2),
+            ("0,-1,0,0\n", 2),
+            ("0,1,0,nan\n", 2),
+        ] {
             let (_folder, path) = file(&format!("{header}{text}"));
             let message = Trace::read_csv(&path).unwrap_err().to_string();
             assert!(message.contains(&format!("trace.txt:{line}:")), "{message}");
@@ -180,7 +185,10 @@ mod tests {
         assert!(matches!(Trace::read_csv(Path::new("no/such/trace.csv")), Err(TraceError::Io { .. })));
         let (_folder, path) = file("time,rate\n");
         assert!(Trace::read_csv(&path).unwrap_err().to_string().contains("header"));
-        for text in ["5\n3\n", "x\n", "-1\n", "0\n0\n", ""] {
+        let (_folder, path) = file("2\n5\n3\n");
+        let message = Trace::read_mahimahi(&path).unwrap_err().to_string();
+        assert!(message.contains("trace.txt:3: \"3\"") && message.contains("not before the line above"), "{message}");
+        for text in ["x\n", "-1\n", "0\n0\n", ""] {
             let (_folder, path) = file(text);
             assert!(Trace::read_mahimahi(&path).is_err(), "{text:?}");
         }
