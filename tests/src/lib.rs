@@ -4,6 +4,7 @@ pub mod bus;
 pub mod fixtures;
 pub mod fleet;
 pub mod localizer;
+pub mod machine;
 pub mod scene;
 pub mod sequences;
 pub mod tensors;

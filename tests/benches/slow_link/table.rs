@@ -4,10 +4,10 @@ use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::fs;
 use std::path::Path;
-use std::process::Command;
 
 use anyhow::Result;
 use protocol::DropReason;
+use tests::machine;
 
 use super::ends::Seen;
 use super::{Cell, Way};
@@ -135,11 +135,10 @@ pub(crate) fn write(folder: &Path, arguments: &str, rows: &[Row]) -> Result<()> 
         offer_max_ms,transport_p50_ms,age_p50_ms,age_p95_ms,age_target_ms,throughput_mbps,on_target\n"
             .to_owned();
     let mut markdown = format!(
-        "`cargo bench -p tests --bench slow_link -- {arguments}`\n\n{}, {}\n\n\
+        "`cargo bench -p tests --bench slow_link -- {arguments}`\n\n{}\n\n\
         | Mbit/s | size | way | s | arrived | not arrived | call max ms | on the way p50 ms | age p50 ms | age p95 ms | \
         target ms | Mbit/s arrived | on target |\n|---|---|---|---|---|---|---|---|---|---|---|---|---|\n",
-        first_line("git", &["describe", "--always", "--dirty", "--exclude=*"]),
-        machine(),
+        machine::describe(),
     );
     for row in rows {
         writeln!(csv, "{}", row.csv())?;
@@ -188,17 +187,4 @@ fn quantile(mut values: Vec<f64>, quantile: f64) -> f64 {
 
 fn size(bytes: usize) -> String {
     if bytes >= 1 << 20 { format!("{} MiB", bytes >> 20) } else { format!("{} KiB", bytes >> 10) }
-}
-
-fn first_line(program: &str, arguments: &[&str]) -> String {
-    let output = Command::new(program).args(arguments).output().map(|output| output.stdout).unwrap_or_default();
-    String::from_utf8_lossy(&output).lines().next().unwrap_or("unknown").to_owned()
-}
-
-/// Cores and their name.
-fn machine() -> String {
-    let text = fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
-    let names: Vec<&str> =
-        text.lines().filter_map(|line| line.strip_prefix("model name")?.split(": ").nth(1)).collect();
-    format!("{} cores of {}", names.len(), names.first().unwrap_or(&"an unknown processor"))
 }
