@@ -301,8 +301,9 @@ mod tests {
         let server = server(|_| Answer::NotFound(String::new()));
         let crowd: Vec<_> = (0..MAX_CONNECTIONS + 3).map(|_| TcpStream::connect(server.address()).unwrap()).collect();
         wait_for("three are refused", || server.readers().dropped() == 3);
+        wait_for("those who ask for nothing have to go", || server.readers().open() == 0);
+        assert_eq!(server.readers().dropped(), 3, "and are no readers");
         drop(crowd);
-        wait_for("the others have gone", || server.readers().open() == 0);
         assert!(fetch(server.address(), "/").is_ok());
     }
 

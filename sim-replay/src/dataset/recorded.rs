@@ -29,7 +29,7 @@ pub(super) fn open(file: &Path) -> Result<Dataset, ReadError> {
         problems.push(ReadError::malformed(file, reason));
     }
     let name = file.file_stem().map_or("recording".into(), |stem| stem.to_string_lossy().into_owned());
-    let source = Recorded::new(recording)?;
+    let source = Recorded::new(recording, &mut problems)?;
     let agents = source.agents.clone();
     let (ticks, missing) = source.ticks();
     let scenario = Scenario {
@@ -56,7 +56,8 @@ struct Recorded {
 }
 
 impl Recorded {
-    fn new(recording: Recording) -> Result<Self, ReadError> {
+    /// A truth that cannot be read is a problem of its moment, and not of the scene.
+    fn new(recording: Recording, problems: &mut Vec<ReadError>) -> Result<Self, ReadError> {
         let mut sensors = BTreeMap::new();
         let mut truth = BTreeMap::new();
         for entry in recording.entries() {
@@ -65,9 +66,10 @@ impl Recorded {
                 Topic::Stream { cav, stream: stream @ (Stream::Lidar | Stream::Gnss | Stream::Radar) } => {
                     sensors.entry((capture_nanos, cav.clone(), *stream)).or_insert_with(|| entry.clone());
                 }
-                Topic::Truth => {
-                    truth.insert(capture_nanos, message::<Truth>(&recording, entry)?);
-                }
+                Topic::Truth => match message::<Truth>(&recording, entry) {
+                    Ok(told) => drop(truth.insert(capture_nanos, told)),
+                    Err(problem) => problems.push(problem),
+                },
                 _ => {}
             }
         }
