@@ -74,7 +74,7 @@ impl<K: Ord + Clone, T> Mailbox<K, T> {
             Err(Full::Lane) => state.lanes.get_mut(&key).and_then(VecDeque::pop_front),
             Ok(()) => None,
         };
-        self.append(&mut state, key, item);
+        self.append(state, key, item);
         displaced.map_or(Pushed::Queued, |(_, older)| Pushed::Displaced(older))
     }
 
@@ -89,7 +89,7 @@ impl<K: Ord + Clone, T> Mailbox<K, T> {
                 Err(Full::Lane) => state = self.changed.wait(state).unwrap_or_else(PoisonError::into_inner),
             }
         }
-        self.append(&mut state, key, item);
+        self.append(state, key, item);
         Pushed::Queued
     }
 
@@ -159,10 +159,12 @@ impl<K: Ord + Clone, T> Mailbox<K, T> {
         }
     }
 
-    fn append(&self, state: &mut State<K, T>, key: K, item: T) {
+    fn append(&self, mut state: MutexGuard<'_, State<K, T>>, key: K, item: T) {
         let arrival = state.next_arrival;
         state.next_arrival += 1;
         state.lanes.entry(key).or_default().push_back((arrival, item));
+        // Whoever wakes up may take this thread's place at once: it must not find the door locked then.
+        drop(state);
         self.changed.notify_all();
     }
 }

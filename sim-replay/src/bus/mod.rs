@@ -24,6 +24,7 @@ mod session;
 pub mod shutdown;
 mod subscriber;
 mod tap;
+mod yielding;
 
 pub use args::{BusArgs, STOP_LIMIT, log_to_stderr};
 pub use books::{Books, StageHistogram};

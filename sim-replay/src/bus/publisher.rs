@@ -12,7 +12,7 @@ use zenoh::qos::{CongestionControl, Priority};
 
 use super::mailbox::{Mailbox, Pushed, Taken};
 use super::session::LONGEST_MESSAGE;
-use super::{Arrival, Books, BusError};
+use super::{Arrival, Books, BusError, yielding};
 
 /// Between two probes of a publisher that has sent nothing yet.
 const PROBE_PERIOD: Duration = Duration::from_millis(50);
@@ -230,6 +230,7 @@ impl Receipt {
 
 impl Sender {
     fn run(mut self) {
+        yielding::let_others_finish();
         if self.is_ours {
             self.notify(Control::Probe);
         }
