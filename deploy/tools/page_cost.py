@@ -30,7 +30,7 @@ def arguments():
     parser.add_argument("--rounds", type=int, default=4)
     parser.add_argument("--frames", type=int, default=150)
     parser.add_argument("--method", default="max")
-    parser.add_argument("--scenario", default=ROOT / "deploy/scenarios/demo.yaml")
+    parser.add_argument("--scenario", help="left out: recorded poses and all defaults, for which two cores suffice")
     parser.add_argument("--scene", help="data set, split or scenario; left out: two vehicles are generated")
     return parser.parse_args()
 
@@ -40,6 +40,13 @@ def generate(folder, frames):
     command = [PROGRAMS / "sim-replay", "synth", "--out", folder, "--subset", "v2vdet", "--seed", "1000"]
     subprocess.run([*command, "--frames", str(frames), "--agents", "2"], check=True, stdout=subprocess.DEVNULL)
     return folder
+
+
+def scenario(folder, scene):
+    """Without the search for poses, which takes most of the time of an agent."""
+    file = folder / "scenario.yaml"
+    file.write_text(f"scene: {{dir: {scene}}}\nmodels: {{weights: {ROOT / 'deploy/weights'}}}\nagents: {{pose: recorded}}\n")
+    return file
 
 
 def line_with(stream, pattern):
@@ -59,7 +66,7 @@ class Page:
         self.viewer = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
         self.address = line_with(self.viewer.stderr, r"http://([\d.:]+)/")[1]
         self.moments = 0
-        self.reader = threading.Thread(target=self.read)
+        self.reader = threading.Thread(target=self.read, daemon=True)
         self.reader.start()
 
     def read(self):
@@ -86,11 +93,12 @@ def run(options, scene, folder, name, with_page):
     fleet = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
     router = line_with(fleet.stderr, rf"run {name} at (\S+):")[1]
     page = Page(name, router) if with_page else None
-    # 3: a machine too slow for live traffic drops frames and says so.
-    if fleet.wait() not in (0, 3):
-        sys.exit(f"the run ended with {fleet.returncode}: see {folder}/{name}/log")
+    code = fleet.wait()
     if page:
         page.close()
+    # 3: a machine too slow for live traffic drops frames and says so.
+    if code not in (0, 3):
+        sys.exit(f"the run {name} ended with {code}")
     with open(folder / name / "frames.csv") as frames:
         latencies = [float(row["latency_ms"]) for row in csv.DictReader(frames) if row["latency_ms"]]
     return latencies, page.moments if page else 0
@@ -105,7 +113,8 @@ def main():
     options = arguments()
     with tempfile.TemporaryDirectory() as work:
         work = pathlib.Path(work)
-        scene = options.scene or generate(work / "scene", options.frames)
+        scene = pathlib.Path(options.scene).resolve() if options.scene else generate(work / "scene", options.frames)
+        options.scenario = options.scenario or scenario(work, scene)
         run(options, scene, work, "warm-up", False)
         pooled = {False: [], True: []}
         for index in range(options.rounds):
