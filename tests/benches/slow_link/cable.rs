@@ -10,8 +10,7 @@ use std::thread;
 use std::time::Duration;
 
 use anyhow::{Context, Result, bail};
-use protocol::{ProcessId, RunId};
-use sim_replay::bus::{Bus, BusOptions, Endpoint, Identity, open};
+use sim_replay::bus::{BusOptions, Endpoint, open};
 use zenoh::{Config, Session, Wait};
 
 use super::ends::{self, Seen};
@@ -66,7 +65,7 @@ pub(crate) fn run_end(arguments: &[String]) -> Result<()> {
             Seen { offers, ..Seen::default() }
         }
         (false, false) => {
-            let agent = join("agent-7", "7")?;
+            let agent = ends::join(&Endpoint::new(ROUTER)?, "agent-7", "7")?;
             let offers = ends::send(&agent, &cell, &[(ends::sent_topic(), "ego-9")])?;
             let ledger = agent.books().ledger();
             agent.leave(Duration::from_secs(20))?;
@@ -79,7 +78,7 @@ pub(crate) fn run_end(arguments: &[String]) -> Result<()> {
 
 fn ego() -> Result<Seen> {
     let _router = open(&BusOptions::router(Endpoint::new(ROUTER)?))?;
-    let ego = join("ego-9", "9")?;
+    let ego = ends::join(&Endpoint::new(ROUTER)?, "ego-9", "9")?;
     say_ready()?;
     let arrivals = ends::receive(&ego, &ends::sent_topic())?;
     Ok(Seen { arrivals, ledger: ego.books().ledger(), ..Seen::default() })
@@ -102,11 +101,6 @@ fn say_ready() -> Result<()> {
     let mut out = std::io::stdout();
     writeln!(out, "ready")?;
     Ok(out.flush()?)
-}
-
-fn join(process: &str, cav: &str) -> Result<Bus> {
-    let identity = Identity { run: RunId::new("slow-link")?, process: ProcessId::new(process)?, cav: ends::cav(cav) };
-    Ok(Bus::join(&BusOptions::client(Endpoint::new(ROUTER)?), identity)?)
 }
 
 /// zenoh as it comes, apart from where it meets and that it does so over TCP alone.

@@ -1,6 +1,7 @@
 //! The two ends of a way: an agent that offers maps, an ego that takes them.
 
 use std::path::Path;
+use std::process::{Command, Stdio};
 use std::sync::Mutex;
 use std::thread;
 use std::time::{Duration, Instant};
@@ -8,14 +9,15 @@ use std::time::{Duration, Instant};
 use anyhow::Result;
 use protocol::message::Bev;
 use protocol::{
-    BevFeatures, BevGrid, CavId, CodecConfig, Ledger, Limits, Pose, PoseEstimate, Role, Stream, Topic, encode_features,
+    BevFeatures, BevGrid, CavId, CodecConfig, Ledger, Limits, Pose, PoseEstimate, ProcessId, Role, RunId, Stream,
+    Topic, encode_features,
 };
 use serde::{Deserialize, Serialize};
 use sim_replay::bus::shutdown::Stop;
-use sim_replay::bus::{Barrier, Bus, Event, PublisherOptions, Route, unix_nanos};
+use sim_replay::bus::{Barrier, Bus, BusOptions, Endpoint, Event, Identity, PublisherOptions, Route, open, unix_nanos};
 use sim_replay::link::node::{self, NodeOptions};
 use sim_replay::link::{Air, CapacityConfig, LinkConfig, QueueConfig};
-use tests::bus::{PATIENCE, TestRouter};
+use tests::bus::{PATIENCE, free_port};
 use zenoh::bytes::ZBytes;
 use zenoh::{Session, Wait};
 
@@ -59,11 +61,21 @@ pub(crate) fn cav(text: &str) -> CavId {
     CavId::new(text).expect("an identifier")
 }
 
-/// Agent, link and ego over one router on loopback.
+/// Agent, link and ego over a router on loopback. It is a process of its own, as in a run: a router that waits for a receiver
+/// holds up a thread that all sessions of a process read with, the receiver's own among them.
 pub(crate) fn over_link(cell: &Cell) -> Result<Seen> {
-    let router = TestRouter::open();
-    let [agent, link, ego] =
-        [("agent-7", "7"), ("link-9", "9"), ("ego-9", "9")].map(|(name, cav)| router.join(name, cav));
+    let endpoint = Endpoint::loopback(free_port());
+    let mut router = Command::new(std::env::current_exe()?);
+    let router = router.args(["router", endpoint.as_str()]).stdin(Stdio::piped()).spawn()?;
+    let seen = between(cell, &endpoint);
+    // The end of its input ends it.
+    router.wait_with_output()?;
+    seen
+}
+
+fn between(cell: &Cell, router: &Endpoint) -> Result<Seen> {
+    let join = |name, cav| join(router, name, cav);
+    let (agent, link, ego) = (join("agent-7", "7")?, join("link-9", "9")?, join("ego-9", "9")?);
     let config = LinkConfig {
         capacity: CapacityConfig::TokenBucket { rate_mbps: cell.rate_mbps, burst_bytes: 0 },
         queue: QueueConfig { keep_newest: true, ..QueueConfig::default() },
@@ -85,6 +97,19 @@ pub(crate) fn over_link(cell: &Cell) -> Result<Seen> {
     let mut ledger = Ledger::default();
     [&agent, &link, &ego].iter().for_each(|bus| ledger.merge(&bus.books().ledger()));
     Ok(Seen { offers, arrivals, ledger })
+}
+
+/// Routes until its input ends.
+pub(crate) fn route(endpoint: &str) -> Result<()> {
+    let _router = open(&BusOptions::router(Endpoint::new(endpoint)?))?;
+    std::io::copy(&mut std::io::stdin(), &mut std::io::sink())?;
+    Ok(())
+}
+
+/// A client in the run of this bench.
+pub(crate) fn join(router: &Endpoint, process: &str, cav: &str) -> Result<Bus> {
+    let identity = Identity { run: RunId::new("slow-link")?, process: ProcessId::new(process)?, cav: self::cav(cav) };
+    Ok(Bus::join(&BusOptions::client(router.clone()), identity)?)
 }
 
 /// Offers maps until the time is over, as an agent does, and waits until they are sent.

@@ -147,6 +147,12 @@ fn main() -> Result<ExitCode> {
         cable::run_end(&arguments[1..])?;
         return Ok(ExitCode::SUCCESS);
     }
+    if let [role, endpoint] = arguments.as_slice()
+        && role == "router"
+    {
+        ends::route(endpoint)?;
+        return Ok(ExitCode::SUCCESS);
+    }
     let wanted = wanted(&arguments)?;
     let rows = measure(&wanted)?;
     table::write(&wanted.out, &arguments.join(" "), &rows)?;
