@@ -137,6 +137,12 @@ impl Selector {
         Self(format!("{KEY_ROOT}/{run}/**"))
     }
 
+    /// What no process ever declares: `v2v/<run>/nobody`. To ask there is to ask the network alone.
+    #[must_use]
+    pub fn nobody(run: &RunId) -> Self {
+        Self(format!("{KEY_ROOT}/{run}/nobody"))
+    }
+
     /// One stream of every vehicle, before the link.
     #[must_use]
     pub fn stream(run: &RunId, stream: Stream) -> Self {

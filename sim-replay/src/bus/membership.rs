@@ -7,12 +7,14 @@ use std::thread::JoinHandle;
 use std::time::Duration;
 
 use protocol::{CavId, Control, Key, ProcessId, Role, RunId, Selector, Topic};
+use zenoh::qos::Priority;
 use zenoh::{Session, Wait};
 
 use super::liveliness::{Presence, Sighting, Watch};
 use super::metrics::MetricsServer;
 use super::notices::{Notices, Speaker};
 use super::publisher::{Publisher, PublisherOptions, unix_nanos};
+use super::receipt::Receipt;
 use super::shutdown::{self, Overdue};
 use super::subscriber::{Inbox, Subscription};
 use super::tap::Tap;
@@ -178,12 +180,14 @@ impl Bus {
     /// # Errors
     /// [`Overdue`] when the network does not let go; the end of the process will.
     pub fn leave(self, limit: Duration) -> Result<(), Overdue> {
-        let Self { session, notices, speaking, .. } = self;
+        let Self { session, identity, notices, speaking, .. } = self;
         notices.close();
         shutdown::within(limit, "the zenoh session", move || {
             if speaking.join().is_err() {
                 tracing::error!("the thread for notices panicked");
             }
+            // A connection that is closed throws away what still lies in its buffers.
+            Receipt::new(&session, &identity.run, Priority::Background).wait(limit);
             if let Err(cause) = session.close().wait() {
                 tracing::warn!("closing the zenoh session: {cause}");
             }

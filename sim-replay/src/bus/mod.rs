@@ -19,6 +19,7 @@ mod metrics;
 mod notices;
 mod publisher;
 mod readiness;
+mod receipt;
 mod roll_call;
 mod session;
 pub mod shutdown;

@@ -11,6 +11,7 @@ use zenoh::bytes::{Encoding, ZBytes};
 use zenoh::qos::{CongestionControl, Priority};
 
 use super::mailbox::{Mailbox, Pushed, Taken};
+use super::receipt::Receipt;
 use super::session::LONGEST_MESSAGE;
 use super::{Arrival, Books, BusError, yielding};
 
@@ -119,7 +120,7 @@ impl Publisher {
             queue: Arc::clone(&queue),
             books: books.clone(),
             publisher,
-            receipt: Receipt { session: session.clone(), key: format!("{key}/receipt"), priority },
+            receipt: Receipt::new(session, &key.run, priority),
             is_one_at_a_time: matches!(overflow, Overflow::KeepNewest(_)),
         };
         let thread = thread::Builder::new()
@@ -202,32 +203,6 @@ struct Sender {
     is_one_at_a_time: bool,
 }
 
-/// Tells when the router has everything that was put before.
-struct Receipt {
-    session: zenoh::Session,
-    /// Nobody answers there.
-    key: String,
-    priority: Priority,
-}
-
-impl Receipt {
-    /// Waits for it. A question that nobody answers comes back from the router at once, and has to go through the same
-    /// queue as the messages before it. A connection that is lost ends the waiting too.
-    fn wait(&self) {
-        let asked = self
-            .session
-            .get(&self.key)
-            .priority(self.priority)
-            .congestion_control(CongestionControl::Block)
-            .timeout(LONGEST_MESSAGE)
-            .wait();
-        match asked {
-            Ok(answers) => while answers.recv().is_ok() {},
-            Err(cause) => tracing::debug!(key = self.key, "nobody to ask for a receipt: {cause}"),
-        }
-    }
-}
-
 impl Sender {
     fn run(mut self) {
         yielding::let_others_finish();
@@ -246,8 +221,6 @@ impl Sender {
             let sent = vec![TopicCount { topic: self.topic.clone(), messages: self.sequence }];
             self.notify(Control::End { ticks: self.sequence, sent });
         }
-        // A session that closes throws away what still lies in its buffers.
-        self.receipt.wait();
     }
 
     fn send(&mut self, Offer { capture_nanos, encode }: Offer) {
@@ -260,7 +233,7 @@ impl Sender {
                 if self.put(bytes) {
                     self.books.handed_over(&self.topic);
                     if is_large && self.is_one_at_a_time {
-                        self.receipt.wait();
+                        self.receipt.wait(LONGEST_MESSAGE);
                     }
                 }
             }

@@ -1,0 +1,35 @@
+//! Whether what was sent has left this machine.
+
+use std::time::Duration;
+
+use protocol::{RunId, Selector};
+use zenoh::qos::{CongestionControl, Priority};
+use zenoh::{Session, Wait};
+
+/// Tells when the router has everything that was put before.
+pub(super) struct Receipt {
+    session: Session,
+    asked: Selector,
+    priority: Priority,
+}
+
+impl Receipt {
+    /// Of what is sent with `priority` and before all that has a lower one.
+    pub(super) fn new(session: &Session, run: &RunId, priority: Priority) -> Self {
+        Self { session: session.clone(), asked: Selector::nobody(run), priority }
+    }
+
+    /// Waits for it, in at most `limit`. A question that nobody answers comes back from the router at once, and has to go
+    /// through the same queue as the messages before it. A connection that is lost ends the waiting too.
+    pub(super) fn wait(&self, limit: Duration) {
+        let asked = (self.session.get(self.asked.as_str()))
+            .priority(self.priority)
+            .congestion_control(CongestionControl::Block)
+            .timeout(limit)
+            .wait();
+        match asked {
+            Ok(answers) => while answers.recv().is_ok() {},
+            Err(cause) => tracing::debug!("nobody to ask for a receipt: {cause}"),
+        }
+    }
+}
