@@ -113,6 +113,8 @@ impl FeatureStore {
         let io = |source| FeatureStoreError::Io { path: path.clone(), source };
         fs::create_dir_all(&kept.folder).map_err(io)?;
         let file = OpenOptions::new().create(true).read(true).append(true).open(&path).map_err(io)?;
+        // Of two trainings that begin together one encodes, the other waits for it.
+        file.lock().map_err(io)?;
         let starts = starts(&file).map_err(io)?;
         // A message that was cut off is made anew.
         file.set_len(starts[starts.len() - 1]).map_err(io)?;
@@ -124,6 +126,7 @@ impl FeatureStore {
         let ticks = scenarios.iter().map(|scenario| scenario.ticks.len()).collect();
         let mut store = Self { path: path.clone(), file, dtype: kept.dtype, names, first, ticks, starts };
         store.fill(weights, scenarios, kept.limit_bytes, on_sweep)?;
+        store.file.unlock().map_err(|source| store.io(source))?;
         Ok(store)
     }
 
