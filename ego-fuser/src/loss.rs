@@ -10,6 +10,8 @@ use crate::targets::{BOX_CODE, Labels};
 
 /// What a turn by a radian weighs against a shift by a metre: about the distance at which neighbours see what the ego sees.
 const METRES_PER_RADIAN: f64 = 20.0;
+/// Errors of poses beyond this are not undone by looking at maps, metres.
+const RECOVERABLE_M: f64 = 5.0;
 
 /// Weights and shapes of the two terms.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -141,7 +143,7 @@ pub fn detection_loss(
 /// How far corrections are from what would undo the errors put on poses: smooth L1 per view, mean over views and samples.
 ///
 /// A turn by a radian counts as a shift by 20 m. No true pose takes part: an error that was put on top is
-/// known whatever lies below.
+/// known whatever lies below. Beyond 5 m nothing is asked: of a vehicle that is lost no map tells where it is.
 ///
 /// # Errors
 /// [`TchError`] when a sample has other views than offsets.
@@ -153,7 +155,12 @@ pub fn alignment_loss(corrections: &[Option<Tensor>], offsets: &[Vec<Offset>]) -
         let wanted: Vec<f32> =
             offsets.iter().skip(1).flat_map(|Offset(offset)| offset.map(|value| value as f32)).collect();
         let wanted = Tensor::f_from_slice(&wanted)?.f_view([-1, 3])?.f_to_device(moved_by.device())?;
-        let off = (moved_by.f_to_kind(Kind::Float)? - wanted) * unit.f_to_device(moved_by.device())?;
+        let is_asked = |Offset([dx, dy, turn_rad]): &Offset| {
+            dx.hypot(*dy) <= RECOVERABLE_M && turn_rad.abs() * METRES_PER_RADIAN <= RECOVERABLE_M
+        };
+        let asked: Vec<f32> = offsets.iter().skip(1).map(|offset| f32::from(u8::from(is_asked(offset)))).collect();
+        let asked = Tensor::f_from_slice(&asked)?.f_view([-1, 1])?.f_to_device(moved_by.device())?;
+        let off = (moved_by.f_to_kind(Kind::Float)? - wanted) * unit.f_to_device(moved_by.device())? * asked;
         losses.push(off.f_smooth_l1_loss(&off.f_zeros_like()?, tch::Reduction::Mean, 1.0)?);
     }
     match losses.as_slice() {
@@ -242,6 +249,8 @@ mod tests {
         assert!((loss(&[Some(still.shallow_clone())], &offsets) - expected).abs() < 1e-6);
         alignment_loss(&[Some(still.shallow_clone()), None], &[offsets[0].clone(), vec![]]).unwrap().backward();
         assert!(still.grad().double_value(&[0, 0]) < 0.0, "towards the offset");
+        let lost = vec![vec![Offset::default(), Offset([9.0, 0.0, 0.0]), Offset([0.0, 0.0, 1.0])]];
+        assert_eq!(loss(&[Some(still.detach())], &lost), 0.0, "of a lost vehicle nothing is asked");
         assert_eq!(loss(&[None], &[vec![Offset::default()]]), 0.0, "an ego alone has nothing to align");
     }
 

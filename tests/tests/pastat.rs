@@ -108,7 +108,7 @@ fn pastat(folder: &Path, data: &Path, init: &Path, name: &str) -> TrainConfig {
     config.init = Some(init.to_owned());
     config.frozen_encoder = Some(KeptMaps { folder: folder.join("maps"), dtype: Dtype::I8, limit_bytes: 1 << 30 });
     config.samples.moments = Moments { frames: 1, gap: 2, max_delay_nanos: 300_000_000 };
-    config.samples.poses = SamplePoses { tables: vec![], noise: Some(noise), noise_share: 0.5 };
+    config.samples.poses = SamplePoses { noise: Some(noise), noise_share: 0.5, ..SamplePoses::default() };
     config
 }
 

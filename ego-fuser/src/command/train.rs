@@ -67,6 +67,9 @@ pub(crate) struct Arguments {
     /// Share of the samples with that error.
     #[arg(long, default_value_t = 1.0)]
     noise_share: f64,
+    /// Share of the samples in which one neighbour is 5 to 30 m from where it believes to be, and as sure of it as ever.
+    #[arg(long, default_value_t = 0.0)]
+    lost_share: f64,
     /// Neighbours' maps are up to so much older than the ego's in training, milliseconds.
     #[arg(long, value_name = "MS", default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=5_000))]
     max_delay: u64,
@@ -170,8 +173,8 @@ impl Arguments {
 
     /// The poses that maps are aligned by.
     fn poses(&self) -> Result<SamplePoses> {
-        if !(0.0..=1.0).contains(&self.noise_share) {
-            return Err(BadInput("--noise-share is a probability".into()).into());
+        if !(0.0..=1.0).contains(&self.noise_share) || !(0.0..=1.0).contains(&self.lost_share) {
+            return Err(BadInput("--noise-share and --lost-share are probabilities".into()).into());
         }
         let read = |file: &PathBuf| PoseTable::read(file).map(Arc::new).map_err(|error| BadInput(error.to_string()));
         let is_noisy = self.position_noise != 0.0 || self.heading_noise != 0.0;
@@ -186,7 +189,7 @@ impl Arguments {
             ..NoisyPoseConfig::default()
         });
         let tables = self.poses.iter().map(read).collect::<Result<_, _>>()?;
-        let poses = SamplePoses { tables, noise, noise_share: self.noise_share };
+        let poses = SamplePoses { tables, noise, noise_share: self.noise_share, lost_share: self.lost_share };
         poses.validate().map_err(|error| BadInput(error.to_string()))?;
         Ok(poses)
     }

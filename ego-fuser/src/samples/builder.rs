@@ -187,7 +187,7 @@ impl SampleBuilder {
             let last = if is_ego { now.tick } else { self.config.moments.draw_newest(ticks, now.tick, rng) };
             let place = newest.len();
             for (step, tick) in self.config.moments.steps(ticks, now.tick, last, gap).into_iter().enumerate() {
-                let [found, pose] = self.pose_at(TickRef { tick, ..now }, agent, is_ego, &error)?;
+                let [found, pose] = self.pose_at(TickRef { tick, ..now }, agent, [index, agents.len()], &error)?;
                 let PoseEstimate::Pose { world_from_cav, confidence } = pose else {
                     match step {
                         0 => break,
@@ -217,18 +217,18 @@ impl SampleBuilder {
         Ok(newest)
     }
 
-    /// The pose that was found, and the same with what is put on top.
+    /// The pose that was found, and the same with what is put on top; `place` is the agent's and of how many.
     fn pose_at(
         &self,
         tick: TickRef,
         agent: usize,
-        is_ego: bool,
+        place: [usize; 2],
         error: &DrawnError,
     ) -> Result<[PoseEstimate; 2], SampleError> {
         let frames = self.scenes.annotations(tick)?;
         let frame = &frames[agent];
         let found = self.config.poses.found(&self.scenes.scenario(tick).name, frame)?;
-        Ok([found, error.added(found, &frame.cav, frame.capture_nanos, is_ego)])
+        Ok([found, error.added(found, &frame.cav, frame.capture_nanos, place)])
     }
 
     /// The pillars of all views; of one view where all points are merged.

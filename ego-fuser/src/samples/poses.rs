@@ -1,5 +1,6 @@
 //! Where vehicles of a sample believe to be.
 
+use std::f64::consts::{PI, TAU};
 use std::sync::Arc;
 
 use agent::pose_source::{NoiseMode, NoisyPose, NoisyPoseConfig, PoseSourceError, PoseTable};
@@ -18,7 +19,12 @@ pub struct SamplePoses {
     pub noise: Option<NoisyPoseConfig>,
     /// Share of the samples that have that error.
     pub noise_share: f64,
+    /// Share of the samples in which one neighbour is somewhere else than it believes, as sure of it as before.
+    pub lost_share: f64,
 }
+
+/// How far from where it believes to be a neighbour that is lost is, metres.
+const LOST_M: std::ops::Range<f64> = 5.0..30.0;
 
 impl SamplePoses {
     /// Checks the numbers of the error.
@@ -32,17 +38,20 @@ impl SamplePoses {
     /// The same without an error on top.
     #[must_use]
     pub fn without_noise(&self) -> Self {
-        Self { noise: None, ..self.clone() }
+        Self { noise: None, lost_share: 0.0, ..self.clone() }
     }
 
     /// Draws the error of one sample.
     pub(super) fn draw(&self, rng: &mut impl Rng) -> Result<DrawnError, SampleError> {
+        let lost = (self.lost_share > 0.0 && rng.random_bool(self.lost_share.min(1.0))).then(|| Lost::draw(rng));
         let is_noisy = self.noise_share >= 1.0 || rng.random_bool(self.noise_share.clamp(0.0, 1.0));
         let seed = rng.random();
-        let Some(noise) = self.noise.as_ref().filter(|_| is_noisy) else { return Ok(DrawnError::default()) };
+        let Some(noise) = self.noise.as_ref().filter(|_| is_noisy) else {
+            return Ok(DrawnError { lost, ..DrawnError::default() });
+        };
         let spares_ego = noise.mode == NoiseMode::Fixed;
         let noise = NoisyPose::new(&NoisyPoseConfig { seed, ..noise.clone() })?;
-        Ok(DrawnError { noise: Some(noise), spares_ego })
+        Ok(DrawnError { noise: Some(noise), spares_ego, lost })
     }
 
     /// Where a vehicle believes to have been, without an error on top.
@@ -81,11 +90,51 @@ pub(super) struct DrawnError {
     noise: Option<NoisyPose>,
     /// The reference code leaves the ego exact where all others are off by the same.
     spares_ego: bool,
+    lost: Option<Lost>,
+}
+
+/// A neighbour that is somewhere else than it believes.
+#[derive(Debug, Clone, Copy)]
+struct Lost {
+    /// Decides which neighbour it is.
+    draw: usize,
+    shift_m: [f64; 2],
+    turn_rad: f64,
+}
+
+impl Lost {
+    fn draw(rng: &mut impl Rng) -> Self {
+        let (distance_m, (sin, cos)) = (rng.random_range(LOST_M), rng.random_range(0.0..TAU).sin_cos());
+        // Half of them know their heading.
+        let turn_rad = if rng.random_bool(0.5) { rng.random_range(-PI..PI) } else { 0.0 };
+        Self { draw: rng.random_range(0..usize::MAX), shift_m: [distance_m * cos, distance_m * sin], turn_rad }
+    }
 }
 
 impl DrawnError {
-    /// A pose with the error on top; the confidence falls with it.
-    pub(super) fn added(&self, found: PoseEstimate, cav: &CavId, capture_nanos: u64, is_ego: bool) -> PoseEstimate {
+    /// A pose with the error on top; the confidence falls with it, unless the vehicle is lost.
+    ///
+    /// `agent` is its place in a sample of `agents`, the ego being 0.
+    pub(super) fn added(
+        &self,
+        found: PoseEstimate,
+        cav: &CavId,
+        capture_nanos: u64,
+        [agent, agents]: [usize; 2],
+    ) -> PoseEstimate {
+        let noisy = self.noisy(found, cav, capture_nanos, agent == 0);
+        let is_lost = |lost: &&Lost| agent > 0 && lost.draw % (agents - 1) == agent - 1;
+        match (self.lost.as_ref().filter(is_lost), noisy) {
+            (Some(lost), PoseEstimate::Pose { world_from_cav, confidence }) => {
+                let [x, y, z] = world_from_cav.translation_m;
+                let shifted = [x + lost.shift_m[0], y + lost.shift_m[1], z];
+                PoseEstimate::new(Pose::from_xyz_yaw(shifted, world_from_cav.yaw_rad() + lost.turn_rad), confidence)
+            }
+            _ => noisy,
+        }
+    }
+
+    fn noisy(&self, found: PoseEstimate, cav: &CavId, capture_nanos: u64, is_ego: bool) -> PoseEstimate {
         let (Some(noise), PoseEstimate::Pose { world_from_cav, confidence }) = (&self.noise, found) else {
             return found;
         };
@@ -110,7 +159,7 @@ mod tests {
 
     fn drawn(mode: NoiseMode, noise_share: f64, seed: u64) -> DrawnError {
         let noise = NoisyPoseConfig { mode, position_std_m: 1.0, ..NoisyPoseConfig::default() };
-        let poses = SamplePoses { tables: vec![], noise: Some(noise), noise_share };
+        let poses = SamplePoses { noise: Some(noise), noise_share, ..SamplePoses::default() };
         poses.validate().unwrap();
         poses.draw(&mut ChaCha8Rng::seed_from_u64(seed)).unwrap()
     }
@@ -119,13 +168,31 @@ mod tests {
     fn each_sample_draws_its_own_error_and_confidence_falls_with_it() {
         let cav = CavId::new("a").unwrap();
         let found = PoseEstimate::new(Pose::IDENTITY, 0.8);
-        let off = |seed| drawn(NoiseMode::Independent, 1.0, seed).added(found, &cav, 5, true);
+        let off = |seed| drawn(NoiseMode::Independent, 1.0, seed).added(found, &cav, 5, [0, 2]);
         assert_eq!(off(1), off(1));
         assert_ne!(off(1), off(2));
         let PoseEstimate::Pose { world_from_cav, confidence } = off(1) else { panic!() };
         let [x, y, z] = world_from_cav.translation_m;
         let square = x * x + y * y + z * z;
         assert!((f64::from(confidence) - 0.8 / (1.0 + square)).abs() < 1e-5);
+    }
+
+    #[test]
+    fn one_neighbour_is_lost_at_all_moments_and_does_not_know() {
+        let cav = CavId::new("a").unwrap();
+        let found = PoseEstimate::new(Pose::IDENTITY, 0.8);
+        let poses = SamplePoses { lost_share: 1.0, ..SamplePoses::default() };
+        for seed in 0..20 {
+            let error = poses.draw(&mut ChaCha8Rng::seed_from_u64(seed)).unwrap();
+            let said: Vec<_> = (0..4).map(|agent| error.added(found, &cav, 5, [agent, 4])).collect();
+            let lost: Vec<_> = (0..4).filter(|&agent| said[agent] != found).collect();
+            assert!(lost.len() == 1 && lost[0] > 0, "{lost:?}");
+            let PoseEstimate::Pose { world_from_cav, confidence } = said[lost[0]] else { panic!() };
+            let [x, y, _] = world_from_cav.translation_m;
+            assert!(LOST_M.contains(&x.hypot(y)) && (confidence - 0.8).abs() < 1e-6);
+            assert_eq!(error.added(found, &cav, 99, [lost[0], 4]), said[lost[0]]);
+            assert_eq!(error.added(found, &cav, 5, [0, 1]), found, "an ego alone");
+        }
     }
 
     #[test]
@@ -143,8 +210,8 @@ mod tests {
         let cav = CavId::new("a").unwrap();
         let found = PoseEstimate::new(Pose::IDENTITY, 0.8);
         let fixed = drawn(NoiseMode::Fixed, 1.0, 3);
-        assert_eq!(fixed.added(found, &cav, 5, true), found);
-        assert_ne!(fixed.added(found, &cav, 5, false), found);
+        assert_eq!(fixed.added(found, &cav, 5, [0, 2]), found);
+        assert_ne!(fixed.added(found, &cav, 5, [1, 2]), found);
         let noisy = (0..200).filter(|&seed| drawn(NoiseMode::Independent, 0.25, seed).noise.is_some()).count();
         assert!((30..70).contains(&noisy), "{noisy}");
     }

@@ -57,6 +57,10 @@ pub(super) fn card(config: &TrainConfig, model: &CooperativeModel, scenes: &Scen
             ),
         );
     }
+    if poses.lost_share > 0.0 {
+        let share = 100.0 * poses.lost_share;
+        card.row("lost vehicles", format_args!("one neighbour in {share:.0} % of the samples, sure of a wrong pose"));
+    }
     if config.loss.alignment_weight > 0.0 {
         let weight = config.loss.alignment_weight;
         card.row("alignment", format_args!("learns to undo that error, loss with weight {weight}"));
