@@ -7,7 +7,7 @@ use std::hint::black_box;
 use agent::model_config::DetectorConfig;
 use agent::process;
 use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
-use ego_fuser::fusion::{FusionStage, ViewFacts};
+use ego_fuser::fusion::{FusionStage, SentMaps, ViewFacts};
 use ego_fuser::{Exchange, Method};
 use protocol::Pose;
 use tch::{Device, Kind, Tensor, no_grad};
@@ -28,7 +28,11 @@ fn fuse(criterion: &mut Criterion) {
             let facts: Vec<_> = entries.map(|(step, agent)| entry(step, agent)).collect();
             let size = [facts.len() as i64, shape[0], shape[1], shape[2]];
             let features = Tensor::rand(size, (Kind::Float, Device::Cpu));
-            let align = || stage.align(&features, None, &facts).expect("maps lie on the lattice");
+            // As the ego keeps them.
+            let of = |first: i64, count: i64| SentMaps { maps: features.narrow(0, first, count), sent: None };
+            let (newest, earlier) = (of(0, agents as i64), of(agents as i64, size[0] - agents as i64));
+            let kept = (stage.frames() > 1).then(|| stage.kept(&earlier).expect("maps are maps"));
+            let align = || stage.align_kept(&newest, kept.as_ref(), &facts).expect("maps lie on the lattice");
             group.bench_function(BenchmarkId::new(format!("warp/{method}"), agents), |bencher| {
                 bencher.iter(|| black_box(no_grad(align)));
             });

@@ -100,7 +100,14 @@ fn measure(criterion: &mut Criterion, name: &str, fusion: &dyn Fusion, agents: i
         .map(|agent| ViewFacts::fresh(agent, Pose::from_xyz_yaw([9.0 * agent as f64, 0.0, 0.0], 0.0)))
         .collect();
     let grid = BevGrid { x_min_m: -140.8, y_min_m: -38.4, cell_m: 1.6, width: width as u32, height: height as u32 };
-    let views = AlignedViews { features: &features, mask: &mask, own_frame: &features, grid: &grid, facts: &facts };
+    let views = AlignedViews {
+        features: &features,
+        mask: &mask,
+        own_frame: &features,
+        grid: &grid,
+        facts: &facts,
+        earlier: None,
+    };
     let mut best_secs = f64::INFINITY;
     let mut group = criterion.benchmark_group("transformers");
     group.sample_size(10);

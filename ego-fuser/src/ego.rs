@@ -16,7 +16,7 @@ use nalgebra::Isometry3;
 use protocol::{BevGrid, CavId, DecodedFeatures, Detection, DropReason, PointCloud, Pose, PoseEstimate, StageTiming};
 use tch::{Kind, TchError, Tensor, no_grad};
 
-use crate::fusion::{FusionStage, StageError, ViewFacts};
+use crate::fusion::{FusionStage, SentMaps, StageError, ViewFacts};
 use crate::history::{History, KeptMap};
 use crate::method::{Exchange, Method, UnknownMethod};
 use crate::model::{METHOD_KEY, SCORE_THRESHOLD};
@@ -282,16 +282,15 @@ impl Ego {
             maps.push(values);
             sent.push(cells);
         }
-        let newest = maps.len();
         let mut facts: Vec<ViewFacts> =
             aligned.iter().enumerate().map(|(agent, view)| view.facts(agent, aligned[0].view)).collect();
         if let Some(pose_graph) = self.fusion.config().pose_graph() {
             box_correction::correct_by_boxes(&mut facts, &maps, &self.detector, pose_graph)?;
             stages.lap("correct");
         }
+        let mut earlier = Vec::new();
         for (agent, kept, ego_from_cav) in self.earlier(aligned) {
-            maps.push(kept.map.shallow_clone());
-            sent.push(kept.sent.shallow_clone());
+            earlier.push(&kept.shown);
             let age_nanos = aligned[0].view.capture_nanos as i64 - kept.capture_nanos as i64;
             facts.push(ViewFacts {
                 agent,
@@ -300,13 +299,15 @@ impl Ego {
                 age_secs: age_nanos as f64 * 1e-9,
             });
         }
-        let moved = self.fusion.align(&Tensor::f_cat(&maps, 0)?, Some(&Tensor::f_cat(&sent, 0)?), &facts)?;
+        let newest = SentMaps { maps: Tensor::f_cat(&maps, 0)?, sent: Some(Tensor::f_cat(&sent, 0)?) };
+        let earlier = (!earlier.is_empty()).then(|| SentMaps::together(&earlier)).transpose()?;
+        let moved = self.fusion.align_kept(&newest, earlier.as_ref(), &facts)?;
         stages.lap("align");
         let fused = self.fusion.fuse(&moved, &facts, false)?.f_unsqueeze(0)?.f_contiguous()?;
         stages.lap("fuse");
-        maps.truncate(newest);
-        self.keep(aligned, maps.into_iter().zip(sent));
-        self.boxes_of(&fused, stages)
+        let detections = self.boxes_of(&fused, stages)?;
+        self.keep(aligned, maps.into_iter().zip(sent))?;
+        Ok(detections)
     }
 
     /// A map `[1, C, H, W]` and what was sent of it `[1, 1, H, W]`.
@@ -337,13 +338,18 @@ impl Ego {
     }
 
     /// Keeps the maps of this frame for those to come.
-    fn keep(&mut self, aligned: &[Aligned<'_>], maps: impl Iterator<Item = (Tensor, Tensor)>) {
+    fn keep(&mut self, aligned: &[Aligned<'_>], maps: impl Iterator<Item = (Tensor, Tensor)>) -> Result<(), EgoError> {
+        if self.fusion.frames() < 2 {
+            return Ok(());
+        }
         for (Aligned { view, .. }, (map, sent)) in aligned.iter().zip(maps) {
             let Some(world_from_cav) = view.pose.world_from_cav().copied() else { continue };
             let confidence = f64::from(view.pose.confidence());
-            let kept = KeptMap { capture_nanos: view.capture_nanos, world_from_cav, confidence, map, sent };
+            let shown = self.fusion.kept(&SentMaps { maps: map, sent: Some(sent) })?;
+            let kept = KeptMap { capture_nanos: view.capture_nanos, world_from_cav, confidence, shown };
             self.history.keep(&view.cav, kept);
         }
+        Ok(())
     }
 
     /// Early fusion: one cloud in the ego frame.

@@ -6,7 +6,8 @@
 use std::collections::{BTreeMap, VecDeque};
 
 use protocol::{CavId, Pose};
-use tch::Tensor;
+
+use crate::fusion::SentMaps;
 
 /// Maps older than this tell of another situation, nanoseconds.
 pub(crate) const MAX_AGE_NANOS: u64 = 1_000_000_000;
@@ -22,10 +23,8 @@ pub(crate) struct KeptMap {
     pub(crate) world_from_cav: Pose,
     /// How sure it was.
     pub(crate) confidence: f64,
-    /// `[1, C, H, W]` in the frame of its sender.
-    pub(crate) map: Tensor,
-    /// `[1, 1, H, W]`, 1 where a cell was sent.
-    pub(crate) sent: Tensor,
+    /// One map, as the fusion keeps it.
+    pub(crate) shown: SentMaps,
 }
 
 /// Maps by vehicle, oldest first.
@@ -86,7 +85,7 @@ impl History {
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;
-    use tch::{Device, Kind};
+    use tch::{Device, Kind, Tensor};
 
     use super::*;
 
@@ -102,8 +101,7 @@ mod tests {
             capture_nanos: frame * FRAME,
             world_from_cav: Pose::IDENTITY,
             confidence: 1.0,
-            map: empty(),
-            sent: empty(),
+            shown: SentMaps { maps: empty(), sent: None },
         }
     }
 

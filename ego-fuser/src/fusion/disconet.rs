@@ -121,7 +121,14 @@ mod tests {
         let mask = Tensor::ones([3, 1, 6, 10], (Kind::Float, Device::Cpu));
         let grid = BevGrid { x_min_m: 0.0, y_min_m: 0.0, cell_m: 1.0, width: 10, height: 6 };
         let facts: Vec<_> = (0..3).map(|agent| ViewFacts::fresh(agent, Pose::IDENTITY)).collect();
-        let views = AlignedViews { features: &features, mask: &mask, own_frame: &features, grid: &grid, facts: &facts };
+        let views = AlignedViews {
+            features: &features,
+            mask: &mask,
+            own_frame: &features,
+            grid: &grid,
+            facts: &facts,
+            earlier: None,
+        };
         network.fuse(&views, true).unwrap().square().sum(Kind::Float).backward();
         for (name, variable) in variables.variables() {
             if variable.requires_grad() {

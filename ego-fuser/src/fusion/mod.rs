@@ -30,7 +30,7 @@ pub use attention::AttentionFusion;
 pub use block_order::BlockOrder;
 pub use config::{FUSION_KEY, FusionConfig};
 pub use max::MaxFusion;
-pub use stage::{AlignedMaps, FusionStage, StageError};
+pub use stage::{AlignedMaps, FusionStage, SentMaps, StageError};
 pub(crate) use stage::{FUSION_PREFIX, stored_config};
 pub use steering::Steering;
 
@@ -58,7 +58,7 @@ impl ViewFacts {
 /// The maps of one sample, aligned; the first is the ego's newest.
 ///
 /// Missing agents are either not in it or have a mask of zeros: both mean the same to every method.
-#[derive(Debug)]
+#[derive(Debug, Clone, Copy)]
 pub struct AlignedViews<'a> {
     /// `[N, C, H, W]` features on the ego lattice.
     pub features: &'a Tensor,
@@ -70,6 +70,19 @@ pub struct AlignedViews<'a> {
     pub grid: &'a BevGrid,
     /// `N`: what is known of each.
     pub facts: &'a [ViewFacts],
+    /// Maps from before each agent's newest, where the method takes them apart, see [`Fusion::earlier_cells`].
+    pub earlier: Option<EarlierViews<'a>>,
+}
+
+/// Aligned maps from before the newest of their agents.
+#[derive(Debug, Clone, Copy)]
+pub struct EarlierViews<'a> {
+    /// `[O, C, h, w]` features on a lattice of the ego with larger cells.
+    pub features: &'a Tensor,
+    /// `[O, 1, h, w]` 1 where a map reaches and was sent, 0 elsewhere.
+    pub mask: &'a Tensor,
+    /// `O`: what is known of each.
+    pub facts: &'a [ViewFacts],
 }
 
 /// A way to fuse aligned feature maps.
@@ -80,9 +93,9 @@ pub trait Fusion: Debug + Send {
     /// [`TchError`] when the shapes of features and mask do not fit.
     fn fuse(&self, views: &AlignedViews<'_>, train: bool) -> Result<Tensor, TchError>;
 
-    /// The same, with how it has moved each entry but the first beyond its pose, `[N - 1, 3]`: along x and y of the ego,
-    /// metres, and about the entry's sender, radians. Nothing for methods that take poses as they are, and where there is
-    /// one entry.
+    /// The same, with how it has moved each entry but the first beyond its pose, `[N - 1, 3]`, those of
+    /// [`AlignedViews::earlier`] last: along x and y of the ego, metres, and about the entry's sender, radians. Nothing for
+    /// methods that take poses as they are, and where there is one entry.
     ///
     /// # Errors
     /// As [`Self::fuse`].
@@ -93,6 +106,12 @@ pub trait Fusion: Debug + Send {
     /// Time steps that it wants of every agent, the newest included.
     fn frames(&self) -> usize {
         1
+    }
+
+    /// Along each edge so many cells of a map from before its agent's newest become one before it is moved; `None`: such
+    /// maps come among the newest, as they are.
+    fn earlier_cells(&self) -> Option<i64> {
+        None
     }
 }
 
@@ -170,7 +189,8 @@ mod tests {
             .collect();
         let (height, width) = (SHAPE[1] as u32, SHAPE[2] as u32);
         let grid = BevGrid { x_min_m: -12.0, y_min_m: -8.0, cell_m: 1.0, width, height };
-        let views = AlignedViews { features, mask: &mask, own_frame: features, grid: &grid, facts: &facts };
+        let views =
+            AlignedViews { features, mask: &mask, own_frame: features, grid: &grid, facts: &facts, earlier: None };
         let fused = no_grad(|| fusion.fuse(&views, false)).unwrap();
         assert_eq!(fused.size(), SHAPE);
         fused
@@ -227,8 +247,8 @@ mod tests {
                 .collect();
             let (height, width) = (SHAPE[1] as u32, SHAPE[2] as u32);
             let grid = BevGrid { x_min_m: -12.0, y_min_m: -8.0, cell_m: 1.0, width, height };
-            let views =
-                AlignedViews { features: &features, mask: &mask, own_frame: &features, grid: &grid, facts: &facts };
+            let (own_frame, facts) = (&features, &facts[..]);
+            let views = AlignedViews { features: &features, mask: &mask, own_frame, grid: &grid, facts, earlier: None };
             let fused = fusion.fuse(&views, true).unwrap();
             if variables.is_empty() {
                 continue;

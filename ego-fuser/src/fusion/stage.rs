@@ -6,10 +6,10 @@ use agent::model_config::{ConfigError, DetectorConfig, YAxis};
 use agent::weights::{Weights, WeightsError};
 use protocol::{BevGrid, Pose};
 use tch::nn::{self, VarStore};
-use tch::{Device, Tensor};
+use tch::{Device, TchError, Tensor};
 
 use super::steering::{self, Steering};
-use super::{AlignedViews, FUSION_KEY, Fusion, FusionConfig, ViewFacts};
+use super::{AlignedViews, EarlierViews, FUSION_KEY, Fusion, FusionConfig, ViewFacts};
 use crate::method::{Exchange, Method};
 use crate::warp::{WarpError, Warped, warp_to_ego};
 
@@ -38,11 +38,46 @@ pub struct FusionStage {
     y_axis: YAxis,
 }
 
+/// Maps in the axes of their senders.
+#[derive(Debug)]
+pub struct SentMaps {
+    /// `[N, C, H, W]`.
+    pub maps: Tensor,
+    /// `[N, 1, H, W]`, 1 where a cell was sent; absent: everywhere.
+    pub sent: Option<Tensor>,
+}
+
+impl SentMaps {
+    /// The entries from `first` up to `end`.
+    fn only(&self, first: i64, end: i64) -> Result<Self, TchError> {
+        let of = |tensor: &Tensor| tensor.f_narrow(0, first, end - first);
+        Ok(Self { maps: of(&self.maps)?, sent: self.sent.as_ref().map(of).transpose()? })
+    }
+
+    /// Maps of one size, one after another.
+    ///
+    /// # Errors
+    /// [`TchError`] when there are none, or of several sizes.
+    pub fn together(all: &[&Self]) -> Result<Self, TchError> {
+        let maps: Vec<&Tensor> = all.iter().map(|maps| &maps.maps).collect();
+        // Where one of them was sent as a whole, that has to be said.
+        let sent = all.iter().any(|maps| maps.sent.is_some()).then(|| {
+            let cells = |maps: &&Self| match &maps.sent {
+                Some(sent) => Ok(sent.shallow_clone()),
+                None => maps.maps.f_narrow(1, 0, 1)?.f_ones_like(),
+            };
+            Tensor::f_cat(&all.iter().map(cells).collect::<Result<Vec<_>, _>>()?, 0)
+        });
+        Ok(Self { maps: Tensor::f_cat(&maps, 0)?, sent: sent.transpose()? })
+    }
+}
+
 /// Maps on the ego lattice, with what they were made from.
 #[derive(Debug)]
 pub struct AlignedMaps {
     own_frame: Tensor,
     warped: Warped,
+    earlier: Option<Warped>,
 }
 
 impl FusionStage {
@@ -102,7 +137,8 @@ impl FusionStage {
     }
 
     /// Moves maps onto the ego lattice: `own_frame` is `[N, C, H, W]`, each map in the axes of its sender, `sent`
-    /// `[N, 1, H, W]` is 1 where a cell was sent (absent: everywhere), `facts` are `N`, the ego's first.
+    /// `[N, 1, H, W]` is 1 where a cell was sent (absent: everywhere), `facts` are `N`: the ego's newest first, then the
+    /// newest of all others, then what is older.
     ///
     /// # Errors
     /// [`WarpError`] when the maps do not lie on the lattice or facts are missing.
@@ -112,13 +148,69 @@ impl FusionStage {
         sent: Option<&Tensor>,
         facts: &[ViewFacts],
     ) -> Result<AlignedMaps, WarpError> {
+        let all = SentMaps { maps: own_frame.shallow_clone(), sent: sent.map(Tensor::shallow_clone) };
+        let (count, newest) = (own_frame.size4()?.0, newest(facts) as i64);
+        if count == newest {
+            return self.align_kept(&all, None, facts);
+        }
+        let earlier = self.kept(&all.only(newest, count)?)?;
+        self.align_kept(&all.only(0, newest.min(count))?, Some(&earlier), facts)
+    }
+
+    /// What is kept of maps for later frames, see [`Fusion::earlier_cells`].
+    ///
+    /// # Errors
+    /// [`TchError`] when the maps are none.
+    pub fn kept(&self, SentMaps { maps, sent }: &SentMaps) -> Result<SentMaps, TchError> {
+        let cells = self.fusion.earlier_cells().unwrap_or(1);
+        // A larger cell was sent where any of its cells was.
+        let sent = sent.as_ref().map(|sent| larger_cells(sent, cells)?.f_ceil()).transpose()?;
+        Ok(SentMaps { maps: larger_cells(maps, cells)?, sent })
+    }
+
+    /// [`Self::align`] with the maps that are older as they were [`Self::kept`].
+    ///
+    /// # Errors
+    /// [`WarpError`] when the maps do not lie on the lattice or facts are missing.
+    pub fn align_kept(
+        &self,
+        newest: &SentMaps,
+        earlier: Option<&SentMaps>,
+        facts: &[ViewFacts],
+    ) -> Result<AlignedMaps, WarpError> {
         let poses: Vec<Pose> = self.of_network(facts).iter().map(|facts| facts.ego_from_cav).collect();
-        let own_frame = match &self.steering {
-            Some(steering) => steering.turn(own_frame, &poses)?,
-            None => own_frame.shallow_clone(),
+        let count = newest.maps.size4()?.0;
+        let maps = count + earlier.map_or(Ok(0), |earlier| earlier.maps.size4().map(|size| size.0))?;
+        if maps != poses.len() as i64 {
+            return Err(WarpError::PoseCount { maps, poses: poses.len() });
+        }
+        let (cells, Some(earlier)) = (self.fusion.earlier_cells(), earlier) else {
+            let (own_frame, warped) = self.moved(newest, &poses, &self.grid)?;
+            return Ok(AlignedMaps { own_frame, warped, earlier: None });
         };
-        let warped = warp_to_ego(&own_frame, sent, &poses, &self.grid)?;
-        Ok(AlignedMaps { own_frame, warped })
+        let Some(cells) = cells else {
+            let (own_frame, warped) = self.moved(&SentMaps::together(&[newest, earlier])?, &poses, &self.grid)?;
+            return Ok(AlignedMaps { own_frame, warped, earlier: None });
+        };
+        let (of_newest, of_earlier) = poses.split_at(count as usize);
+        let (own_frame, warped) = self.moved(newest, of_newest, &self.grid)?;
+        let earlier = self.moved(earlier, of_earlier, &with_cells_of(&self.grid, cells))?.1;
+        Ok(AlignedMaps { own_frame, warped, earlier: Some(earlier) })
+    }
+
+    /// Maps turned, and moved onto the ego's `grid`.
+    fn moved(
+        &self,
+        SentMaps { maps, sent }: &SentMaps,
+        poses: &[Pose],
+        grid: &BevGrid,
+    ) -> Result<(Tensor, Warped), WarpError> {
+        let own_frame = match &self.steering {
+            Some(steering) => steering.turn(maps, poses)?,
+            None => maps.shallow_clone(),
+        };
+        let warped = warp_to_ego(&own_frame, sent.as_ref(), poses, grid)?;
+        Ok((own_frame, warped))
     }
 
     /// Fuses aligned maps into `[C, H, W]` in the frame of the ego.
@@ -139,9 +231,14 @@ impl FusionStage {
         facts: &[ViewFacts],
         train: bool,
     ) -> Result<(Tensor, Option<Tensor>), WarpError> {
-        let AlignedMaps { own_frame, warped } = maps;
+        let AlignedMaps { own_frame, warped, earlier } = maps;
         let facts = &*self.of_network(facts);
-        let views = AlignedViews { features: &warped.features, mask: &warped.mask, own_frame, grid: &self.grid, facts };
+        let (facts, before) = facts.split_at(if earlier.is_some() { newest(facts) } else { facts.len() });
+        let Warped { features, mask } = warped;
+        let earlier = earlier.as_ref();
+        let earlier =
+            earlier.map(|warped| EarlierViews { features: &warped.features, mask: &warped.mask, facts: before });
+        let views = AlignedViews { features, mask, own_frame, grid: &self.grid, facts, earlier };
         Ok(self.fusion.fuse_and_correct(&views, train)?)
     }
 }
@@ -155,6 +252,27 @@ impl FusionStage {
         let mirrored = facts.iter().map(|facts| ViewFacts { ego_from_cav: facts.ego_from_cav.mirrored_y(), ..*facts });
         Cow::Owned(mirrored.collect())
     }
+}
+
+/// How many of the first entries are the newest of their agents.
+fn newest(facts: &[ViewFacts]) -> usize {
+    let is_first = |(entry, of): &(usize, &ViewFacts)| facts[..*entry].iter().all(|before| before.agent != of.agent);
+    facts.iter().enumerate().take_while(is_first).count()
+}
+
+/// Maps `[N, C, H, W]` with cells of `cells` by `cells`, each their mean; those at the edges of fewer.
+pub(super) fn larger_cells(maps: &Tensor, cells: i64) -> Result<Tensor, TchError> {
+    if cells == 1 {
+        return Ok(maps.shallow_clone());
+    }
+    maps.f_avg_pool2d([cells, cells], [cells, cells], [0_i64, 0], true, false, None::<i64>)
+}
+
+/// The lattice of such maps.
+fn with_cells_of(grid: &BevGrid, cells: i64) -> BevGrid {
+    let cells = cells as u32;
+    let (width, height) = (grid.width.div_ceil(cells), grid.height.div_ceil(cells));
+    BevGrid { cell_m: grid.cell_m * f64::from(cells), width, height, ..*grid }
 }
 
 /// The configuration that a weights file names, as long as it belongs to `method`.

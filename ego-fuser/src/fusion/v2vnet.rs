@@ -224,8 +224,14 @@ mod tests {
             let own_frame = Tensor::full([3, 4, 4, 24], 0.5, FLOAT);
             let _ = own_frame.get(2).narrow(2, 12, 12).fill_(third);
             let features = own_frame.shallow_clone();
-            let views =
-                AlignedViews { features: &features, mask: &mask, own_frame: &own_frame, grid: &grid, facts: &facts };
+            let views = AlignedViews {
+                features: &features,
+                mask: &mask,
+                own_frame: &own_frame,
+                grid: &grid,
+                facts: &facts,
+                earlier: None,
+            };
             no_grad(|| network.fuse(&views, false)).unwrap()
         };
         for (rounds, is_heard) in [(1, false), (2, true)] {

@@ -170,7 +170,14 @@ mod tests {
         let features = Tensor::ones([2, 3, 1, 2], FLOAT) * &mask;
         let grid = BevGrid { x_min_m: 0.0, y_min_m: 0.0, cell_m: 1.0, width: 2, height: 1 };
         let facts = [0, 1].map(|agent| ViewFacts::fresh(agent, Pose::IDENTITY));
-        let views = AlignedViews { features: &features, mask: &mask, own_frame: &features, grid: &grid, facts: &facts };
+        let views = AlignedViews {
+            features: &features,
+            mask: &mask,
+            own_frame: &features,
+            grid: &grid,
+            facts: &facts,
+            earlier: None,
+        };
         for (missing, expected) in [(Missing::Absent, 1.0), (Missing::Zero, 1.0 / (1.0 + (-(3f64.sqrt())).exp()))] {
             let config = Where2commConfig { missing, ..Where2commConfig::default() };
             let fused = Where2comm::new(&config).fuse(&views, false).unwrap();

@@ -6,6 +6,7 @@ use tch::{Kind, TchError, Tensor};
 
 use super::config::FsaConfig;
 use super::correlation::{PARTS, correlate, peaks, shifts};
+use super::entries::Maps;
 use crate::warp::{BILINEAR, NEAREST, PADDING_ZEROS};
 
 /// Keeps the weight of a map that fits nowhere from being divided by.
@@ -23,13 +24,20 @@ pub(super) struct Area {
     middle_m: [f64; 2],
     half_m: [f64; 2],
     cell_m: f64,
+    /// Cells are compared with those of the ego up to so many cells away.
+    radius: i64,
 }
 
 impl Area {
-    /// The area of `height` x `width` cells that begin where `grid` begins.
-    pub(super) fn new(grid: &BevGrid, [height, width]: [i64; 2]) -> Self {
+    /// The area of `height` x `width` cells that begin where `grid` begins; maps are compared up to `radius` cells away.
+    pub(super) fn new(grid: &BevGrid, [height, width]: [i64; 2], radius: i64) -> Self {
         let half_m = [width as f64 * grid.cell_m / 2.0, height as f64 * grid.cell_m / 2.0];
-        Self { middle_m: [grid.x_min_m + half_m[0], grid.y_min_m + half_m[1]], half_m, cell_m: grid.cell_m }
+        Self { middle_m: [grid.x_min_m + half_m[0], grid.y_min_m + half_m[1]], half_m, cell_m: grid.cell_m, radius }
+    }
+
+    /// The same with cells of `cells` by `cells`, compared up to about as many metres away.
+    pub(super) fn with_cells_of(self, cells: i64) -> Self {
+        Self { cell_m: self.cell_m * cells as f64, radius: (self.radius + cells - 1) / cells, ..self }
     }
 
     /// `[PARTS^2, 2]`: the middles of the parts that maps are compared by, metres from the middle of the area.
@@ -55,11 +63,30 @@ pub(super) struct SpatialAlignment {
     hidden: nn::Linear,
     /// What is added to the motion that fits the parts' shifts, and how much of that motion is taken.
     delta: nn::Linear,
+    /// What the map's tokens are told of how well it fits.
+    fit: nn::Linear,
+}
+
+/// What the comparison of `K` maps with the ego's has found.
+#[derive(Debug)]
+pub(super) struct Found {
+    /// `[K, 3]`: shift along x and y in metres, turn in radians.
+    pub(super) deltas: Tensor,
+    /// `[K, D]`: how well each map fits, as a token. A map that fits nowhere is of a sender that is not where it says.
+    pub(super) fit: Tensor,
+}
+
+impl Found {
+    /// What several comparisons have found, one after another.
+    pub(super) fn all(found: &[Self]) -> Result<Self, TchError> {
+        let cat = |of: fn(&Self) -> &Tensor| Tensor::f_cat(&found.iter().map(of).collect::<Vec<_>>(), 0);
+        Ok(Self { deltas: cat(|found| &found.deltas)?, fit: cat(|found| &found.fit)? })
+    }
 }
 
 impl SpatialAlignment {
-    /// Moves nothing before it is trained.
-    pub(super) fn new(path: &nn::Path<'_>, channels: i64, config: &FsaConfig) -> Self {
+    /// Moves nothing and tells tokens of `dim` channels nothing before it is trained.
+    pub(super) fn new(path: &nn::Path<'_>, [channels, dim]: [i64; 2], config: &FsaConfig) -> Self {
         let FsaConfig { matching, hidden, .. } = *config;
         let still = nn::LinearConfig { ws_init: Init::Const(0.0), bs_init: Some(Init::Const(0.0)), bias: true };
         let around = nn::ConvConfig { padding: 1, ..Default::default() };
@@ -73,30 +100,33 @@ impl SpatialAlignment {
             sharpness: path.var("sharpness", &[], Init::Const(SHARPNESS.ln())),
             hidden: nn::linear(path / "hidden", inputs, hidden, nn::LinearConfig::default()),
             delta: nn::linear(path / "delta", hidden, 6, still),
+            fit: nn::linear(path / "fit", hidden, dim, still),
             config: config.clone(),
         }
     }
 
-    /// `[N - 1, 3]`: shift along x and y in metres, turn in radians, of every entry but the first.
+    /// Cells are compared up to so many cells away.
+    pub(super) fn radius(&self) -> i64 {
+        self.config.radius
+    }
+
+    /// Compares `K` maps with the ego's.
     ///
     /// # Shapes
-    /// - `maps`: `[N, C, H, W]`, the ego's newest first
-    /// - `mask`: `[N, 1, H, W]`, 1 where a map shows something
-    /// - `trust`: `[N, 3]`, the confidence embedding, the confidence itself and the ego's; zeros: nothing is known
-    /// - `ego_from_cav`: `N` poses of the maps' senders
-    pub(super) fn deltas(
+    /// - `ego`, `others`: 1 and `K` maps on the lattice of `area`
+    /// - `trust`: `[K, 3]`, the confidence embedding, the confidence itself and the ego's; zeros: nothing is known
+    /// - `ego_from_cav`: `K` poses of the maps' senders
+    pub(super) fn compare(
         &self,
-        maps: &Tensor,
-        mask: &Tensor,
+        ego: &Maps,
+        others: &Maps,
         trust: &Tensor,
         ego_from_cav: &[Pose],
         area: &Area,
-    ) -> Result<Tensor, TchError> {
-        let entries = maps.size4()?.0;
-        let shown = self.shown(maps, mask)?;
-        let (ego, others) = (shown.f_narrow(0, 0, 1)?, shown.f_narrow(0, 1, entries - 1)?);
-        let found = correlate(&ego, &others, self.config.radius)?;
-        let shifts = (shifts(self.config.radius)? * area.cell_m).f_to_device(maps.device())?;
+    ) -> Result<Found, TchError> {
+        let found = correlate(&self.shown(ego)?, &self.shown(others)?, area.radius)?;
+        let device = others.features.device();
+        let shifts = (shifts(area.radius)? * area.cell_m).f_to_device(device)?;
         let sharpness = self.sharpness.f_exp()?;
         let parts = peaks(&found.parts, &sharpness, &shifts)?;
         let whole = peaks(&found.whole, &sharpness, &shifts)?;
@@ -104,22 +134,23 @@ impl SpatialAlignment {
         let (fit, fit_whole) = (fit?, fit_whole?);
         let weight = fit.f_relu()?.f_square()? * &found.energy;
         let motion = rigid_motion(&parts, &weight, ego_from_cav, area)?;
-        let by_entry = |parts: Tensor| parts.f_transpose(0, 1)?.f_reshape([entries - 1, -1]);
-        let trust = trust.f_narrow(0, 1, entries - 1)?;
+        let by_entry = |parts: Tensor| parts.f_transpose(0, 1)?.f_reshape([ego_from_cav.len() as i64, -1]);
+        let motion_in = motion.shallow_clone();
         let inputs =
-            [by_entry(parts)?, by_entry(fit)?, whole, fit_whole.f_unsqueeze(1)?, motion.shallow_clone(), trust];
-        let learnt = self.delta.forward(&self.hidden.forward(&Tensor::f_cat(&inputs, 1)?).f_relu()?);
+            [by_entry(parts)?, by_entry(fit)?, whole, fit_whole.f_unsqueeze(1)?, motion_in, trust.shallow_clone()];
+        let hidden = self.hidden.forward(&Tensor::f_cat(&inputs, 1)?).f_relu()?;
+        let learnt = self.delta.forward(&hidden);
         let FsaConfig { max_shift_m, max_turn_rad, .. } = self.config;
         let bounds = Tensor::f_from_slice(&[max_shift_m as f32, max_shift_m as f32, max_turn_rad as f32])?;
-        let bounds = bounds.f_to_device(maps.device())?;
+        let bounds = bounds.f_to_device(device)?;
         let raw = learnt.f_narrow(1, 0, 3)? + motion / &bounds * learnt.f_narrow(1, 3, 3)?;
-        Ok(raw.f_tanh()? * bounds)
+        Ok(Found { deltas: raw.f_tanh()? * bounds, fit: self.fit.forward(&hidden) })
     }
 
     /// What is compared, `[N, M, H, W]`: zero in the mean of what a map shows, so that empty road fits nothing.
-    fn shown(&self, maps: &Tensor, mask: &Tensor) -> Result<Tensor, TchError> {
+    fn shown(&self, Maps { features, mask }: &Maps) -> Result<Tensor, TchError> {
         let [cell, around] = &self.matching;
-        let shown = around.forward(&cell.forward(maps).f_relu()?);
+        let shown = around.forward(&cell.forward(features).f_relu()?);
         let over_map = |tensor: &Tensor| tensor.f_sum_dim_intlist([2_i64, 3].as_slice(), true, None);
         let mean = over_map(&(&shown * mask))? / over_map(mask)?.f_clamp_min(1.0)?;
         Ok((shown - mean) * mask)
@@ -144,7 +175,7 @@ fn rigid_motion(parts: &Tensor, weight: &Tensor, ego_from_cav: &[Pose], area: &A
     let inertia = over_parts(&(arm.f_square()?.f_sum_dim_intlist([2_i64].as_slice(), true, None)? * &share))?;
     // A single part says nothing of a turn: a few metres keep that from being divided by.
     let turn = over_parts(&(turning * &share))? / inertia.f_add_scalar(ARM_M * ARM_M)?;
-    let senders: Vec<f32> = ego_from_cav[1..]
+    let senders: Vec<f32> = ego_from_cav
         .iter()
         .flat_map(|pose| [0, 1].map(|axis| (pose.translation_m[axis] - area.middle_m[axis]) as f32))
         .collect();
@@ -198,7 +229,11 @@ mod tests {
     const GRID: BevGrid = BevGrid { x_min_m: -8.0, y_min_m: -4.0, cell_m: 0.5, width: 32, height: 16 };
 
     fn area() -> Area {
-        Area::new(&GRID, [16, 32])
+        Area::new(&GRID, [16, 32], 4)
+    }
+
+    fn random(maps: i64) -> Maps {
+        Maps { features: Tensor::randn([maps, 4, 16, 32], FLOAT), mask: Tensor::ones([maps, 1, 16, 32], FLOAT) }
     }
 
     fn moved(maps: &Tensor, delta: [f32; 3], ego_from_cav: Pose) -> Tensor {
@@ -210,13 +245,14 @@ mod tests {
     #[test]
     fn untrained_it_moves_nothing_and_gradients_reach_it() {
         let variables = VarStore::new(Device::Cpu);
-        let fsa = SpatialAlignment::new(&variables.root(), 4, &FsaConfig::default());
-        let poses = [Pose::IDENTITY, Pose::from_xyz_yaw([3.0, 1.0, 0.0], 0.3), Pose::IDENTITY];
-        let (maps, mask) = (Tensor::randn([3, 4, 16, 32], FLOAT), Tensor::ones([3, 1, 16, 32], FLOAT));
-        let deltas = fsa.deltas(&maps, &mask, &Tensor::ones([3, TRUST], FLOAT), &poses, &area()).unwrap();
+        let fsa = SpatialAlignment::new(&variables.root(), [4, 6], &FsaConfig::default());
+        let poses = [Pose::from_xyz_yaw([3.0, 1.0, 0.0], 0.3), Pose::IDENTITY];
+        let found = fsa.compare(&random(1), &random(2), &Tensor::ones([2, TRUST], FLOAT), &poses, &area()).unwrap();
+        assert_eq!(found.fit, Tensor::zeros([2, 6], FLOAT));
+        let deltas = found.deltas;
         assert_eq!(deltas, Tensor::zeros([2, 3], FLOAT));
         let maps = Tensor::randn([2, 4, 16, 32], FLOAT);
-        let lattice = lattice(&deltas, &poses[1..], &area(), [16, 32]).unwrap();
+        let lattice = lattice(&deltas, &poses, &area(), [16, 32]).unwrap();
         let (same, valid) = resample(&maps, &Tensor::ones([2, 1, 16, 32], FLOAT), &lattice).unwrap();
         assert!(same.allclose(&maps, 1e-4, 1e-4, false));
         assert_eq!(valid.min().double_value(&[]), 1.0);
@@ -250,11 +286,10 @@ mod tests {
     fn the_shift_is_bounded_whatever_is_learnt() {
         let variables = VarStore::new(Device::Cpu);
         let config = FsaConfig::default();
-        let fsa = SpatialAlignment::new(&variables.root(), 4, &config);
+        let fsa = SpatialAlignment::new(&variables.root(), [4, 6], &config);
         let _ = tch::no_grad(|| variables.variables()["delta.bias"].shallow_clone().fill_(1e6));
-        let (maps, mask) = (Tensor::randn([2, 4, 16, 32], FLOAT), Tensor::ones([2, 1, 16, 32], FLOAT));
-        let trust = Tensor::ones([2, TRUST], FLOAT);
-        let deltas = fsa.deltas(&maps, &mask, &trust, &[Pose::IDENTITY; 2], &area()).unwrap();
+        let trust = Tensor::ones([1, TRUST], FLOAT);
+        let deltas = fsa.compare(&random(1), &random(1), &trust, &[Pose::IDENTITY], &area()).unwrap().deltas;
         let found = Vec::<f32>::try_from(deltas.view(-1)).unwrap();
         assert!((found[0] - 3.0).abs() < 1e-6 && (f64::from(found[2]) - config.max_turn_rad).abs() < 1e-6);
     }
@@ -276,8 +311,7 @@ mod tests {
             .collect();
         let parts = Tensor::from_slice(&parts).view([-1, 1, 2]);
         let wide = Area { cell_m: 0.5, ..area() };
-        let motion =
-            rigid_motion(&parts, &Tensor::ones([PARTS * PARTS, 1], FLOAT), &[Pose::IDENTITY, sender], &wide).unwrap();
+        let motion = rigid_motion(&parts, &Tensor::ones([PARTS * PARTS, 1], FLOAT), &[sender], &wide).unwrap();
         let [dx, dy, theta] = [0, 1, 2].map(|index| motion.double_value(&[0, index]));
         // The turn comes out smaller by the arm that is added, and the shift by what that turn moves the sender.
         assert!(theta > 0.4 * turn && theta <= turn, "{theta}");

@@ -1,7 +1,7 @@
 //! Attention among the tokens of one cell, over agents and time, and among the tokens of one map, within windows.
 
 use tch::nn::{self, Init, Module};
-use tch::{TchError, Tensor};
+use tch::{Kind, TchError, Tensor};
 
 /// What a masked score is set to: low enough for no weight, and finite, so that rows with nothing valid stay numbers.
 const MASKED: f64 = -1e9;
@@ -10,8 +10,12 @@ const MASKED: f64 = -1e9;
 #[derive(Debug)]
 pub(super) struct AgentAttention {
     query: nn::Linear,
-    key_value: nn::Linear,
+    key: nn::Linear,
+    value: nn::Linear,
     out: nn::Linear,
+    /// `[D, heads]`, 1 where a channel is of a head: sums over a head's channels are products with it, and so are copies of
+    /// a head's weight to its channels; both cost less than sums and products of many small rows.
+    members: Tensor,
     heads: i64,
 }
 
@@ -20,8 +24,10 @@ impl AgentAttention {
         let bare = nn::LinearConfig { bias: false, ..Default::default() };
         Self {
             query: nn::linear(path / "query", dim, dim, bare),
-            key_value: nn::linear(path / "key_value", dim, 2 * dim, bare),
+            key: nn::linear(path / "key", dim, dim, bare),
+            value: nn::linear(path / "value", dim, dim, bare),
             out: nn::linear(path / "out", dim, dim, nn::LinearConfig::default()),
+            members: Tensor::eye(heads, (Kind::Float, path.device())).repeat_interleave_self_int(dim / heads, 0, None),
             heads,
         }
     }
@@ -36,22 +42,24 @@ impl AgentAttention {
         let (entries, height, width, dim) = tokens.size4()?;
         let (cells, each) = (height * width, dim / self.heads);
         let query = self.query.forward(&tokens.f_narrow(0, 0, rows)?) / (each as f64).sqrt();
-        let key_value = self.key_value.forward(tokens);
-        let key = key_value.f_narrow(3, 0, dim)?.f_reshape([entries, cells, self.heads, each])?;
-        let value = key_value.f_narrow(3, dim, dim)?.f_reshape([entries, cells, self.heads, each])?;
-        let query = query.f_view([rows, cells, self.heads, each])?;
+        let (key, value) = (self.key.forward(tokens), self.value.forward(tokens));
         let hidden = valid.f_eq(0.0)?.f_view([entries, cells, 1])?;
-        let mixed =
-            if rows == 1 { one_row(&query, &key, &value, &hidden)? } else { all_rows(&query, &key, &value, &hidden)? };
+        let mixed = if rows == 1 {
+            let by_cell = |tensor: &Tensor| tensor.f_view([-1, cells, dim]);
+            self.one_row(&by_cell(&query)?, &by_cell(&key)?, &by_cell(&value)?, &hidden)?
+        } else {
+            let by_head = |tensor: &Tensor| tensor.f_view([-1, cells, self.heads, each]);
+            all_rows(&by_head(&query)?, &by_head(&key)?, &by_head(&value)?, &hidden)?
+        };
         Ok(self.out.forward(&mixed.f_reshape([rows, height, width, dim])?))
     }
-}
 
-/// Only the ego asks: sums over few entries, cheaper than products of small matrices.
-fn one_row(query: &Tensor, key: &Tensor, value: &Tensor, hidden: &Tensor) -> Result<Tensor, TchError> {
-    let scores = (query * key).f_sum_dim_intlist([3_i64].as_slice(), false, None)?;
-    let weights = scores.f_masked_fill(hidden, MASKED)?.f_softmax(0, None)?;
-    (weights.f_unsqueeze(3)? * value).f_sum_dim_intlist([0_i64].as_slice(), true, None)
+    /// Only the ego asks: sums over few entries, cheaper than products of small matrices.
+    fn one_row(&self, query: &Tensor, key: &Tensor, value: &Tensor, hidden: &Tensor) -> Result<Tensor, TchError> {
+        let scores = (query * key).f_matmul(&self.members)?;
+        let weights = scores.f_masked_fill(hidden, MASKED)?.f_softmax(0, None)?;
+        (weights.f_matmul(&self.members.f_transpose(0, 1)?)? * value).f_sum_dim_intlist([0_i64].as_slice(), true, None)
+    }
 }
 
 fn all_rows(query: &Tensor, key: &Tensor, value: &Tensor, hidden: &Tensor) -> Result<Tensor, TchError> {
@@ -158,8 +166,8 @@ fn relative_places(edge: i64) -> Vec<i64> {
 
 #[cfg(test)]
 mod tests {
+    use tch::Device;
     use tch::nn::VarStore;
-    use tch::{Device, Kind};
 
     use super::*;
 

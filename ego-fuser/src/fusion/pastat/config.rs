@@ -83,6 +83,9 @@ pub struct PastatConfig {
     pub refine: Option<i64>,
     /// Time steps wanted of every agent, the T of the paper.
     pub frames: usize,
+    /// Along each edge so many cells of a map from before its agent's newest are taken together before it is moved: what
+    /// is a few steps old need not be known to the cell.
+    pub earlier_cells: i64,
     /// Time from one step to the next that the temporal encoding counts in, seconds.
     pub frame_secs: f64,
     /// Whether poses' confidences are embedded (Eq. 7).
@@ -108,6 +111,7 @@ impl PastatConfig {
             rows: Rows::Ego,
             refine: Some(32),
             frames: 3,
+            earlier_cells: 2,
             frame_secs: 0.1,
             ce: true,
             fsa: Some(FsaConfig::default()),
@@ -126,6 +130,7 @@ impl PastatConfig {
             windows: vec![4, 8],
             rows: Rows::All,
             refine: Some(channels),
+            earlier_cells: 1,
             fsa: Some(FsaConfig { matching: 16, ..FsaConfig::default() }),
             ..Self::lean(channels)
         }
@@ -148,7 +153,7 @@ impl PastatConfig {
     /// compares.
     #[must_use]
     pub fn padding_cells(&self) -> i64 {
-        let parts = if self.fsa.is_some() { PARTS } else { 1 };
+        let parts = if self.fsa.is_some() { PARTS * self.earlier_cells } else { 1 };
         lcm(self.patch * self.windows.iter().copied().fold(1, lcm), parts)
     }
 
@@ -171,6 +176,9 @@ impl PastatConfig {
             if !(1..=most).contains(&value) {
                 return error(field, value.to_string(), "above zero and of a sensible size");
             }
+        }
+        if self.earlier_cells < 1 || self.patch % self.earlier_cells != 0 {
+            return error("pastat earlier_cells", self.earlier_cells.to_string(), "a divisor of the patch");
         }
         if self.dim % (2 * self.heads) != 0 {
             return error("pastat dim", self.dim.to_string(), "a multiple of twice the heads");
@@ -236,6 +244,7 @@ mod tests {
         for (config, part) in [
             (PastatConfig { dim: 36, ..PastatConfig::lean(64) }, "dim is 36"),
             (PastatConfig { windows: vec![4, 8, 16], ..PastatConfig::lean(64) }, "windows is [4, 8, 16]"),
+            (PastatConfig { earlier_cells: 3, ..PastatConfig::lean(64) }, "earlier_cells is 3"),
             (PastatConfig { frames: 0, ..PastatConfig::lean(64) }, "frames is 0"),
             (PastatConfig { frame_secs: f64::NAN, ..PastatConfig::lean(64) }, "frame_secs is NaN"),
         ] {

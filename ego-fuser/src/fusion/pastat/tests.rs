@@ -2,6 +2,7 @@ use protocol::{BevGrid, Pose};
 use tch::nn::VarStore;
 use tch::{Device, Kind, no_grad};
 
+use super::super::{EarlierViews, ViewFacts};
 use super::*;
 
 const FLOAT: (Kind, Device) = (Kind::Float, Device::Cpu);
@@ -32,14 +33,26 @@ impl Scene {
     }
 
     fn fused(&self, pastat: &Pastat) -> Tensor {
-        let views = AlignedViews {
-            features: &self.features,
-            mask: &self.mask,
-            own_frame: &self.features,
+        self.seen_by(pastat, |views| pastat.fuse(&views, true).unwrap())
+    }
+
+    /// What `see` makes of it: the newest of each agent, and the rest with larger cells.
+    fn seen_by<T>(&self, pastat: &Pastat, see: impl FnOnce(AlignedViews<'_>) -> T) -> T {
+        let is_newest =
+            |entry: &usize| self.facts[..*entry].iter().all(|facts| facts.agent != self.facts[*entry].agent);
+        let (newest, earlier): (Vec<usize>, Vec<usize>) = (0..self.facts.len()).partition(is_newest);
+        let (newest, earlier) = (self.only(&newest), self.only(&earlier));
+        let cells = pastat.config.earlier_cells;
+        let maps = Maps { features: earlier.features, mask: earlier.mask }.with_cells_of(cells).unwrap();
+        let before = EarlierViews { features: &maps.features, mask: &maps.mask, facts: &earlier.facts };
+        see(AlignedViews {
+            features: &newest.features,
+            mask: &newest.mask,
+            own_frame: &newest.features,
             grid: &GRID,
-            facts: &self.facts,
-        };
-        pastat.fuse(&views, true).unwrap()
+            facts: &newest.facts,
+            earlier: (!earlier.facts.is_empty()).then_some(before),
+        })
     }
 
     /// The same with these entries alone, in this order.
@@ -65,7 +78,7 @@ fn trained(config: &PastatConfig) -> (VarStore, Pastat) {
     let pastat = Pastat::new(&variables.root(), config).unwrap();
     no_grad(|| {
         for (name, mut variable) in variables.variables() {
-            if ["delta", "out", "cells", "conv1"].iter().any(|part| name.contains(part)) {
+            if ["delta", "fit", "out", "cells", "conv1"].iter().any(|part| name.contains(part)) {
                 let _ = variable.normal_(0.0, 0.2);
             }
         }
@@ -79,7 +92,7 @@ fn distance(a: &Tensor, b: &Tensor) -> f64 {
 
 #[test]
 fn untrained_it_is_the_maximum_of_the_newest_maps() {
-    for config in [small(), PastatConfig { rows: Rows::All, patch: 1, ..small() }] {
+    for config in [small(), PastatConfig { rows: Rows::All, patch: 1, earlier_cells: 1, ..small() }] {
         let variables = VarStore::new(Device::Cpu);
         let pastat = Pastat::new(&variables.root(), &config).unwrap();
         let scene = Scene::new(&[0, 1, 2, 0, 1], &[0.0, 0.1, 0.0, 0.1, 0.2]);
@@ -157,7 +170,7 @@ fn every_parameter_gets_a_gradient() {
 fn fsa_learns_a_shift_from_the_maps_alone() {
     tch::manual_seed(7);
     let variables = VarStore::new(Device::Cpu);
-    let config = PastatConfig { patch: 1, ..small() };
+    let config = PastatConfig { patch: 1, earlier_cells: 1, ..small() };
     let pastat = Pastat::new(&variables.root(), &config).unwrap();
     let mut optimizer = agent::training::AdamW::new(&variables, agent::training::AdamWConfig::default());
     // The neighbour shows what the ego shows, a cell beside it; what is wanted is one sharp map.
@@ -166,9 +179,9 @@ fn fsa_learns_a_shift_from_the_maps_alone() {
         let cells = Tensor::rand([1, 4, 12, 20], FLOAT).gt(0.9).to_kind(Kind::Float) * 3.0;
         let shift = if step.is_multiple_of(2) { 1 } else { -1 };
         scene.features = Tensor::cat(&[&cells, &cells.roll([shift], [3])], 0);
-        let entries = pastat.align(&scene.features, &scene.mask, &Told::new(&scene.facts), &GRID).unwrap();
+        let entries = scene.seen_by(&pastat, |views| pastat.align(&Shown::of(&views).unwrap(), &GRID).unwrap());
         let inside = |map: Tensor| map.narrow(1, 2, 8).narrow(2, 4, 12);
-        let difference = inside(entries.newest.get(1)) - inside(cells.get(0));
+        let difference = inside(entries.others.features.get(0)) - inside(cells.get(0));
         let loss = difference.square().mean(Kind::Float);
         if train {
             optimizer.zero_grad();

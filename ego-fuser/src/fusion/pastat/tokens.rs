@@ -39,11 +39,22 @@ impl Tokeniser {
         }
     }
 
-    /// Tokens `[N, h, w, D]` of maps `[N, C, H, W]` with their shares of all trust, `[N]`, and their ages.
-    pub(super) fn forward(&self, maps: &Tensor, shares: &Tensor, age_secs: &[f64]) -> Result<Tensor, TchError> {
-        let dim = self.config.dim;
-        let tokens = self.patches.forward(maps).f_permute([0, 2, 3, 1])?;
-        let per_map = |values: Tensor| values.f_view([-1, 1, 1, dim]);
+    /// What maps `[N, C, H, W]` show, `[N, h, w, D]`; each of their cells is one of `cells` by `cells`.
+    pub(super) fn shown(&self, maps: &Tensor, cells: i64) -> Result<Tensor, TchError> {
+        if cells == 1 {
+            return self.patches.forward(maps).f_permute([0, 2, 3, 1]);
+        }
+        // As if each of the cells that were taken together showed their mean.
+        let weight =
+            self.patches.ws.f_avg_pool2d([cells, cells], [cells, cells], [0_i64, 0], false, true, None::<i64>)?;
+        let (weight, edge) = (weight * (cells * cells) as f64, self.config.patch / cells);
+        maps.f_conv2d(&weight, self.patches.bs.as_ref(), [edge, edge], [0, 0], [1, 1], 1)?.f_permute([0, 2, 3, 1])
+    }
+
+    /// Tokens `[N, h, w, D]` of what maps show, with the maps' shares of all trust, `[N]`, and their ages.
+    pub(super) fn tokens(&self, shown: &Tensor, shares: &Tensor, age_secs: &[f64]) -> Result<Tensor, TchError> {
+        let per_map = |values: Tensor| values.f_view([-1, 1, 1, self.config.dim]);
+        let tokens = shown.shallow_clone();
         let tokens = match &self.confidence {
             Some(weight) => tokens + per_map(shares.f_unsqueeze(1)? * weight)?,
             None => tokens,
@@ -52,18 +63,19 @@ impl Tokeniser {
             Some(wavelengths) => {
                 let values: Vec<f32> =
                     age_secs.iter().flat_map(|&age| encoding(age, &self.config, wavelengths)).collect();
-                tokens + per_map(Tensor::f_from_slice(&values)?.f_to_device(maps.device())?)?
+                tokens + per_map(Tensor::f_from_slice(&values)?.f_to_device(shown.device())?)?
             }
             None => tokens,
         };
         tokens.f_contiguous()
     }
 
-    /// `[N, h, w]`: 1 for tokens of which any cell is valid in the mask `[N, 1, H, W]`.
-    pub(super) fn valid(&self, mask: &Tensor) -> Result<Tensor, TchError> {
-        let patch = self.config.patch;
+    /// `[N, h, w]`: 1 for tokens of which any cell is valid in the mask `[N, 1, H, W]`, a cell of which is one of `cells` by
+    /// `cells`.
+    pub(super) fn valid(&self, mask: &Tensor, cells: i64) -> Result<Tensor, TchError> {
+        let edge = self.config.patch / cells;
         let none: [i64; 2] = [0, 0];
-        mask.f_max_pool2d([patch, patch], [patch, patch], none, [1, 1], false)?.f_squeeze_dim(1)
+        mask.f_max_pool2d([edge, edge], [edge, edge], none, [1, 1], false)?.f_squeeze_dim(1)
     }
 }
 
