@@ -37,6 +37,11 @@ impl Padding {
         maps.f_pad([0, self.right, 0, self.below, 0, 0, 0, slots], "constant", 0.0)
     }
 
+    /// `maps` with zeros below and to the right, so that rows and columns are multiples of `cells`.
+    pub(super) fn to_multiples_of(cells: i64, maps: &Tensor) -> Result<Tensor, TchError> {
+        Self::to_multiples(maps, cells)?.maps(maps, 0)
+    }
+
     /// The same for a mask `[N, 1, H, W]`: there is nothing to be seen of neighbours beyond the edge, but the ego has to
     /// look at something, and looks at itself.
     pub(super) fn mask(self, mask: &Tensor, slots: i64) -> Result<Tensor, TchError> {

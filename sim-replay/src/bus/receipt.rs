@@ -1,6 +1,6 @@
 //! Whether what was sent has left this machine.
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use protocol::{RunId, Selector};
 use zenoh::qos::{CongestionControl, Priority};
@@ -22,6 +22,7 @@ impl Receipt {
     /// Waits for it, in at most `limit`. A question that nobody answers comes back from the router at once, and has to go
     /// through the same queue as the messages before it. A connection that is lost ends the waiting too.
     pub(super) fn wait(&self, limit: Duration) {
+        let begun = Instant::now();
         let asked = (self.session.get(self.asked.as_str()))
             .priority(self.priority)
             .congestion_control(CongestionControl::Block)
@@ -30,6 +31,9 @@ impl Receipt {
         match asked {
             Ok(answers) => while answers.recv().is_ok() {},
             Err(cause) => tracing::debug!("nobody to ask for a receipt: {cause}"),
+        }
+        if begun.elapsed() >= limit {
+            tracing::warn!(?limit, "the router has not said that it has everything: what was sent last may be lost");
         }
     }
 }

@@ -4,7 +4,7 @@ use protocol::Pose;
 use tch::{Kind, TchError, Tensor};
 
 use super::confidence::{shares, steps_back};
-use super::tokens::padded;
+use crate::fusion::padding::Padding;
 use crate::fusion::stage::larger_cells;
 use crate::fusion::{AlignedViews, ViewFacts};
 
@@ -42,7 +42,8 @@ impl Maps {
 
     /// With rows below and columns to the right that show nothing, so that both counts are multiples of `cells`.
     pub(super) fn padded(&self, cells: i64) -> Result<Self, TchError> {
-        Ok(Self { features: padded(&self.features, cells)?, mask: padded(&self.mask, cells)? })
+        let padded = |maps: &Tensor| Padding::to_multiples_of(cells, maps);
+        Ok(Self { features: padded(&self.features)?, mask: padded(&self.mask)? })
     }
 
     /// With cells of `cells` by `cells`.

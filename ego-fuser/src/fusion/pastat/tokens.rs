@@ -6,16 +6,6 @@ use tch::{Kind, TchError, Tensor};
 use super::config::PastatConfig;
 use super::temporal::encoding;
 
-/// Maps with zero rows below and columns to the right, so that both counts are multiples of `cells`.
-pub(super) fn padded(maps: &Tensor, cells: i64) -> Result<Tensor, TchError> {
-    let (_, _, height, width) = maps.size4()?;
-    let more = |size: i64| (cells - size % cells) % cells;
-    match (more(height), more(width)) {
-        (0, 0) => Ok(maps.shallow_clone()),
-        (below, right) => maps.f_constant_pad_nd([0, right, 0, below]),
-    }
-}
-
 /// Patches of cells to tokens, with what is known of a map beside what it shows.
 #[derive(Debug)]
 pub(super) struct Tokeniser {

@@ -28,6 +28,7 @@ use tch::{Kind, TchError, Tensor};
 use self::attention::TrajectoryAttention;
 use self::field::Trajectories;
 use super::config::within;
+use super::padding::Padding;
 use super::{AlignedViews, Fusion, present};
 
 /// Sizes of [`TrafAlign`].
@@ -148,7 +149,8 @@ impl TrafAlign {
     fn fuse_present(&self, maps: &Tensor, mask: &Tensor, agents: &Agents, train: bool) -> Result<Tensor, TchError> {
         let (_, _, height, width) = maps.size4()?;
         // The U-Net halves the tokens once.
-        let (maps, mask) = (padded(maps, 2 * self.config.patch)?, padded(mask, 2 * self.config.patch)?);
+        let padded = |maps: &Tensor| Padding::to_multiples_of(2 * self.config.patch, maps);
+        let (maps, mask) = (padded(maps)?, padded(mask)?);
         let mut tokens = self.over_time(&maps, &mask, agents, train)?;
         let points = self.trajectories.points(&tokens, train)?;
         for layer in &self.layers {
@@ -192,13 +194,6 @@ impl Agents {
         });
         Self { newest: newest.collect(), owner, age_secs }
     }
-}
-
-/// Zeros below and to the right, up to a multiple of `cells`.
-fn padded(maps: &Tensor, cells: i64) -> Result<Tensor, TchError> {
-    let (_, _, height, width) = maps.size4()?;
-    let [below, right] = [height, width].map(|size| (cells - size % cells) % cells);
-    if below + right == 0 { Ok(maps.shallow_clone()) } else { maps.f_constant_pad_nd([0, right, 0, below]) }
 }
 
 impl Fusion for TrafAlign {
