@@ -78,7 +78,8 @@ impl Arguments {
         let scenes = std::path::absolute(&self.scenes)?;
         let name = format!("v2vdet-{}-{}x{}", self.seed, self.agents, self.frames);
         let folder = scenes.join(&name);
-        if folder.is_dir() {
+        let options = self.options(folder.clone());
+        if synth::are_kept(&options).map_err(|error| BadInput(error.to_string()))? {
             return Ok(folder);
         }
         eprintln!(
@@ -89,10 +90,7 @@ impl Arguments {
             folder.display()
         );
         let began = Instant::now();
-        // Under its name only when it is whole: a run that is cut off must not leave half a scene to the next one.
-        let unfinished = scenes.join(format!("{name}.unfinished"));
-        generate(&self.options(unfinished.clone()))?;
-        std::fs::rename(&unfinished, &folder).with_context(|| format!("keeping {}", folder.display()))?;
+        generate(&options)?;
         eprintln!("generated in {:.1} s", began.elapsed().as_secs_f64());
         Ok(folder)
     }
@@ -103,7 +101,6 @@ impl Arguments {
             frames: self.frames,
             agents: agents..=agents,
             threads: std::thread::available_parallelism().map_or(1, usize::from),
-            force: true,
             ..SynthOptions::new(Subset::V2vdet, self.seed, out)
         }
     }
@@ -124,7 +121,7 @@ impl Arguments {
 /// Generates a scene with a progress bar.
 fn generate(options: &SynthOptions) -> anyhow::Result<()> {
     let bar = indicatif::ProgressBar::new(1000 * options.scenarios() as u64);
-    let generated = synth::generate(options, &|thousandths| bar.set_position(thousandths));
+    let generated = synth::generate_whole(options, &|thousandths| bar.set_position(thousandths));
     bar.finish_and_clear();
     match generated {
         Ok(_) => Ok(()),

@@ -304,24 +304,23 @@ impl Sweep {
 
 /// Generates the data set where it is asked for and not there.
 fn generate(experiment: &Experiment) -> Result<(), SweepError> {
-    let Some(generate) = experiment.generate.as_ref().filter(|_| !experiment.dataset.exists()) else { return Ok(()) };
-    // Under its name only when it is whole.
-    let unfinished = experiment.dataset.with_extension("unfinished");
+    let Some(generate) = &experiment.generate else { return Ok(()) };
     let options = SynthOptions {
         frames: generate.frames,
         scenes: generate.scenarios,
         agents: generate.agents(),
         threads: std::thread::available_parallelism().map_or(1, usize::from),
-        force: true,
-        ..SynthOptions::new(Subset::V2vdet, generate.seed, unfinished.clone())
+        ..SynthOptions::new(Subset::V2vdet, generate.seed, experiment.dataset.clone())
     };
+    if synth::are_kept(&options)? {
+        return Ok(());
+    }
     eprintln!("generating {} scenarios into {}", generate.scenarios, experiment.dataset.display());
     let bar = progress("{bar:30} {percent} %  {eta} left", 1000 * options.scenarios());
-    let generated = synth::generate(&options, &|thousandths| bar.set_position(thousandths));
+    let generated = synth::generate_whole(&options, &|thousandths| bar.set_position(thousandths));
     bar.finish_and_clear();
     generated?;
-    fs::rename(&unfinished, &experiment.dataset)
-        .map_err(|source| SweepError::Io { path: experiment.dataset.clone(), source })
+    Ok(())
 }
 
 fn progress(template: &str, length: usize) -> ProgressBar {

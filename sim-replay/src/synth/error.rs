@@ -13,6 +13,26 @@ pub enum SynthError {
     /// There is something in the output folder already.
     #[error("{} is not empty; --force writes into it all the same", .0.display())]
     NotEmpty(PathBuf),
+    /// Scenes that are kept are not those that are asked for.
+    #[error("{} holds scenes made with {setting} {found}, not {wanted}; take another folder, or remove it", folder.display())]
+    Kept {
+        /// Where they lie.
+        folder: PathBuf,
+        /// The first setting that differs.
+        setting: &'static str,
+        /// What they were made with.
+        found: String,
+        /// What is asked for.
+        wanted: String,
+    },
+    /// What lies in a folder does not say how it was made.
+    #[error("{}: {problem}; scenes that were generated say there how", path.display())]
+    Read {
+        /// The file that should.
+        path: PathBuf,
+        /// What is wrong with it.
+        problem: String,
+    },
     /// A file or folder could not be written.
     #[error("{}: {source}", path.display())]
     Write {

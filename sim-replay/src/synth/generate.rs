@@ -10,7 +10,7 @@ use super::error::SynthError;
 use super::lidar::{LIDAR_MOUNT_M, Lidar, lidar_motion};
 use super::options::{Subset, SynthOptions};
 use super::positioning::{Fix, Positioning};
-use super::protocol_file::protocol_yaml;
+use super::protocol_file::{FILE_NAME, protocol_yaml};
 use super::radar::Radar;
 use super::recording::{RecordedFrame, Recording, SceneSpec, record};
 use super::traffic::STEP_S;
@@ -134,7 +134,7 @@ impl Scene<'_, '_> {
             fs::remove_dir_all(&folder).map_err(|source| SynthError::Write { path: folder.clone(), source })?;
         }
         make_folder(&folder)?;
-        write_file(&folder.join("data_protocol.yaml"), protocol_yaml(self.options, &self.spec, self.world.town))?;
+        write_file(&folder.join(FILE_NAME), protocol_yaml(self.options, &self.spec, self.world.town))?;
         let agents = self.agents(&recording, &folder)?;
         let mut summary = self.write_frames(&recording, &agents, progress)?;
         summary.scenarios = 1;

@@ -19,6 +19,7 @@
 pub mod cast;
 mod error;
 mod generate;
+mod kept;
 pub mod lidar;
 mod options;
 mod parking;
@@ -35,6 +36,7 @@ mod writer;
 
 pub use error::SynthError;
 pub use generate::{Summary, generate};
+pub use kept::{are_kept, generate_whole};
 pub use options::{Subset, SynthOptions};
 pub use weather::Weather;
 pub use world::ground_surface;

@@ -5,6 +5,9 @@ use super::recording::SceneSpec;
 use super::traffic::STEP_S;
 use crate::town::Town;
 
+/// The file's name, in the folder of its scenario.
+pub(super) const FILE_NAME: &str = "data_protocol.yaml";
+
 /// The text of the file. It names what decides the bytes of the scenario, and the sensors in the words of OpenCDA.
 pub(crate) fn protocol_yaml(options: &SynthOptions, spec: &SceneSpec, town: &Town) -> String {
     let SynthOptions { subset, seed, town_seed, weather, frames, period_s, .. } = options;
