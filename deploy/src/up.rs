@@ -2,7 +2,7 @@
 
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
-use std::sync::mpsc::{Receiver, RecvTimeoutError, channel};
+use std::sync::mpsc::channel;
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
@@ -19,9 +19,11 @@ use crate::progress::Display;
 use crate::run_folder::{RunFolder, RunFolderError, name_of_now};
 use crate::scenario::{Clock, Scenario};
 use crate::score::{Board, Progress, Scored, ScorerError, ScorerNode};
-use crate::supervise::{Happening, ProcessEvent, SuperviseError, Supervisor};
+use crate::status::Phase;
+use crate::supervise::{SuperviseError, Supervisor};
+use crate::watch::{Ending, Watch};
 
-/// How often the display is brought up to date, and conditions are looked at.
+/// How often the display is brought up to date.
 const BEAT: Duration = Duration::from_millis(100);
 /// Of the time for ending: until the replay must be gone.
 const REPLAY_SHARE: f64 = 0.25;
@@ -118,16 +120,6 @@ impl UpError {
     }
 }
 
-/// How the watch over a run ended.
-enum Ending {
-    /// The scene is over.
-    Over,
-    /// Someone asked to end.
-    Asked,
-    /// A process stays down.
-    Failed { process: String, how: String },
-}
-
 /// Runs a scenario to its end, or until Ctrl-C.
 ///
 /// # Errors
@@ -191,7 +183,9 @@ fn watch(
     let restarts = fleet.scenario.timeouts.restarts;
     display.say(&format!("run {run} at {endpoint}: {} processes, logs in {}", specs.len(), folder.log_dir().display()));
     let mut supervisor = Supervisor::start(specs, &folder.log_dir(), restarts, &events)?;
-    let ending = follow(&happened, scorer, stop, &mut display);
+    let mut watch = Watch::new(fleet, run, endpoint, folder);
+    let ending = watch.follow(&supervisor, &happened, scorer, stop, &mut display);
+    watch.tell(Phase::Ending, &scorer.progress());
     let limits = Limits::of(fleet, &ending);
     let mut killed = supervisor.end(|name| name == REPLAY, limits.replay).killed;
     drain(&supervisor, scorer, limits.drain, &mut display);
@@ -200,48 +194,16 @@ fn watch(
     killed.extend(supervisor.end(|name| name != RECORDER, limits.all).killed);
     killed.extend(supervisor.end(|_| true, limits.all + RECORDER_SHARE).killed);
     display.finish();
+    while let Ok(event) = happened.try_recv() {
+        watch.note(&event);
+    }
+    watch.tell(Phase::Over, &scorer.progress());
     Ok((ending, killed))
 }
 
 /// The ports behind that of `first`, on the same address.
 fn ports_behind(first: SocketAddr) -> impl Iterator<Item = SocketAddr> {
     (first.port()..u16::MAX).map(move |port| SocketAddr::new(first.ip(), port + 1))
-}
-
-/// Shows what happens until the scene is over, someone asks to end, or a process stays down.
-fn follow(happened: &Receiver<ProcessEvent>, scorer: &ScorerNode, stop: &Stop, display: &mut Display) -> Ending {
-    loop {
-        if stop.requested() {
-            display.say("ending");
-            return Ending::Asked;
-        }
-        display.update(&scorer.progress());
-        let ProcessEvent { name, what } = match happened.recv_timeout(BEAT) {
-            Ok(event) => event,
-            Err(RecvTimeoutError::Timeout) => continue,
-            // Not before the supervisor is gone, which outlives this.
-            Err(RecvTimeoutError::Disconnected) => return Ending::Asked,
-        };
-        match what {
-            Happening::Started { pid } => display.say(&format!("{name} runs (pid {pid})")),
-            Happening::Fell { how, again_after } => {
-                display.say(&format!("{name} {how}; starting it again in {:.1} s", again_after.as_secs_f64()));
-            }
-            Happening::GaveUp { how, is_optional: true } => {
-                display.say(&format!("{name} {how}; the run goes on without it"));
-            }
-            Happening::GaveUp { how, is_optional: false } => return Ending::Failed { process: name, how },
-            Happening::Done { data_lost } => {
-                if data_lost {
-                    display.say(&format!("{name} says that data were lost; see its log"));
-                }
-                // The replay is the clock of the run; the others follow it.
-                if name == REPLAY {
-                    return Ending::Over;
-                }
-            }
-        }
-    }
 }
 
 /// Moments until which each step of the end has time.

@@ -2,6 +2,7 @@
 
 mod demo;
 mod eval;
+mod status;
 mod sweep;
 mod up;
 mod view;
@@ -27,6 +28,8 @@ pub(crate) enum Command {
     Eval(Box<eval::Arguments>),
     /// Run a grid of experiments in virtual time: one CSV, charts, a report.
     Sweep(sweep::Arguments),
+    /// Say how a run goes: is every process there, ready and answering? Exit code 1 where something is wrong.
+    Status(status::Arguments),
     /// Start a fleet: processes, scene, models, network; Ctrl-C ends it.
     Up(Box<up::Arguments>),
     /// Look at a run in a browser: the scene from above, the links, where the time goes.
@@ -40,6 +43,7 @@ impl Command {
         match self {
             Self::Demo(arguments) => arguments.run(),
             Self::Eval(arguments) => arguments.run(),
+            Self::Status(arguments) => arguments.run(),
             Self::Sweep(arguments) => arguments.run(),
             Self::Up(arguments) => arguments.run(),
             Self::View(arguments) => arguments.run(),

@@ -121,6 +121,7 @@ impl Scenario {
         positive("timeouts.ready_s", self.timeouts.ready_s)?;
         positive("timeouts.drain_s", self.timeouts.drain_s)?;
         positive("timeouts.stop_s", self.timeouts.stop_s)?;
+        positive("timeouts.hang_s", self.timeouts.hang_s)?;
         if self.scene.frames == Some(0) {
             return Err(value("scene.frames", "0".into(), "must be at least 1"));
         }

@@ -418,10 +418,12 @@ pub struct Timeouts {
     pub stop_s: f64,
     /// How often a process that keeps failing is started again.
     pub restarts: u32,
+    /// For a process that has fallen silent to say something, before it is killed and started again, seconds.
+    pub hang_s: f64,
 }
 
 impl Default for Timeouts {
     fn default() -> Self {
-        Self { ready_s: 60.0, drain_s: 3.0, stop_s: 4.0, restarts: 5 }
+        Self { ready_s: 60.0, drain_s: 3.0, stop_s: 4.0, restarts: 5, hang_s: 15.0 }
     }
 }

@@ -44,6 +44,8 @@ pub struct Progress {
     pub dropped: u64,
     /// The replay has said that nothing more will come.
     pub ended: bool,
+    /// When each process last told about itself, by name.
+    pub heard: BTreeMap<String, Instant>,
 }
 
 impl Progress {
@@ -284,10 +286,14 @@ impl Worker {
 
     fn stats(&mut self, arrival: &Arrival) {
         let Some(Stats { process, ledger, stages }) = self.inbox.decode(arrival, &Limits::DEFAULT) else { return };
+        let (name, at) = (process.to_string(), arrival.at);
         // A process that was started again has another epoch: both lives count.
         self.books.insert((process.clone(), arrival.header.stamp.epoch), ProcessBooks { process, ledger, stages });
         let dropped = self.books.values().map(|books| books.ledger.total().dropped_total()).sum();
-        self.note(|progress| progress.dropped = dropped);
+        self.note(|progress| {
+            progress.dropped = dropped;
+            progress.heard.insert(name, at);
+        });
     }
 
     fn note(&self, change: impl FnOnce(&mut Progress)) {

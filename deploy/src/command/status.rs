@@ -1,0 +1,39 @@
+//! `v2vloc status`.
+
+use std::path::PathBuf;
+
+use deploy::status::RunStatus;
+
+use super::{BadInput, Outcome};
+
+#[derive(Debug, clap::Args)]
+pub(crate) struct Arguments {
+    /// Folder of the run [default: of those in --runs the one that told about itself last].
+    run: Option<PathBuf>,
+    /// Folder of the run folders.
+    #[arg(long, default_value = "runs")]
+    runs: PathBuf,
+    /// Print JSON instead of a table.
+    #[arg(long)]
+    json: bool,
+}
+
+impl Arguments {
+    /// Prints how the run goes.
+    pub(crate) fn run(self) -> anyhow::Result<Outcome> {
+        let bad_input = |error: deploy::status::StatusError| BadInput(error.to_string());
+        let folder = match self.run {
+            Some(run) if run.is_dir() => run,
+            Some(name) => self.runs.join(name),
+            None => RunStatus::newest(&self.runs).map_err(bad_input)?,
+        };
+        let status = RunStatus::read(&folder).map_err(bad_input)?;
+        if self.json {
+            println!("{}", serde_json::to_string_pretty(&status)?);
+        } else {
+            print!("{}", status.table());
+        }
+        anyhow::ensure!(status.is_well(), "run {} is not well", status.run);
+        Ok(Outcome::Done)
+    }
+}

@@ -1,0 +1,115 @@
+//! A supervisor over shells.
+
+use std::sync::mpsc::{Receiver, channel};
+
+use rustix::process::{Pid, Signal, kill_process};
+
+use super::watcher::FIRST_PAUSE;
+use super::*;
+
+const PATIENCE: Duration = Duration::from_secs(20);
+
+fn shell(name: &str, life: Life, script: &str) -> ProcessSpec {
+    ProcessSpec { name: name.into(), program: "/bin/sh".into(), args: vec!["-c".into(), script.into()], life }
+}
+
+fn start(spec: ProcessSpec, restarts: u32) -> (Supervisor, Receiver<ProcessEvent>, tempfile::TempDir) {
+    let folder = tempfile::tempdir().unwrap();
+    let (events, received) = channel();
+    (Supervisor::start(vec![spec], folder.path(), restarts, &events).unwrap(), received, folder)
+}
+
+fn next(events: &Receiver<ProcessEvent>) -> Happening {
+    events.recv_timeout(PATIENCE).unwrap().what
+}
+
+#[test]
+fn who_ends_well_is_done() {
+    let (supervisor, events, folder) = start(shell("job", Life::Service, "echo hello; exit 3"), 3);
+    assert!(matches!(next(&events), Happening::Started { .. }));
+    assert_eq!(next(&events), Happening::Done { data_lost: true });
+    assert_eq!(std::fs::read_to_string(folder.path().join("job.log")).unwrap(), "hello\n");
+    assert!(supervisor.stop(PATIENCE).killed.is_empty());
+}
+
+#[test]
+fn a_killed_service_is_started_again() {
+    let (supervisor, events, _folder) = start(shell("car", Life::Service, "exec sleep 600"), 3);
+    let Happening::Started { pid: first } = next(&events) else { panic!("not started") };
+    kill_process(Pid::from_raw(first as i32).unwrap(), Signal::KILL).unwrap();
+    let Happening::Fell { how, again_after, restart } = next(&events) else { panic!("not fallen") };
+    assert_eq!((how.as_str(), again_after, restart), ("was ended by signal 9", FIRST_PAUSE, 1));
+    let Happening::Started { pid: second } = next(&events) else { panic!("not restarted") };
+    assert_ne!(first, second);
+    assert!(supervisor.stop(PATIENCE).killed.is_empty(), "sleep ends on SIGTERM");
+}
+
+#[test]
+fn a_service_that_keeps_falling_is_given_up_with_its_last_words() {
+    let (_supervisor, events, _folder) = start(shell("car", Life::Service, "echo no engine >&2; exit 1"), 1);
+    let happenings: Vec<_> = (0..4).map(|_| next(&events)).collect();
+    assert!(matches!(&happenings[1], Happening::Fell { again_after, .. } if *again_after == FIRST_PAUSE));
+    assert_eq!(happenings[3], Happening::GaveUp { how: "ended with code 1: no engine".into(), is_optional: false });
+}
+
+#[test]
+fn the_lifeline_holds_as_long_as_the_supervisor() {
+    let (supervisor, events, folder) = start(shell("car", Life::Service, "echo up; cat; echo cut off"), 3);
+    assert!(matches!(next(&events), Happening::Started { .. }));
+    let log = folder.path().join("car.log");
+    let began = Instant::now();
+    while std::fs::read_to_string(&log).unwrap().is_empty() && began.elapsed() < PATIENCE {
+        std::thread::yield_now();
+    }
+    // Its input does not end, so neither does it.
+    assert!(events.recv_timeout(Duration::from_millis(200)).is_err());
+    drop(supervisor.stop(PATIENCE));
+    assert_eq!(std::fs::read_to_string(&log).unwrap(), "up\n");
+}
+
+#[test]
+fn bad_input_is_not_tried_again() {
+    let (_supervisor, events, _folder) = start(shell("car", Life::Service, "echo bad map; exit 2"), 5);
+    assert!(matches!(next(&events), Happening::Started { .. }));
+    assert_eq!(next(&events), Happening::GaveUp { how: "ended with code 2: bad map".into(), is_optional: false });
+}
+
+#[test]
+fn who_ignores_the_request_is_killed_at_the_deadline() {
+    let (supervisor, events, folder) =
+        start(shell("deaf", Life::Service, "trap '' TERM; echo up; while :; do sleep 0.05; done"), 3);
+    assert!(matches!(next(&events), Happening::Started { .. }));
+    let log = folder.path().join("deaf.log");
+    let began = Instant::now();
+    while std::fs::read_to_string(&log).unwrap().is_empty() && began.elapsed() < PATIENCE {
+        std::thread::yield_now();
+    }
+    let asked = Instant::now();
+    assert_eq!(supervisor.stop(Duration::from_millis(300)).killed, ["deaf"]);
+    assert!(asked.elapsed() < Duration::from_secs(4), "{:?}", asked.elapsed());
+}
+
+#[test]
+fn a_missing_program_is_named() {
+    let (events, _received) = channel();
+    let spec =
+        ProcessSpec { name: "agent".into(), program: "/nowhere/agent".into(), args: vec![], life: Life::Service };
+    let folder = tempfile::tempdir().unwrap();
+    let error = Supervisor::start(vec![spec], folder.path(), 0, &events).err().unwrap();
+    assert!(error.to_string().starts_with("/nowhere/agent is missing"), "{error}");
+}
+
+#[test]
+fn who_hangs_is_killed_and_started_again_even_if_stopped() {
+    let (supervisor, events, _folder) = start(shell("car", Life::Service, "exec sleep 600"), 3);
+    let Happening::Started { pid: first } = next(&events) else { panic!("not started") };
+    kill_process(Pid::from_raw(first as i32).unwrap(), Signal::STOP).unwrap();
+    supervisor.replace("nobody", "is not here");
+    supervisor.replace("car", "has said nothing for 5 s");
+    let Happening::Fell { how, .. } = next(&events) else { panic!("not fallen") };
+    assert_eq!(how, "has said nothing for 5 s");
+    let Happening::Started { pid: second } = next(&events) else { panic!("not restarted") };
+    assert_ne!(first, second);
+    kill_process(Pid::from_raw(second as i32).unwrap(), Signal::STOP).unwrap();
+    assert!(supervisor.stop(PATIENCE).killed.is_empty(), "who is stopped is woken to end");
+}

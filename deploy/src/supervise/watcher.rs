@@ -1,0 +1,175 @@
+//! One process through its lives.
+
+use std::fs::{File, OpenOptions};
+use std::os::unix::process::ExitStatusExt;
+use std::path::PathBuf;
+use std::process::{ExitStatus, Stdio};
+use std::sync::mpsc::Sender;
+use std::time::{Duration, Instant};
+
+use rustix::process::{Pid, Signal, kill_process};
+use tokio::process::{Child, Command};
+use tokio::sync::{mpsc, watch};
+
+use super::{Happening, Life, ProcessEvent, ProcessSpec, SuperviseError};
+
+/// Exit code of our programs for bad usage or input: starting again cannot help.
+const BAD_INPUT: i32 = 2;
+/// Exit code of our programs when all was done but data were lost.
+const DATA_LOST: i32 = 3;
+/// A process that has lived this long has recovered; its next fall is a first one again.
+const RECOVERED: Duration = Duration::from_secs(10);
+/// First pause before a restart; it doubles up to [`LONGEST_PAUSE`].
+pub(super) const FIRST_PAUSE: Duration = Duration::from_millis(200);
+/// Longest pause before a restart.
+const LONGEST_PAUSE: Duration = Duration::from_secs(5);
+
+/// Where the output of a process goes.
+#[derive(Debug)]
+pub(super) struct Log {
+    path: PathBuf,
+    file: File,
+}
+
+impl Log {
+    pub(super) fn create(path: PathBuf) -> Result<Self, SuperviseError> {
+        match OpenOptions::new().create(true).append(true).open(&path) {
+            Ok(file) => Ok(Self { path, file }),
+            Err(source) => Err(SuperviseError::Log { path, source }),
+        }
+    }
+
+    /// The last line that says something.
+    fn last_line(&self) -> Option<String> {
+        let bytes = std::fs::read(&self.path).ok()?;
+        let tail = String::from_utf8_lossy(&bytes[bytes.len().saturating_sub(4096)..]).into_owned();
+        tail.lines().rev().map(str::trim).find(|line| !line.is_empty()).map(str::to_owned)
+    }
+}
+
+/// Follows one process through its lives.
+pub(super) struct Watcher {
+    pub(super) spec: ProcessSpec,
+    pub(super) log: Log,
+    pub(super) restarts: u32,
+    pub(super) events: Sender<ProcessEvent>,
+    pub(super) stop: watch::Receiver<Option<Instant>>,
+    /// Why it is to be killed and started again.
+    pub(super) replace: mpsc::Receiver<String>,
+    /// Falls without a recovery in between.
+    pub(super) falls: u32,
+    /// Times that it was started again.
+    pub(super) restarted: u32,
+}
+
+impl Watcher {
+    /// Runs until told to stop or the process stays down. Returns whether it had to be killed.
+    pub(super) async fn run(mut self) -> bool {
+        loop {
+            let born = Instant::now();
+            let how = match self.spawn() {
+                Err(error) => format!("cannot be started: {error}"),
+                Ok(mut child) => {
+                    // Taken out, as waiting for a child closes the input that it still holds.
+                    let _lifeline = child.stdin.take();
+                    self.tell(Happening::Started { pid: child.id().unwrap_or(0) });
+                    let stop = self.stop.clone();
+                    // A wish of an earlier life.
+                    while self.replace.try_recv().is_ok() {}
+                    tokio::select! {
+                        Some(why) = self.replace.recv() => {
+                            // It cannot fail to end; an error means that it is gone already.
+                            let _ = child.kill().await;
+                            why
+                        },
+                        status = child.wait() => match status {
+                            Ok(status) if is_done(status) => {
+                                self.tell(Happening::Done { data_lost: !status.success() });
+                                return false;
+                            }
+                            Ok(status) if status.code() == Some(BAD_INPUT) => return self.give_up(&in_words(status)),
+                            Ok(status) => in_words(status),
+                            Err(error) => error.to_string(),
+                        },
+                        deadline = asked_to_stop(stop) => return end(child, deadline).await,
+                    }
+                }
+            };
+            if born.elapsed() > RECOVERED {
+                self.falls = 0;
+            }
+            self.falls += 1;
+            if self.spec.life != Life::Service || self.falls > self.restarts {
+                return self.give_up(&how);
+            }
+            let pause = LONGEST_PAUSE.min(FIRST_PAUSE * (1 << (self.falls - 1).min(5)));
+            self.restarted += 1;
+            self.tell(Happening::Fell { how, again_after: pause, restart: self.restarted });
+            tokio::select! {
+                () = tokio::time::sleep(pause) => {}
+                _ = asked_to_stop(self.stop.clone()) => return false,
+            }
+        }
+    }
+
+    fn spawn(&self) -> std::io::Result<Child> {
+        Command::new(&self.spec.program)
+            .args(&self.spec.args)
+            .stdin(Stdio::piped())
+            .stdout(self.log.file.try_clone()?)
+            .stderr(self.log.file.try_clone()?)
+            // Ctrl-C on a terminal reaches a whole process group: ours alone, so that the fleet ends in order.
+            .process_group(0)
+            .kill_on_drop(true)
+            .spawn()
+    }
+
+    fn give_up(&self, how: &str) -> bool {
+        let said = self.log.last_line().map_or(String::new(), |line| format!(": {line}"));
+        let is_optional = self.spec.life == Life::Optional;
+        self.tell(Happening::GaveUp { how: format!("{how}{said}"), is_optional });
+        false
+    }
+
+    fn tell(&self, what: Happening) {
+        // Nobody listens any more once the run is over.
+        let _ = self.events.send(ProcessEvent { name: self.spec.name.clone(), what });
+    }
+}
+
+/// Resolves with the deadline for ending.
+async fn asked_to_stop(mut stop: watch::Receiver<Option<Instant>>) -> Instant {
+    match stop.wait_for(Option::is_some).await {
+        Ok(deadline) => deadline.unwrap_or_else(Instant::now),
+        // The supervisor is gone.
+        Err(_) => Instant::now(),
+    }
+}
+
+/// Asks a process to end, kills it at the deadline. Returns whether it had to be killed.
+async fn end(mut child: Child, deadline: Instant) -> bool {
+    if let Some(pid) = child.id().and_then(|pid| Pid::from_raw(i32::try_from(pid).ok()?)) {
+        // It may have ended in this very moment, which is as good.
+        let _ = kill_process(pid, Signal::TERM);
+        // Stopped, it would not hear.
+        let _ = kill_process(pid, Signal::CONT);
+    }
+    if tokio::time::timeout_at(deadline.into(), child.wait()).await.is_ok() {
+        return false;
+    }
+    // The wait after the kill cannot fail to end; an error means that it is gone already.
+    let _ = child.kill().await;
+    true
+}
+
+fn is_done(status: ExitStatus) -> bool {
+    status.success() || status.code() == Some(DATA_LOST)
+}
+
+fn in_words(status: ExitStatus) -> String {
+    match (status.code(), status.signal()) {
+        (Some(code), _) => format!("ended with code {code}"),
+        (None, Some(signal)) => format!("was ended by signal {signal}"),
+        (None, None) => "ended".into(),
+    }
+}

@@ -1,0 +1,113 @@
+//! The watch over a run while it goes: shows what happens, replaces who hangs, tells `v2vloc status`.
+
+use std::sync::mpsc::{Receiver, RecvTimeoutError};
+use std::time::{Duration, Instant};
+
+use protocol::RunId;
+use sim_replay::bus::Endpoint;
+use sim_replay::bus::shutdown::Stop;
+
+use crate::fleet::{Fleet, REPLAY};
+use crate::health::Health;
+use crate::progress::Display;
+use crate::run_folder::RunFolder;
+use crate::score::{Progress, ScorerNode};
+use crate::status::{Phase, StatusWriter};
+use crate::supervise::{Happening, ProcessEvent, Supervisor};
+
+/// How often the display is brought up to date, and conditions are looked at.
+const BEAT: Duration = Duration::from_millis(100);
+
+/// How the watch over a run ended.
+pub(crate) enum Ending {
+    /// The scene is over.
+    Over,
+    /// Someone asked to end.
+    Asked,
+    /// A process stays down.
+    Failed { process: String, how: String },
+}
+
+/// The watch over a run while it goes.
+pub(crate) struct Watch {
+    health: Health,
+    status: StatusWriter,
+}
+
+impl Watch {
+    pub(crate) fn new(fleet: &Fleet, run: &RunId, endpoint: &Endpoint, folder: &RunFolder) -> Self {
+        let timeouts = &fleet.scenario.timeouts;
+        let [hang, start] = [timeouts.hang_s, timeouts.ready_s.max(timeouts.hang_s)].map(Duration::from_secs_f64);
+        Self {
+            health: Health::new(hang, start),
+            status: StatusWriter::new(folder.path(), run.as_str(), endpoint.as_str()),
+        }
+    }
+
+    /// Takes note of what happened.
+    pub(crate) fn note(&mut self, event: &ProcessEvent) {
+        self.health.note(event, Instant::now());
+    }
+
+    /// Writes down where the run stands.
+    pub(crate) fn tell(&mut self, phase: Phase, progress: &Progress) {
+        let health = &self.health;
+        self.status.write(phase, progress, |now| health.statuses(now));
+    }
+
+    /// Shows what happens, and replaces who hangs, until the scene is over, someone asks to end, or a process stays down.
+    pub(crate) fn follow(
+        &mut self,
+        supervisor: &Supervisor,
+        happened: &Receiver<ProcessEvent>,
+        scorer: &ScorerNode,
+        stop: &Stop,
+        display: &mut Display,
+    ) -> Ending {
+        loop {
+            if stop.requested() {
+                display.say("ending");
+                return Ending::Asked;
+            }
+            let progress = scorer.progress();
+            display.update(&progress);
+            for (name, why) in self.health.look(&progress.heard, Instant::now()) {
+                supervisor.replace(&name, &why);
+            }
+            self.tell(Phase::Running, &progress);
+            let event = match happened.recv_timeout(BEAT) {
+                Ok(event) => event,
+                Err(RecvTimeoutError::Timeout) => continue,
+                // Not before the supervisor is gone, which outlives this.
+                Err(RecvTimeoutError::Disconnected) => return Ending::Asked,
+            };
+            self.note(&event);
+            if let Some(ending) = show(event, display) {
+                return ending;
+            }
+        }
+    }
+}
+
+/// Shows what happened to a process; how the run ends where that ends it.
+fn show(ProcessEvent { name, what }: ProcessEvent, display: &Display) -> Option<Ending> {
+    match what {
+        Happening::Started { pid } => display.say(&format!("{name} runs (pid {pid})")),
+        Happening::Fell { how, again_after, restart } => display
+            .say(&format!("{name} {how}; starting it again in {:.1} s (restart {restart})", again_after.as_secs_f64())),
+        Happening::GaveUp { how, is_optional: true } => {
+            display.say(&format!("{name} {how}; the run goes on without it"));
+        }
+        Happening::GaveUp { how, is_optional: false } => return Some(Ending::Failed { process: name, how }),
+        Happening::Done { data_lost } => {
+            if data_lost {
+                display.say(&format!("{name} says that data were lost; see its log"));
+            }
+            // The replay is the clock of the run; the others follow it.
+            if name == REPLAY {
+                return Some(Ending::Over);
+            }
+        }
+    }
+    None
+}
