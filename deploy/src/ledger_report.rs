@@ -1,5 +1,7 @@
 //! `ledger.json`: every process's books, their sum, and whether it balances.
 
+use std::collections::BTreeSet;
+
 use protocol::{Balance, Counts, Ledger, StageSummary};
 use serde::Serialize;
 
@@ -12,6 +14,10 @@ pub struct LedgerReport {
     pub balances: bool,
     /// What does not add up, and topics that nobody listened to.
     pub balance: Balance,
+    /// Processes that were away for a while.
+    pub away: BTreeSet<String>,
+    /// Messages of which nobody can tell what became of them, because one of those was away.
+    pub excused: u64,
     /// Everything added up.
     pub total: Counts,
     /// All processes together, by topic and receiver.
@@ -32,9 +38,14 @@ pub struct ProcessReport {
 }
 
 impl LedgerReport {
-    /// The report on `books`, whose sum is `sum`.
+    /// The report on `books`, whose sum is `sum`; who was away, and what is excused by that.
     #[must_use]
-    pub fn new(books: &[ProcessBooks], sum: &Ledger, balance: &Balance) -> Self {
+    pub fn new(
+        books: &[ProcessBooks],
+        sum: &Ledger,
+        balance: &Balance,
+        (away, excused): (&BTreeSet<String>, u64),
+    ) -> Self {
         let process = |books: &ProcessBooks| ProcessReport {
             process: books.process.to_string(),
             ledger: books.ledger.clone(),
@@ -43,6 +54,8 @@ impl LedgerReport {
         Self {
             balances: balance.is_exact(),
             balance: balance.clone(),
+            away: away.clone(),
+            excused,
             total: sum.total(),
             sum: sum.clone(),
             processes: books.iter().map(process).collect(),

@@ -8,6 +8,7 @@
 //! - [`view`]: a page to look at a run, live or recorded.
 //! - [`run_folder`], [`metrics`], [`ledger_report`], [`picture`]: what is kept of it.
 
+pub mod absences;
 mod crew_processes;
 pub mod evaluation;
 pub mod fingerprint;

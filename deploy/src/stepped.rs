@@ -3,6 +3,7 @@
 //! The run folder is that of a live run. Nothing in it but `scenario.yaml` and `log/` depends on machine, load, time of day
 //! or on how many processes there are.
 
+use std::collections::BTreeSet;
 use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::ops::ControlFlow;
@@ -175,7 +176,7 @@ fn write(
     let metrics = Metrics::of(board, "stepped", names, board.seconds(), Messages::of(&ledger.total()));
     folder.write_json("metrics.json", &metrics)?;
     folder.write_frames(board.records())?;
-    folder.write_json("ledger.json", &LedgerReport::new(&[], ledger, &balance))?;
+    folder.write_json("ledger.json", &LedgerReport::new(&[], ledger, &balance, (&BTreeSet::new(), 0)))?;
     let models = &fleet.scenario.models;
     let localizer = models.localizer.as_ref().filter(|_| fleet.scenario.uses_localizer());
     let end_to_end = models.end_to_end.as_deref().filter(|_| fleet.scenario.uses_end_to_end());

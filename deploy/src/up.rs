@@ -1,5 +1,6 @@
 //! One run from beginning to end: plan, start, watch, end, score, write.
 
+use std::collections::BTreeSet;
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::channel;
@@ -11,6 +12,7 @@ use protocol::{Balance, Ledger, RunId};
 use sim_replay::bus::shutdown::Stop;
 use sim_replay::bus::{BusError, Endpoint};
 
+use crate::absences;
 use crate::fingerprint::Provenance;
 use crate::fleet::{Fleet, FleetError, RECORDER, REPLAY};
 use crate::metrics::{Messages, Metrics};
@@ -147,10 +149,10 @@ pub fn up(scenario: &Scenario, options: &UpOptions) -> Result<RunResult, UpError
     if let Err(overdue) = place.close() {
         tracing::warn!("{overdue}");
     }
-    let (ending, killed) = watched?;
+    let watched = watched?;
 
-    let result = write(&fleet, &run, folder, scored, &ending, killed, fingerprint)?;
-    match ending {
+    let result = write(&fleet, &run, folder, scored, &watched, fingerprint)?;
+    match watched.ending {
         Ending::Over | Ending::Asked => Ok(result),
         Ending::Failed { process, how } => {
             let log = result.folder.log_dir().join(format!("{process}.log"));
@@ -159,8 +161,16 @@ pub fn up(scenario: &Scenario, options: &UpOptions) -> Result<RunResult, UpError
     }
 }
 
-/// Starts the processes, follows the run to its end, and ends the processes. Returns how it ended and who had to be
-/// killed.
+/// What a run was like for those who watched.
+struct Watched {
+    ending: Ending,
+    /// Who had to be killed at the end.
+    killed: Vec<String>,
+    /// Who was away for a while.
+    away: BTreeSet<String>,
+}
+
+/// Starts the processes, follows the run to its end, and ends the processes.
 fn watch(
     fleet: &Fleet,
     run: &RunId,
@@ -169,7 +179,7 @@ fn watch(
     folder: &RunFolder,
     scorer: &ScorerNode,
     stop: &Stop,
-) -> Result<(Ending, Vec<String>), UpError> {
+) -> Result<Watched, UpError> {
     let (events, happened) = channel();
     let mut specs = fleet.processes(run, endpoint.as_str(), programs);
     specs.extend(fleet.recorder(run, endpoint.as_str(), programs, &folder.file("recording.mcap")));
@@ -185,6 +195,8 @@ fn watch(
     let mut supervisor = Supervisor::start(specs, &folder.log_dir(), restarts, &events)?;
     let mut watch = Watch::new(fleet, run, endpoint, folder);
     let ending = watch.follow(&supervisor, &happened, scorer, stop, &mut display);
+    let mut away = scorer.absent();
+    away.extend(watch.fallen());
     watch.tell(Phase::Ending, &scorer.progress());
     let limits = Limits::of(fleet, &ending);
     let mut killed = supervisor.end(|name| name == REPLAY, limits.replay).killed;
@@ -198,7 +210,8 @@ fn watch(
         watch.note(&event);
     }
     watch.tell(Phase::Over, &scorer.progress());
-    Ok((ending, killed))
+    away.extend(killed.iter().cloned());
+    Ok(Watched { ending, killed, away })
 }
 
 /// The ports behind that of `first`, on the same address.
@@ -263,8 +276,7 @@ fn write(
     run: &RunId,
     folder: RunFolder,
     scored: Scored,
-    ending: &Ending,
-    killed: Vec<String>,
+    watched: &Watched,
     fingerprint: JoinHandle<std::io::Result<Provenance>>,
 ) -> Result<RunResult, UpError> {
     let Scored { board, books, progress } = scored;
@@ -272,11 +284,13 @@ fn write(
     for process in &books {
         sum.merge(&process.ledger);
     }
+    let excused = sum.excuse(|account| absences::concerns(&watched.away, account));
     let balance = sum.balance();
     let metrics = metrics(fleet, &board, &progress, &sum);
     folder.write_json("metrics.json", &metrics)?;
     folder.write_frames(board.records())?;
-    folder.write_json("ledger.json", &crate::ledger_report::LedgerReport::new(&books, &sum, &balance))?;
+    let away = (&watched.away, excused);
+    folder.write_json("ledger.json", &crate::ledger_report::LedgerReport::new(&books, &sum, &balance, away))?;
     let provenance = match fingerprint.join() {
         Ok(Ok(provenance)) => Some(provenance),
         Ok(Err(error)) => {
@@ -288,7 +302,8 @@ fn write(
     let resolved = Scenario { run: Some(run.clone()), provenance, ..fleet.scenario.clone() };
     folder.write("scenario.yaml", &resolved.to_yaml())?;
     let picture = crate::showcase::draw(fleet, &board, &folder.file("frame.png"));
-    let interrupted = matches!(ending, Ending::Asked);
+    let interrupted = matches!(watched.ending, Ending::Asked);
+    let killed = watched.killed.clone();
     Ok(RunResult { folder, metrics, balance, missed: board.missed(), interrupted, killed, picture })
 }
 

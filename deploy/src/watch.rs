@@ -49,6 +49,12 @@ impl Watch {
         self.health.note(event, Instant::now());
     }
 
+    /// Who has fallen, at least once.
+    pub(crate) fn fallen(&self) -> Vec<String> {
+        let statuses = self.health.statuses(Instant::now()).into_iter();
+        statuses.filter(|process| process.last_fall.is_some()).map(|process| process.name).collect()
+    }
+
     /// Writes down where the run stands.
     pub(crate) fn tell(&mut self, phase: Phase, progress: &Progress) {
         let health = &self.health;

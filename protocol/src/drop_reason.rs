@@ -32,6 +32,8 @@ named! {
         NoPose = "no_pose",
         /// From a vehicle farther away than vehicles talk to each other.
         OutOfRange = "out_of_range",
+        /// Who sent it, was to have it or carried it was away for a while, and nobody can tell what became of it.
+        Away = "away",
     }
 }
 

@@ -17,6 +17,7 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
+use crate::balance::Difference;
 use crate::{Balance, DropReason, ProcessId, RateReason, Topic};
 
 /// What is counted separately: a topic, and who receives it (`None`: whoever does).
@@ -217,6 +218,26 @@ impl Ledger {
         Balance::of(self)
     }
 
+    /// Books what nobody can account for on the accounts that `is_excused` names, because one of those concerned was away:
+    /// as dropped for that reason what vanished, as sent what came although its sender never told of it. Returns how many
+    /// messages that were. All other accounts have to add up by themselves.
+    pub fn excuse(&mut self, is_excused: impl Fn(&Account) -> bool) -> u64 {
+        let mut excused = 0;
+        for Difference { topic, to, missing, .. } in self.balance().differences {
+            let account = Account { topic, to };
+            if !is_excused(&account) {
+                continue;
+            }
+            let counts = self.counts(&account);
+            match u64::try_from(missing) {
+                Ok(vanished) => *counts.dropped.entry(DropReason::Away).or_default() += vanished,
+                Err(_) => counts.sent = counts.sent.saturating_add(missing.unsigned_abs()),
+            }
+            excused += missing.unsigned_abs();
+        }
+        excused
+    }
+
     fn counts(&mut self, account: &Account) -> &mut Counts {
         if !self.accounts.contains_key(account) {
             self.accounts.insert(account.clone(), Counts::default());
@@ -311,6 +332,20 @@ mod tests {
         ledger.sent(&published);
         ledger.dropped(&published, DropReason::Superseded);
         receivers.iter().for_each(|receiver| ledger.received(receiver));
+        assert!(ledger.balance().is_exact());
+    }
+
+    #[test]
+    fn who_was_away_is_excused_and_nobody_else() {
+        let mut ledger = sum(&books());
+        let (published, lost) = (Account::published(bev()), Account::towards(bev(), &process("ego-4279")));
+        (0..3).for_each(|_| ledger.sent(&published));
+        assert_eq!(ledger.excuse(|_| false), 0);
+        assert_eq!(ledger.excuse(|account| *account == lost), 3);
+        assert_eq!(ledger.get(&lost).unwrap().dropped[&DropReason::Away], 3);
+        assert!(ledger.balance().is_exact());
+        (0..2).for_each(|_| ledger.received(&lost));
+        assert_eq!(ledger.excuse(|account| *account == lost), 2);
         assert!(ledger.balance().is_exact());
     }
 

@@ -1,6 +1,7 @@
 //! What the end-to-end and golden tests share.
 
 pub mod bus;
+pub mod faults;
 pub mod fixtures;
 pub mod fleet;
 pub mod localizer;

@@ -1,6 +1,6 @@
 //! The scorer's place on the bus: takes truth, detections, poses and everyone's books, and keeps the board.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
 use std::io::{BufWriter, Write};
 use std::path::PathBuf;
@@ -17,6 +17,7 @@ use sim_replay::bus::{Arrival, Bus, BusError, Event, Identity, Inbox, Presence, 
 use zenoh::Session;
 
 use super::Board;
+use crate::absences::Absences;
 
 /// Name of the scorer in keys, ledgers and routes.
 const SCORER: &str = "scorer";
@@ -104,6 +105,7 @@ pub struct ScorerNode {
     inbox: Arc<Inbox>,
     progress: Arc<Mutex<Progress>>,
     thread: JoinHandle<(Board, Books)>,
+    absences: Absences,
     _subscriptions: Vec<Subscription>,
     _presence: Presence,
 }
@@ -136,6 +138,7 @@ impl ScorerNode {
             subscriptions.push(bus.subscribe(Topic::Stream { cav: cav.clone(), stream: Stream::Pose }, &inbox)?);
         }
         let presence = bus.announce(Role::Scorer)?;
+        let absences = Absences::watch(&bus)?;
         let io = |what: String| move |source| ScorerError::Io { what, source };
         let file = File::create(&detections_file).map_err(io(detections_file.display().to_string()))?;
         let progress = Arc::<Mutex<Progress>>::default();
@@ -150,7 +153,7 @@ impl ScorerNode {
         };
         let thread = thread::Builder::new().name(SCORER.into()).spawn(move || worker.run());
         let thread = thread.map_err(io("the scorer's thread".into()))?;
-        Ok(Self { bus, inbox, progress, thread, _subscriptions: subscriptions, _presence: presence })
+        Ok(Self { bus, inbox, progress, thread, absences, _subscriptions: subscriptions, _presence: presence })
     }
 
     /// Serves the scorer's own counters to Prometheus.
@@ -168,6 +171,12 @@ impl ScorerNode {
         self.progress.lock().unwrap_or_else(PoisonError::into_inner).clone()
     }
 
+    /// Who was away so far, by process.
+    #[must_use]
+    pub fn absent(&self) -> BTreeSet<String> {
+        self.absences.so_far()
+    }
+
     /// Ends the scorer after everything that has come in is judged.
     ///
     /// # Panics
@@ -182,7 +191,7 @@ impl ScorerNode {
             stages: self.bus.books().stages(),
         };
         let progress = self.progress.lock().unwrap_or_else(PoisonError::into_inner).clone();
-        drop((self._subscriptions, self._presence));
+        drop((self._subscriptions, self._presence, self.absences));
         if let Err(overdue) = self.bus.leave(LEAVE_LIMIT) {
             tracing::warn!("{overdue}");
         }

@@ -34,7 +34,7 @@ pub struct ProcessSpec {
 /// What the end of a process means.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Life {
-    /// When it fails, it is started again.
+    /// It works until the run is over; when it ends before, it is started again.
     Service,
     /// It has one job, which cannot be taken up in the middle; when it fails, it stays down.
     Task,

@@ -25,7 +25,7 @@ fn next(events: &Receiver<ProcessEvent>) -> Happening {
 
 #[test]
 fn who_ends_well_is_done() {
-    let (supervisor, events, folder) = start(shell("job", Life::Service, "echo hello; exit 3"), 3);
+    let (supervisor, events, folder) = start(shell("job", Life::Task, "echo hello; exit 3"), 3);
     assert!(matches!(next(&events), Happening::Started { .. }));
     assert_eq!(next(&events), Happening::Done { data_lost: true });
     assert_eq!(std::fs::read_to_string(folder.path().join("job.log")).unwrap(), "hello\n");
@@ -112,4 +112,11 @@ fn who_hangs_is_killed_and_started_again_even_if_stopped() {
     assert_ne!(first, second);
     kill_process(Pid::from_raw(second as i32).unwrap(), Signal::STOP).unwrap();
     assert!(supervisor.stop(PATIENCE).killed.is_empty(), "who is stopped is woken to end");
+}
+
+#[test]
+fn a_service_that_ends_well_but_too_early_is_started_again() {
+    let (_supervisor, events, _folder) = start(shell("car", Life::Service, "exit 0"), 1);
+    assert!(matches!(next(&events), Happening::Started { .. }));
+    assert!(matches!(next(&events), Happening::Fell { how, .. } if how.contains("nobody here had asked")));
 }

@@ -83,10 +83,11 @@ impl Watcher {
                             why
                         },
                         status = child.wait() => match status {
-                            Ok(status) if is_done(status) => {
+                            Ok(status) if is_done(status) && self.spec.life != Life::Service => {
                                 self.tell(Happening::Done { data_lost: !status.success() });
                                 return false;
                             }
+                            Ok(status) if is_done(status) => "ended, though nobody here had asked it to".into(),
                             Ok(status) if status.code() == Some(BAD_INPUT) => return self.give_up(&in_words(status)),
                             Ok(status) => in_words(status),
                             Err(error) => error.to_string(),

@@ -1,0 +1,129 @@
+//! Faults of a running fleet: processes killed, stopped and ended, cables cut and silent, the router gone. Which, when and
+//! how long comes from a seed.
+
+mod check;
+mod fleet;
+mod proxy;
+
+use std::fmt;
+use std::time::Duration;
+
+use sim_replay::random::derive_seed;
+
+pub use check::{Findings, Result, Results};
+pub use fleet::{FaultyFleet, Report};
+pub use proxy::Proxy;
+
+/// The vehicles; the first is the ego's.
+pub const VEHICLES: [&str; 4] = ["10", "20", "30", "40"];
+
+/// What is done.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Kind {
+    /// `kill -9`.
+    Kill,
+    /// SIGTERM, as an operator ends a process.
+    End,
+    /// SIGSTOP, and after a while SIGCONT.
+    Stop,
+    /// The connection is cut; the process may connect again at once.
+    Cut,
+    /// Nothing comes through for a while, and no end of the connection is told.
+    Silence,
+}
+
+/// To whom.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Target {
+    /// A process, by its name.
+    Process(String),
+    /// The router that all meet at: gone, and there again after a while.
+    Router,
+}
+
+/// One fault.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Fault {
+    /// What.
+    pub kind: Kind,
+    /// To whom.
+    pub target: Target,
+    /// How long it lasts, where it lasts.
+    pub lasts: Duration,
+    /// After everything is as before, until the fault.
+    pub after: Duration,
+}
+
+impl Fault {
+    /// Whether nothing can be expected of the ego meanwhile: what it lives on is hit, or the way to whoever listens.
+    #[must_use]
+    pub fn silences_ego(&self) -> bool {
+        let own = [format!("agent-{}", VEHICLES[0]), format!("ego-{}", VEHICLES[0]), "replay".into()];
+        match &self.target {
+            Target::Router => true,
+            Target::Process(name) => own.contains(name),
+        }
+    }
+}
+
+impl fmt::Display for Fault {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let target = match &self.target {
+            Target::Process(name) => name,
+            Target::Router => "the router",
+        };
+        let seconds = self.lasts.as_secs_f64();
+        match self.kind {
+            Kind::Kill => write!(f, "{target} killed"),
+            Kind::End => write!(f, "{target} ended"),
+            Kind::Stop => write!(f, "{target} stopped for {seconds:.1} s"),
+            Kind::Cut => write!(f, "{target} cut off"),
+            Kind::Silence => write!(f, "{target} not heard for {seconds:.1} s"),
+        }
+    }
+}
+
+/// `count` faults, the same for the same seed: all kinds, on all processes of the fleet and on its router.
+#[must_use]
+pub fn plan(seed: u64, count: usize) -> Vec<Fault> {
+    let draw = |number: usize, what: u64, below: u64| derive_seed(seed, &[number as u64, what]) % below;
+    let mut targets: Vec<String> = VEHICLES.iter().map(|cav| format!("agent-{cav}")).collect();
+    targets.extend([format!("ego-{}", VEHICLES[0]), format!("link-{}", VEHICLES[0]), "replay".into()]);
+    let fault = |number: usize| {
+        let after = Duration::from_millis(draw(number, 0, 400));
+        let long = draw(number, 1, 50) == 0;
+        let lasts = Duration::from_millis(if long { 10_000 } else { 100 + draw(number, 2, 1900) });
+        let place = draw(number, 3, targets.len() as u64 + 1) as usize;
+        let Some(name) = targets.get(place).cloned() else {
+            return Fault { kind: Kind::Stop, target: Target::Router, lasts: lasts.min(Duration::from_secs(2)), after };
+        };
+        // The replay is the world: it may stand still or be out of reach, but it cannot be taken up in the middle.
+        let kinds: &[Kind] = if name == "replay" {
+            &[Kind::Stop, Kind::Cut, Kind::Silence]
+        } else {
+            &[Kind::Kill, Kind::Kill, Kind::End, Kind::Stop, Kind::Cut, Kind::Silence]
+        };
+        let kind = kinds[draw(number, 4, kinds.len() as u64) as usize];
+        Fault { kind, target: Target::Process(name), lasts, after }
+    };
+    (0..count).map(fault).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeSet;
+
+    use super::*;
+
+    #[test]
+    fn a_plan_comes_from_its_seed_and_hits_everyone_in_every_way() {
+        let faults = plan(1, 500);
+        assert_eq!(faults, plan(1, 500));
+        assert_eq!(faults[..20], plan(1, 20));
+        assert_ne!(faults, plan(2, 500));
+        let hit: BTreeSet<_> = faults.iter().map(|fault| (&fault.target, fault.kind)).collect();
+        // Six processes in five ways, the replay in three, the router.
+        assert_eq!(hit.len(), 6 * 5 + 3 + 1);
+        assert!(faults.iter().all(|fault| fault.lasts <= Duration::from_secs(10)));
+    }
+}
