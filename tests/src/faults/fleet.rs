@@ -9,12 +9,12 @@ use std::time::{Duration, Instant};
 
 use deploy::health::Usage;
 use protocol::HEADER_LEN;
-use sim_replay::bus::{BusOptions, Endpoint, open, unix_nanos};
+use sim_replay::bus::{BusOptions, Endpoint, open};
 use zenoh::{Session, Wait};
 
-use super::{Fault, Findings, Kind, Proxy, Results, Target, VEHICLES};
+use super::{Fault, Findings, Kind, Proxy, Results, Target, VEHICLES, unix_ms, write_scenario};
 use crate::bus::{free_port, wait_for};
-use crate::fleet::{Up, signal, write_weights};
+use crate::fleet::{Up, signal};
 
 /// Between two ticks of the scene.
 const PERIOD_MS: u64 = 100;
@@ -54,6 +54,8 @@ pub struct Report {
     pub balances: bool,
     /// What they do not add up by.
     pub differences: String,
+    /// Messages of which nobody can tell what became of them, as one they concern was away.
+    pub excused: u64,
     /// From Ctrl-C to the end.
     pub stop: Duration,
     /// Files in shared memory that were not there before.
@@ -78,16 +80,11 @@ impl FaultyFleet {
         let proxy = Proxy::open(port);
         let heard = Arc::<Mutex<FirstHeard>>::default();
         let observer = observe(&router_endpoint, &heard);
-        crate::scene::write(folder, &VEHICLES, 10);
-        write_weights(&folder.join("weights.safetensors"));
-        let scenario = folder.join("scenario.yaml");
-        let text = format!(
-            "run: test\nscene: {{dir: scene, loop: true}}\nmodels: {{weights: weights.safetensors}}\nmethod: max\n\
-             network: {{connect: {}}}\nlink: {{air: ideal}}\nego: {{deadline_ms: 50, max_age_ms: 500}}\n\
-             timeouts: {{restarts: 1000000}}\n",
+        let rest = format!(
+            "network: {{connect: {}}}\nlink: {{air: ideal}}\ntimeouts: {{restarts: 1000000}}",
             proxy.endpoint.as_str()
         );
-        fs::write(&scenario, text).expect("a writable folder");
+        let scenario = write_scenario(folder, &rest);
         let up = Up::start(folder, &scenario);
         let results = Results::of(&up.folder);
         let mut fleet = Self {
@@ -242,6 +239,7 @@ impl FaultyFleet {
             slowest,
             balances: ledger["balances"] == true,
             differences: ledger["balance"].to_string(),
+            excused: ledger["excused"].as_u64().unwrap_or(0),
             stop,
             left_over: shared_memory().difference(&self.shared_memory).cloned().collect(),
             growth: [growth_of(|usage| usage.descriptors), growth_of(|usage| usage.threads)],
@@ -270,8 +268,4 @@ fn observe(router: &Endpoint, heard: &Arc<Mutex<FirstHeard>>) -> Session {
 fn shared_memory() -> BTreeSet<String> {
     let entries = fs::read_dir("/dev/shm").into_iter().flatten().flatten();
     entries.map(|entry| entry.file_name().to_string_lossy().into_owned()).collect()
-}
-
-fn unix_ms() -> u64 {
-    unix_nanos() / 1_000_000
 }

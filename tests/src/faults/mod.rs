@@ -2,6 +2,7 @@
 //! how long comes from a seed.
 
 mod check;
+mod endurance;
 mod fleet;
 mod proxy;
 
@@ -11,11 +12,16 @@ use std::time::Duration;
 use sim_replay::random::derive_seed;
 
 pub use check::{Findings, Result, Results};
+pub use endurance::{ColdStart, Soak, cold_start, soak, write_scenario};
 pub use fleet::{FaultyFleet, Report};
 pub use proxy::Proxy;
 
 /// The vehicles; the first is the ego's.
 pub const VEHICLES: [&str; 4] = ["10", "20", "30", "40"];
+
+fn unix_ms() -> u64 {
+    sim_replay::bus::unix_nanos() / 1_000_000
+}
 
 /// What is done.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -68,11 +74,8 @@ impl Fault {
 
 impl fmt::Display for Fault {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let target = match &self.target {
-            Target::Process(name) => name,
-            Target::Router => "the router",
-        };
         let seconds = self.lasts.as_secs_f64();
+        let Target::Process(target) = &self.target else { return write!(f, "the router gone for {seconds:.1} s") };
         match self.kind {
             Kind::Kill => write!(f, "{target} killed"),
             Kind::End => write!(f, "{target} ended"),

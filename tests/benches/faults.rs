@@ -1,0 +1,134 @@
+//! What faults do to a fleet, how fast it starts and ends, and whether it can run for long.
+//!
+//! Four vehicles at 10 Hz with recorded poses and a small network, so that two cores are enough; every process is the real
+//! program, and they meet over cables that can be cut.
+//!
+//! ```text
+//! cargo build --release --workspace --bins
+//! cargo bench -p tests --bench faults -- --faults 500 --seed 1     # about 25 minutes
+//! cargo bench -p tests --bench faults -- --starts 100              # about 10 minutes
+//! cargo bench -p tests --bench faults -- --soak 3600               # an hour
+//! ```
+//!
+//! Prints a line per fault to standard error and the summary, in Markdown, to standard output. Fails where a target is missed.
+
+use std::time::Duration;
+
+use anyhow::{Context, Result, bail};
+use tests::faults::{FaultyFleet, Report, cold_start, plan, soak};
+use tests::machine;
+
+fn main() -> Result<()> {
+    let arguments: Vec<String> = std::env::args().skip(1).filter(|argument| argument != "--bench").collect();
+    let mut seed = 1;
+    let mut misses = Vec::new();
+    println!("{}\n", machine::describe());
+    for pair in arguments.chunks(2) {
+        let [name, value] = pair else { bail!("{} needs a value", pair[0]) };
+        let value: u64 = value.parse().with_context(|| format!("{name} {value}"))?;
+        match name.as_str() {
+            "--seed" => seed = value,
+            "--faults" => misses.extend(under_faults(seed, value as usize)),
+            "--starts" => misses.extend(starts(value as usize)),
+            "--soak" => misses.extend(for_long(Duration::from_secs(value))),
+            _ => bail!("{name} is none of --seed, --faults, --starts, --soak"),
+        }
+    }
+    if !misses.is_empty() {
+        bail!("missed: {}", misses.join("; "));
+    }
+    Ok(())
+}
+
+/// The names of the targets that do not hold.
+fn missed(targets: &[(bool, String)]) -> Vec<String> {
+    for (holds, target) in targets {
+        println!("- {target}: {}", if *holds { "yes" } else { "**no**" });
+    }
+    targets.iter().filter(|(holds, _)| !holds).map(|(_, target)| target.clone()).collect()
+}
+
+fn under_faults(seed: u64, count: usize) -> Vec<String> {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let faults = plan(seed, count);
+    let report = FaultyFleet::start(folder.path())
+        .suffer(&faults, |number, fault, ms| eprintln!("{number}: {fault}, as before after {ms} ms"));
+    let Report { mut findings, slowest, balances, differences, excused, stop, left_over, growth, restarts } = report;
+    findings.fused_again_ms.sort_unstable();
+    let returns = findings.fused_again_ms.len();
+    let quantile = |share: f64| {
+        let place = (share * returns as f64).ceil() as usize;
+        findings.fused_again_ms.get(place.saturating_sub(1)).copied().unwrap_or(0)
+    };
+    let worst = quantile(1.0);
+    println!("## {count} faults, seed {seed}\n");
+    println!("{restarts} restarts; slowest to be as before: {} ms ({})", slowest.0, slowest.1);
+    println!(
+        "first message of a new life to first result with it: median {} ms, 95 % {} ms",
+        quantile(0.5),
+        quantile(0.95)
+    );
+    println!("{excused} messages excused, as one they concern was away; {differences}");
+    let [descriptors, threads] = growth;
+    missed(&[
+        (
+            findings.gaps == 0,
+            format!("no gap over two periods (longest {} ms, {} above)", findings.longest_gap_ms, findings.gaps),
+        ),
+        (worst <= 1000, format!("fused again within 1 s of the first message ({returns} times, longest {worst} ms)")),
+        (balances, "the ledger balances".into()),
+        (left_over.is_empty(), format!("nothing left in shared memory {left_over:?}")),
+        (descriptors.0 <= 8, format!("descriptors flat (at most {:+} in a life, {})", descriptors.0, descriptors.1)),
+        (threads.0 <= 4, format!("threads flat (at most {:+} in a life, {})", threads.0, threads.1)),
+        (stop < Duration::from_secs(5), format!("ended within 5 s ({:.1} s)", stop.as_secs_f64())),
+    ])
+}
+
+fn starts(count: usize) -> Vec<String> {
+    let all: Vec<_> = (0..count)
+        .map(|number| {
+            let folder = tempfile::tempdir().expect("a temporary folder");
+            let start = cold_start(folder.path());
+            eprintln!("{number}: {start:?}");
+            start
+        })
+        .collect();
+    let mut first: Vec<u64> = all.iter().map(|start| start.first_fused_ms).collect();
+    first.sort_unstable();
+    let slowest = first.last().copied().unwrap_or(0);
+    let stop = all.iter().map(|start| start.stop).max().unwrap_or_default();
+    println!("## {count} cold starts\n");
+    println!("first fused result: median {} ms, longest {slowest} ms", first[first.len() / 2]);
+    missed(&[
+        (slowest < 3000, format!("first fused frame under 3 s after the start (longest {slowest} ms)")),
+        (all.iter().all(|start| start.lost_before == 0), "no frame lost before it".into()),
+        (stop < Duration::from_secs(5), format!("every stop under 5 s (longest {:.2} s)", stop.as_secs_f64())),
+        (all.iter().all(|start| start.left == 0), "nobody left behind".into()),
+    ])
+}
+
+fn for_long(lasts: Duration) -> Vec<String> {
+    let folder = tempfile::tempdir().expect("a temporary folder");
+    let soak = soak(folder.path(), lasts, |since, usage| {
+        let line = usage.iter().map(|(name, usage)| format!("{name} {:.0}", usage.resident_mib.unwrap_or(0.0)));
+        eprintln!("{:.0} s, MiB: {}", since.as_secs_f64(), line.collect::<Vec<_>>().join(", "));
+    });
+    println!("## {} minutes\n", lasts.as_secs() / 60);
+    println!("{} results\n", soak.frames);
+    println!("| process | MiB after warm-up | at the end | MiB a minute | descriptors | threads |");
+    println!("|---|---|---|---|---|---|");
+    for ((name, [first, last, slope]), (_, [d0, d1, t0, t1])) in soak.memory.iter().zip(&soak.handles) {
+        println!("| {name} | {first:.1} | {last:.1} | {slope:+.3} | {d0}, {d1} | {t0}, {t1} |");
+    }
+    println!();
+    let steepest = soak.memory.iter().map(|(_, [.., slope])| *slope).fold(f64::MIN, f64::max);
+    let [first, last] = soak.p99_ms;
+    missed(&[
+        (steepest < 1.0, format!("memory grows by less than 1 MiB a minute (steepest {steepest:+.3})")),
+        (
+            last <= 1.1 * first,
+            format!("p99 at the end within 10 % of that after warm-up ({first:.1} and {last:.1} ms)"),
+        ),
+        (soak.balances, "the ledger balances".into()),
+    ])
+}
