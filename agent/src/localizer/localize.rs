@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 
 use protocol::{PointCloud, PoseEstimate, StageTiming};
 use tch::nn::VarStore;
-use tch::{Device, Kind, Tensor, no_grad};
+use tch::{Device, Kind, TchError, Tensor, no_grad};
 
 use super::confidence::{CONFIDENCE_KEY, Confidence};
 use super::error::LocalizerError;
@@ -13,8 +13,9 @@ use super::head_config::SceneHeadConfig;
 use super::pose_evidence::PoseEvidence;
 use super::pose_search::{PoseSearch, SearchTimes};
 use super::pose_solver::{self, FoundPose, PoseSolver, Solved};
-use super::scene_encoder::SceneEncoder;
+use super::scene_encoder::{SceneEncoder, SceneFeatures};
 use super::scene_head::SceneHead;
+use super::second_look::SweepCells;
 use super::sweep_voxels::{Cell, SweepVoxels};
 use super::voxel_batch::VoxelBatch;
 use crate::registration::Correspondence;
@@ -22,6 +23,8 @@ use crate::weights::Weights;
 
 /// Cells that are regressed at most, where the head allows for more: poses hardly gain from more, and they take time.
 pub(super) const CELLS: usize = 256;
+/// Cells of the second look at most: it costs little for each of them, and what they err by averages out.
+const SECOND_CELLS: usize = 768;
 /// Share of the regressed cells that may be flat ground, which looks the same everywhere.
 const FLAT_SHARE: f64 = 0.25;
 
@@ -38,11 +41,10 @@ pub struct SceneCoordinates {
     pub origin_m: [f64; 3],
 }
 
-/// Scene coordinates, and the features they were regressed from, which the second look asks for.
+/// Scene coordinates, and the cells that the second look asks for: more of the same sweep.
 struct Regressed {
     coordinates: SceneCoordinates,
-    /// `[N, cell_channels]`.
-    cells: Tensor,
+    again: SweepCells,
 }
 
 /// Time per stage.
@@ -176,20 +178,25 @@ impl Localizer {
         times.encode = start.elapsed();
 
         let start = Instant::now();
-        let rows: Vec<i64> = chosen.iter().map(|&cell| cell as i64).collect();
-        let rows = Tensor::f_from_slice(&rows)?.f_to_device(self.device)?;
-        let cells = no_grad(|| features.cells.f_index_select(0, &rows))?;
-        let (world, epsilon_m) = no_grad(|| -> Result<(Vec<f32>, Vec<f32>), tch::TchError> {
-            let logits = self.head.classify(&features.sweeps, false)?.f_expand([rows.size()[0], -1], false)?;
+        let SweepCells { features: cells, sensor_m } = self.pick(&sweep, &features, &chosen)?;
+        let again = self.pick(&sweep, &features, &choose_evenly(sweep.cells(), SECOND_CELLS))?;
+        let (world, epsilon_m) = no_grad(|| -> Result<(Vec<f32>, Vec<f32>), TchError> {
+            let logits = self.head.classify(&features.sweeps, false)?.f_expand([chosen.len() as i64, -1], false)?;
             let regression = self.head.regress(&self.head.normalise(&cells)?, &logits, Kind::Float)?;
             let world = Vec::try_from(&regression.coordinates_m.f_reshape([-1])?.f_to_device(Device::Cpu)?)?;
             Ok((world, Vec::try_from(&regression.epsilon_m.f_to_device(Device::Cpu)?)?))
         })?;
         times.regress = start.elapsed();
-        let sensor_m = chosen.iter().map(|&cell| sweep.cells()[cell].centroid_m).collect();
         let origin_m = self.head.config().origin_m;
         let coordinates = SceneCoordinates { sensor_m, world_m: world.as_chunks().0.to_vec(), epsilon_m, origin_m };
-        Ok(Some(Regressed { coordinates, cells }))
+        Ok(Some(Regressed { coordinates, again }))
+    }
+
+    fn pick(&self, sweep: &SweepVoxels, features: &SceneFeatures, chosen: &[usize]) -> Result<SweepCells, TchError> {
+        let rows: Vec<i64> = chosen.iter().map(|&cell| cell as i64).collect();
+        let rows = Tensor::f_from_slice(&rows)?.f_to_device(self.device)?;
+        let features = no_grad(|| features.cells.f_index_select(0, &rows))?;
+        Ok(SweepCells { features, sensor_m: chosen.iter().map(|&cell| sweep.cells()[cell].centroid_m).collect() })
     }
 
     /// Search and confidence.
@@ -210,13 +217,13 @@ impl Localizer {
     /// answer: [`PoseEstimate::NoPose`].
     pub fn localize(&self, cloud: &PointCloud) -> Result<Localization, LocalizerError> {
         let mut times = LocalizerTimes::default();
-        let Regressed { coordinates, cells } = match self.regress(cloud, &mut times)? {
+        let Regressed { coordinates, again } = match self.regress(cloud, &mut times)? {
             Some(regressed) => regressed,
             None => return Ok(Localization::new(&self.solver.solve(&SceneCoordinates::default()), times)),
         };
         let search = PoseSearch { head: &self.head, solver: &self.solver, kind: Kind::Float };
         let mut spent = SearchTimes::default();
-        let solved = search.run(&coordinates, &cells, &mut spent)?;
+        let solved = search.run(&coordinates, &again, &mut spent)?;
         Ok(Localization::new(&solved, LocalizerTimes { solve: spent.solve, refine: spent.refine, ..times }))
     }
 }
@@ -305,13 +312,34 @@ pub fn sigma(epsilon_m: f32) -> f32 {
 /// Up to `count` cells, evenly over the sweep, flat ground no more than its share.
 pub(super) fn choose_evenly(cells: &[Cell], count: usize) -> Vec<usize> {
     let (flat, high): (Vec<usize>, Vec<usize>) = (0..cells.len()).partition(|&cell| cells[cell].is_flat());
-    let flat_count = (count as f64 * FLAT_SHARE) as usize;
-    let mut chosen = every_nth(&high, count - flat_count);
-    chosen.extend(every_nth(&flat, flat_count));
+    let mut chosen = every_nth(&high, (count as f64 * (1.0 - FLAT_SHARE)) as usize);
+    // A share of what is chosen: a sweep with little but ground must not be placed by its ground.
+    let flat_count = chosen.len() as f64 * FLAT_SHARE / (1.0 - FLAT_SHARE);
+    chosen.extend(every_nth(&flat, flat_count as usize));
     chosen
 }
 
 fn every_nth(rows: &[usize], count: usize) -> Vec<usize> {
     let kept = count.min(rows.len());
     (0..kept).map(|place| rows[place * rows.len() / kept]).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn ground_is_never_more_than_its_share() {
+        let cells = |high: usize, flat: usize| -> Vec<Cell> {
+            let cell = |extent_m| Cell { extent_m, ..Cell::default() };
+            std::iter::repeat_n(cell(2.0), high).chain(std::iter::repeat_n(cell(0.1), flat)).collect()
+        };
+        for (high, flat, expected) in [(1000, 1000, 256), (60, 1000, 80), (1000, 10, 202), (0, 500, 0)] {
+            let cells = cells(high, flat);
+            let chosen = choose_evenly(&cells, 256);
+            let ground = chosen.iter().filter(|&&cell| cells[cell].is_flat()).count();
+            assert_eq!(chosen.len(), expected);
+            assert!(ground as f64 <= FLAT_SHARE * chosen.len() as f64, "{ground} of {expected}");
+        }
+    }
 }

@@ -2,12 +2,12 @@
 
 use std::time::{Duration, Instant};
 
-use tch::{Kind, TchError, Tensor};
+use tch::{Kind, TchError};
 
 use super::localize::SceneCoordinates;
 use super::pose_solver::{FoundPose, PoseSolver, Solved};
 use super::scene_head::SceneHead;
-use super::second_look::look_again;
+use super::second_look::{SweepCells, look_again};
 use crate::registration::NoRegistration;
 
 /// How much farther off than usual cells may be in one search after the other.
@@ -41,23 +41,23 @@ struct Attempt {
 }
 
 impl PoseSearch<'_> {
-    /// The pose that most cells agree on in the end; `cells` are the features `[N, cell_channels]` of `coordinates`.
+    /// The pose that most cells agree on in the end; `again` are the cells of the second look.
     ///
     /// # Errors
     /// The tensor library's. That there is no pose is an answer.
     pub(super) fn run(
         &self,
         coordinates: &SceneCoordinates,
-        cells: &Tensor,
+        again: &SweepCells,
         times: &mut SearchTimes,
     ) -> Result<Solved, TchError> {
         let agreement = |attempt: &Result<Attempt, _>| attempt.as_ref().map_or(-1.0, |attempt| attempt.agreement);
-        let mut best = self.attempt(coordinates, cells, WIDENING[0], times)?;
+        let mut best = self.attempt(coordinates, again, WIDENING[0], times)?;
         for &factor in &WIDENING[1..] {
             if agreement(&best) >= SURE {
                 break;
             }
-            let next = self.attempt(coordinates, cells, factor, times)?;
+            let next = self.attempt(coordinates, again, factor, times)?;
             if agreement(&next) > agreement(&best) {
                 best = next;
             }
@@ -69,7 +69,7 @@ impl PoseSearch<'_> {
     fn attempt(
         &self,
         coordinates: &SceneCoordinates,
-        cells: &Tensor,
+        again: &SweepCells,
         factor: f64,
         times: &mut SearchTimes,
     ) -> Result<Result<Attempt, NoRegistration>, TchError> {
@@ -82,7 +82,7 @@ impl PoseSearch<'_> {
         };
         let start = Instant::now();
         let (pose, is_wide) = (rough.target_from_source, factor > 1.0);
-        let second = look_again(self.head, cells, &coordinates.sensor_m, &pose, is_wide, self.kind)?;
+        let second = look_again(self.head, again, &pose, is_wide, self.kind)?;
         let found = self.solver.judge(coordinates, &rough, second.as_ref());
         let agreement = second.map_or(rough.inlier_ratio, |second| second.registration.inlier_ratio);
         times.refine += start.elapsed();

@@ -17,6 +17,15 @@ const AGREES_M: f64 = 1.0;
 /// What even the best cell does not know, metres.
 const FLOOR_M: f32 = 0.1;
 
+/// Cells of one sweep that the refiner is asked for.
+#[derive(Debug)]
+pub(super) struct SweepCells {
+    /// `[N, cell_channels]`.
+    pub(super) features: Tensor,
+    /// `[N]`: in the sensor frame, metres.
+    pub(super) sensor_m: Vec<[f32; 3]>,
+}
+
 /// A sharpened pose and the answers that it rests on.
 #[derive(Debug, Clone, PartialEq)]
 pub(super) struct SecondLook {
@@ -33,24 +42,23 @@ pub(super) struct SecondLook {
     pub(super) information_per_m2: f64,
 }
 
-/// Asks the refiner where cells are that `start` puts somewhere.
+/// Asks the refiner where cells are that `start` puts somewhere; poses are relative to the head's origin.
 ///
-/// `cells` are features `[N, cell_channels]`, `sensor_m` `[N]` places in the sensor frame; poses are relative to the head's
-/// origin. `is_wide` says that `start` may be off by more than usual. Nothing comes back where the head has no refiner or
-/// its answers fix no pose.
+/// `is_wide` says that `start` may be off by more than usual. Nothing comes back where the head has no refiner or its
+/// answers fix no pose.
 ///
 /// # Errors
 /// The tensor library's.
 pub(super) fn look_again(
     head: &SceneHead,
-    cells: &Tensor,
-    sensor_m: &[[f32; 3]],
+    cells: &SweepCells,
     start: &Isometry3<f64>,
     is_wide: bool,
     kind: Kind,
 ) -> Result<Option<SecondLook>, TchError> {
     let Some(refiner) = head.refiner() else { return Ok(None) };
-    let cells = head.normalise(cells)?;
+    let sensor_m = &cells.sensor_m;
+    let cells = head.normalise(&cells.features)?;
     let device = cells.device();
     let mut pose = *start;
     let mut answer = None;

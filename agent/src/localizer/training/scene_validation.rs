@@ -9,6 +9,7 @@ use crate::localizer::localize::SceneCoordinates;
 use crate::localizer::pose_search::{PoseSearch, SearchTimes};
 use crate::localizer::pose_solver::PoseSolver;
 use crate::localizer::scene_head::SceneHead;
+use crate::localizer::second_look::SweepCells;
 use crate::pose_error::PoseError;
 
 /// Errors on sweeps that were not trained on.
@@ -57,7 +58,7 @@ pub(super) fn validate(
     for (sweep, truth) in cache.world_from_sensor.iter().enumerate() {
         let count = sweeps[first..].iter().take_while(|&&of| of == sweep as i64).count();
         let rows = first..first + count;
-        let cells = cache.cells.f_narrow(0, first as i64, count as i64)?;
+        let features = cache.cells.f_narrow(0, first as i64, count as i64)?;
         first += count;
         let coordinates = SceneCoordinates {
             sensor_m: sensor.as_chunks().0[rows.clone()].to_vec(),
@@ -65,7 +66,8 @@ pub(super) fn validate(
             epsilon_m: epsilon[rows].to_vec(),
             origin_m: head.config().origin_m,
         };
-        let found = search.run(&coordinates, &cells, &mut SearchTimes::default())?;
+        let again = SweepCells { features, sensor_m: coordinates.sensor_m.clone() };
+        let found = search.run(&coordinates, &again, &mut SearchTimes::default())?;
         let (metres, degrees) = found.map_or((f64::INFINITY, 180.0), |found| {
             let error = PoseError::between(&found.world_from_sensor.into(), &(*truth).into());
             (error.distance_m, error.angle_deg)
