@@ -65,6 +65,29 @@ fn a_vehicle_that_finds_no_pose_says_so_and_the_fleet_goes_on() {
 }
 
 #[test]
+fn a_vehicle_whose_network_was_trained_end_to_end_takes_part_with_the_pose_that_it_regresses() {
+    let _alone = alone();
+    let folder = tempfile::tempdir().unwrap();
+    localizer::write_end_to_end(folder.path(), EndToEndKind::Pose, 3);
+    let scenario = write_scenario(folder.path(), 4, "lockstep: true", "vehicles: {4288: {pose: end_to_end}}");
+    let text = fs::read_to_string(&scenario).unwrap();
+    fs::write(&scenario, text.replace("weights.safetensors}", "weights.safetensors, end_to_end: Pose.safetensors}"))
+        .unwrap();
+    let mut up = Up::start(folder.path(), &scenario);
+    assert_eq!(up.wait().code(), Some(0));
+    let json =
+        |name: &str| -> Value { serde_json::from_str(&fs::read_to_string(up.folder.join(name)).unwrap()).unwrap() };
+    // It always has an answer and never doubts it: that is what the localizer is compared with.
+    let metrics = json("metrics.json");
+    assert_eq!((&metrics["pose_source"], &metrics["pose"]["no_pose"]), (&"mixed".into(), &0.into()));
+    assert_eq!(metrics["pose"]["success_3m"], 0.5, "it has learnt nothing: {}", metrics["pose"]);
+    assert_eq!(json("ledger.json")["balances"], true);
+    assert_eq!(results(&up.folder).len(), 4);
+    let provenance = Scenario::load(&up.folder.join("scenario.yaml")).unwrap().provenance.unwrap();
+    assert_eq!(provenance.end_to_end_sha256.unwrap().len(), 64);
+}
+
+#[test]
 fn eval_prints_the_numbers_that_others_read_and_writes_what_was_asked_for() {
     let folder = tempfile::tempdir().unwrap();
     let (encoder, head) = scene_and_networks(folder.path());

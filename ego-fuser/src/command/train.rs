@@ -173,9 +173,6 @@ impl Arguments {
 
     /// The poses that maps are aligned by.
     fn poses(&self) -> Result<SamplePoses> {
-        if !(0.0..=1.0).contains(&self.noise_share) || !(0.0..=1.0).contains(&self.lost_share) {
-            return Err(BadInput("--noise-share and --lost-share are probabilities".into()).into());
-        }
         let read = |file: &PathBuf| PoseTable::read(file).map(Arc::new).map_err(|error| BadInput(error.to_string()));
         let is_noisy = self.position_noise != 0.0 || self.heading_noise != 0.0;
         let noise = is_noisy.then(|| NoisyPoseConfig {

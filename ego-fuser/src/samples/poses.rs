@@ -32,6 +32,11 @@ impl SamplePoses {
     /// # Errors
     /// [`PoseSourceError`] names the field.
     pub fn validate(&self) -> Result<(), PoseSourceError> {
+        for (field, value) in [("noise_share", self.noise_share), ("lost_share", self.lost_share)] {
+            if !(0.0..=1.0).contains(&value) {
+                return Err(PoseSourceError::Value { field, value, must: "a share, 0 to 1" });
+            }
+        }
         self.noise.as_ref().map_or(Ok(()), |noise| NoisyPose::new(noise).map(|_| ()))
     }
 
@@ -43,8 +48,9 @@ impl SamplePoses {
 
     /// Draws the error of one sample.
     pub(super) fn draw(&self, rng: &mut impl Rng) -> Result<DrawnError, SampleError> {
-        let lost = (self.lost_share > 0.0 && rng.random_bool(self.lost_share.min(1.0))).then(|| Lost::draw(rng));
-        let is_noisy = self.noise_share >= 1.0 || rng.random_bool(self.noise_share.clamp(0.0, 1.0));
+        // One draw less where the share is all or nothing: samples of before stay what they were.
+        let lost = (self.lost_share > 0.0 && rng.random_bool(self.lost_share)).then(|| Lost::draw(rng));
+        let is_noisy = self.noise_share >= 1.0 || rng.random_bool(self.noise_share);
         let seed = rng.random();
         let Some(noise) = self.noise.as_ref().filter(|_| is_noisy) else {
             return Ok(DrawnError { lost, ..DrawnError::default() });
@@ -175,6 +181,15 @@ mod tests {
         let [x, y, z] = world_from_cav.translation_m;
         let square = x * x + y * y + z * z;
         assert!((f64::from(confidence) - 0.8 / (1.0 + square)).abs() < 1e-5);
+    }
+
+    #[test]
+    fn a_share_that_is_none_is_refused_by_name() {
+        for share in [-0.1, 1.1, f64::NAN] {
+            let refused = |poses: SamplePoses| poses.validate().unwrap_err().to_string();
+            assert!(refused(SamplePoses { lost_share: share, ..SamplePoses::default() }).contains("lost_share"));
+            assert!(refused(SamplePoses { noise_share: share, ..SamplePoses::default() }).contains("noise_share"));
+        }
     }
 
     #[test]
