@@ -128,6 +128,22 @@ impl<T> Pairing<T> {
         self.waiting.get(cav).into_iter().flatten().map(|held| held.capture_nanos)
     }
 
+    /// Everyone of whom something waits.
+    #[must_use]
+    pub fn cavs(&self) -> Vec<CavId> {
+        self.waiting.keys().cloned().collect()
+    }
+
+    /// The clock of the scene was turned back to `now_nanos`: forgets what a CAV said of later times, but for what may be
+    /// `ahead_nanos` early. How many of these messages were never used.
+    pub fn turn_back(&mut self, cav: &CavId, now_nanos: u64, ahead_nanos: u64) -> usize {
+        let Some(queue) = self.waiting.get_mut(cav) else { return 0 };
+        let latest = now_nanos.saturating_add(ahead_nanos);
+        let unused = queue.iter().filter(|held| held.capture_nanos > latest && !held.is_used).count();
+        queue.retain(|held| held.capture_nanos <= if held.is_used { now_nanos } else { latest });
+        unused
+    }
+
     /// Forgets a CAV that has left; how many of its messages were never used.
     pub fn forget(&mut self, cav: &CavId) -> usize {
         self.waiting.remove(cav).map_or(0, |queue| queue.iter().filter(|held| !held.is_used).count())
@@ -159,6 +175,18 @@ mod tests {
     fn ages(pairing: &mut Pairing<u64>, ego: u64) -> (Vec<i64>, Vec<DropReason>) {
         let (paired, dropped) = pairing.pair(ego);
         (paired.iter().map(|found| found.age_nanos).collect(), dropped.iter().map(|lost| lost.reason).collect())
+    }
+
+    #[test]
+    fn a_scene_that_begins_anew_is_paired_from_its_first_frame() {
+        let mut pairing = pairing();
+        for frame in [50, 51] {
+            assert_eq!(pairing.insert(&cav("a"), frame * FRAME, frame), None);
+        }
+        assert_eq!(ages(&mut pairing, 50 * FRAME), (vec![0], vec![]));
+        assert_eq!(pairing.turn_back(&cav("a"), 2 * FRAME, 20 * FRAME), 1);
+        assert_eq!(pairing.insert(&cav("a"), 2 * FRAME, 2), None);
+        assert_eq!(ages(&mut pairing, 2 * FRAME), (vec![0], vec![]));
     }
 
     #[test]

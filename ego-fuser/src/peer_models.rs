@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 
 use agent::detector::Detector;
 use protocol::message::{Descriptor, ModelHash};
-use protocol::{BevGrid, CavId};
+use protocol::{BevFeatures, BevGrid, CavId, WireError};
 
 /// A network that is not the ego's: the field that tells, and both values.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -40,6 +40,21 @@ impl PeerModels {
             model_hash: own.model_hash(),
             others: BTreeMap::new(),
         }
+    }
+
+    /// Whether a map lies on the lattice of the ego's network.
+    ///
+    /// # Errors
+    /// [`WireError`] names what differs.
+    pub(crate) fn check(&self, map: &BevFeatures) -> Result<(), WireError> {
+        if map.grid != self.grid {
+            return Err(WireError::Grid { expected: self.grid.to_string(), found: map.grid.to_string() });
+        }
+        if map.channels != self.channels {
+            let (expected, found) = (self.channels.into(), map.channels.into());
+            return Err(WireError::Shape { what: "channels", expected, found });
+        }
+        Ok(())
     }
 
     /// Takes in what an agent says of itself; how its network differs, when that is news.

@@ -34,6 +34,10 @@ named! {
         OutOfRange = "out_of_range",
         /// Who sent it, was to have it or carried it was away for a while, and nobody can tell what became of it.
         Away = "away",
+        /// Of a time that has not come yet.
+        Future = "future",
+        /// From a vehicle whose words do not fit what the ego sees itself.
+        Distrusted = "distrusted",
     }
 }
 
@@ -42,6 +46,6 @@ impl DropReason {
     /// left out.
     #[must_use]
     pub fn is_loss(self) -> bool {
-        !matches!(self, Self::LinkLoss | Self::LinkQueue | Self::OutOfRange)
+        !matches!(self, Self::LinkLoss | Self::LinkQueue | Self::OutOfRange | Self::Distrusted)
     }
 }

@@ -10,6 +10,9 @@ use super::{Node, OwnFrame, Received};
 use crate::ego::{Content, View};
 use crate::neighbourhood::sender_of;
 
+/// A neighbour's map may be of so much later a time than the newest of the ego's own, nanoseconds: its computer is faster.
+const MAX_AHEAD_NANOS: u64 = 2_000_000_000;
+
 impl Node<'_> {
     /// Takes a message in: the own agent's begins a frame, a neighbour's waits for one.
     pub(super) fn admit(&mut self, arrival: &Arrival) {
@@ -19,6 +22,9 @@ impl Node<'_> {
         }
         if *cav != self.cav && self.models.is_other(cav) {
             return self.bus.books().dropped(&arrival.topic, DropReason::Shape);
+        }
+        if let Some(reason) = self.out_of_time(arrival).filter(|_| *cav != self.cav) {
+            return self.bus.books().dropped(&arrival.topic, reason);
         }
         let began = Instant::now();
         let Some((pose, content)) = self.decode(arrival) else { return };
@@ -30,6 +36,7 @@ impl Node<'_> {
         let capture_nanos = arrival.header.stamp.capture_nanos;
         let view = View { cav: cav.clone(), pose, capture_nanos, content };
         if *cav == self.cav {
+            self.keep_time(capture_nanos);
             let frame_index = arrival.header.stamp.sequence;
             self.frames.push_back(OwnFrame { frame_index, capture_nanos, transport, begun: arrival.at, view });
             return;
@@ -42,6 +49,36 @@ impl Node<'_> {
         if let Some(lost) = self.pairing.insert(cav, capture_nanos, Received { view, payload_bytes, wire_bytes }) {
             self.bus.books().dropped(&arrival.topic, lost.reason);
         }
+    }
+
+    /// Whether a message tells of a time that has not come, later than the ego's own sweeps by more than its own agent may
+    /// lag behind; or of one that no frame of the ego asks for any more.
+    fn out_of_time(&self, arrival: &Arrival) -> Option<DropReason> {
+        let capture_nanos = arrival.header.stamp.capture_nanos;
+        let newest = self.own_nanos?;
+        let oldest = self.frames.front().map_or(newest, |frame| frame.capture_nanos);
+        if capture_nanos > newest.saturating_add(MAX_AHEAD_NANOS) {
+            Some(DropReason::Future)
+        } else if capture_nanos.saturating_add(self.options.pairing.max_age_nanos) < oldest {
+            Some(DropReason::Stale)
+        } else {
+            None
+        }
+    }
+
+    /// The ego's own sweeps say what time it is. Where they begin anew, so does everything.
+    fn keep_time(&mut self, capture_nanos: u64) {
+        let max_age_nanos = self.options.pairing.max_age_nanos;
+        if self.own_nanos.is_some_and(|own| capture_nanos.saturating_add(max_age_nanos) < own) {
+            tracing::info!(capture_nanos, "the scene has begun anew");
+            for cav in self.pairing.cavs() {
+                for _ in 0..self.pairing.turn_back(&cav, capture_nanos, MAX_AHEAD_NANOS) {
+                    self.bus.books().dropped(&self.topic(&cav), DropReason::Stale);
+                }
+            }
+            self.ego.forget();
+        }
+        self.own_nanos = Some(capture_nanos);
     }
 
     /// Takes in what an agent says of itself. The maps of another network are left out from then on.
@@ -72,7 +109,8 @@ impl Node<'_> {
             }
             _ => {
                 let Bev { pose, features } = self.inbox.decode(arrival, limits)?;
-                match features.decode(limits) {
+                let decoded = features.decode(limits).and_then(|map| self.models.check(&map.features).map(|()| map));
+                match decoded {
                     Ok(features) => Some((pose, Content::Features(features))),
                     Err(error) => {
                         self.bus.books().rejected(&arrival.topic, &error);

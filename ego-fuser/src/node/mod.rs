@@ -119,6 +119,8 @@ struct Node<'a> {
     models: PeerModels,
     pairing: Pairing<Received>,
     frames: VecDeque<OwnFrame>,
+    /// Capture time of the ego's newest sweep, nanoseconds.
+    own_nanos: Option<u64>,
     ended: BTreeSet<CavId>,
     detections: Publisher,
     json: Publisher,
@@ -151,6 +153,7 @@ impl<'a> Node<'a> {
             models: PeerModels::new(ego.detector()),
             pairing: Pairing::new(options.pairing),
             frames: VecDeque::new(),
+            own_nanos: None,
             ended: BTreeSet::new(),
             detections: bus.publisher(topic(Stream::Detections), PublisherOptions::DETECTIONS.lossless(PLACES))?,
             json: bus.publisher(topic(Stream::DetectionsJson), PublisherOptions::DETECTIONS)?,

@@ -2,10 +2,14 @@
 
 use std::collections::{BTreeMap, VecDeque};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
-use protocol::{Account, DropReason, Ledger, ProcessId, RateReason, StageSummary, Topic, WireError};
+use protocol::{Account, CavId, DropReason, Ledger, ProcessId, RateReason, StageSummary, Topic, WireError};
 
+use super::clock_offset::ClockOffset;
+
+/// Vehicles whose clock and standing are remembered at most.
+const MAX_PEERS: usize = 128;
 /// Timings kept per stage: at 10 Hz the last three minutes.
 const KEPT_TIMINGS: usize = 2048;
 
@@ -25,6 +29,24 @@ struct State {
     // Unsound messages, of whatever kind of topic.
     refused: BTreeMap<Topic, u64>,
     stages: BTreeMap<String, Timings>,
+    peers: BTreeMap<CavId, Peer>,
+}
+
+#[derive(Default)]
+struct Peer {
+    clock: Option<ClockOffset>,
+    trust: Option<f64>,
+}
+
+/// What a process makes of a vehicle that it hears.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PeerSummary {
+    /// The vehicle.
+    pub cav: CavId,
+    /// Its clock less ours, seconds, less the shortest time a message of it was under way.
+    pub clock_offset_s: Option<f64>,
+    /// How far it is believed, 0..1; only where somebody asks.
+    pub trust: Option<f64>,
 }
 
 /// Upper ends of the histogram's buckets, seconds: from a checksum to a lost cause.
@@ -122,6 +144,37 @@ impl Books {
         }
     }
 
+    /// A message of `cav` came: what that says of its clock. Said in the log when it is far off, and when it is not any more.
+    pub(super) fn heard_clock(&self, cav: &CavId, sent_nanos: u64, arrived_nanos: u64, at: Instant) {
+        let news = self.lock().peer(cav).and_then(|peer| {
+            let clock = peer.clock.get_or_insert_with(|| ClockOffset::new(at));
+            Some((clock.note(sent_nanos, arrived_nanos, at)?, clock.seconds()))
+        });
+        match news {
+            Some((true, offset_s)) => tracing::warn!(%cav, offset_s, "its clock is far from ours"),
+            Some((false, offset_s)) => tracing::info!(%cav, offset_s, "its clock is near ours again"),
+            None => {}
+        }
+    }
+
+    /// How far a vehicle is believed from now on, 0..1.
+    pub fn trusted(&self, cav: &CavId, trust: f64) {
+        if let Some(peer) = self.lock().peer(cav) {
+            peer.trust = Some(trust);
+        }
+    }
+
+    /// What is known of the vehicles that are heard.
+    #[must_use]
+    pub fn peers(&self) -> Vec<PeerSummary> {
+        let summary = |(cav, peer): (&CavId, &Peer)| PeerSummary {
+            cav: cav.clone(),
+            clock_offset_s: peer.clock.as_ref().map(ClockOffset::seconds),
+            trust: peer.trust,
+        };
+        self.lock().peers.iter().map(summary).collect()
+    }
+
     /// A stage took this long for one frame.
     pub fn timed(&self, stage: &str, time: Duration) {
         let mut state = self.lock();
@@ -194,6 +247,13 @@ impl Books {
 }
 
 impl State {
+    fn peer(&mut self, cav: &CavId) -> Option<&mut Peer> {
+        if self.peers.len() >= MAX_PEERS && !self.peers.contains_key(cav) {
+            return None;
+        }
+        Some(self.peers.entry(cav.clone()).or_default())
+    }
+
     fn pass(&mut self, account: Account) {
         *self.passed.entry(account).or_default() += 1;
     }

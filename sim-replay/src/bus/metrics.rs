@@ -94,6 +94,25 @@ impl Collector for BooksCollector {
             ConstGauge::new(count).encode(in_flight.encode_family(&labels)?)?;
         }
         let seconds = Unit::Seconds;
+        let peers = self.0.peers();
+        let mut clocks = encoder.encode_descriptor(
+            "clock_offset",
+            "Clock of a vehicle less ours, less the shortest time a message was under way",
+            Some(&seconds),
+            MetricType::Gauge,
+        )?;
+        for (cav, offset_s) in peers.iter().filter_map(|peer| Some((&peer.cav, peer.clock_offset_s?))) {
+            ConstGauge::new(offset_s).encode(clocks.encode_family(&[("vehicle", cav.as_str())])?)?;
+        }
+        let mut trust = encoder.encode_descriptor(
+            "trust",
+            "How far the ego believes a vehicle, 0 to 1",
+            None,
+            MetricType::Gauge,
+        )?;
+        for (cav, value) in peers.iter().filter_map(|peer| Some((&peer.cav, peer.trust?))) {
+            ConstGauge::new(value).encode(trust.encode_family(&[("vehicle", cav.as_str())])?)?;
+        }
         let mut stages = encoder.encode_descriptor(
             "stage",
             "Time a stage takes for one frame",
@@ -129,6 +148,7 @@ mod tests {
         books.received(&lidar);
         books.dropped(&lidar, DropReason::Superseded);
         books.offered(&bev);
+        books.trusted(&cav, 0.25);
         for milliseconds in [0.2, 3.0, 4.0, 40.0, 9_000.0] {
             books.timed("encode \"x\"", Duration::from_secs_f64(milliseconds / 1e3));
         }
@@ -146,6 +166,7 @@ mod tests {
                 "v2vloc_messages_dropped_total{{{process},topic=\"4279/lidar\",side=\"receiver\",reason=\"superseded\"}} 1"
             ),
             format!("v2vloc_messages_in_flight{{{process},topic=\"4279/lidar\",side=\"receiver\"}} 2"),
+            format!("v2vloc_trust{{{process},vehicle=\"4279\"}} 0.25"),
             "# TYPE v2vloc_stage_seconds histogram".into(),
             "# EOF".into(),
         ] {

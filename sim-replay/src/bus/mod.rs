@@ -12,6 +12,8 @@
 
 mod args;
 mod books;
+mod clock_offset;
+mod freshness;
 mod liveliness;
 pub mod mailbox;
 mod membership;
@@ -28,7 +30,7 @@ mod tap;
 mod yielding;
 
 pub use args::{BusArgs, STOP_LIMIT, log_to_stderr};
-pub use books::{Books, StageHistogram};
+pub use books::{Books, PeerSummary, StageHistogram};
 pub use liveliness::{Presence, Sighting, Watch};
 pub use membership::{Bus, Identity};
 pub use metrics::{MetricsServer, exposition};

@@ -1,6 +1,5 @@
 //! Taking messages off the network's hands at once, and handing them to the thread that works on them.
 
-use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
 
@@ -9,8 +8,10 @@ use zenoh::Wait;
 use zenoh::bytes::ZBytes;
 use zenoh::sample::Sample;
 
+use super::freshness::{Freshness, Verdict};
 use super::mailbox::{Mailbox, Pushed, Taken};
 use super::notices::Notices;
+use super::publisher::unix_nanos;
 use super::{Books, BusError};
 
 /// Where a message waits: data and notices of one topic apart, so that a notice never takes the place of data.
@@ -71,13 +72,15 @@ impl Arrival {
 /// What a thread works on: the messages of all topics it subscribed to, in bounded lanes.
 pub struct Inbox {
     mailbox: Mailbox<Lane, Event>,
+    freshness: Mutex<Freshness>,
     books: Books,
 }
 
 impl Inbox {
     pub(super) fn new(places: usize, max_topics: usize, books: &Books) -> Arc<Self> {
         // Two lanes a topic: data and notices.
-        Arc::new(Self { mailbox: Mailbox::new(places, max_topics.saturating_mul(2)), books: books.clone() })
+        let mailbox = Mailbox::new(places, max_topics.saturating_mul(2));
+        Arc::new(Self { mailbox, freshness: Mutex::default(), books: books.clone() })
     }
 
     /// The oldest event, waiting until `deadline` for one.
@@ -171,16 +174,11 @@ struct Door {
     inbox: Arc<Inbox>,
     places: Option<usize>,
     notices: Notices,
-    // The latest sequence of each topic and epoch: a restarted sender begins anew.
-    last: Mutex<BTreeMap<(Topic, u64), u64>>,
 }
-
-/// Topics and epochs remembered: senders restart now and then, and a hostile one must not fill the memory.
-const MAX_REMEMBERED: usize = 1024;
 
 impl Door {
     fn new(inbox: &Arc<Inbox>, places: Option<usize>, notices: &Notices) -> Self {
-        Self { inbox: Arc::clone(inbox), places, notices: notices.clone(), last: Mutex::default() }
+        Self { inbox: Arc::clone(inbox), places, notices: notices.clone() }
     }
 
     fn admit(&self, topic: Topic, sample: &Sample) {
@@ -191,15 +189,16 @@ impl Door {
         if header.kind == Kind::Control && has_notices(&topic) {
             return self.note(topic, &header, sample);
         }
+        let at = Instant::now();
         if has_notices(&topic) {
             self.inbox.books.arrived(&topic);
             self.notices.heard(&topic);
-            if !self.is_new(&topic, &header) {
-                return self.inbox.books.dropped(&topic, DropReason::Duplicate);
+            if let Some(reason) = self.no_news(&topic, &header, at) {
+                return self.inbox.books.dropped(&topic, reason);
             }
         }
         let payload = sample.payload().clone();
-        let arrival = Arrival { topic: topic.clone(), header, at: Instant::now(), payload };
+        let arrival = Arrival { topic: topic.clone(), header, at, payload };
         self.inbox.deliver(&topic, Event::Message(arrival), self.places);
     }
 
@@ -220,23 +219,24 @@ impl Door {
         }
     }
 
-    fn is_new(&self, topic: &Topic, header: &Header) -> bool {
-        let (key, sequence) = ((topic.clone(), header.stamp.epoch), header.stamp.sequence);
-        let mut last = self.last.lock().unwrap_or_else(PoisonError::into_inner);
-        match last.get_mut(&key) {
-            Some(before) if *before >= sequence => false,
-            Some(before) => {
-                *before = sequence;
-                true
+    /// Why a message is not to be used, where it is not news.
+    fn no_news(&self, topic: &Topic, header: &Header, at: Instant) -> Option<DropReason> {
+        let stamp = &header.stamp;
+        let Verdict { dropped, quarantine } = {
+            let mut freshness = self.inbox.freshness.lock().unwrap_or_else(PoisonError::into_inner);
+            freshness.admit(topic, stamp.epoch, stamp.sequence, at)
+        };
+        match quarantine {
+            Some(true) => {
+                tracing::warn!(%topic, "two senders speak under one name: neither is heard until one is silent")
             }
-            None => {
-                if last.len() >= MAX_REMEMBERED {
-                    last.clear();
-                }
-                last.insert(key, sequence);
-                true
-            }
+            Some(false) => tracing::info!(%topic, "one sender is left under this name: it is heard again"),
+            None => {}
         }
+        if dropped.is_none() {
+            self.inbox.books.heard_clock(&stamp.cav, stamp.publish_nanos, unix_nanos(), at);
+        }
+        dropped
     }
 }
 
