@@ -4,6 +4,7 @@
 //! Recorded datasets differ in axes, units, pose formats and file layouts. All of that ends at this crate's readers:
 //! behind [`dataset::open`] there is one [`frame::Frame`], in the conventions of [`protocol`].
 
+pub mod bounded;
 pub mod bus;
 pub mod carla_pose;
 pub mod dataset;

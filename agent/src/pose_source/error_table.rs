@@ -1,8 +1,9 @@
 //! Pose errors that a pose generator really made, one row per sweep.
 
-use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
+
+use sim_replay::bounded;
 
 use super::noise::PlanarError;
 
@@ -11,6 +12,8 @@ const HEADER: &str = "x_m,y_m,z_m,yaw_deg,confidence";
 
 /// Errors beyond this are no errors of a pose but of a file, metres.
 const MAX_ERROR_M: f64 = 1e5;
+/// Largest file that is read, bytes.
+const MAX_BYTES: u64 = 64 << 20;
 
 /// Why a table of errors cannot be read.
 #[derive(Debug, thiserror::Error)]
@@ -81,7 +84,8 @@ impl ErrorTable {
     /// # Errors
     /// [`ErrorTableError`] names the file, the line and the column.
     pub fn read(path: &Path) -> Result<Self, ErrorTableError> {
-        let text = fs::read_to_string(path).map_err(|source| ErrorTableError::Io { path: path.to_owned(), source })?;
+        let text = bounded::read_text(path, MAX_BYTES)
+            .map_err(|source| ErrorTableError::Io { path: path.to_owned(), source })?;
         let mut lines = text.lines().enumerate();
         let header = lines.next().map_or("", |(_, line)| line.trim());
         if header != HEADER {
@@ -145,7 +149,7 @@ mod tests {
     fn read(text: &str) -> Result<ErrorTable, ErrorTableError> {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("errors.csv");
-        fs::write(&path, text).unwrap();
+        std::fs::write(&path, text).unwrap();
         ErrorTable::read(&path)
     }
 

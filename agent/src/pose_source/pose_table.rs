@@ -2,16 +2,19 @@
 
 use std::collections::HashMap;
 use std::fmt::Write as _;
-use std::fs::{self, OpenOptions};
+use std::fs::OpenOptions;
 use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 
 use protocol::{CavId, NoPoseReason, Pose, PoseEstimate};
 use serde::{Deserialize, Serialize};
+use sim_replay::bounded;
 
 /// The first line of a table.
 const HEADER: &str = "scenario,cav,capture_nanos,x_m,y_m,z_m,qw,qx,qy,qz,confidence,no_pose,inliers";
 const COLUMNS: usize = 13;
+/// Largest file that is read, bytes: two million sweeps.
+const MAX_BYTES: u64 = 256 << 20;
 
 /// Why a table of poses cannot be read or written.
 #[derive(Debug, thiserror::Error)]
@@ -82,7 +85,8 @@ impl PoseTable {
     /// # Errors
     /// [`PoseTableError`] names the file and the line.
     pub fn read(path: &Path) -> Result<Self, PoseTableError> {
-        let text = fs::read_to_string(path).map_err(|source| PoseTableError::Io { path: path.to_owned(), source })?;
+        let text = bounded::read_text(path, MAX_BYTES)
+            .map_err(|source| PoseTableError::Io { path: path.to_owned(), source })?;
         let at = |line, problem| PoseTableError::Line { path: path.to_owned(), line, problem };
         let mut lines = text.lines().enumerate();
         let header = lines.next().map_or("", |(_, line)| line);
@@ -305,7 +309,7 @@ mod tests {
             (format!("{HEADER}\ns,a,1,,,,,,,,,tired,0\n"), "tired"),
             (format!("{HEADER}\ns,A/b,1,0,0,0,1,0,0,0,0.5,,\n"), "cav"),
         ] {
-            fs::write(&file, text).unwrap();
+            std::fs::write(&file, text).unwrap();
             let message = PoseTable::read(&file).unwrap_err().to_string();
             assert!(message.contains(part), "{message}");
         }

@@ -8,13 +8,13 @@ mod error;
 mod save;
 
 use std::collections::BTreeMap;
-use std::fs;
 use std::path::{Path, PathBuf};
 
 use half::{bf16, f16};
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::de::DeserializeOwned;
 use sha2::{Digest, Sha256};
+use sim_replay::bounded;
 use tch::Tensor;
 use tch::nn::VarStore;
 
@@ -42,6 +42,9 @@ struct Values {
     values: Vec<f32>,
 }
 
+/// Largest file that is read, bytes: a hundred times the largest network here.
+const MAX_BYTES: u64 = 4 << 30;
+
 impl Weights {
     /// Reads a whole file.
     ///
@@ -51,7 +54,7 @@ impl Weights {
     /// [`WeightsError`] when the file is missing, cut off, or holds values that are no parameters.
     pub fn load(path: &Path) -> Result<Self, WeightsError> {
         let io = |source| WeightsError::Io { path: path.to_owned(), source };
-        let bytes = fs::read(path).map_err(io)?;
+        let bytes = bounded::read(path, MAX_BYTES).map_err(io)?;
         let format = |source| WeightsError::Format { path: path.to_owned(), size: bytes.len(), source };
         let (_, header) = SafeTensors::read_metadata(&bytes).map_err(format)?;
         let file = SafeTensors::deserialize(&bytes).map_err(format)?;
@@ -312,9 +315,9 @@ mod tests {
         let path = folder.path().join("cut.safetensors");
         assert!(matches!(Weights::load(&path), Err(WeightsError::Io { .. })));
         save(&path, &network(&small()), &metadata(&small()), Precision::Single).unwrap();
-        let bytes = fs::read(&path).unwrap();
+        let bytes = std::fs::read(&path).unwrap();
         for length in [0, 7, 100, bytes.len() - 1] {
-            fs::write(&path, &bytes[..length]).unwrap();
+            std::fs::write(&path, &bytes[..length]).unwrap();
             let message = Weights::load(&path).unwrap_err().to_string();
             assert!(message.contains("cut.safetensors") && message.contains(&length.to_string()), "{message}");
         }

@@ -8,6 +8,7 @@ use ego_fuser::Method;
 use ego_fuser::evaluate::stepped::ComputeTimes;
 use protocol::Dtype;
 use serde::{Deserialize, Serialize};
+use sim_replay::bounded;
 use sim_replay::link::LinkConfig;
 
 use super::SweepError;
@@ -182,13 +183,17 @@ fn gigabytes() -> f64 {
     6.0
 }
 
+/// Largest file that is read, bytes.
+const MAX_BYTES: u64 = 1 << 20;
+
 impl Experiment {
     /// Reads and checks an experiment. Relative paths in it are taken from its folder.
     ///
     /// # Errors
     /// [`SweepError`] names the file and the field.
     pub fn read(path: &Path) -> Result<Self, SweepError> {
-        let text = std::fs::read_to_string(path).map_err(|source| SweepError::Io { path: path.into(), source })?;
+        let text =
+            bounded::read_text(path, MAX_BYTES).map_err(|source| SweepError::Io { path: path.into(), source })?;
         let spec = |problem: String| SweepError::Spec { path: path.into(), problem };
         let mut experiment: Self = serde_saphyr::from_str(&text).map_err(|error| {
             let line = error.location().map_or(String::new(), |location| format!("line {}: ", location.line()));

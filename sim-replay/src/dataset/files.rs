@@ -1,10 +1,10 @@
 //! Folders and files, with the path in every error.
 
-use std::fs::{self, File};
-use std::io::Read;
 use std::path::{Path, PathBuf};
+use std::{fs, io};
 
 use super::ReadError;
+use crate::bounded;
 
 /// A folder's entries that are not hidden, in text order.
 #[derive(Debug, Default)]
@@ -37,15 +37,10 @@ pub(super) fn list(dir: &Path) -> Result<Listing, ReadError> {
 
 /// Reads a file of at most `max_bytes`.
 pub(super) fn read_limited(path: &Path, max_bytes: u64) -> Result<Vec<u8>, ReadError> {
-    let io = |error| ReadError::io(path, error);
-    let file = File::open(path).map_err(io)?;
-    let stated = file.metadata().map_err(io)?.len();
-    let mut bytes = Vec::with_capacity(usize::try_from(stated.min(max_bytes)).unwrap_or(0));
-    file.take(max_bytes + 1).read_to_end(&mut bytes).map_err(io)?;
-    if bytes.len() as u64 > max_bytes {
-        return Err(ReadError::malformed(path, format!("larger than {max_bytes} bytes, the most that is read")));
-    }
-    Ok(bytes)
+    bounded::read(path, max_bytes).map_err(|error| match error.kind() {
+        io::ErrorKind::FileTooLarge => ReadError::malformed(path, error.to_string()),
+        _ => ReadError::io(path, error),
+    })
 }
 
 /// Reads a text file of at most `max_bytes`.

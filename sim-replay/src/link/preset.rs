@@ -1,9 +1,9 @@
 //! Links by name: those that others have described, and files.
 
-use std::fs;
 use std::path::{Path, PathBuf};
 
 use super::config::{CapacityConfig, DelayLaw, LinkConfig, LinkError, LossLaw, LossUnit, Medium, QueueConfig};
+use crate::bounded;
 
 /// Every preset with one line about it.
 pub const PRESETS: [(&str, &str); 6] = [
@@ -14,6 +14,9 @@ pub const PRESETS: [(&str, &str); 6] = [
     ("c-v2x", "LTE sidelink (PC5 mode 4) at 8 Mbit/s, one channel for all, 20 ms"),
     ("5g-uu", "5G over a base station: 50 Mbit/s up for each, 20 ms with a long tail"),
 ];
+
+/// Largest file that is read, bytes.
+const MAX_BYTES: u64 = 1 << 20;
 
 impl LinkConfig {
     /// The link that a preset or a YAML file describes, and the folder that paths in it start at. Checked, but for the
@@ -27,7 +30,7 @@ impl LinkConfig {
             return Ok((Self::preset(name)?, PathBuf::from(".")));
         }
         let path = PathBuf::from(name);
-        let text = fs::read_to_string(&path).map_err(|source| LinkError::File {
+        let text = bounded::read_text(&path, MAX_BYTES).map_err(|source| LinkError::File {
             path: path.clone(),
             known: names.join(", "),
             source,
