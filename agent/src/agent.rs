@@ -9,6 +9,7 @@ use protocol::{
 };
 use tch::Tensor;
 
+use crate::attack::{Attack, Overheard};
 use crate::detector::{Detector, DetectorError, EncodeTimes};
 use crate::pose_source::{PoseInput, PoseSource};
 use crate::postprocess::{AgentBoxes, PostprocessConfig, postprocess};
@@ -88,6 +89,7 @@ pub struct Agent {
     detector: Detector,
     postprocess: PostprocessConfig,
     rate: RateControl,
+    attack: Option<Attack>,
 }
 
 impl Agent {
@@ -95,7 +97,7 @@ impl Agent {
     #[must_use]
     pub fn new(cav: CavId, pose_source: Box<dyn PoseSource>, detector: Detector) -> Self {
         let postprocess = PostprocessConfig::for_late_fusion(detector.config());
-        Self { cav, pose_source, detector, postprocess, rate: RateControl::default() }
+        Self { cav, pose_source, detector, postprocess, rate: RateControl::default(), attack: None }
     }
 
     /// The same with another clean-up of its own detections.
@@ -108,6 +110,32 @@ impl Agent {
     #[must_use]
     pub fn within(self, rate: RateConfig) -> Self {
         Self { rate: RateControl::new(rate), ..self }
+    }
+
+    /// The same telling lies: to find out what they do to others.
+    #[must_use]
+    pub fn lying(self, attack: Option<Attack>) -> Self {
+        if let Some(attack) = &attack {
+            tracing::warn!(cav = %self.cav, lie = attack.lie().name(), "this vehicle has been told to LIE to its neighbours");
+        }
+        Self { attack, ..self }
+    }
+
+    /// Another vehicle's words, which a liar may repeat.
+    pub fn overhear(&mut self, overheard: impl FnOnce() -> Overheard) {
+        if let Some(attack) = &mut self.attack {
+            attack.overhear(overheard());
+        }
+    }
+
+    /// The points it shares: those that are not on its own body.
+    #[must_use]
+    pub fn share_points(&mut self, cloud: &PointCloud) -> PointCloud {
+        let points = self.detector.crop().without_own_body(cloud);
+        match &mut self.attack {
+            Some(attack) => attack.points(points),
+            None => points,
+        }
     }
 
     /// Who it is.
@@ -124,12 +152,13 @@ impl Agent {
 
     /// First step: the pose, which goes out before anything else is computed.
     pub fn estimate_pose(&mut self, input: &AgentInput<'_>) -> PoseEstimate {
-        self.pose_source.estimate(&PoseInput {
+        let pose = self.pose_source.estimate(&PoseInput {
             cav: &self.cav,
             capture_nanos: input.capture_nanos,
             cloud: input.cloud,
             measured: input.measured_pose,
-        })
+        });
+        self.attack.as_ref().map_or(pose, |attack| attack.pose(pose))
     }
 
     /// Last step where there is no queue: the map as `codec` wants it, or smaller where it has to be. A live agent does this
@@ -173,7 +202,7 @@ impl Agent {
     ///
     /// # Errors
     /// [`DetectorError::Shape`] when it is not one of this detector's maps.
-    pub fn perceive_map(&self, map: &Tensor) -> Result<Perception, DetectorError> {
+    pub fn perceive_map(&mut self, map: &Tensor) -> Result<Perception, DetectorError> {
         let (features, message) = timed(|| self.detector.to_message(map))?;
         let (heads, head) = timed(|| self.detector.heads(map))?;
         let (detections, boxes) = timed(|| {
@@ -183,7 +212,11 @@ impl Agent {
             Ok(found.iter().map(|candidate| candidate.detection(Some(self.cav.clone()))).collect())
         })?;
         let times = PerceptionTimes { encode: EncodeTimes::default(), message, head, boxes };
-        Ok(Perception { features, confidence: heads.confidence, detections, times })
+        let seen = Perception { features, confidence: heads.confidence, detections, times };
+        Ok(match &mut self.attack {
+            Some(attack) => attack.perception(seen),
+            None => seen,
+        })
     }
 
     /// Both steps.

@@ -3,6 +3,7 @@
 pub mod agent;
 pub mod agent_attention;
 pub mod anchors;
+pub mod attack;
 pub mod backbone;
 pub mod canvas;
 pub mod chart;

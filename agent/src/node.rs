@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 
 use protocol::codec::CodecConfig;
 use protocol::message::{Bev, Boxes, Descriptor, Points};
-use protocol::{DropReason, Dtype, Gnss, Lidar, Limits, PoseEstimate, Role, Stream, Topic, wire};
+use protocol::{DropReason, Dtype, Gnss, Lidar, Limits, PointCloud, PoseEstimate, Role, Stream, Topic, wire};
 use sim_replay::bus::mailbox::Taken;
 use sim_replay::bus::shutdown::Stop;
 use sim_replay::bus::{
@@ -16,7 +16,6 @@ use sim_replay::bus::{
 };
 
 use crate::agent::{Agent, AgentInput, Perception};
-use crate::crop::Crop;
 use crate::rate::{RateConfig, RateControl, Turn};
 use crate::sweep_pairing::{PairedSweep, SweepPairing};
 
@@ -181,7 +180,8 @@ impl<'a> Node<'a> {
                 }
                 books.timed("agent", began.elapsed());
                 self.report.sweeps += 1;
-                self.outlet.offer(input, pose, perception, books);
+                let shared = self.outlet.points.is_some().then(|| self.agent.share_points(input.cloud));
+                self.outlet.offer(input, pose, perception, shared, books);
             }
             Err(error) => {
                 self.report.failed += 1;
@@ -203,7 +203,6 @@ struct Outlet {
     rate: Arc<Mutex<RateControl>>,
     /// Maps offered so far.
     offered: u64,
-    crop: Crop,
     description: Descriptor,
     next_descriptor: Instant,
 }
@@ -231,7 +230,6 @@ impl Outlet {
             codec: options.codec,
             rate: Arc::new(Mutex::new(RateControl::new(options.rate))),
             offered: 0,
-            crop: *detector.crop(),
             description,
             next_descriptor: Instant::now(),
         })
@@ -245,7 +243,14 @@ impl Outlet {
         }
     }
 
-    fn offer(&mut self, input: &AgentInput<'_>, pose: PoseEstimate, perception: Perception, books: &Books) {
+    fn offer(
+        &mut self,
+        input: &AgentInput<'_>,
+        pose: PoseEstimate,
+        perception: Perception,
+        shared: Option<PointCloud>,
+        books: &Books,
+    ) {
         let Perception { features, confidence, detections, .. } = perception;
         if let Some(bev) = &self.bev {
             let (codec, rate, books, topic) = (self.codec, Arc::clone(&self.rate), books.clone(), bev.topic().clone());
@@ -265,8 +270,8 @@ impl Outlet {
         if let Some(boxes) = &self.boxes {
             boxes.offer(input.capture_nanos, Boxes { pose, detections });
         }
-        if let Some(points) = &self.points {
-            points.offer(input.capture_nanos, Points { pose, points: self.crop.without_own_body(input.cloud) });
+        if let (Some(points), Some(shared)) = (&self.points, shared) {
+            points.offer(input.capture_nanos, Points { pose, points: shared });
         }
     }
 

@@ -6,12 +6,14 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Instant;
 
+use agent::attack::AttackConfig;
 use agent::pose_source::PoseSourceConfig;
 use agent::rate::RateConfig;
 use agent::weights::Weights;
 use ego_fuser::evaluate::stepped::SteppedConfig;
 use ego_fuser::evaluate::{EvaluateConfig, EvaluateError, EvaluatedFrame, Evaluator};
 use ego_fuser::feature_store::{FeatureStore, KeptMaps, MapSource};
+use ego_fuser::trust::TrustConfig;
 use ego_fuser::{Exchange, Method};
 use protocol::{CavId, CodecConfig};
 use sim_replay::dataset::{self, ReadError, Scenario};
@@ -35,6 +37,10 @@ pub struct EvaluationOptions {
     pub rate: RateConfig,
     /// How long messages of neighbours are under way, nanoseconds.
     pub delay_nanos: u64,
+    /// Neighbours that lie; absent: none.
+    pub attack: Option<AttackConfig>,
+    /// Whether the ego leaves out neighbours that it does not trust, and when.
+    pub trust: Option<TrustConfig>,
     /// Where maps of encoders are kept, so that each is computed once for many evaluations.
     pub maps: Option<KeptMaps>,
     /// Frames to judge at most, over all scenarios.
@@ -133,6 +139,8 @@ pub(crate) fn judged(
         rate: options.rate,
         rule: None,
         delay_nanos: options.delay_nanos,
+        attack: options.attack,
+        trust: options.trust,
     })?;
     if let Some(kept) = options.maps.as_ref().filter(|_| method.exchange() != Exchange::Points) {
         evaluator = evaluator.with_maps(maps(kept, &weights, &scenarios)?);

@@ -275,6 +275,9 @@ impl Fleet {
         if let Some(level) = settings.codec.zstd_level {
             args.option("--zstd", &level.to_string());
         }
+        if let Some(lie) = settings.lie {
+            args.option("--lie", &lie.name().replace('_', "-"));
+        }
         // Nor does that map cross the air.
         if *cav != self.ego {
             rate_options(&mut args, &settings.rate);
@@ -289,6 +292,9 @@ impl Fleet {
         args.option("--method", self.scenario.method.name());
         args.option("--deadline-ms", &self.scenario.ego.deadline_ms.to_string());
         args.option("--max-age-ms", &self.scenario.ego.max_age_ms.to_string());
+        if self.scenario.ego.trust {
+            args.flag("--trust");
+        }
         if self.is_over_link() {
             args.flag("--over-link");
         }

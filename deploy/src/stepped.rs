@@ -14,6 +14,7 @@ use agent::pose_source::{self, EndToEndPoseConfig, NoisyPoseConfig, PgcConfig, P
 use ego_fuser::evaluate::stepped::{ComputeTimes, Crew, SteppedConfig, VehicleConfig};
 use ego_fuser::evaluate::{EvaluateConfig, EvaluateError, EvaluatedFrame, Evaluator};
 use ego_fuser::pairing::PairingConfig;
+use ego_fuser::trust::TrustConfig;
 use indicatif::{ProgressBar, ProgressStyle};
 use protocol::{CavId, DetectionsReport};
 use sim_replay::dataset::{self, Scenario as Recorded};
@@ -79,6 +80,8 @@ fn evaluate_config(fleet: &Fleet) -> EvaluateConfig {
         rate: scenario.agents.rate,
         rule: Some(fleet.ground_truth_rule()),
         delay_nanos: 0,
+        attack: None,
+        trust: scenario.ego.trust.then(TrustConfig::default),
     }
 }
 
@@ -110,7 +113,8 @@ fn stepped_config(fleet: &Fleet, compute: ComputeTimes) -> Result<SteppedConfig,
 
 fn vehicle(scenario: &Scenario, cav: &CavId) -> VehicleConfig {
     let settings = scenario.settings_of(cav);
-    VehicleConfig { pose_source: pose_source(scenario, &settings.pose), codec: settings.codec, rate: settings.rate }
+    let pose_source = pose_source(scenario, &settings.pose);
+    VehicleConfig { pose_source, codec: settings.codec, rate: settings.rate, lie: settings.lie }
 }
 
 /// The source that an agent's process would set up for these settings.

@@ -21,6 +21,7 @@ use crate::history::{History, KeptMap};
 use crate::method::{Exchange, Method, UnknownMethod};
 use crate::model::{METHOD_KEY, SCORE_THRESHOLD};
 use crate::samples::merge_points;
+use crate::trust::{Trust, TrustConfig};
 use crate::warp::WarpError;
 
 /// What one vehicle sees, as it arrived.
@@ -85,6 +86,8 @@ pub struct EgoOutput {
     pub fused: Vec<usize>,
     /// The other neighbours, each with its reason.
     pub skipped: Vec<(usize, Skipped)>,
+    /// How far each neighbour that could be fused is believed, 0..1; empty where nobody asks.
+    pub trusts: Vec<(usize, f64)>,
     /// Where the time went.
     pub stages: Vec<StageTiming>,
 }
@@ -141,6 +144,7 @@ pub struct Ego {
     detector: Detector,
     fusion: FusionStage,
     history: History,
+    trust: Option<Trust>,
     limits: PostprocessConfig,
     comm_range_m: f64,
 }
@@ -178,7 +182,7 @@ impl Ego {
         let limits = PostprocessConfig::for_detector(detector.config());
         let limits = PostprocessConfig { score_threshold: SCORE_THRESHOLD, ..limits };
         let history = History::new(fusion.frames());
-        Self { method, detector, fusion, history, limits, comm_range_m: Self::COMM_RANGE_M }
+        Self { method, detector, fusion, history, trust: None, limits, comm_range_m: Self::COMM_RANGE_M }
     }
 
     /// The same with other limits of the clean-up.
@@ -191,6 +195,15 @@ impl Ego {
     #[must_use]
     pub fn with_comm_range(self, comm_range_m: f64) -> Self {
         Self { comm_range_m, ..self }
+    }
+
+    /// The same leaving out neighbours whose words do not fit what the ego sees itself.
+    ///
+    /// # Errors
+    /// The tensor library's.
+    pub fn with_trust(mut self, config: Option<TrustConfig>) -> Result<Self, EgoError> {
+        self.trust = config.map(|config| Trust::new(config, &mut self.detector)).transpose()?;
+        Ok(self)
     }
 
     /// Its method.
@@ -208,6 +221,7 @@ impl Ego {
     /// Forgets the maps of earlier frames: another scene begins.
     pub fn forget(&mut self) {
         self.history.clear();
+        self.trust.iter_mut().for_each(Trust::clear);
     }
 
     /// Detects around the ego. Neighbours that cannot be used are left out; with none left the ego goes on alone.
@@ -233,12 +247,27 @@ impl Ego {
             }
         }
         let mut stages = Stages::start();
+        let mut trusts = Vec::new();
+        if let Some(trust) = &mut self.trust
+            && !fused.is_empty()
+        {
+            let told: Vec<(&View, Pose)> = aligned[1..].iter().map(|view| (view.view, view.ego_from_cav)).collect();
+            let beliefs = no_grad(|| trust.judge(own, &told, &mut self.detector))?;
+            let is_out: Vec<bool> = beliefs.iter().map(|belief| belief.is_out).collect();
+            let doubted = fused.iter().zip(&is_out).filter(|(_, is_out)| **is_out);
+            skipped.extend(doubted.map(|(&index, _)| (index, Skipped::Unusable(DropReason::Distrusted))));
+            trusts = fused.iter().zip(&beliefs).map(|(&index, belief)| (index, belief.trust)).collect();
+            fused = keep(fused, &is_out);
+            let mut others = keep(aligned.split_off(1), &is_out);
+            aligned.append(&mut others);
+            stages.lap("trust");
+        }
         let detections = no_grad(|| match needed {
             Exchange::Boxes => Ok(self.merge_boxes(&aligned, &mut stages)),
             Exchange::Points => self.merge_points(&aligned, &mut stages),
             Exchange::Features | Exchange::Nothing => self.merge_features(&aligned, &mut stages),
         })?;
-        Ok(EgoOutput { detections, fused, skipped, stages: stages.timings })
+        Ok(EgoOutput { detections, fused, skipped, trusts, stages: stages.timings })
     }
 
     /// Where a neighbour stands relative to the ego, or why it has no part.
@@ -395,6 +424,11 @@ impl Ego {
         stages.lap("boxes");
         Ok(detections)
     }
+}
+
+/// The items that are not marked.
+fn keep<T>(items: Vec<T>, is_out: &[bool]) -> Vec<T> {
+    items.into_iter().zip(is_out).filter_map(|(item, is_out)| (!is_out).then_some(item)).collect()
 }
 
 /// What the ego needs of itself: like its neighbours, and its own map where it is alone.

@@ -11,6 +11,7 @@ use std::ops::ControlFlow;
 use std::path::PathBuf;
 
 use agent::agent::{Agent, AgentInput, Perception};
+use agent::attack::{Attack, AttackConfig, Overheard};
 use agent::detector::{Detector, DetectorError};
 use agent::model_config::DetectorConfig;
 use agent::pose_source::{NoiseMode, PoseSourceConfig, PoseSourceError};
@@ -29,6 +30,7 @@ use tch::Tensor;
 use crate::ego::{Content, Ego, EgoError, EgoOutput, Skipped, View, own_content};
 use crate::feature_store::{FeatureStoreError, MapSource};
 use crate::method::{Exchange, Method};
+use crate::trust::TrustConfig;
 
 use stepped::{RemoteCrew, RemoteError, SteppedConfig, VehicleConfig};
 
@@ -49,6 +51,10 @@ pub struct EvaluateConfig {
     pub rule: Option<GroundTruthRule>,
     /// How long messages of neighbours are under way, nanoseconds: the ego fuses the newest that are at least so old.
     pub delay_nanos: u64,
+    /// Neighbours that lie; absent: none.
+    pub attack: Option<AttackConfig>,
+    /// Whether the ego leaves out neighbours that it does not trust.
+    pub trust: Option<TrustConfig>,
 }
 
 /// Why an evaluation ended early.
@@ -133,7 +139,7 @@ impl Evaluator {
     /// # Errors
     /// [`EvaluateError`] names the file and what is wrong with it.
     pub fn new(config: EvaluateConfig) -> Result<Self, EvaluateError> {
-        let ego = Ego::load(&config.weights, config.method)?;
+        let ego = Ego::load(&config.weights, config.method)?.with_trust(config.trust)?;
         let rule = config.rule.unwrap_or_else(|| rule_of(ego.detector()));
         let codec = CodecConfig { gate: config.codec.gate.or(ego.method().gate()), ..config.codec };
         let config = EvaluateConfig { codec, ..config };
@@ -230,7 +236,13 @@ impl Evaluator {
         // What the ego's own vehicle tells it does not cross the air.
         let rate = if is_ego { RateConfig::default() } else { own.map_or(self.config.rate, |own| own.rate) };
         let detector = Detector::from_weights(&self.weights, &self.weights.config()?)?;
-        Ok(Agent::new(cav.clone(), source.for_scenario(&scenario.name).build()?, detector).within(rate))
+        let place = scenario.agents.iter().position(|agent| agent == cav).unwrap_or(0);
+        let attack = match own.and_then(|own| own.lie) {
+            Some(lie) => Some(Attack::new(lie, cav, 0)),
+            None => self.config.attack.and_then(|attack| attack.of(place, cav)),
+        };
+        let agent = Agent::new(cav.clone(), source.for_scenario(&scenario.name).build()?, detector);
+        Ok(agent.within(rate).lying(attack))
     }
 
     /// Whether sweeps have to be read at all.
@@ -267,6 +279,7 @@ impl Evaluator {
             // What the ego leaves out for others it has itself.
             let gate = self.config.codec.gate.filter(|_| index > 0);
             let codec = CodecConfig { gate, ..self.config.codec };
+            agent.overhear(|| sent.last().map(Sent::overheard).unwrap_or_default());
             sent.push(view(agent, frame, maps.get(index), is_needed.then_some(exchange), &codec)?);
         }
         let poses = sent.iter().map(|sent| sent.pose).collect();
@@ -383,6 +396,18 @@ impl Sent {
         Some(View { cav: cav.clone(), pose: *pose, capture_nanos: *capture_nanos, content: content.clone()? })
     }
 
+    /// As a vehicle that repeats it hears it.
+    fn overheard(&self) -> Overheard {
+        let mut heard = Overheard::default();
+        match self.content.clone() {
+            Some(Content::Features(map)) => heard.features = Some(map.features),
+            Some(Content::Boxes(found)) => heard.detections = Some(found),
+            Some(Content::Points(points)) => heard.points = Some(points),
+            None => {}
+        }
+        heard
+    }
+
     /// The same, with payload and wire bytes.
     fn heard(&self) -> Option<(View, (u64, u64))> {
         Some((self.view()?, (self.payload_bytes, self.wire_bytes)))
@@ -417,7 +442,7 @@ fn view(
     let (content, bytes) = match exchange {
         None => return Ok(sent(None, 0, 0)),
         Some(Exchange::Points) => {
-            let points = agent.detector().crop().without_own_body(&frame.points);
+            let points = agent.share_points(&frame.points);
             let (message, bytes) = through_the_wire(&stamp, Points { pose, points })?;
             (Content::Points(message.points), bytes)
         }

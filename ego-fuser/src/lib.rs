@@ -27,6 +27,7 @@ pub mod residual;
 pub mod samples;
 pub mod targets;
 pub mod train;
+pub mod trust;
 pub mod warp;
 
 pub use method::{Exchange, Method};

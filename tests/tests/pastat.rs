@@ -122,6 +122,8 @@ fn evaluate(weights: &Path, data: &Path, poses: PoseSourceConfig, delay_nanos: u
         rate: RateConfig::default(),
         rule: None,
         delay_nanos,
+        attack: None,
+        trust: None,
     };
     let mut evaluator = Evaluator::new(config).unwrap();
     let scenarios = dataset::open(data).unwrap().scenarios;

@@ -49,6 +49,8 @@ fn evaluate(folder: &Path, stepped: Option<SteppedConfig>) -> (Vec<EvaluatedFram
         rate: RateConfig::default(),
         rule: None,
         delay_nanos: 0,
+        attack: None,
+        trust: None,
     };
     let mut evaluator = Evaluator::new(config).unwrap();
     if let Some(stepped) = stepped {

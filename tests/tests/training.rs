@@ -89,7 +89,9 @@ fn evaluate(weights: PathBuf, scene: &Path, method: Method, dtype: Dtype) -> Vec
     let codec = CodecConfig { dtype, ..CodecConfig::default() };
     let pose_source = PoseSourceConfig::Recorded;
     let rate = RateConfig::default();
-    let config = EvaluateConfig { weights, method: Some(method), pose_source, codec, rate, rule: None, delay_nanos: 0 };
+    let method = Some(method);
+    let (rule, delay_nanos, attack, trust) = (None, 0, None, None);
+    let config = EvaluateConfig { weights, method, pose_source, codec, rate, rule, delay_nanos, attack, trust };
     let mut evaluator = Evaluator::new(config).unwrap();
     let mut frames = Vec::new();
     for scenario in &dataset::open(scene).unwrap().scenarios {

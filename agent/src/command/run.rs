@@ -4,6 +4,7 @@ use std::path::PathBuf;
 use std::str::FromStr;
 
 use agent::agent::Agent;
+use agent::attack::{Attack, Lie};
 use agent::detector::Detector;
 use agent::node::{self, NodeOptions};
 use agent::pose_source::sanity::SanityConfig;
@@ -57,6 +58,9 @@ pub(crate) struct Args {
     zstd: Option<i32>,
     #[command(flatten)]
     rate: RateArgs,
+    /// Tell lies, to see what they do to the fleet.
+    #[arg(long, value_enum)]
+    lie: Option<LieAbout>,
     /// Threads to compute with; the same number gives the same bits.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
     threads: u16,
@@ -139,6 +143,18 @@ enum PoseFrom {
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum LieAbout {
+    /// A pose 5 to 30 m off, and sure of it.
+    ShiftedPose,
+    /// Noise instead of what is seen.
+    Noise,
+    /// What was seen first, again and again.
+    Copied,
+    /// Ten vehicles that are not there.
+    Invented,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum Mode {
     /// One offset, the same for all vehicles and frames.
     Fixed,
@@ -211,7 +227,14 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
 impl Args {
     fn agent(&self) -> anyhow::Result<Agent> {
         let detector = Detector::load(&self.weights).context("weights")?;
-        Ok(Agent::new(self.cav.clone(), self.pose_source()?, detector))
+        let lie = self.lie.map(|lie| match lie {
+            LieAbout::ShiftedPose => Lie::ShiftedPose,
+            LieAbout::Noise => Lie::Noise,
+            LieAbout::Copied => Lie::Copied,
+            LieAbout::Invented => Lie::Invented,
+        });
+        let attack = lie.map(|lie| Attack::new(lie, &self.cav, 0));
+        Ok(Agent::new(self.cav.clone(), self.pose_source()?, detector).lying(attack))
     }
 
     fn pose_source(&self) -> anyhow::Result<Box<dyn PoseSource>> {

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
+use agent::attack::{AttackConfig, Lie};
 use agent::pose_source::sanity::SanityConfig;
 use agent::pose_source::{
     CachedPoseConfig, EndToEndPoseConfig, NoiseMode, NoisyPoseConfig, PgcConfig, PoseSourceConfig,
@@ -14,7 +15,9 @@ use deploy::report;
 use deploy::table::{self, TableObserver, TableSpec};
 use ego_fuser::Method;
 use ego_fuser::evaluate::stepped::{ComputeTimes, Crew, SteppedConfig};
+use ego_fuser::feature_store::KeptMaps;
 use ego_fuser::pairing::PairingConfig;
+use ego_fuser::trust::TrustConfig;
 use indicatif::{ProgressBar, ProgressStyle};
 use protocol::{CodecConfig, ConfidenceGate, Dtype};
 use sim_replay::link::LinkConfig;
@@ -83,6 +86,18 @@ pub(crate) struct Arguments {
     /// Compute time of pose, map and fusion, milliseconds, for example 20,60,30 (--link).
     #[arg(long, value_name = "MS,MS,MS", value_delimiter = ',', num_args = 1, default_values_t = [0.0; 3], requires = "link")]
     compute: Vec<f64>,
+    /// Lets neighbours lie: to see what that does to the ego.
+    #[arg(long, value_enum, value_name = "LIE")]
+    attack: Option<Attack>,
+    /// How many of them lie, the first of every scenario (--attack).
+    #[arg(long, default_value_t = 1, requires = "attack")]
+    liars: usize,
+    /// Same seed, same lies (--attack).
+    #[arg(long, default_value_t = 0, requires = "attack")]
+    attack_seed: u64,
+    /// Leaves out neighbours whose words do not fit what the ego sees itself.
+    #[arg(long)]
+    trust: bool,
     /// How exactly feature values cross the air.
     #[arg(long, value_enum, default_value_t = Exactness::F32)]
     dtype: Exactness,
@@ -101,6 +116,9 @@ pub(crate) struct Arguments {
     /// Most bytes per second of a neighbour's messages with maps, in the same way [default: any].
     #[arg(long, value_name = "BYTES")]
     bytes_per_second: Option<u64>,
+    /// Keep the maps of the encoder in this folder, so that each is computed once for many evaluations.
+    #[arg(long, value_name = "DIR")]
+    maps: Option<PathBuf>,
     /// Frames to judge at most, over all scenarios [default: all].
     #[arg(long, value_parser = clap::value_parser!(u64).range(1..))]
     frames: Option<u64>,
@@ -127,6 +145,18 @@ enum PoseFrom {
     EndToEnd,
     /// Found before, from a table.
     Cached,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Attack {
+    /// A pose 5 to 30 m off, and sure of it.
+    ShiftedPose,
+    /// Noise instead of what is seen.
+    Noise,
+    /// What another vehicle said.
+    Copied,
+    /// Ten vehicles that are not there.
+    Invented,
 }
 
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
@@ -178,28 +208,44 @@ impl Arguments {
     }
 
     fn options(&self) -> Result<EvaluationOptions, BadInput> {
+        let codec = CodecConfig {
+            dtype: match self.dtype {
+                Exactness::F32 => Dtype::F32,
+                Exactness::F16 => Dtype::F16,
+                Exactness::I8 => Dtype::I8,
+            },
+            gate: self.gate.map(|threshold| ConfidenceGate { threshold, ..ConfidenceGate::default() }),
+            budget_bytes: self.budget,
+            zstd_level: self.zstd,
+        };
         Ok(EvaluationOptions {
             // Required where there is no table.
             dataset: self.dataset.clone().unwrap_or_default(),
             weights: self.weights.clone().unwrap_or_default(),
             pose_source: self.pose_source()?,
-            codec: CodecConfig {
-                dtype: match self.dtype {
-                    Exactness::F32 => Dtype::F32,
-                    Exactness::F16 => Dtype::F16,
-                    Exactness::I8 => Dtype::I8,
-                },
-                gate: self.gate.map(|threshold| ConfidenceGate { threshold, ..ConfidenceGate::default() }),
-                budget_bytes: self.budget,
-                zstd_level: self.zstd,
-            },
+            codec,
             rate: RateConfig {
                 message_bytes: self.message_bytes,
                 bytes_per_second: self.bytes_per_second,
                 watch_queue: false,
             },
             delay_nanos: self.delay * 1_000_000,
-            maps: None,
+            attack: self.attack.map(|attack| AttackConfig {
+                lie: match attack {
+                    Attack::ShiftedPose => Lie::ShiftedPose,
+                    Attack::Noise => Lie::Noise,
+                    Attack::Copied => Lie::Copied,
+                    Attack::Invented => Lie::Invented,
+                },
+                liars: self.liars,
+                seed: self.attack_seed,
+            }),
+            trust: self.trust.then(TrustConfig::default),
+            maps: self.maps.as_ref().map(|folder| KeptMaps {
+                folder: folder.clone(),
+                dtype: codec.dtype,
+                limit_bytes: u64::MAX,
+            }),
             frames: self.frames.map(at_most),
             stepped: self.link.as_deref().map(|link| self.stepped(link)).transpose()?,
             part: Part { scenarios: self.scenarios.map(at_most), ticks: None },

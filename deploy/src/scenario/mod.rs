@@ -9,6 +9,7 @@ use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
+use agent::attack::Lie;
 use agent::rate::RateConfig;
 use ego_fuser::evaluate::stepped::ComputeTimes;
 use ego_fuser::{Exchange, Method};
@@ -301,6 +302,9 @@ pub struct AgentSettings {
     pub publish: Option<Publish>,
     /// Who starts the process.
     pub launch: Launch,
+    /// What the vehicle lies about, to see what that does to the ego; absent: nothing.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lie: Option<Lie>,
 }
 
 /// Who starts a vehicle's process.
@@ -328,6 +332,9 @@ pub struct AgentOverrides {
     pub publish: Option<Publish>,
     /// See [`AgentSettings::launch`].
     pub launch: Option<Launch>,
+    /// See [`AgentSettings::lie`].
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub lie: Option<Lie>,
 }
 
 impl Scenario {
@@ -363,6 +370,7 @@ impl Scenario {
             rate: own.rate.unwrap_or(base.rate),
             publish: own.publish.or(base.publish),
             launch: own.launch.unwrap_or(base.launch),
+            lie: own.lie.or(base.lie),
         }
     }
 }
@@ -377,11 +385,13 @@ pub struct Ego {
     pub deadline_ms: u64,
     /// Oldest neighbour map that is still fused, by capture time, milliseconds.
     pub max_age_ms: u64,
+    /// Whether neighbours whose words do not fit what the ego sees itself are left out.
+    pub trust: bool,
 }
 
 impl Default for Ego {
     fn default() -> Self {
-        Self { id: None, deadline_ms: 100, max_age_ms: 150 }
+        Self { id: None, deadline_ms: 100, max_age_ms: 150, trust: false }
     }
 }
 

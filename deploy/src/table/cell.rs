@@ -3,8 +3,10 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use agent::attack::AttackConfig;
 use agent::pose_source::PoseSourceConfig;
 use ego_fuser::Method;
+use ego_fuser::trust::TrustConfig;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
@@ -34,6 +36,12 @@ pub struct CellKey {
     /// Scenarios at most, evenly spread.
     #[serde(default)]
     pub scenarios: Option<usize>,
+    /// Neighbours that lie.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub attack: Option<AttackConfig>,
+    /// When the ego leaves out neighbours that it does not trust.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub trust: Option<TrustConfig>,
     /// Version of the program.
     pub version: String,
 }

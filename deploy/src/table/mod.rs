@@ -22,6 +22,7 @@ pub use text::{csv, markdown};
 use crate::evaluation::{EvaluationError, EvaluationOptions, Part, evaluate};
 use crate::weights_choice::WeightsChoiceError;
 use ego_fuser::feature_store::KeptMaps;
+use ego_fuser::trust::TrustConfig;
 
 /// Why a table came to nothing.
 #[derive(Debug, thiserror::Error)]
@@ -149,6 +150,8 @@ impl Run<'_> {
             dtype: self.spec.dtype,
             frames: self.spec.frames,
             scenarios: table.scenarios,
+            attack: column.attack,
+            trust: column.trust.then(TrustConfig::default),
             version: env!("CARGO_PKG_VERSION").to_owned(),
         };
         let known = Cell::read(&key, &self.cells)?;
@@ -163,6 +166,8 @@ impl Run<'_> {
             codec: self.spec.codec(),
             rate: RateConfig::default(),
             delay_nanos: column.delay_ms.saturating_mul(1_000_000),
+            attack: column.attack,
+            trust: column.trust.then(TrustConfig::default),
             maps: self.spec.maps.as_ref().map(|folder| KeptMaps {
                 folder: folder.clone(),
                 dtype: self.spec.dtype,

@@ -2,10 +2,12 @@
 
 use std::path::{Path, PathBuf};
 
+use agent::attack::AttackConfig;
 use agent::pose_source::PoseSourceConfig;
 use ego_fuser::Method;
 use protocol::{CodecConfig, Dtype};
 use serde::Deserialize;
+use sim_replay::bounded;
 
 use super::TableError;
 use crate::weights_choice::weights_of;
@@ -79,6 +81,12 @@ pub struct Column {
     /// How long messages of neighbours are under way, milliseconds.
     #[serde(default)]
     pub delay_ms: u64,
+    /// Neighbours that lie; absent: none.
+    #[serde(default)]
+    pub attack: Option<AttackConfig>,
+    /// Whether the ego leaves out neighbours that it does not trust.
+    #[serde(default)]
+    pub trust: bool,
 }
 
 fn half() -> Dtype {
@@ -89,13 +97,17 @@ fn gigabytes() -> f64 {
     8.0
 }
 
+/// Largest file that is read, bytes.
+const MAX_BYTES: u64 = 1 << 20;
+
 impl TableSpec {
     /// Reads a file of tables.
     ///
     /// # Errors
     /// [`TableError`] names the file and what is wrong with it.
     pub fn read(path: &Path) -> Result<Self, TableError> {
-        let text = std::fs::read_to_string(path).map_err(|source| TableError::Io { path: path.to_owned(), source })?;
+        let text =
+            bounded::read_text(path, MAX_BYTES).map_err(|source| TableError::Io { path: path.to_owned(), source })?;
         let spec: Self = serde_saphyr::from_str(&text)
             .map_err(|error| TableError::Spec { path: path.to_owned(), problem: error.to_string() })?;
         spec.check().map_err(|problem| TableError::Spec { path: path.to_owned(), problem })?;

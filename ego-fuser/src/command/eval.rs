@@ -63,6 +63,8 @@ impl Arguments {
                 rate: RateConfig::default(),
                 rule: None,
                 delay_nanos: 0,
+                attack: None,
+                trust: None,
             };
             rows.push(evaluate(config, &scenarios, self.frames.unwrap_or(usize::MAX), self.json)?);
         }

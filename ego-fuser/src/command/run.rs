@@ -9,6 +9,7 @@ use ego_fuser::Method;
 use ego_fuser::ego::Ego;
 use ego_fuser::node::{self, NodeOptions};
 use ego_fuser::pairing::PairingConfig;
+use ego_fuser::trust::TrustConfig;
 use protocol::{CavId, Role};
 use sim_replay::bus::{BusArgs, STOP_LIMIT, log_to_stderr};
 
@@ -40,6 +41,9 @@ pub(crate) struct Arguments {
     /// Hear neighbours behind the emulated air (`sim-replay link`) and not directly.
     #[arg(long)]
     over_link: bool,
+    /// Leave out neighbours whose words do not fit what the ego sees itself.
+    #[arg(long)]
+    trust: bool,
     /// Threads to compute with; the same number gives the same bits.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
     threads: u16,
@@ -58,6 +62,7 @@ impl Arguments {
         tch::set_num_threads(i32::from(self.threads));
         let options = self.options()?;
         let ego = Ego::load(&self.weights, self.method).map_err(|error| BadInput(format!("weights: {error}")))?;
+        let ego = ego.with_trust(self.trust.then(TrustConfig::default))?;
         let stop = self.bus.stop().context("installing signal handlers")?;
         let bus = self.bus.join(Role::Ego, &self.ego)?;
         tracing::info!(ego = %self.ego, method = %ego.method(), weights = %self.weights.display(), "ready");

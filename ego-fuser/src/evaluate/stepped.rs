@@ -13,6 +13,7 @@ use std::ops::{ControlFlow, Range};
 use std::path::PathBuf;
 
 use agent::agent::Agent;
+use agent::attack::Lie;
 use agent::pose_source::PoseSourceConfig;
 use agent::rate::RateConfig;
 use protocol::{CavId, CodecConfig, PoseEstimate, RateChoice, SkippedNeighbour, StageTiming, Stream};
@@ -75,6 +76,8 @@ pub struct VehicleConfig {
     pub codec: CodecConfig,
     /// What it fits them to. There is no queue to watch.
     pub rate: RateConfig,
+    /// What it lies about; absent: nothing.
+    pub lie: Option<Lie>,
 }
 
 /// Runs a scenario; `on_frame` may end it. Each frame's stamp says when the ego published it.
@@ -224,13 +227,14 @@ impl<'a> Run<'a> {
             return Ok(remote.ask(frames).map_err(Box::new)?);
         }
         let method = self.evaluator.ego.method();
-        let mut all = Vec::with_capacity(frames.len());
+        let mut all: Vec<Sent> = Vec::with_capacity(frames.len());
         for (member, frame) in self.crew.iter_mut().zip(frames) {
             // Without an exchange, neighbours have nothing to encode; where they are is still asked.
             let is_needed = all.is_empty() || method != Method::None;
             let map = if is_needed { self.evaluator.map_of(self.scenario, member.place, tick)? } else { None };
             let exchange = is_needed.then(|| own_content(method));
             if let Pipeline::Here(agent, codec) = &mut member.pipeline {
+                agent.overhear(|| all.last().map(Sent::overheard).unwrap_or_default());
                 all.push(view(agent, frame, map.as_ref(), exchange, codec)?);
             }
         }

@@ -60,7 +60,10 @@ impl Node<'_> {
         let mut choice = self.choose(capture_nanos);
         let own_topic = self.topic(&self.cav);
         match self.ego.detect(&own, &choice.views) {
-            Ok(EgoOutput { detections, fused, skipped, stages }) => {
+            Ok(EgoOutput { detections, fused, skipped, trusts, stages }) => {
+                for (index, trust) in trusts {
+                    self.bus.books().trusted(&choice.views[index].cav, trust);
+                }
                 self.bus.books().received(&own_topic);
                 self.leave_out(&skipped, &mut choice);
                 let fused = self.take_in(&own, &fused, &choice);

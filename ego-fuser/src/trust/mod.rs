@@ -1,0 +1,246 @@
+//! Whom the ego believes: whether what a neighbour says fits what the ego sees itself where both look.
+//!
+//! Every message is looked at alone, by the ego's own head, before any of it is fused ([`seen`]): vehicles that only one
+//! of the two sees, whether each sees the other where it says to be, whether the message is somebody else's
+//! ([`evidence`]). What frames say is averaged, the newest counting half; who falls below a threshold is left out until it
+//! has been believable for a while. A neighbour of whom nothing can be said keeps the trust that it has. Maps are believed
+//! until something speaks against them, as what is fused must agree with the ego's own in any case; boxes, which count
+//! as they come, only when something speaks for them.
+
+mod evidence;
+mod seen;
+
+use std::collections::BTreeMap;
+
+use agent::detector::{Detector, DetectorError};
+use nalgebra::Isometry2;
+use protocol::{CavId, PointCloud, Pose};
+use serde::{Deserialize, Serialize};
+
+use crate::ego::View;
+use evidence::Evidence;
+use seen::{Seen, likeness};
+
+/// How much a frame counts against all before it.
+const NEWEST: f64 = 0.5;
+/// Vehicles that are remembered at most.
+const MAX_PEERS: usize = 64;
+/// Messages further apart than this are not compared with each other, seconds.
+const SUCCESSIVE_S: f64 = 0.25;
+/// No vehicle drives faster, metres a second.
+const MAX_SPEED_MPS: f64 = 70.0;
+/// Poses are off by no more than this from one to the next, metres.
+const MAX_JUMP_M: f64 = 20.0;
+/// No vehicle turns faster, radians a second, and no pose is turned further from one to the next, radians.
+const MAX_TURN: (f64, f64) = (2.0, 1.0);
+
+/// When a neighbour is left out and when it is taken back.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct TrustConfig {
+    /// Below this running mean of the evidence a neighbour is left out, log odds.
+    pub leave_out_below: f64,
+    /// Above this it is taken back.
+    pub take_back_above: f64,
+}
+
+impl Default for TrustConfig {
+    fn default() -> Self {
+        Self { leave_out_below: -0.7, take_back_above: 0.7 }
+    }
+}
+
+/// What is remembered of each neighbour.
+#[derive(Debug)]
+pub(crate) struct Trust {
+    config: TrustConfig,
+    /// The map of an empty world, `[C, H, W]`.
+    empty: Vec<f32>,
+    peers: BTreeMap<CavId, Standing>,
+}
+
+#[derive(Debug)]
+struct Standing {
+    log_odds: f64,
+    is_out: bool,
+    /// Capture time, place and looks of the message that was judged last.
+    last: Option<(u64, Pose, Vec<f32>)>,
+}
+
+/// How far a neighbour is believed.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Belief {
+    /// How likely it is honest, 0..1.
+    pub trust: f64,
+    /// Whether it is left out.
+    pub is_out: bool,
+}
+
+impl Trust {
+    /// Trusts everybody.
+    pub(crate) fn new(config: TrustConfig, detector: &mut Detector) -> Result<Self, DetectorError> {
+        let empty = detector.encode(&PointCloud::default())?.features;
+        let empty = Vec::try_from(&empty.f_contiguous()?.f_view([-1])?)?;
+        Ok(Self { config, empty, peers: BTreeMap::new() })
+    }
+
+    /// Forgets everybody: another scene begins.
+    pub(crate) fn clear(&mut self) {
+        self.peers.clear();
+    }
+
+    /// How far each of the neighbours, with where they lie, is believed.
+    pub(crate) fn judge(
+        &mut self,
+        own: &View,
+        neighbours: &[(&View, Pose)],
+        detector: &mut Detector,
+    ) -> Result<Vec<Belief>, DetectorError> {
+        let mine = Seen::in_message(&own.content, detector, &self.empty)?;
+        let mut all = Vec::with_capacity(neighbours.len());
+        for (view, _) in neighbours {
+            all.push(Seen::in_message(&view.content, detector, &self.empty)?);
+        }
+        // A message that serves a second frame says nothing new.
+        let is_new = |view: &View| self.last_of(&view.cav).is_none_or(|(nanos, ..)| *nanos != view.capture_nanos);
+        let evidence = neighbours.iter().zip(&all);
+        let mut evidence: Vec<Option<Evidence>> = evidence
+            .map(|((view, ego_from_cav), seen)| {
+                is_new(view).then(|| self.evidence(own, &mine, view, ego_from_cav, seen))
+            })
+            .collect();
+        mark_copies(&mut evidence, &all);
+        let mut beliefs = Vec::with_capacity(neighbours.len());
+        for ((view, _), evidence) in neighbours.iter().zip(evidence) {
+            let log_odds = evidence.as_ref().and_then(Evidence::log_odds);
+            tracing::debug!(cav = %view.cav, log_odds, ?evidence, "neighbour judged");
+            beliefs.push(self.add_up(&view.cav, log_odds, mine.is_boxes()));
+        }
+        for ((view, _), seen) in neighbours.iter().zip(all) {
+            if let (Some(standing), Some(pose)) = (self.peers.get_mut(&view.cav), view.pose.world_from_cav()) {
+                standing.last = Some((view.capture_nanos, *pose, seen.print));
+            }
+        }
+        Ok(beliefs)
+    }
+
+    fn last_of(&self, cav: &CavId) -> Option<&(u64, Pose, Vec<f32>)> {
+        self.peers.get(cav)?.last.as_ref()
+    }
+
+    /// What there is to say of a message but for its likeness to those of other neighbours in the same frame.
+    fn evidence(&self, own: &View, mine: &Seen, view: &View, ego_from_cav: &Pose, seen: &Seen) -> Evidence {
+        let [x, y, _] = ego_from_cav.translation_m;
+        let lies = Isometry2::new([x, y].into(), ego_from_cav.yaw_rad());
+        let mut evidence = Evidence::between(mine, seen, &lies, view.age_nanos(own) as f64 * 1e-9);
+        let earlier = self.peers.iter().filter(|(cav, _)| **cav != view.cav).filter_map(|(_, peer)| peer.last.as_ref());
+        let others = earlier.map(|(_, _, print)| print).chain([&mine.print]);
+        evidence.like_another = others.map(|print| alike(&seen.print, print)).fold(0.0, f64::max);
+        if let (Some((capture_nanos, before, print)), Some(now)) = (self.last_of(&view.cav), view.pose.world_from_cav())
+        {
+            let elapsed_s = (view.capture_nanos as f64 - *capture_nanos as f64).abs() * 1e-9;
+            evidence.jumped = is_jump(before, now, elapsed_s);
+            evidence.like_before = (elapsed_s < SUCCESSIVE_S).then(|| likeness(&seen.print, print));
+        }
+        evidence
+    }
+
+    /// Takes in what a frame says; whoever `must_earn` it is left out until something speaks for it.
+    fn add_up(&mut self, cav: &CavId, log_odds: Option<f64>, must_earn: bool) -> Belief {
+        let TrustConfig { leave_out_below, take_back_above } = self.config;
+        if self.peers.len() >= MAX_PEERS && !self.peers.contains_key(cav) {
+            // Of more vehicles than an ego can listen to, nothing is known.
+            return Belief { trust: 0.5, is_out: must_earn };
+        }
+        let stranger = Standing { log_odds: 0.0, is_out: must_earn, last: None };
+        let standing = self.peers.entry(cav.clone()).or_insert(stranger);
+        if let Some(log_odds) = log_odds {
+            standing.log_odds += NEWEST * (log_odds - standing.log_odds);
+        }
+        let was_out = standing.is_out;
+        standing.is_out = standing.log_odds < if was_out { take_back_above } else { leave_out_below };
+        match (was_out, standing.is_out) {
+            (false, true) => tracing::warn!(%cav, "its words do not fit what the ego sees: it is left out"),
+            (true, false) => tracing::info!(%cav, "its words fit what the ego sees: it is believed"),
+            _ => {}
+        }
+        Belief { trust: 1.0 / (1.0 + (-standing.log_odds).exp()), is_out: standing.is_out }
+    }
+}
+
+/// Of two neighbours that say the same, the one whose words fit worse in any case is the copier; both where neither's do.
+fn mark_copies(evidence: &mut [Option<Evidence>], all: &[Seen]) {
+    let fits: Vec<f64> =
+        evidence.iter().map(|evidence| evidence.as_ref().and_then(Evidence::log_odds).unwrap_or(0.0)).collect();
+    for (index, evidence) in evidence.iter_mut().enumerate() {
+        let Some(evidence) = evidence else { continue };
+        for other in (0..all.len()).filter(|&other| other != index && fits[other] >= fits[index]) {
+            evidence.like_another = evidence.like_another.max(alike(&all[index].print, &all[other].print));
+        }
+    }
+}
+
+/// How alike two messages are, where they say enough to be a copy: two vehicles that see a single box may well agree.
+fn alike(one: &[f32], other: &[f32]) -> f64 {
+    const ENOUGH: usize = 9;
+    if one.len() < ENOUGH { 0.0 } else { likeness(one, other) }
+}
+
+/// Whether no vehicle gets from one pose to the other in that time, whatever the poses' errors.
+fn is_jump(before: &Pose, now: &Pose, elapsed_s: f64) -> bool {
+    let moved = before.from_world(now);
+    let [x, y, _] = moved.translation_m;
+    let (turns, error) = MAX_TURN;
+    x.hypot(y) > MAX_JUMP_M + MAX_SPEED_MPS * elapsed_s || moved.yaw_rad().abs() > error + turns * elapsed_s
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn trust() -> Trust {
+        Trust { config: TrustConfig::default(), empty: vec![], peers: BTreeMap::new() }
+    }
+
+    #[test]
+    fn who_is_left_out_comes_back_after_a_while_and_not_at_once() {
+        let mut trust = trust();
+        let cav = CavId::new("a").unwrap();
+        let mut hear = |log_odds: Option<f64>| trust.add_up(&cav, log_odds, false);
+        assert!(!hear(None).is_out, "nobody is doubted without a reason");
+        assert!(hear(Some(-3.0)).is_out, "strong evidence counts at once");
+        assert!(hear(None).is_out, "the same message says nothing new");
+        let returns = (0..20).position(|_| !hear(Some(1.5)).is_out).unwrap();
+        assert!((1..6).contains(&returns), "after {returns} frames");
+        assert!(!hear(Some(-1.0)).is_out, "one doubtful frame is forgiven");
+        assert!((0..20).map(|_| hear(Some(4.0))).last().unwrap().trust > 0.97);
+        assert!(hear(Some(-8.0)).is_out, "no trust is so great that a plain lie passes");
+    }
+
+    #[test]
+    fn boxes_are_believed_when_something_speaks_for_them() {
+        let mut trust = trust();
+        let cav = CavId::new("a").unwrap();
+        assert!(trust.add_up(&cav, None, true).is_out);
+        assert!(!trust.add_up(&cav, Some(2.0), true).is_out);
+        assert!(!trust.add_up(&cav, None, true).is_out);
+    }
+
+    #[test]
+    fn what_is_remembered_is_bounded() {
+        let mut trust = trust();
+        for number in 0..1000 {
+            trust.add_up(&CavId::new(&format!("v{number}")).unwrap(), Some(-9.0), false);
+        }
+        assert_eq!(trust.peers.len(), MAX_PEERS);
+    }
+
+    #[test]
+    fn a_pose_nobody_can_have_driven_to_is_told() {
+        let here = Pose::from_xyz_yaw([100.0, 50.0, 2.0], 0.0);
+        assert!(!is_jump(&here, &Pose::from_xyz_yaw([115.0, 50.0, 2.0], 0.5), 0.1), "noise of a poor pose");
+        assert!(is_jump(&here, &Pose::from_xyz_yaw([140.0, 50.0, 2.0], 0.0), 0.1));
+        assert!(is_jump(&here, &Pose::from_xyz_yaw([100.0, 50.0, 2.0], 2.0), 0.1));
+        assert!(!is_jump(&here, &Pose::from_xyz_yaw([140.0, 50.0, 2.0], 2.0), 1.0));
+    }
+}
