@@ -6,6 +6,7 @@ pub mod fixtures;
 pub mod fleet;
 pub mod localizer;
 pub mod machine;
+pub mod mutation;
 pub mod scene;
 pub mod sequences;
 pub mod tensors;

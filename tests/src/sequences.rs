@@ -82,7 +82,7 @@ fn matrix(pose: &Isometry3<f64>) -> [f64; 12] {
 
 /// An HDF5 file with the datasets `valid_timestamps` (`n` integers) and `poses` (`n x 12` doubles), the simplest there is:
 /// superblock 0, object headers 1, links in the root's header, data in one piece each.
-fn hdf5(stamps: &[u64], poses: &[[f64; 12]]) -> Vec<u8> {
+pub(crate) fn hdf5(stamps: &[u64], poses: &[[f64; 12]]) -> Vec<u8> {
     // HDF5's descriptions of little-endian 64-bit integers and IEEE doubles.
     const INTEGER: &[u8] = &[0x10, 0x08, 0, 0, 8, 0, 0, 0, 0, 0, 64, 0];
     const DOUBLE: &[u8] = &[0x11, 0x20, 0x3f, 0, 8, 0, 0, 0, 0, 0, 64, 0, 52, 11, 0, 52, 0xff, 0x03, 0, 0];

@@ -1,0 +1,43 @@
+//! The long run of damaged inputs: `cargo bench -p tests --bench mutation -- [MESSAGES] [FILES] [SEED]`, by default ten
+//! million messages and a million files of each format; prints a table. TMPDIR=/dev/shm spares the disk.
+
+use peak_alloc::PeakAlloc;
+use tests::mutation::run::{Meter, all};
+
+#[global_allocator]
+static MEMORY: PeakAlloc = PeakAlloc;
+
+struct Memory;
+
+impl Meter for Memory {
+    fn reset(&self) {
+        MEMORY.reset_peak_usage();
+    }
+
+    fn peak_bytes(&self) -> usize {
+        MEMORY.peak_usage()
+    }
+
+    fn held_bytes(&self) -> usize {
+        MEMORY.current_usage()
+    }
+}
+
+fn main() {
+    let numbers: Vec<u64> = std::env::args().skip(1).filter_map(|argument| argument.parse().ok()).collect();
+    let number = |place: usize, usual| numbers.get(place).copied().unwrap_or(usual);
+    let (messages, files, seed) = (number(0, 10_000_000), number(1, 1_000_000), number(2, 7));
+    let scratch = tempfile::tempdir().expect("a temporary folder");
+    println!("| format | damaged | accepted | panics | peak memory of one, KiB | seconds |");
+    println!("| --- | --- | --- | --- | --- | --- |");
+    for report in all(scratch.path(), messages, files, seed, &Memory) {
+        let (kib, seconds) = (report.peak_bytes.div_ceil(1024), report.took.as_secs());
+        println!(
+            "| {} | {} | {} | {} | {kib} | {seconds} |",
+            report.name,
+            report.cases,
+            report.accepted,
+            report.panics.len()
+        );
+    }
+}

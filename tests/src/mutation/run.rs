@@ -1,0 +1,84 @@
+//! Many damaged inputs through one reader, and what came of it.
+
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use sim_replay::random::SplitMix64;
+
+use super::{damage, readers, seeds, wire_target};
+
+/// Counts memory; the allocator belongs to the program.
+pub trait Meter {
+    /// The peak begins anew.
+    fn reset(&self);
+    /// Bytes held at the peak.
+    fn peak_bytes(&self) -> usize;
+    /// Bytes held now.
+    fn held_bytes(&self) -> usize;
+}
+
+/// What came of one format.
+#[derive(Debug, Clone)]
+pub struct Report {
+    /// The format.
+    pub name: &'static str,
+    /// Damaged inputs.
+    pub cases: u64,
+    /// Of these, inputs that were taken for sound: what the damage left, or made, of them was.
+    pub accepted: u64,
+    /// Seeds of the cases that panicked.
+    pub panics: Vec<u64>,
+    /// Most memory that one case took beyond what was held before it.
+    pub peak_bytes: usize,
+    /// All the time.
+    pub took: Duration,
+}
+
+/// Runs `cases` damaged inputs of every format (`files`), or of the messages (`messages`), from `seed` on.
+///
+/// # Panics
+/// When a seed is not accepted undamaged: then nothing behind the first check would be tried.
+#[must_use]
+pub fn all(scratch: &Path, messages: u64, files: u64, seed: u64, meter: &dyn Meter) -> Vec<Report> {
+    let mut reports = Vec::new();
+    if messages > 0 {
+        let sound = seeds::messages();
+        let damage = wire_target::damage_message;
+        reports.push(one(("messages", &sound), messages, seed, meter, damage, &wire_target::read));
+    }
+    if files > 0 {
+        for reader in readers::all(scratch) {
+            let read = |bytes: &[u8]| reader.try_read(bytes);
+            reports.push(one((reader.name, &reader.seeds), files, seed, meter, damage, &read));
+        }
+    }
+    reports
+}
+
+fn one(
+    (name, sound): (&'static str, &[Vec<u8>]),
+    cases: u64,
+    seed: u64,
+    meter: &dyn Meter,
+    damage: fn(&mut Vec<u8>, &[u8], &mut SplitMix64),
+    read: &dyn Fn(&[u8]) -> bool,
+) -> Report {
+    for (number, bytes) in sound.iter().enumerate() {
+        assert!(read(bytes), "{name}: sound input {number} is refused");
+    }
+    let (begun, mut accepted, mut panics, mut peak_bytes) = (Instant::now(), 0, Vec::new(), 0);
+    for case in 0..cases {
+        let mut random = SplitMix64::derived(seed, &[case]);
+        let mut bytes = sound[random.below(sound.len())].clone();
+        damage(&mut bytes, &sound[random.below(sound.len())], &mut random);
+        meter.reset();
+        let held = meter.held_bytes();
+        match catch_unwind(AssertUnwindSafe(|| read(&bytes))) {
+            Ok(was_accepted) => accepted += u64::from(was_accepted),
+            Err(_) => panics.push(case),
+        }
+        peak_bytes = peak_bytes.max(meter.peak_bytes().saturating_sub(held));
+    }
+    Report { name, cases, accepted, panics, peak_bytes, took: begun.elapsed() }
+}

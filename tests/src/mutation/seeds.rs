@@ -1,0 +1,164 @@
+//! Sound inputs to damage, made by our own code.
+
+use std::path::Path;
+
+use protocol::{Key, RunId, wire};
+use sim_replay::pcd::{Encoding, IntensityField, encode};
+use sim_replay::recording::{RecordingOptions, RecordingWriter};
+
+#[path = "../../../protocol/tests/sample/mod.rs"]
+mod sample;
+
+/// A sealed message of every kind, and a map in every codec.
+///
+/// # Panics
+/// Never: the samples are sound.
+#[must_use]
+pub fn messages() -> Vec<Vec<u8>> {
+    let maps = sample::every_codec().into_iter().map(|config| protocol::Message::Bev(sample::bev(&config)));
+    let all = sample::every_kind().into_iter().chain(maps);
+    all.map(|message| wire::encode_any(&sample::stamp(), message).expect("a sound message").to_vec()).collect()
+}
+
+/// Sweeps as text and as bytes, with and without colours.
+#[must_use]
+pub fn clouds() -> Vec<Vec<u8>> {
+    let kinds = [Encoding::Ascii, Encoding::Binary]
+        .into_iter()
+        .flat_map(|encoding| [IntensityField::Intensity, IntensityField::Red].map(|field| (encoding, field)));
+    let mut files: Vec<Vec<u8>> = kinds.map(|(encoding, field)| encode(&sample::points(), encoding, field)).collect();
+    files.push(compressed());
+    files
+}
+
+/// Four points, packed by LZF as nothing but literals.
+fn compressed() -> Vec<u8> {
+    let body: Vec<u8> = (0..16).flat_map(|number| (number as f32).to_le_bytes()).collect();
+    let packed: Vec<u8> = body.chunks(32).flat_map(|run| [&[run.len() as u8 - 1][..], run].concat()).collect();
+    let mut file =
+        b"VERSION 0.7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH 4\nHEIGHT 1\n\
+                     VIEWPOINT 0 0 0 1 0 0 0\nPOINTS 4\nDATA binary_compressed\n"
+            .to_vec();
+    file.extend((packed.len() as u32).to_le_bytes());
+    file.extend((body.len() as u32).to_le_bytes());
+    file.extend(packed);
+    file
+}
+
+/// A recording of a message of every kind.
+///
+/// # Panics
+/// When the disk refuses.
+#[must_use]
+pub fn recording(scratch: &Path) -> Vec<u8> {
+    let path = scratch.join("seed.mcap");
+    let mut writer = RecordingWriter::create(&path, RecordingOptions::default()).expect("a writable folder");
+    let run = RunId::new("test").expect("an identifier");
+    for (number, bytes) in messages().iter().enumerate() {
+        let topic = ["4279/bev", "4279/lidar", "truth", "4288/pose"][number % 4].parse().expect("a topic");
+        writer.write(&Key { run: run.clone(), topic }, 1_000 * number as u64, bytes).expect("a writable folder");
+    }
+    writer.finish().expect("a writable folder");
+    std::fs::read(&path).expect("it was written")
+}
+
+/// The description of a frame as OPV2V keeps it.
+pub const OPV2V: &str = "lidar_pose: [1.5, -2.0, 1.9, 0.0, 90.0, 0.0]\ntrue_ego_pos: [1.5, -2.0, 1.9, 0.0, 90.0, 0.0]\n\
+    ego_speed: 36.0\nvehicles:\n  100:\n    angle: [0.0, 12.5, 0.0]\n    center: [0.0, 0.0, 0.8]\n    \
+    extent: [2.0, 0.9, 0.8]\n    location: [20.0, 3.0, 0.0]\n    speed: 36.0\n  101: &car\n    angle: [0.0, 0.0, 0.0]\n    \
+    center: [0.0, 0.0, 0.8]\n    extent: [2.0, 0.9, 0.8]\n    location: [-8.0, 3.0, 0.0]\n    speed: 0.0\n";
+
+/// The same as V2V4Real does: matrices as Python wrote them.
+pub const V2V4REAL: &str = "lidar_pose: &id003 !!python/object/apply:numpy.core.multiarray._reconstruct
+  args:
+  - &id001 !!python/name:numpy.ndarray ''
+  - !!python/tuple
+    - 0
+  - !!binary |
+    Yg==
+  state: !!python/tuple
+  - 1
+  - !!python/tuple
+    - 4
+    - 4
+  - &id002 !!python/object/apply:numpy.dtype
+    args:
+    - f8
+    - false
+    - true
+    state: !!python/tuple
+    - 3
+    - <
+    - null
+    - null
+    - null
+    - -1
+    - -1
+    - 0
+  - false
+  - !!binary |
+    AAAAAAAA8D8AAAAAAAAAAAAAAAAAAAAAAAAAAAAAFEAAAAAAAAAAAAAAAAAAAPA/AAAAAAAA
+    AAAAAAAAAAAYQAAAAAAAAAAAAAAAAAAAAAAAAAAAAADwPwAAAAAAAAAAAAAAAAAAAAAAAAAA
+    AAAAAAAAAAAAAAAAAAAAAAAA8D8=
+true_ego_pos: [0, 0, 0, 0, 0, 0]
+ego_speed: 3.6
+vehicles:
+  1:
+    angle: [0, 90, 0]
+    center: [0, 0, 0]
+    extent: [2, 1, 0.75]
+    location: [10, 4, -1]
+    ass_id: 5
+    obj_type: Truck
+";
+
+/// A road, a junction, a crossing.
+pub const OPENDRIVE: &str = r#"<?xml version="1.0"?><OpenDRIVE><header revMajor="1" revMinor="4"/>
+<road name="a" length="40.0" id="1" junction="-1"><link><successor elementType="junction" elementId="9"/></link>
+<type s="0" type="town"><speed max="50" unit="km/h"/></type>
+<planView><geometry s="0" x="0" y="0" hdg="0" length="20"><line/></geometry>
+<geometry s="20" x="20" y="0" hdg="0" length="20"><arc curvature="0.02"/></geometry></planView>
+<elevationProfile><elevation s="0" a="0" b="0.01" c="0" d="0"/></elevationProfile>
+<lanes><laneOffset s="0" a="0" b="0" c="0" d="0"/><laneSection s="0">
+<left><lane id="1" type="driving" level="false"><width sOffset="0" a="3.5" b="0" c="0" d="0"/></lane></left>
+<center><lane id="0" type="none" level="false"/></center>
+<right><lane id="-1" type="driving" level="false"><width sOffset="0" a="3.5" b="0" c="0" d="0"/></lane></right>
+</laneSection></lanes></road>
+<road name="b" length="10.0" id="2" junction="9"><link><predecessor elementType="road" elementId="1" contactPoint="end"/></link>
+<planView><geometry s="0" x="40" y="4" hdg="0.4" length="10"><spiral curvStart="0" curvEnd="0.05"/></geometry></planView>
+<lanes><laneSection s="0"><center><lane id="0" type="none" level="false"/></center>
+<right><lane id="-1" type="driving" level="false"><width sOffset="0" a="3.5" b="0" c="0" d="0"/></lane></right>
+</laneSection></lanes></road>
+<junction id="9" name="j"><connection id="0" incomingRoad="1" connectingRoad="2" contactPoint="start">
+<laneLink from="-1" to="-1"/></connection></junction></OpenDRIVE>"#;
+
+/// A deployment with most of its fields.
+pub const SCENARIO: &str = "run: test\nscene: {dir: scene, rate: 1.0, seek: 0, frames: 10, loop: false}\n\
+    models: {weights: weights.safetensors}\nmethod: max\nagents: {codec: {dtype: f16, budget_bytes: 100000, zstd_level: 3}}\n\
+    vehicles: {'4288': {pose: recorded}}\nego: {deadline_ms: 50}\ntimeouts: {ready_s: 3}\n";
+
+/// A grid of runs.
+pub const EXPERIMENT: &str = include_str!("../../../deploy/experiments/smoke.yaml");
+
+/// An emulated air.
+pub const LINK: &str = include_str!("../../../deploy/experiments/links/newest-first.yaml");
+
+/// Tables of methods.
+pub const TABLES: &str = "dataset: scenes\nweights: weights\ndtype: f16\nframes: 40\ntables:\n- name: main\n  scenarios: 3\n  \
+    rows:\n  - {name: a, method: max, weights: [a.safetensors]}\n  - {method: none}\n  columns:\n  \
+    - {name: PGC, poses: {cached: {file: poses.csv}}, delay_ms: 100}\n  \
+    - {name: noisy, poses: {noisy: {mode: independent, position_std_m: 1, heading_std_deg: 1}}}\n";
+
+/// What a link did over time.
+pub const TRACE: &str = "time_s,rate_mbps,delay_ms,loss\n0,27,10,0.01\n0.5,6,20.5,0\n1.25,0,100,1\n";
+
+/// When packets could leave.
+pub const MAHIMAHI: &str = "0\n1\n1\n5\n12\n40\n";
+
+/// Poses of a localizer.
+pub const POSES: &str = "scenario,cav,capture_nanos,x_m,y_m,z_m,qw,qx,qy,qz,confidence,no_pose,inliers\n\
+    town,1000,3000000000,258.3,296.2,1.99,0.712174537,0.000278377,0.000295992,-0.702002324,0.99,,\n\
+    town,1000,3100000000,,,,,,,,,low_confidence,12\n";
+
+/// Errors of poses.
+pub const ERRORS: &str = "x_m,y_m,z_m,yaw_deg,confidence\n0.5,-0.25,0.1,1.5,0.9\n-1,2,0,-3,0.4\n";

@@ -1,0 +1,63 @@
+//! A short run of damaged inputs through everything that reads: nothing panics, nothing takes memory on somebody's word.
+//! `cargo bench -p tests --bench mutation` is the long one.
+
+use std::sync::{Mutex, PoisonError};
+
+use peak_alloc::PeakAlloc;
+use tests::mutation::run::{Meter, Report, all};
+use tests::mutation::wire_target::{self, LIMITS};
+
+#[global_allocator]
+static MEMORY: PeakAlloc = PeakAlloc;
+
+/// One at a time: the peak is that of the whole process.
+static ALONE: Mutex<()> = Mutex::new(());
+
+struct Memory;
+
+impl Meter for Memory {
+    fn reset(&self) {
+        MEMORY.reset_peak_usage();
+    }
+
+    fn peak_bytes(&self) -> usize {
+        MEMORY.peak_usage()
+    }
+
+    fn held_bytes(&self) -> usize {
+        MEMORY.current_usage()
+    }
+}
+
+fn check(reports: &[Report]) {
+    for report in reports {
+        eprintln!("{report:?}");
+        assert!(report.panics.is_empty(), "{}: cases {:?} panicked", report.name, report.panics);
+        assert!(report.accepted < report.cases, "{}: nothing is refused", report.name);
+        assert!(report.peak_bytes as u64 <= 2 * LIMITS.max_body_bytes, "{}: {} bytes", report.name, report.peak_bytes);
+    }
+}
+
+#[test]
+fn damaged_messages_are_refused_or_sound() {
+    let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
+    check(&all(std::path::Path::new(""), 100_000, 0, 1, &Memory));
+}
+
+#[test]
+fn damaged_files_are_refused_or_sound() {
+    let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
+    let scratch = tempfile::tempdir().unwrap();
+    check(&all(scratch.path(), 0, 5_000, 1, &Memory));
+}
+
+#[test]
+fn a_message_of_15_bytes_that_claims_2_to_the_42_takes_no_memory() {
+    let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
+    let mut bytes = [0; 15];
+    bytes[..8].copy_from_slice(&(1_u64 << 42).to_le_bytes());
+    Memory.reset();
+    let held = Memory.held_bytes();
+    assert!((0..1000).all(|_| !wire_target::read(&bytes)));
+    assert!(Memory.peak_bytes() - held < 4096, "{} bytes", Memory.peak_bytes() - held);
+}
