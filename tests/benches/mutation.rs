@@ -1,8 +1,9 @@
 //! The long run of damaged inputs: `cargo bench -p tests --bench mutation -- [MESSAGES] [FILES] [SEED]`, by default ten
-//! million messages and a million files of each format; prints a table. TMPDIR=/dev/shm spares the disk.
+//! million messages and a million files of each format; prints a table. TMPDIR=/dev/shm spares the disk. With
+//! `-- --seeds FOLDER` it writes the sound inputs down instead, for `fuzz/`.
 
 use peak_alloc::PeakAlloc;
-use tests::mutation::run::{Meter, all};
+use tests::mutation::run::{Meter, all, formats};
 
 #[global_allocator]
 static MEMORY: PeakAlloc = PeakAlloc;
@@ -28,6 +29,10 @@ fn main() {
     let number = |place: usize, usual| numbers.get(place).copied().unwrap_or(usual);
     let (messages, files, seed) = (number(0, 10_000_000), number(1, 1_000_000), number(2, 7));
     let scratch = tempfile::tempdir().expect("a temporary folder");
+    let folder = std::env::args().skip_while(|argument| argument != "--seeds").nth(1);
+    if let Some(folder) = folder {
+        return write_seeds(folder.as_ref(), formats(scratch.path()));
+    }
     println!("| format | damaged | accepted | panics | peak memory of one, KiB | seconds |");
     println!("| --- | --- | --- | --- | --- | --- |");
     for report in all(scratch.path(), messages, files, seed, &Memory) {
@@ -39,5 +44,16 @@ fn main() {
             report.accepted,
             report.panics.len()
         );
+    }
+}
+
+/// A folder for each format, a file for each sound input.
+fn write_seeds(folder: &std::path::Path, formats: Vec<(&str, Vec<Vec<u8>>)>) {
+    for (name, seeds) in formats {
+        let folder = folder.join(name.replace(' ', "_"));
+        std::fs::create_dir_all(&folder).expect("a writable folder");
+        for (number, seed) in seeds.iter().enumerate() {
+            std::fs::write(folder.join(format!("{number:02}")), seed).expect("a writable folder");
+        }
     }
 }

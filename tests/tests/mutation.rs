@@ -4,7 +4,8 @@
 use std::sync::{Mutex, PoisonError};
 
 use peak_alloc::PeakAlloc;
-use tests::mutation::run::{Meter, Report, all};
+use tests::mutation::readers::all as all_readers;
+use tests::mutation::run::{Meter, Report, all, formats};
 use tests::mutation::wire_target::{self, LIMITS};
 
 #[global_allocator]
@@ -49,6 +50,25 @@ fn damaged_files_are_refused_or_sound() {
     let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
     let scratch = tempfile::tempdir().unwrap();
     check(&all(scratch.path(), 0, 5_000, 1, &Memory));
+}
+
+#[test]
+fn every_format_has_a_fuzz_target_with_sound_seeds() {
+    let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
+    let scratch = tempfile::tempdir().unwrap();
+    let fuzz = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).with_file_name("fuzz");
+    let targets = std::fs::read_to_string(fuzz.join("Cargo.toml")).unwrap();
+    let readers = all_readers(scratch.path());
+    for (name, seeds) in formats(scratch.path()) {
+        let target = name.replace(' ', "_");
+        assert!(targets.contains(&format!("name = \"{target}\"\n")), "{target} is no target");
+        for number in 0..seeds.len() {
+            let bytes = std::fs::read(fuzz.join("seeds").join(&target).join(format!("{number:02}"))).unwrap();
+            let reader = readers.iter().find(|reader| reader.name == name);
+            let is_sound = reader.map_or_else(|| wire_target::read(&bytes), |reader| reader.try_read(&bytes));
+            assert!(is_sound, "{target} {number}");
+        }
+    }
 }
 
 #[test]

@@ -56,6 +56,16 @@ pub fn all(scratch: &Path, messages: u64, files: u64, seed: u64, meter: &dyn Met
     reports
 }
 
+/// Every format with its sound inputs.
+///
+/// # Panics
+/// When the disk refuses.
+#[must_use]
+pub fn formats(scratch: &Path) -> Vec<(&'static str, Vec<Vec<u8>>)> {
+    let files = readers::all(scratch).into_iter().map(|reader| (reader.name, reader.seeds));
+    std::iter::once(("messages", seeds::messages())).chain(files).collect()
+}
+
 fn one(
     (name, sound): (&'static str, &[Vec<u8>]),
     cases: u64,
