@@ -182,6 +182,8 @@ mod tests {
             dtype: protocol::Dtype::F16,
             frames: None,
             scenarios: None,
+            attack: None,
+            trust: None,
             version: "1".into(),
         };
         Cell { key, weights: "w.safetensors".into(), commit: "abc".into(), metrics }
