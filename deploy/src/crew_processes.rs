@@ -14,6 +14,7 @@ use sim_replay::bus::{Bus, Identity};
 use crate::fleet::Fleet;
 use crate::network::MeetingPlace;
 use crate::run_folder::RunFolder;
+use crate::security::RunKeys;
 use crate::supervise::{Happening, Supervisor};
 use crate::up::UpError;
 
@@ -28,6 +29,7 @@ pub(crate) struct CrewProcesses {
     bus: Bus,
     place: MeetingPlace,
     grace: Duration,
+    _keys: Option<RunKeys>,
 }
 
 impl CrewProcesses {
@@ -41,8 +43,9 @@ impl CrewProcesses {
         folder: &RunFolder,
         programs: &Path,
     ) -> Result<(Self, RemoteCrew), UpError> {
-        let place = MeetingPlace::open(&fleet.scenario.network)?;
-        let mut specs = fleet.processes(run, place.endpoint.as_str(), programs);
+        let keys = fleet.keys(folder)?;
+        let place = MeetingPlace::open(&fleet.scenario.network, run, keys.as_ref())?;
+        let mut specs = fleet.processes(run, place.endpoint.as_str(), keys.as_ref(), programs);
         specs.retain(|spec| spec.program.ends_with("agent"));
         let identity = Identity {
             run: run.clone(),
@@ -69,12 +72,13 @@ impl CrewProcesses {
         let timeouts = &fleet.scenario.timeouts;
         let remote = RemoteCrew::meet(&bus, &vehicles, Duration::from_secs_f64(timeouts.ready_s), &stop)
             .map_err(|error| EvaluateError::from(Box::new(error)))?;
-        Ok((Self { supervisor, bus, place, grace: Duration::from_secs_f64(timeouts.stop_s) }, remote))
+        let grace = Duration::from_secs_f64(timeouts.stop_s);
+        Ok((Self { supervisor, bus, place, grace, _keys: keys }, remote))
     }
 
     /// Ends all; the names of those that had to be killed.
     pub(crate) fn end(self) -> Vec<String> {
-        let Self { supervisor, bus, place, grace } = self;
+        let Self { supervisor, bus, place, grace, _keys } = self;
         let killed = supervisor.stop(grace).killed;
         for closed in [bus.leave(LEAVE_LIMIT), place.close()] {
             if let Err(overdue) = closed {

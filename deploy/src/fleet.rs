@@ -9,7 +9,7 @@ use agent::localizer::{EndToEndLocalizer, Localizer, LocalizerError};
 use agent::model_config::DetectorConfig;
 use agent::weights::{Weights, WeightsError};
 use ego_fuser::Exchange;
-use protocol::{CavId, ProcessId, Role, RunId, Stream, Topic};
+use protocol::{CavId, Party, ProcessId, Role, RunId, Stream, Topic};
 use sim_replay::bus::{Route, process_id};
 use sim_replay::dataset::{self, ReadError};
 use sim_replay::ground_truth::GroundTruthRule;
@@ -17,8 +17,11 @@ use sim_replay::link::{Air, LinkError};
 use tch::Device;
 
 use self::arguments::{Arguments, Meeting, dtype, noise_mode, rate_options, smoothing};
+use crate::keys::KeyError;
+use crate::run_folder::RunFolder;
 use crate::scenario::{Launch, PoseSource, Publish, Scenario};
 use crate::score::scorer_cav;
+use crate::security::RunKeys;
 use crate::supervise::{Life, ProcessSpec};
 use crate::weights_choice::{WeightsChoiceError, weights_of};
 
@@ -202,11 +205,30 @@ impl Fleet {
         if names.all(|name| name == first) { first } else { "mixed" }
     }
 
-    /// Every process to start, which all meet at `endpoint`; the programs lie in `programs`.
+    /// Every process that the run may have, for its keys.
     #[must_use]
-    pub fn processes(&self, run: &RunId, endpoint: &str, programs: &Path) -> Vec<ProcessSpec> {
+    pub fn parties(&self) -> Vec<Party> {
+        let agents = self.agents.iter().map(|cav| Party::new(Role::Agent, cav));
+        let egos = [Role::Ego, Role::Link].map(|role| Party::new(role, &self.ego));
+        let others = [Role::Replay, Role::Scorer, Role::Recorder, Role::Viewer].map(Party::alone);
+        agents.chain(egos).chain(others).collect()
+    }
+
+    /// The keys of a run of this fleet, where its scenario asks for security.
+    ///
+    /// # Errors
+    /// [`KeyError`] when they cannot be made.
+    pub fn keys(&self, folder: &RunFolder) -> Result<Option<RunKeys>, KeyError> {
+        let security = self.scenario.security.as_ref();
+        security.map(|security| RunKeys::of(security, self.parties(), folder.path())).transpose()
+    }
+
+    /// Every process to start, which all meet at `endpoint`, with their keys if there are any; the programs lie in
+    /// `programs`.
+    #[must_use]
+    pub fn processes(&self, run: &RunId, endpoint: &str, keys: Option<&RunKeys>, programs: &Path) -> Vec<ProcessSpec> {
         let shared_memory_mib = self.scenario.network.shared_memory_mib;
-        let meeting = Meeting { run, endpoint, programs, shared_memory_mib };
+        let meeting = Meeting { run, endpoint, programs, keys, shared_memory_mib };
         let here = |cav: &&CavId| self.scenario.settings_of(cav).launch == Launch::Here;
         let mut specs: Vec<ProcessSpec> =
             self.agents.iter().filter(here).map(|cav| self.agent(cav, &meeting)).collect();
@@ -218,10 +240,17 @@ impl Fleet {
 
     /// The process that writes the run to `file`, where the scenario asks for one.
     #[must_use]
-    pub fn recorder(&self, run: &RunId, endpoint: &str, programs: &Path, file: &Path) -> Option<ProcessSpec> {
+    pub fn recorder(
+        &self,
+        run: &RunId,
+        endpoint: &str,
+        keys: Option<&RunKeys>,
+        programs: &Path,
+        file: &Path,
+    ) -> Option<ProcessSpec> {
         let record = self.scenario.record.as_ref()?;
         let shared_memory_mib = self.scenario.network.shared_memory_mib;
-        let meeting = Meeting { run, endpoint, programs, shared_memory_mib };
+        let meeting = Meeting { run, endpoint, programs, keys, shared_memory_mib };
         let mut args = Arguments::of("record", &meeting);
         args.option("--out", file);
         if !record.without.is_empty() {

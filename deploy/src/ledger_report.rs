@@ -1,9 +1,10 @@
 //! `ledger.json`: every process's books, their sum, and whether it balances.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 use protocol::{Balance, Counts, Ledger, StageSummary};
 use serde::Serialize;
+use sim_replay::bus::Refusal;
 
 use crate::score::ProcessBooks;
 
@@ -22,8 +23,24 @@ pub struct LedgerReport {
     pub total: Counts,
     /// All processes together, by topic and receiver.
     pub sum: Ledger,
+    /// What the router of the run did not let through: by whom, what, why.
+    #[serde(skip_serializing_if = "Vec::is_empty")]
+    pub refused: Vec<RefusedReport>,
     /// The last word of each process; one that was started again is there once for each life.
     pub processes: Vec<ProcessReport>,
+}
+
+/// What the router did not let one peer say.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct RefusedReport {
+    /// Whose certificate it showed.
+    pub peer: String,
+    /// `put`, `declare`, `query`.
+    pub message: String,
+    /// `access-control` or `low-pass`.
+    pub reason: String,
+    /// How often.
+    pub count: u64,
 }
 
 /// The books of one life of a process.
@@ -58,7 +75,20 @@ impl LedgerReport {
             excused,
             total: sum.total(),
             sum: sum.clone(),
+            refused: Vec::new(),
             processes: books.iter().map(process).collect(),
         }
+    }
+
+    /// The same with what the router of the run refused.
+    #[must_use]
+    pub fn with_refused(self, refused: &BTreeMap<Refusal, u64>) -> Self {
+        let refused = refused.iter().map(|(Refusal { peer, message, reason }, count)| RefusedReport {
+            peer: peer.clone(),
+            message: message.clone(),
+            reason: reason.clone(),
+            count: *count,
+        });
+        Self { refused: refused.collect(), ..self }
     }
 }

@@ -1,15 +1,19 @@
 //! Where the processes of a run meet: a router inside this process, or one that runs elsewhere.
 
 use std::net::TcpListener;
+use std::time::Duration;
 
 use sim_replay::bus::shutdown::{self, Overdue};
 use sim_replay::bus::{BusError, BusOptions, Endpoint, open};
 use zenoh::{Session, Wait};
 
+use protocol::{Party, Role, RunId};
+
 use crate::scenario::Network;
+use crate::security::RunKeys;
 
 /// How long closing the session may take.
-const CLOSE_LIMIT: std::time::Duration = std::time::Duration::from_millis(500);
+const CLOSE_LIMIT: Duration = Duration::from_millis(500);
 
 /// An open session, and the endpoint that the other processes connect to.
 pub struct MeetingPlace {
@@ -17,20 +21,30 @@ pub struct MeetingPlace {
     pub session: Session,
     /// What to tell the others.
     pub endpoint: Endpoint,
+    /// Whether the router is this process and refuses what is not allowed.
+    pub is_guarded: bool,
 }
 
 impl MeetingPlace {
-    /// Opens the router of this run, or connects to the one that the scenario names.
+    /// Opens the router of this run, or connects to the one that the scenario names; with keys over TLS.
     ///
     /// # Errors
-    /// [`BusError`] when the port is in use, nothing answers there, or the endpoint is none.
-    pub fn open(network: &Network) -> Result<Self, BusError> {
-        if let Some(router) = &network.connect {
-            let endpoint = Endpoint::new(router)?;
-            return Ok(Self { session: open(&BusOptions::client(endpoint.clone()))?, endpoint });
-        }
-        let endpoint = with_port(&network.listen)?;
-        Ok(Self { session: open(&BusOptions::router(endpoint.clone()))?, endpoint })
+    /// [`BusError`] when the port is in use, nothing answers there, the endpoint is none or the keys are not right.
+    pub fn open(network: &Network, run: &RunId, keys: Option<&RunKeys>) -> Result<Self, BusError> {
+        let options = match &network.connect {
+            Some(router) => {
+                let options = BusOptions::client(Endpoint::new(router)?);
+                keys.map_or(Ok(options.clone()), |keys| {
+                    keys.for_client(options, Party::alone(Role::Scorer).name().as_str())
+                })
+            }
+            None => {
+                let mut options = BusOptions::router(with_port(&network.listen)?);
+                options.stall_limit = Duration::from_secs_f64(network.stall_limit_s);
+                keys.map_or(Ok(options.clone()), |keys| keys.for_router(options, run))
+            }
+        }?;
+        Ok(Self { session: open(&options)?, endpoint: options.endpoint().clone(), is_guarded: options.guard.is_some() })
     }
 
     /// Closes the session.
@@ -50,7 +64,7 @@ impl MeetingPlace {
 fn with_port(listen: &str) -> Result<Endpoint, BusError> {
     let endpoint = |text: &str| Endpoint::new(text);
     let Some(host) = listen.strip_suffix(":0") else { return endpoint(listen) };
-    let address = format!("{}:0", host.trim_start_matches("tcp/"));
+    let address = format!("{}:0", host.trim_start_matches("tcp/").trim_start_matches("tls/"));
     // Asking the system beats guessing; should another program take the port in between, the router says so.
     let port = TcpListener::bind(&address).and_then(|listener| listener.local_addr()).map(|address| address.port());
     endpoint(&format!("{host}:{}", port.unwrap_or(0)))
@@ -71,8 +85,8 @@ mod tests {
     fn a_port_in_use_is_named() {
         let taken = TcpListener::bind("127.0.0.1:0").unwrap();
         let listen = format!("tcp/{}", taken.local_addr().unwrap());
-        let error =
-            MeetingPlace::open(&Network { listen: listen.clone(), ..Network::default() }).err().unwrap().to_string();
+        let network = Network { listen: listen.clone(), ..Network::default() };
+        let error = MeetingPlace::open(&network, &"r1".parse().unwrap(), None).err().unwrap().to_string();
         assert!(error.contains(&listen) && error.contains("in use"), "{error}");
     }
 }

@@ -1,6 +1,6 @@
 //! One run from beginning to end: plan, start, watch, end, score, write.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::channel;
@@ -10,17 +10,20 @@ use std::time::{Duration, Instant};
 use ego_fuser::evaluate::EvaluateError;
 use protocol::{Balance, Ledger, RunId};
 use sim_replay::bus::shutdown::Stop;
-use sim_replay::bus::{BusError, Endpoint};
+use sim_replay::bus::{BusError, Endpoint, Refusal};
 
 use crate::absences;
 use crate::fingerprint::Provenance;
 use crate::fleet::{Fleet, FleetError, RECORDER, REPLAY};
+use crate::keys::KeyError;
+use crate::ledger_report::LedgerReport;
 use crate::metrics::{Messages, Metrics};
 use crate::network::MeetingPlace;
 use crate::progress::Display;
 use crate::run_folder::{RunFolder, RunFolderError, name_of_now};
 use crate::scenario::{Clock, Scenario};
 use crate::score::{Board, Progress, Scored, ScorerError, ScorerNode};
+use crate::security::{RefusalWatch, RunKeys};
 use crate::status::Phase;
 use crate::supervise::{SuperviseError, Supervisor};
 use crate::watch::{Ending, Watch};
@@ -86,6 +89,9 @@ pub enum UpError {
     /// The processes cannot meet.
     #[error(transparent)]
     Network(#[from] BusError),
+    /// There are no keys for the processes.
+    #[error("security: {0}")]
+    Keys(#[from] KeyError),
     /// The scorer cannot work.
     #[error("scorer: {0}")]
     Scorer(#[from] ScorerError),
@@ -115,6 +121,7 @@ impl UpError {
     #[must_use]
     pub fn is_bad_input(&self) -> bool {
         match self {
+            Self::Network(error) => error.is_bad_input(),
             Self::Fleet(_) | Self::Folder(RunFolderError::Taken(_)) => true,
             Self::Evaluate(error) => matches!(**error, EvaluateError::TooSlow { .. } | EvaluateError::Link(_)),
             _ => false,
@@ -137,21 +144,26 @@ pub fn up(scenario: &Scenario, options: &UpOptions) -> Result<RunResult, UpError
     stop.on_signals().map_err(UpError::Signals)?;
     let fingerprint = fingerprint(&fleet, &options.programs);
 
-    let place = MeetingPlace::open(&fleet.scenario.network)?;
+    let keys = fleet.keys(&folder)?;
+    let place = MeetingPlace::open(&fleet.scenario.network, &run, keys.as_ref())?;
+    let refused = RefusalWatch::over(&place)?;
     let board = Board::new(fleet.ego.clone(), fleet.ground_truth_rule(), fleet.map_values());
     let detections = folder.file("detections.jsonl");
     let mut scorer = ScorerNode::start(place.session.clone(), &run, &fleet.agents, &fleet.ego, board, detections)?;
     if let Some(address) = fleet.scenario.network.metrics {
         scorer.serve_metrics(address)?;
     }
-    let watched = watch(&fleet, &run, &place.endpoint, &options.programs, &folder, &scorer, &stop);
+    let meeting = (&place.endpoint, keys.as_ref());
+    let watched = watch(&fleet, &run, meeting, &options.programs, &folder, &scorer, &stop);
+    // Before the scorer closes the session.
+    let refused = refused.finish();
     let scored = scorer.finish();
     if let Err(overdue) = place.close() {
         tracing::warn!("{overdue}");
     }
     let watched = watched?;
 
-    let result = write(&fleet, &run, folder, scored, &watched, fingerprint)?;
+    let result = write(&fleet, &run, folder, (scored, &refused), &watched, fingerprint)?;
     match watched.ending {
         Ending::Over | Ending::Asked => Ok(result),
         Ending::Failed { process, how } => {
@@ -174,15 +186,15 @@ struct Watched {
 fn watch(
     fleet: &Fleet,
     run: &RunId,
-    endpoint: &Endpoint,
+    (endpoint, keys): (&Endpoint, Option<&RunKeys>),
     programs: &Path,
     folder: &RunFolder,
     scorer: &ScorerNode,
     stop: &Stop,
 ) -> Result<Watched, UpError> {
     let (events, happened) = channel();
-    let mut specs = fleet.processes(run, endpoint.as_str(), programs);
-    specs.extend(fleet.recorder(run, endpoint.as_str(), programs, &folder.file("recording.mcap")));
+    let mut specs = fleet.processes(run, endpoint.as_str(), keys, programs);
+    specs.extend(fleet.recorder(run, endpoint.as_str(), keys, programs, &folder.file("recording.mcap")));
     let mut display = Display::new(fleet.ticks);
     if let Some(first) = fleet.scenario.network.metrics {
         for (spec, address) in specs.iter_mut().zip(ports_behind(first)) {
@@ -275,7 +287,7 @@ fn write(
     fleet: &Fleet,
     run: &RunId,
     folder: RunFolder,
-    scored: Scored,
+    (scored, refused): (Scored, &BTreeMap<Refusal, u64>),
     watched: &Watched,
     fingerprint: JoinHandle<std::io::Result<Provenance>>,
 ) -> Result<RunResult, UpError> {
@@ -289,8 +301,8 @@ fn write(
     let metrics = metrics(fleet, &board, &progress, &sum);
     folder.write_json("metrics.json", &metrics)?;
     folder.write_frames(board.records())?;
-    let away = (&watched.away, excused);
-    folder.write_json("ledger.json", &crate::ledger_report::LedgerReport::new(&books, &sum, &balance, away))?;
+    let report = LedgerReport::new(&books, &sum, &balance, (&watched.away, excused)).with_refused(refused);
+    folder.write_json("ledger.json", &report)?;
     let provenance = match fingerprint.join() {
         Ok(Ok(provenance)) => Some(provenance),
         Ok(Err(error)) => {

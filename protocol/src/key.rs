@@ -16,10 +16,12 @@
 use std::fmt;
 use std::str::FromStr;
 
-use crate::{CavId, IdError, ProcessId, Role, RunId, Stream, Topic, Verb};
+use crate::{CavId, IdError, ProcessId, Role, RunId, Runs, Stream, Topic, Verb};
 
 /// First chunk of every key.
 pub const KEY_ROOT: &str = "v2v";
+/// What no process ever declares.
+pub(crate) const NOBODY: &str = "nobody";
 /// Longer texts are no keys, whatever they say.
 pub(crate) const MAX_KEY_BYTES: usize = 256;
 
@@ -131,6 +133,17 @@ impl FromStr for Key {
 pub struct Selector(String);
 
 impl Selector {
+    /// Keys below the run in some runs.
+    pub(crate) fn within(runs: &Runs, topics: &dyn fmt::Display) -> Self {
+        Self(format!("{KEY_ROOT}/{runs}/{topics}"))
+    }
+
+    /// Everything of some runs.
+    #[must_use]
+    pub fn all_of(runs: &Runs) -> Self {
+        Self::within(runs, &"**")
+    }
+
     /// Everything of a run.
     #[must_use]
     pub fn run(run: &RunId) -> Self {
@@ -140,7 +153,7 @@ impl Selector {
     /// What no process ever declares: `v2v/<run>/nobody`. To ask there is to ask the network alone.
     #[must_use]
     pub fn nobody(run: &RunId) -> Self {
-        Self(format!("{KEY_ROOT}/{run}/nobody"))
+        Self(format!("{KEY_ROOT}/{run}/{NOBODY}"))
     }
 
     /// One stream of every vehicle, before the link.

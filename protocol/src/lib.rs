@@ -76,6 +76,7 @@
 //! - BEV maps are `[C, H, W]`: the row grows with y, the column with x.
 //! - Times are nanoseconds: capture times on the clock of the scene, everything else on the Unix clock.
 
+pub mod access;
 mod balance;
 mod bev;
 mod body;
@@ -97,6 +98,7 @@ mod stream;
 mod topic;
 pub mod wire;
 
+pub use access::{Act, Party, PartyError, Right, Runs};
 pub use balance::{Balance, Difference, Unheard};
 pub use bev::{BevFeatures, BevGrid};
 pub use body::{Body, BodyShape};

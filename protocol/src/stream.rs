@@ -54,6 +54,17 @@ impl Stream {
         })
     }
 
+    /// More than a message of this stream ever has, bytes; `None`: as much as the transport takes. For whoever passes
+    /// messages on without reading them.
+    #[must_use]
+    pub fn most_bytes(self) -> Option<usize> {
+        match self {
+            Self::Pose | Self::Gnss => Some(16 << 10),
+            Self::Descriptor | Self::Boxes | Self::Detections => Some(4 << 20),
+            Self::Lidar | Self::Camera(_) | Self::Radar | Self::Bev | Self::Points | Self::DetectionsJson => None,
+        }
+    }
+
     /// Reads the chunks of a key that name a stream.
     pub(crate) fn from_chunks(chunks: &[&str]) -> Option<Self> {
         Some(match chunks {

@@ -4,6 +4,8 @@ pub mod bus;
 pub mod faults;
 pub mod fixtures;
 pub mod fleet;
+pub mod hosts;
+pub mod keys;
 pub mod localizer;
 pub mod machine;
 pub mod mutation;

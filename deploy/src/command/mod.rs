@@ -2,6 +2,8 @@
 
 mod demo;
 mod eval;
+mod keys;
+mod router;
 mod status;
 mod sweep;
 mod up;
@@ -18,6 +20,7 @@ use deploy::scenario::ScenarioError;
 use deploy::sweep::SweepError;
 use deploy::table::TableError;
 use deploy::up::UpError;
+use sim_replay::bus::BusError;
 
 /// What `v2vloc` can be asked to do.
 #[derive(Debug, clap::Subcommand)]
@@ -26,6 +29,10 @@ pub(crate) enum Command {
     Demo(Box<demo::Arguments>),
     /// Judge methods on recorded scenes without a network: AP, pose errors, bytes.
     Eval(Box<eval::Arguments>),
+    /// Make a test authority and certificates for the processes of a fleet.
+    Keys(keys::Arguments),
+    /// Be the router of a fleet whose processes run on several hosts, or write the configuration of a zenohd that is.
+    Router(router::Arguments),
     /// Run a grid of experiments in virtual time: one CSV, charts, a report.
     Sweep(sweep::Arguments),
     /// Say how a run goes: is every process there, ready and answering? Exit code 1 where something is wrong.
@@ -44,6 +51,8 @@ impl Command {
             Self::Demo(arguments) => arguments.run(),
             Self::Eval(arguments) => arguments.run(),
             Self::Status(arguments) => arguments.run(),
+            Self::Keys(arguments) => arguments.run(),
+            Self::Router(arguments) => arguments.run(),
             Self::Sweep(arguments) => arguments.run(),
             Self::Up(arguments) => arguments.run(),
             Self::View(arguments) => arguments.run(),
@@ -88,6 +97,7 @@ pub(crate) fn exit_code(error: &anyhow::Error) -> ExitCode {
             || cause.is::<FleetError>()
             || cause.is::<EvaluationError>()
             || cause.is::<TableError>()
+            || cause.downcast_ref::<BusError>().is_some_and(BusError::is_bad_input)
             || cause.downcast_ref::<SweepError>().is_some_and(SweepError::is_bad_input)
             || cause.downcast_ref::<UpError>().is_some_and(UpError::is_bad_input)
     });

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use deploy::view::{LiveRun, RecordedRun, ViewError, serve_live, serve_recorded};
 use protocol::{CavId, Role, RunId};
 use sim_replay::bus::shutdown::Stop;
-use sim_replay::bus::{Bus, BusOptions, Endpoint, Identity, process_id};
+use sim_replay::bus::{Bus, BusOptions, Credentials, Endpoint, Identity, process_id};
 use sim_replay::web::WebServer;
 
 use super::{BadInput, Outcome};
@@ -30,6 +30,9 @@ pub(crate) struct Arguments {
     /// The router of the live run, tcp/HOST:PORT; `v2vloc up` says it.
     #[arg(long)]
     connect: Option<Endpoint>,
+    /// Folder with the viewer's keys, where the live run has security (`v2vloc keys` writes DIR/viewer).
+    #[arg(long, value_name = "DIR")]
+    tls: Option<PathBuf>,
     /// Where to serve the page.
     #[arg(long, value_name = "HOST:PORT", default_value = "127.0.0.1:8088")]
     listen: SocketAddr,
@@ -54,7 +57,13 @@ impl Arguments {
                 let _ = rustix::process::nice(VIEWER_NICENESS);
                 let cav = CavId::new("viewer")?;
                 let identity = Identity { run: name.clone(), process: process_id(Role::Viewer, &cav), cav };
-                let bus = Bus::join(&BusOptions::client(router), identity)?;
+                let mut options = BusOptions::client(router);
+                if let Some(folder) = &self.tls {
+                    let credentials = Credentials::read(folder)?;
+                    credentials.check_name(identity.process.as_str())?;
+                    options = options.with_credentials(credentials);
+                }
+                let bus = Bus::join(&options, identity)?;
                 serve_live(self.listen, Arc::new(LiveRun::start(bus)?))
             }
             (None, _, _) => {

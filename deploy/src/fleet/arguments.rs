@@ -7,6 +7,7 @@ use agent::rate::RateConfig;
 use protocol::{Dtype, RunId, Smoothing};
 
 use crate::scenario::NoiseMode;
+use crate::security::RunKeys;
 use crate::supervise::{Life, ProcessSpec};
 
 /// Where the processes of a run meet, and where their programs lie.
@@ -17,12 +18,17 @@ pub(super) struct Meeting<'a> {
     pub endpoint: &'a str,
     /// Folder of the programs.
     pub programs: &'a Path,
+    /// Where the processes find their keys, where they have some.
+    pub keys: Option<&'a RunKeys>,
     /// Memory for large messages between processes of one machine, MiB; 0: none.
     pub shared_memory_mib: usize,
 }
 
 impl Meeting<'_> {
-    pub(super) fn process(&self, name: String, program: &str, args: Arguments, life: Life) -> ProcessSpec {
+    pub(super) fn process(&self, name: String, program: &str, mut args: Arguments, life: Life) -> ProcessSpec {
+        if let Some(keys) = self.keys {
+            args.option("--tls", &keys.of_process(&name));
+        }
         ProcessSpec { name, program: self.programs.join(program), args: args.0, life }
     }
 }

@@ -88,12 +88,13 @@ impl Scenario {
         let mut scenario = Self::parse(&text, path)?;
         let folder = std::path::absolute(path).map_err(unreadable)?;
         let folder = folder.parent().unwrap_or(Path::new("/"));
-        let Scenario { scene, models, link, .. } = &mut scenario;
+        let Scenario { scene, models, link, security, .. } = &mut scenario;
+        let keys = security.iter_mut().flat_map(|security| &mut security.keys);
         let localizer = models.localizer.iter_mut().flat_map(|models| [&mut models.encoder, &mut models.head]);
         let networks = localizer.chain(&mut models.end_to_end);
         let is_preset = |air: &Path| PRESETS.iter().any(|(name, _)| Path::new(name) == air);
         let air = link.iter_mut().map(|link| &mut link.air).filter(|air| !is_preset(air));
-        for place in [&mut scene.dir, &mut models.weights].into_iter().chain(networks).chain(air) {
+        for place in [&mut scene.dir, &mut models.weights].into_iter().chain(networks).chain(air).chain(keys) {
             *place = without_dots(&folder.join(&place));
         }
         Ok(scenario)
@@ -118,6 +119,7 @@ impl Scenario {
             if fits { Ok(()) } else { Err(value(field, number.to_string(), "must be a number above 0")) }
         };
         positive("scene.rate", self.scene.rate)?;
+        positive("network.stall_limit_s", self.network.stall_limit_s)?;
         positive("timeouts.ready_s", self.timeouts.ready_s)?;
         positive("timeouts.drain_s", self.timeouts.drain_s)?;
         positive("timeouts.stop_s", self.timeouts.stop_s)?;
@@ -132,6 +134,7 @@ impl Scenario {
             return Err(value("ego.deadline_ms", self.ego.deadline_ms.to_string(), "must be at most 60000"));
         }
         self.check_clock(path)?;
+        self.check_security(path)?;
         if let Some(ego) = &self.ego.id
             && !self.scene.agents.is_empty()
             && !self.scene.agents.contains(ego)
@@ -174,6 +177,30 @@ impl Scenario {
             if !place.exists() {
                 return Err(ScenarioError::Missing { path: path.into(), field, missing: place.clone() });
             }
+        }
+        Ok(())
+    }
+
+    fn check_security(&self, path: &Path) -> Result<(), ScenarioError> {
+        let Some(security) = &self.security else { return Ok(()) };
+        if let Some(missing) = security.keys.as_ref().filter(|folder| !folder.is_dir()) {
+            return Err(ScenarioError::Missing { path: path.into(), field: "security.keys", missing: missing.clone() });
+        }
+        let elsewhere = self.network.connect.is_some()
+            || [&self.agents.launch]
+                .into_iter()
+                .chain(self.vehicles.values().filter_map(|own| own.launch.as_ref()))
+                .any(|launch| *launch == Launch::Elsewhere);
+        if security.keys.is_none() && elsewhere {
+            let rule =
+                "must name the folder of `v2vloc keys`: processes on other hosts need keys of the same authority";
+            let field = "security.keys";
+            return Err(ScenarioError::Value { path: path.into(), field, found: "left out".into(), rule });
+        }
+        if self.clock == Clock::Stepped && self.network.connect.is_some() {
+            let rule = "runs in virtual time are their own router when there is security";
+            let found = self.network.connect.clone().unwrap_or_default();
+            return Err(ScenarioError::Value { path: path.into(), field: "network.connect", found, rule });
         }
         Ok(())
     }

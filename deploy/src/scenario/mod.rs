@@ -58,6 +58,9 @@ pub struct Scenario {
     /// Where the processes meet.
     #[serde(default)]
     pub network: Network,
+    /// Whether the processes show certificates to each other; absent: they do not.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub security: Option<Security>,
     /// How long to wait for what.
     #[serde(default)]
     pub timeouts: Timeouts,
@@ -405,6 +408,10 @@ pub struct Network {
     pub connect: Option<String>,
     /// Shared memory for large messages between processes of one machine, MiB; 0: everything takes the socket.
     pub shared_memory_mib: usize,
+    /// How long the router inside this run may take to hand one message to one receiver, seconds, before it closes that
+    /// connection. Meanwhile it delivers nothing else of the same sender: a receiver behind a slow link needs more (8 MiB at
+    /// 13 Mbit/s take 5 s), and everybody else waits for it.
+    pub stall_limit_s: f64,
     /// Where the scorer serves its counters to Prometheus; the other processes take the ports behind it, in the order in
     /// which they are started. Not served when absent.
     pub metrics: Option<SocketAddr>,
@@ -412,8 +419,22 @@ pub struct Network {
 
 impl Default for Network {
     fn default() -> Self {
-        Self { listen: "tcp/127.0.0.1:0".into(), connect: None, shared_memory_mib: 0, metrics: None }
+        Self {
+            listen: "tcp/127.0.0.1:0".into(),
+            connect: None,
+            shared_memory_mib: 0,
+            stall_limit_s: 5.0,
+            metrics: None,
+        }
     }
+}
+
+/// TLS between all processes, and for each of them only what is its to say.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Security {
+    /// Folder that `v2vloc keys` has written, relative to the scenario file; absent: keys are made for this run alone.
+    pub keys: Option<PathBuf>,
 }
 
 /// How long to wait for what.

@@ -2,13 +2,14 @@
 
 use std::io::IsTerminal;
 use std::net::SocketAddr;
+use std::path::PathBuf;
 use std::time::Duration;
 
 use protocol::{CavId, Role, RunId};
 use tracing_subscriber::EnvFilter;
 
 use super::shutdown::Stop;
-use super::{Bus, BusError, BusOptions, Endpoint, Identity, process_id};
+use super::{Bus, BusError, BusOptions, Credentials, Endpoint, Identity, process_id};
 
 /// How long a process may take to end after it was asked to: within the 5 s that a whole fleet has.
 pub const STOP_LIMIT: Duration = Duration::from_secs(4);
@@ -25,6 +26,10 @@ pub struct BusArgs {
     /// Be the run's router oneself and listen here, tcp/HOST:PORT; no launcher or zenohd is needed then.
     #[arg(long, conflicts_with = "connect")]
     pub listen: Option<Endpoint>,
+    /// Folder with the keys of this process (ca.pem, cert.pem, key.pem): connect over TLS, show the certificate and take
+    /// no router without one. `v2vloc keys` makes them.
+    #[arg(long, value_name = "DIR")]
+    pub tls: Option<PathBuf>,
     /// Seconds to go on trying to reach the router.
     #[arg(long, default_value_t = 10.0)]
     pub connect_timeout: f64,
@@ -44,8 +49,10 @@ pub struct BusArgs {
 
 impl BusArgs {
     /// The session that the arguments ask for.
-    #[must_use]
-    pub fn options(&self) -> BusOptions {
+    ///
+    /// # Errors
+    /// [`BusError::Keys`] when there is something wrong with those of `--tls`.
+    pub fn options(&self) -> Result<BusOptions, BusError> {
         let mut options = match &self.listen {
             Some(listen) => BusOptions::router(listen.clone()),
             None => BusOptions::client(self.connect.clone()),
@@ -53,7 +60,10 @@ impl BusArgs {
         options.patience = Duration::try_from_secs_f64(self.connect_timeout).unwrap_or(Duration::ZERO);
         options.shared_memory_pool = Some(self.shm_mib << 20).filter(|bytes| *bytes > 0);
         options.max_message_bytes = self.max_message_mib.max(1) << 20;
-        options
+        Ok(match &self.tls {
+            Some(folder) => options.with_credentials(Credentials::read(folder)?),
+            None => options,
+        })
     }
 
     /// Joins the run in a role.
@@ -62,7 +72,11 @@ impl BusArgs {
     /// [`BusError`] names the endpoint and what to do.
     pub fn join(&self, role: Role, cav: &CavId) -> Result<Bus, BusError> {
         let identity = Identity { run: self.run.clone(), process: process_id(role, cav), cav: cav.clone() };
-        let mut bus = Bus::join(&self.options(), identity)?;
+        let options = self.options()?;
+        if let Some(credentials) = &options.credentials {
+            credentials.check_name(identity.process.as_str())?;
+        }
+        let mut bus = Bus::join(&options, identity)?;
         if let Some(address) = self.metrics {
             let address = bus.serve_metrics(address)?;
             tracing::info!("metrics at http://{address}/metrics");

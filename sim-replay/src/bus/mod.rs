@@ -5,6 +5,8 @@
 //!   mailboxes in which the newest wins ([`mailbox`], [`Publisher`], [`Inbox`]).
 //! - What is overwritten, refused or still under way is counted ([`Books`]), and the books are published.
 //! - A scene starts when every route has carried something ([`Barrier`]).
+//! - With keys every process shows who it is, and the router lets it say only what is its to say ([`Credentials`],
+//!   [`Guard`]); what it refused is counted ([`Refusals`]).
 //! - Ending takes a bounded time, whatever the network does ([`shutdown`]).
 //!
 //! Nothing here is async: zenoh brings its own runtimes, and a `put` that waits for a slow network must not hold up an
@@ -13,7 +15,9 @@
 mod args;
 mod books;
 mod clock_offset;
+mod credentials;
 mod freshness;
+mod guard;
 mod liveliness;
 pub mod mailbox;
 mod membership;
@@ -22,6 +26,7 @@ mod notices;
 mod publisher;
 mod readiness;
 mod receipt;
+mod refusals;
 mod roll_call;
 mod session;
 pub mod shutdown;
@@ -31,11 +36,14 @@ mod yielding;
 
 pub use args::{BusArgs, STOP_LIMIT, log_to_stderr};
 pub use books::{Books, PeerSummary, StageHistogram};
+pub use credentials::{AUTHORITY_FILE, CERTIFICATE_FILE, Credentials, KEY_FILE, MEMBERS_FILE, ROUTER};
+pub use guard::Guard;
 pub use liveliness::{Presence, Sighting, Watch};
 pub use membership::{Bus, Identity};
 pub use metrics::{MetricsServer, exposition};
 pub use publisher::{Overflow, Publisher, PublisherOptions, unix_nanos};
 pub use readiness::{Attended, Barrier, NotReady, Route, RouteError, process_id};
+pub use refusals::{Refusal, Refusals};
 pub use roll_call::RollCall;
 pub use session::{BusError, BusOptions, Endpoint, Role as SessionRole, open};
 pub use subscriber::{Arrival, Event, Inbox, Subscription};

@@ -12,7 +12,7 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use protocol::{CavId, Control, Limits, ProcessId, Role, Topic, Verb};
+use protocol::{CavId, Control, Limits, Party, ProcessId, Role, Topic, Verb};
 
 use super::mailbox::Taken;
 use super::{Bus, BusError, Event, Inbox, Subscription};
@@ -42,13 +42,9 @@ impl fmt::Display for Route {
 
 /// The name of a process in ledgers and routes: `agent-4279`, or the role alone where the vehicle is only a stand-in for
 /// it (`replay`).
-///
-/// # Panics
-/// Never: both parts are identifiers, and short enough.
 #[must_use]
 pub fn process_id(role: Role, cav: &CavId) -> ProcessId {
-    let name = if cav.as_str() == role.to_string() { role.to_string() } else { format!("{role}-{cav}") };
-    ProcessId::new(&name).expect("two identifiers and a hyphen make one")
+    Party::new(role, cav).name()
 }
 
 /// A text that is not a route.

@@ -2,10 +2,14 @@
 
 use std::fmt;
 use std::net::TcpListener;
+use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
 use zenoh::{Config, Session, Wait};
+
+use super::credentials::{AUTHORITY_FILE, CERTIFICATE_FILE, Credentials, KEY_FILE};
+use super::guard::{self, Guard};
 
 /// First and longest pause between two attempts to reach the router again.
 const RETRY_FIRST: Duration = Duration::from_millis(100);
@@ -14,11 +18,19 @@ const RETRY_LONGEST: Duration = Duration::from_secs(1);
 /// lie before the newest message: an eighth of what a socket's buffer grows to anyway.
 const TENSOR_BATCHES: usize = 8;
 
+/// Sessions that a router has at once: twice as many as a run of 64 vehicles needs.
+const MAX_SESSIONS: usize = 256;
+/// Connections that may be in the middle of introducing themselves.
+const MAX_STRANGERS: usize = 64;
+
 /// How long a client may take to hand over one message: 8 MiB at 1 Mbit/s, and then some. A router that hangs is noticed
 /// much sooner, by its silence.
 pub(super) const LONGEST_MESSAGE: Duration = Duration::from_secs(120);
 /// The same for a router, whose other messages of the same sender wait meanwhile.
 const LONGEST_DELIVERY: Duration = Duration::from_secs(5);
+
+const TCP: &str = "tcp/";
+const TLS: &str = "tls/";
 
 /// Which end of the star a process is.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -35,18 +47,18 @@ pub enum Role {
     },
 }
 
-/// A checked zenoh endpoint on TCP: `tcp/HOST:PORT`.
+/// A checked zenoh endpoint: `tcp/HOST:PORT`, or `tls/HOST:PORT` where both ends have keys.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Endpoint(String);
 
 impl Endpoint {
-    /// Reads `tcp/HOST:PORT`; IPv6 hosts stand in brackets.
+    /// Reads `tcp/HOST:PORT` or `tls/HOST:PORT`; IPv6 hosts stand in brackets.
     ///
     /// # Errors
     /// [`BusError::Endpoint`] names what is not one.
     pub fn new(text: &str) -> Result<Self, BusError> {
         let bad = || BusError::Endpoint(text.chars().take(100).collect());
-        let address = text.strip_prefix("tcp/").ok_or_else(bad)?;
+        let address = text.strip_prefix(TCP).or_else(|| text.strip_prefix(TLS)).ok_or_else(bad)?;
         let (host, port) = address.rsplit_once(':').ok_or_else(bad)?;
         let bracketed = host.starts_with('[') && host.ends_with(']');
         let clean = |c: char| c.is_ascii_alphanumeric() || ".-_".contains(c) || (bracketed && "[]:%".contains(c));
@@ -62,6 +74,18 @@ impl Endpoint {
         Self(format!("tcp/127.0.0.1:{port}"))
     }
 
+    /// The same place, spoken to with keys. Who has them never falls back to plain TCP.
+    #[must_use]
+    pub fn secured(&self) -> Self {
+        Self(format!("{TLS}{}", self.address()))
+    }
+
+    /// Whether only those with keys speak there.
+    #[must_use]
+    pub fn is_secured(&self) -> bool {
+        self.0.starts_with(TLS)
+    }
+
     /// The endpoint as zenoh writes it.
     #[must_use]
     pub fn as_str(&self) -> &str {
@@ -69,7 +93,8 @@ impl Endpoint {
     }
 
     fn address(&self) -> &str {
-        self.0.trim_start_matches("tcp/")
+        // Checked when it was made.
+        &self.0[TCP.len()..]
     }
 }
 
@@ -102,6 +127,10 @@ pub struct BusOptions {
     /// How long handing over one message may take before the connection is closed. Meanwhile a router delivers nothing
     /// else that the same sender sends, so this bounds what one stuck receiver costs the others.
     pub stall_limit: Duration,
+    /// Keys: all traffic goes over TLS, and both ends show certificates of the same authority.
+    pub credentials: Option<Credentials>,
+    /// What a router lets through, by certificate; everything when absent.
+    pub guard: Option<Guard>,
 }
 
 impl BusOptions {
@@ -125,7 +154,45 @@ impl BusOptions {
             // Twice a full map of OpenCOOD's size (256 x 48 x 176 cells of f32 at stride 4 are 8.7 MB) and every cloud.
             max_message_bytes: 32 << 20,
             stall_limit,
+            credentials: None,
+            guard: None,
         }
+    }
+
+    /// The same with keys: the endpoint is one of TLS from here on.
+    #[must_use]
+    pub fn with_credentials(mut self, credentials: Credentials) -> Self {
+        let (Role::Router { listen: endpoint } | Role::Client { connect: endpoint }) = &mut self.role;
+        *endpoint = endpoint.secured();
+        self.credentials = Some(credentials);
+        self
+    }
+
+    /// The same as a router that lets nothing through but what `guard` says.
+    #[must_use]
+    pub fn guarded_by(self, guard: Guard) -> Self {
+        Self { guard: Some(guard), ..self }
+    }
+
+    /// Where this end listens or connects.
+    #[must_use]
+    pub fn endpoint(&self) -> &Endpoint {
+        let (Role::Router { listen: endpoint } | Role::Client { connect: endpoint }) = &self.role;
+        endpoint
+    }
+
+    /// The same as a configuration for a `zenohd` of its own.
+    #[must_use]
+    pub fn for_zenohd(&self) -> Value {
+        let mut whole = json!({});
+        for (key, value) in self.settings() {
+            let mut place = &mut whole;
+            for part in key.split('/') {
+                place = &mut place[part];
+            }
+            *place = value;
+        }
+        whole
     }
 
     /// The keys of zenoh's configuration that differ from its defaults, or on which this crate relies.
@@ -135,7 +202,7 @@ impl BusOptions {
             Role::Client { connect } => ("client", vec![], vec![connect.as_str()]),
         };
         let millis = |duration: Duration| u64::try_from(duration.as_millis()).unwrap_or(u64::MAX);
-        vec![
+        let mut settings = vec![
             ("mode", json!(mode)),
             ("listen/endpoints", json!(listen)),
             ("listen/timeout_ms", json!(0)),
@@ -166,6 +233,10 @@ impl BusOptions {
             ("transport/link/tx/queue/size/data", json!(TENSOR_BATCHES)),
             ("transport/link/tx/queue/size/data_low", json!(TENSOR_BATCHES)),
             ("transport/link/rx/max_message_size", json!(self.max_message_bytes)),
+            ("transport/link/protocols", json!([if self.credentials.is_some() { "tls" } else { "tcp" }])),
+            ("transport/unicast/max_sessions", json!(MAX_SESSIONS)),
+            ("transport/unicast/max_links", json!(1)),
+            ("transport/unicast/accept_pending", json!(MAX_STRANGERS)),
             (
                 "transport/link/tx/queue/congestion_control/block/wait_before_close",
                 json!(u64::try_from(self.stall_limit.as_micros()).unwrap_or(u64::MAX)),
@@ -176,16 +247,52 @@ impl BusOptions {
                 "transport/shared_memory/transport_optimization/pool_size",
                 json!(self.shared_memory_pool.unwrap_or(16 << 20)),
             ),
-        ]
+        ];
+        if matches!(self.role, Role::Router { .. }) {
+            settings.push(("low_pass_filter", guard::size_limits()));
+        }
+        settings.extend(self.credentials.iter().flat_map(tls_settings));
+        if let Some(guard) = &self.guard {
+            settings.push(("access_control", guard.rules()));
+            // Where it says what it refused; the guard lets nobody else read there.
+            settings.push(("adminspace", json!({"enabled": true, "permissions": {"read": true, "write": false}})));
+        }
+        settings
     }
+}
+
+fn tls_settings(credentials: &Credentials) -> Vec<(&'static str, Value)> {
+    let path = |file| json!(credentials.path(file));
+    vec![
+        ("transport/link/tls/root_ca_certificate", path(AUTHORITY_FILE)),
+        ("transport/link/tls/enable_mtls", json!(true)),
+        ("transport/link/tls/listen_certificate", path(CERTIFICATE_FILE)),
+        ("transport/link/tls/listen_private_key", path(KEY_FILE)),
+        ("transport/link/tls/connect_certificate", path(CERTIFICATE_FILE)),
+        ("transport/link/tls/connect_private_key", path(KEY_FILE)),
+        ("transport/link/tls/verify_name_on_connect", json!(true)),
+        // A certificate that has run out ends the connections that it opened.
+        ("transport/link/tls/close_link_on_expiration", json!(true)),
+    ]
 }
 
 /// Why the bus could not be opened or used.
 #[derive(Debug, thiserror::Error)]
 pub enum BusError {
     /// Not an endpoint.
-    #[error("{0:?} is not an endpoint: tcp/HOST:PORT, for example tcp/127.0.0.1:7447")]
+    #[error("{0:?} is not an endpoint: tcp/HOST:PORT, for example tcp/127.0.0.1:7447, or tls/HOST:PORT")]
     Endpoint(String),
+    /// Keys that are not there, or not right.
+    #[error("{}: {what}", path.display())]
+    Keys {
+        /// The file or folder.
+        path: PathBuf,
+        /// What is wrong with it.
+        what: String,
+    },
+    /// An endpoint where only those with keys speak.
+    #[error("{0} takes keys: name their folder (--tls DIR; v2vloc keys makes them)")]
+    NoKeys(Endpoint),
     /// zenoh refused or changed a setting.
     #[error("zenoh setting {key}: wanted {wanted}, {found}")]
     Setting {
@@ -204,7 +311,8 @@ pub enum BusError {
     },
     /// Nothing answers at the router's place.
     #[error(
-        "no router at {endpoint} after {waited_s:.1} s; start it first (v2vloc up, or zenohd) or correct the endpoint"
+        "no router at {endpoint} after {waited_s:.1} s; start it first (v2vloc up, or zenohd) or correct the endpoint{}",
+        if endpoint.is_secured() { ". It may also have refused this certificate: its log says so" } else { "" }
     )]
     Unreachable {
         /// Where.
@@ -239,6 +347,12 @@ pub enum BusError {
 }
 
 impl BusError {
+    /// Whether what was asked for is at fault, so that trying again changes nothing.
+    #[must_use]
+    pub fn is_bad_input(&self) -> bool {
+        matches!(self, Self::Endpoint(_) | Self::Keys { .. } | Self::NoKeys(_))
+    }
+
     pub(super) fn zenoh(doing: impl Into<String>, cause: &zenoh::Error) -> Self {
         Self::Zenoh { doing: doing.into(), cause: cause.to_string() }
     }
@@ -252,6 +366,9 @@ impl BusError {
 /// # Errors
 /// [`BusError`] names the endpoint and what to do.
 pub fn open(options: &BusOptions) -> Result<Session, BusError> {
+    if options.credentials.is_none() && options.endpoint().is_secured() {
+        return Err(BusError::NoKeys(options.endpoint().clone()));
+    }
     let config = config(options)?;
     let began = Instant::now();
     zenoh::open(config).wait().map_err(|cause| match &options.role {
@@ -298,6 +415,9 @@ fn same(found: &Value, wanted: &Value) -> bool {
         (Value::Object(found), Value::Object(wanted)) => {
             wanted.iter().all(|(key, value)| found.get(key).is_some_and(|found| same(found, value)))
         }
+        (Value::Array(found), Value::Array(wanted)) => {
+            found.len() == wanted.len() && found.iter().zip(wanted).all(|(found, wanted)| same(found, wanted))
+        }
         _ => found == wanted,
     }
 }
@@ -308,7 +428,7 @@ mod tests {
 
     #[test]
     fn reads_endpoints() {
-        for text in ["tcp/127.0.0.1:7447", "tcp/[::1]:7447", "tcp/router.local:1"] {
+        for text in ["tcp/127.0.0.1:7447", "tcp/[::1]:7447", "tcp/router.local:1", "tls/router.local:1"] {
             assert_eq!(Endpoint::new(text).unwrap().as_str(), text);
         }
         for text in
@@ -326,6 +446,23 @@ mod tests {
         options.shared_memory_pool = Some(64 << 20);
         config(&options).unwrap();
         config(&BusOptions::router(Endpoint::loopback(7447))).unwrap();
+    }
+
+    #[test]
+    fn without_keys_nobody_goes_where_keys_are_asked_for() {
+        let endpoint = Endpoint::loopback(7447).secured();
+        assert_eq!(endpoint.as_str(), "tls/127.0.0.1:7447");
+        assert!(matches!(open(&BusOptions::client(endpoint)), Err(BusError::NoKeys(_))));
+    }
+
+    #[test]
+    fn every_rule_reads_back() {
+        let members = ["agent-1", "ego-1", "link-1", "replay", "scorer", "recorder", "viewer"];
+        let members = members.map(|name| name.parse().unwrap()).into();
+        let guard = Guard { members, runs: protocol::Runs::Any };
+        let options = BusOptions::router(Endpoint::loopback(7447)).guarded_by(guard);
+        config(&options).unwrap();
+        assert_eq!(options.for_zenohd()["transport"]["link"]["protocols"], json!(["tcp"]));
     }
 
     #[test]

@@ -1,0 +1,60 @@
+//! `v2vloc keys`.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use deploy::keys::{KeyError, KeyPlan, make};
+use protocol::{CavId, Party, Role};
+
+use super::{BadInput, Outcome};
+
+#[derive(Debug, clap::Args)]
+pub(crate) struct Arguments {
+    /// Folder of the keys: one folder for each process, and the authority's key, which belongs on no vehicle.
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// Vehicles: each gets a certificate for its agent.
+    #[arg(long, value_name = "CAV,..", value_delimiter = ',')]
+    agents: Vec<CavId>,
+    /// Vehicles that fuse: each gets certificates for its ego-fuser and for the link in front of it.
+    #[arg(long, value_name = "CAV,..", value_delimiter = ',')]
+    egos: Vec<CavId>,
+    /// Names or addresses under which the router is reached, beside localhost.
+    #[arg(long, value_name = "HOST,..", value_delimiter = ',')]
+    hosts: Vec<String>,
+    /// Days that the certificates hold.
+    #[arg(long, default_value_t = 30, value_parser = clap::value_parser!(u32).range(1..=3650))]
+    days: u32,
+    /// Replace certificates that are there; the authority stays.
+    #[arg(long)]
+    force: bool,
+    /// Print the files as JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+impl Arguments {
+    /// Writes the keys and names the files.
+    pub(crate) fn run(self) -> anyhow::Result<Outcome> {
+        let mut parties: Vec<Party> = self.agents.iter().map(|cav| Party::new(Role::Agent, cav)).collect();
+        parties.extend(self.egos.iter().flat_map(|cav| [Role::Ego, Role::Link].map(|role| Party::new(role, cav))));
+        // Later vehicles join a fleet whose other processes have theirs.
+        let others = [Role::Replay, Role::Scorer, Role::Recorder, Role::Viewer].map(Party::alone);
+        let has_own = |party: &Party| self.out.join(party.to_string()).exists();
+        parties.extend(others.into_iter().filter(|party| self.force || !has_own(party)));
+        let mut plan = KeyPlan::new(&self.out, parties, self.days);
+        plan.hosts.extend(self.hosts);
+        plan.lifetime = Duration::from_secs(u64::from(self.days) * 24 * 3600);
+        plan.replace = self.force;
+        let written = make(&plan).map_err(|error| match error {
+            KeyError::There(_) | KeyError::Unusable { .. } => anyhow::Error::from(BadInput(error.to_string())),
+            KeyError::Io { .. } => anyhow::Error::from(error),
+        })?;
+        if self.json {
+            println!("{}", serde_json::to_string_pretty(&written)?);
+        } else {
+            written.iter().for_each(|path| println!("{}", path.display()));
+        }
+        Ok(Outcome::Done)
+    }
+}

@@ -1,0 +1,104 @@
+//! `v2vloc router`.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+
+use anyhow::Context;
+use protocol::{RunId, Runs};
+use sim_replay::bus::shutdown::Stop;
+use sim_replay::bus::{BusOptions, Credentials, Endpoint, Guard, ROUTER, Refusals, STOP_LIMIT, open};
+use zenoh::Wait;
+
+use super::Outcome;
+
+/// How often the router says what it has refused.
+const LOOK_ROUND: Duration = Duration::from_secs(5);
+
+#[derive(Debug, clap::Args)]
+pub(crate) struct Arguments {
+    /// Where to listen, tcp/HOST:PORT; with --tls the same place speaks TLS.
+    #[arg(long, default_value = "tcp/127.0.0.1:7447")]
+    listen: Endpoint,
+    /// Folder with the router's keys (`v2vloc keys` writes DIR/router): every process has to show a certificate, and may
+    /// do only what is its to do.
+    #[arg(long, value_name = "DIR")]
+    tls: Option<PathBuf>,
+    /// The only run that is let through [default: any].
+    #[arg(long)]
+    run: Option<RunId>,
+    /// Seconds that handing one message to one receiver may take before its connection is closed.
+    #[arg(long, default_value_t = 5.0, value_parser = seconds)]
+    stall_limit: f64,
+    /// Largest message, MiB.
+    #[arg(long, default_value_t = 32)]
+    max_message_mib: usize,
+    /// Write the same as a configuration for `zenohd -c FILE`, and do not run.
+    #[arg(long, value_name = "FILE")]
+    zenohd: Option<PathBuf>,
+    /// End when standard input ends: for a supervisor that holds the other end of the pipe.
+    #[arg(long)]
+    supervised: bool,
+}
+
+fn seconds(text: &str) -> Result<f64, String> {
+    let seconds: f64 = text.parse().map_err(|_| "not a number".to_owned())?;
+    if (0.1..=3600.0).contains(&seconds) { Ok(seconds) } else { Err("0.1 to 3600 s".to_owned()) }
+}
+
+impl Arguments {
+    /// Routes until Ctrl-C.
+    pub(crate) fn run(self) -> anyhow::Result<Outcome> {
+        let options = self.options()?;
+        if let Some(path) = &self.zenohd {
+            let text = serde_json::to_string_pretty(&options.for_zenohd())? + "\n";
+            std::fs::write(path, text).with_context(|| path.display().to_string())?;
+            eprintln!("{}", path.display());
+            return Ok(Outcome::Done);
+        }
+        let stop = Stop::new();
+        stop.on_signals()?;
+        if self.supervised {
+            stop.on_end_of_input()?;
+        }
+        stop.enforce(STOP_LIMIT);
+        let session = open(&options)?;
+        eprintln!("routing at {} (Ctrl-C ends it)", options.endpoint());
+        let (mut refusals, mut said) = (Refusals::default(), BTreeMap::new());
+        loop {
+            let ended = stop.wait_until(Instant::now() + LOOK_ROUND);
+            if options.guard.is_some() {
+                refusals.update(&session);
+                for (refusal, count) in refusals.counts() {
+                    let before = said.insert(refusal.clone(), count).unwrap_or(0);
+                    if count > before {
+                        tracing::warn!(
+                            peer = refusal.peer,
+                            reason = refusal.reason,
+                            what = refusal.message,
+                            count,
+                            "refused"
+                        );
+                    }
+                }
+            }
+            if ended {
+                break;
+            }
+        }
+        session.close().wait().map_err(anyhow::Error::from_boxed)?;
+        Ok(Outcome::Done)
+    }
+
+    fn options(&self) -> anyhow::Result<BusOptions> {
+        let mut options = BusOptions::router(self.listen.clone());
+        options.stall_limit = Duration::from_secs_f64(self.stall_limit);
+        options.max_message_bytes = self.max_message_mib.max(1) << 20;
+        let Some(folder) = &self.tls else { return Ok(options) };
+        let credentials = Credentials::read(folder)?;
+        credentials.check_name(ROUTER)?;
+        let runs = self.run.clone().map_or(Runs::Any, Runs::One);
+        let guard = Guard { members: credentials.members()?, runs };
+        Ok(options.with_credentials(credentials).guarded_by(guard))
+    }
+}

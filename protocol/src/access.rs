@@ -1,0 +1,267 @@
+//! Who may do what: the one list from which every rule of a router is made.
+//!
+//! | party | publishes | hears |
+//! | --- | --- | --- |
+//! | `agent-<cav>` | its pose, maps, boxes, points, descriptor | its own sensors |
+//! | `ego-<cav>` | its detections | what all agents publish, directly or behind its link |
+//! | `link-<ego>` | `rx/<ego>/...` | what all agents publish, and where they are |
+//! | `replay` | every vehicle's sensors, the truth, the end of the scene | control, detections |
+//! | `scorer` | control | the truth, detections, poses, statistics |
+//! | `recorder` | nothing | everything |
+//! | `viewer` | nothing | results, sensors, statistics |
+//!
+//! Beside that everyone says that it is there, that it is ready and how its books stand, each under its own name.
+
+use std::fmt;
+use std::str::FromStr;
+
+use serde::{Deserialize, Serialize};
+
+use crate::names::written_as_text;
+use crate::{CavId, IdError, Limits, ProcessId, Role, RunId, Selector, Stream, Topic, Verb};
+
+/// A process as its certificate names it: `agent-4279`, `replay`.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
+#[serde(try_from = "String", into = "String")]
+pub struct Party {
+    /// What it does.
+    pub role: Role,
+    /// For which vehicle; a process without one has the name of its role.
+    pub cav: CavId,
+}
+
+/// A text that names no party.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum PartyError {
+    /// It begins with no role.
+    #[error("{0:?} is no party: agent-<cav>, ego-<cav>, link-<cav>, replay, scorer, recorder or viewer")]
+    Role(String),
+    /// It does not go on with a vehicle.
+    #[error(transparent)]
+    Cav(#[from] IdError),
+}
+
+impl Party {
+    /// A process of a vehicle.
+    #[must_use]
+    pub fn new(role: Role, cav: &CavId) -> Self {
+        Self { role, cav: cav.clone() }
+    }
+
+    /// A process that belongs to no vehicle.
+    ///
+    /// # Panics
+    /// Never: the names of roles are identifiers.
+    #[must_use]
+    pub fn alone(role: Role) -> Self {
+        Self { role, cav: CavId::new(role.as_str()).expect("the name of a role is an identifier") }
+    }
+
+    /// Its name in ledgers, routes and certificates.
+    ///
+    /// # Panics
+    /// Never: both parts are identifiers, and short enough.
+    #[must_use]
+    pub fn name(&self) -> ProcessId {
+        ProcessId::new(&self.to_string()).expect("two identifiers and a hyphen make one")
+    }
+
+    /// All it may do in `runs`.
+    #[must_use]
+    pub fn rights(&self, runs: &Runs) -> Vec<Right> {
+        let keys = |topic: &dyn fmt::Display| Selector::within(runs, topic);
+        let own = |stream| keys(&Topic::Stream { cav: self.cav.clone(), stream });
+        let everyones = |stream: &dyn fmt::Display| keys(&format_args!("*/{stream}"));
+        let over_link = |stream: &dyn fmt::Display| keys(&format_args!("rx/{}/*/{stream}", self.cav));
+        let control = |verb| keys(&Topic::Control(verb));
+        let (publish, hear) = match self.role {
+            Role::Agent => {
+                let sensors = SENSORS.into_iter().map(own).chain([keys(&format_args!("{}/camera/*", self.cav))]);
+                (SHARED.map(own).into(), sensors.collect())
+            }
+            Role::Ego => {
+                let shared = SHARED.iter().flat_map(|stream| [everyones(stream), over_link(stream)]);
+                (DETECTIONS.map(own).into(), shared.collect())
+            }
+            Role::Link => {
+                let shared = SHARED.iter().chain([&Stream::Gnss]).map(|stream| everyones(stream));
+                (SHARED.iter().map(|stream| over_link(stream)).collect(), shared.collect())
+            }
+            Role::Replay => {
+                let sensors = SENSORS.iter().map(|stream| everyones(stream));
+                let own = [keys(&"*/camera/*"), keys(&Topic::Truth), control(Verb::End)];
+                (sensors.chain(own).collect(), vec![keys(&"control/*"), everyones(&Stream::Detections)])
+            }
+            Role::Scorer => {
+                let heard = [everyones(&Stream::Detections), everyones(&Stream::Pose)];
+                let own = [keys(&Topic::Truth), keys(&"stats/*"), keys(&"control/*")];
+                (vec![keys(&"control/*")], own.into_iter().chain(heard).collect())
+            }
+            Role::Recorder => (Vec::new(), vec![keys(&"**")]),
+            Role::Viewer => {
+                let results = [Stream::Pose, Stream::Boxes, Stream::Detections];
+                let shown = results.iter().chain(&SENSORS).map(|stream| everyones(stream));
+                let rest = ["rx/*/*/pose", "truth", "stats/*", "control/*"].map(|topic| keys(&topic));
+                (Vec::new(), shown.chain(rest).collect::<Vec<_>>())
+            }
+        };
+        let right = |act| move |keys: Selector| Right { act, keys };
+        let mut rights: Vec<Right> = publish.into_iter().map(right(Act::Publish)).collect();
+        rights.push(right(Act::Publish)(control(Verb::Ready)));
+        rights.push(right(Act::Publish)(keys(&Topic::Stats(self.name()))));
+        rights.extend(hear.into_iter().map(right(Act::Hear)));
+        rights.push(right(Act::Announce)(keys(&Topic::Alive { role: self.role, cav: self.cav.clone() })));
+        rights.extend(self.watched().map(|topic| right(Act::Watch)(keys(&topic))));
+        rights.push(right(Act::Ask)(keys(&crate::key::NOBODY)));
+        rights
+    }
+
+    /// Whose coming and going it follows.
+    fn watched(&self) -> Option<&'static str> {
+        match self.role {
+            Role::Ego | Role::Link => Some("alive/agent/*"),
+            Role::Scorer | Role::Viewer | Role::Recorder => Some("alive/*/*"),
+            Role::Agent | Role::Replay => None,
+        }
+    }
+}
+
+/// Keys of which no message has more than so many bytes, in whatever run.
+#[must_use]
+pub fn size_limits() -> Vec<(Vec<Selector>, usize)> {
+    let small = [Stream::Pose, Stream::Gnss, Stream::Descriptor, Stream::Boxes, Stream::Detections];
+    let keys = |stream| [format!("*/{stream}"), format!("rx/*/*/{stream}")];
+    let selectors = |topics: Vec<String>| topics.iter().map(|topics| Selector::within(&Runs::Any, topics)).collect();
+    let limit = |stream: Stream| Some((selectors(keys(stream).into()), stream.most_bytes()?));
+    let talk = vec!["control/*".to_owned(), "stats/*".to_owned()];
+    let talk = (selectors(talk), 2 * Limits::HARD_METADATA_BYTES as usize);
+    small.into_iter().filter_map(limit).chain([talk]).collect()
+}
+
+/// What the replay publishes for vehicles, cameras apart.
+const SENSORS: [Stream; 3] = [Stream::Lidar, Stream::Gnss, Stream::Radar];
+/// What agents tell each other.
+const SHARED: [Stream; 5] = [Stream::Pose, Stream::Bev, Stream::Boxes, Stream::Points, Stream::Descriptor];
+/// What an ego tells everyone.
+const DETECTIONS: [Stream; 2] = [Stream::Detections, Stream::DetectionsJson];
+
+impl fmt::Display for Party {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        if self.cav.as_str() == self.role.as_str() {
+            return f.write_str(self.role.as_str());
+        }
+        write!(f, "{}-{}", self.role, self.cav)
+    }
+}
+
+impl FromStr for Party {
+    type Err = PartyError;
+
+    fn from_str(text: &str) -> Result<Self, PartyError> {
+        let (role, cav) = text.split_once('-').map_or((text, None), |(role, cav)| (role, Some(cav)));
+        let unknown = || PartyError::Role(text.chars().take(2 * ProcessId::MAX_LEN).collect());
+        let role = Role::ALL.into_iter().find(|known| known.as_str() == role).ok_or_else(unknown)?;
+        match cav {
+            Some(cav) => Ok(Self { role, cav: CavId::new(cav)? }),
+            None => Ok(Self::alone(role)),
+        }
+    }
+}
+
+written_as_text!(Party);
+
+/// In which runs rights hold.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Runs {
+    /// This one.
+    One(RunId),
+    /// Whatever they are called: for a router that outlives runs.
+    Any,
+}
+
+impl fmt::Display for Runs {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::One(run) => run.fmt(f),
+            Self::Any => f.write_str("*"),
+        }
+    }
+}
+
+/// What a party may do with keys.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub enum Act {
+    /// Put messages.
+    Publish,
+    /// Subscribe, and be sent what is put.
+    Hear,
+    /// Show itself by a liveliness token.
+    Announce,
+    /// See the tokens of others.
+    Watch,
+    /// Ask a question, which nobody may answer.
+    Ask,
+}
+
+impl Act {
+    /// Every act, in order.
+    pub const ALL: [Self; 5] = [Self::Publish, Self::Hear, Self::Announce, Self::Watch, Self::Ask];
+}
+
+/// One thing that a party may do.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Right {
+    /// What.
+    pub act: Act,
+    /// With which keys.
+    pub keys: Selector,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn rights(party: &str, act: Act) -> Vec<String> {
+        let runs = Runs::One(RunId::new("r1").unwrap());
+        let rights = party.parse::<Party>().unwrap().rights(&runs);
+        rights.iter().filter(|right| right.act == act).map(|right| right.keys.to_string()).collect()
+    }
+
+    #[test]
+    fn parties_are_written_and_read_back() {
+        for text in ["agent-4279", "agent--1", "ego-4279", "link-4279", "replay", "scorer", "recorder", "viewer"] {
+            let party: Party = text.parse().unwrap();
+            assert_eq!((party.to_string().as_str(), party.name().as_str()), (text, text));
+        }
+        for text in ["", "router", "agent-*", "agent-truth", "agent-4279/bev", "driver-1"] {
+            assert!(text.parse::<Party>().is_err(), "{text}");
+        }
+    }
+
+    #[test]
+    fn a_vehicle_publishes_under_its_own_name_alone() {
+        for party in ["agent-4279", "ego-4279"] {
+            for keys in rights(party, Act::Publish) {
+                let own = keys.starts_with("v2v/r1/4279/") || keys == format!("v2v/r1/stats/{party}");
+                assert!(own || keys == "v2v/r1/control/ready", "{party}: {keys}");
+                assert!(!keys.contains('*'), "{party}: {keys}");
+            }
+        }
+        assert!(rights("link-4279", Act::Publish).contains(&"v2v/r1/rx/4279/*/bev".to_owned()));
+        assert_eq!(rights("agent-4279", Act::Announce), ["v2v/r1/alive/agent/4279"]);
+    }
+
+    #[test]
+    fn agents_never_hear_the_truth_or_each_other() {
+        assert!(rights("agent-4279", Act::Hear).iter().all(|keys| keys.starts_with("v2v/r1/4279/")));
+        for party in ["agent-4279", "ego-4279", "link-4279"] {
+            assert!(!rights(party, Act::Hear).contains(&"v2v/r1/truth".to_owned()), "{party}");
+        }
+    }
+
+    #[test]
+    fn rights_hold_in_one_run_or_in_any() {
+        let agent: Party = "agent-1".parse().unwrap();
+        assert!(agent.rights(&Runs::Any).iter().all(|right| right.keys.as_str().starts_with("v2v/*/")));
+    }
+}

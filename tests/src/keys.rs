@@ -1,0 +1,99 @@
+//! Routers that ask for keys, and sessions with and without them.
+
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use deploy::keys::{KeyPlan, make};
+use protocol::{CavId, Party, RunId, Runs};
+use sim_replay::bus::{self, Bus, BusError, BusOptions, Credentials, Endpoint, Guard, Identity, Refusal, Refusals};
+use zenoh::Session;
+
+use crate::bus::free_port;
+
+/// Keys of an authority of its own, for these processes of a fleet.
+///
+/// # Panics
+/// When the disk refuses.
+#[must_use]
+pub fn keys_for(folder: &Path, parties: &[&str]) -> PathBuf {
+    let parties = parties.iter().map(|name| name.parse::<Party>().expect("a party")).collect();
+    make(&KeyPlan::new(folder, parties, 1)).expect("a writable folder");
+    folder.to_path_buf()
+}
+
+/// A router that lets in those with keys of `folder`, each for what is its to do in the run `test`.
+pub struct GuardedRouter {
+    /// Where it listens.
+    pub endpoint: Endpoint,
+    /// Its session.
+    pub session: Session,
+    keys: PathBuf,
+}
+
+impl GuardedRouter {
+    /// Opens one on a free port.
+    ///
+    /// # Panics
+    /// When there is none.
+    #[must_use]
+    pub fn open(keys: &Path) -> Self {
+        let credentials = Credentials::read(&keys.join("router")).expect("keys of a router");
+        let runs = Runs::One(RunId::new("test").expect("an identifier"));
+        let guard = Guard { members: credentials.members().expect("a list"), runs };
+        // Another process may take the port between the two calls.
+        let opened = (0..20).find_map(|_| {
+            let options = BusOptions::router(Endpoint::loopback(free_port()));
+            let options = options.with_credentials(credentials.clone()).guarded_by(guard.clone());
+            bus::open(&options).ok().map(|session| (options.endpoint().clone(), session))
+        });
+        let (endpoint, session) = opened.expect("a free port on loopback");
+        Self { endpoint, session, keys: keys.to_path_buf() }
+    }
+
+    /// How a client with the keys of `holder` connects.
+    ///
+    /// # Panics
+    /// When it has none.
+    #[must_use]
+    pub fn options(&self, holder: &str) -> BusOptions {
+        let credentials = Credentials::read(&self.keys.join(holder)).expect("keys");
+        let mut options = BusOptions::client(self.endpoint.clone()).with_credentials(credentials);
+        options.patience = Duration::from_secs(20);
+        options
+    }
+
+    /// A process of the run `test` with the keys of `holder` that says it is `process`, of vehicle `cav`.
+    ///
+    /// # Errors
+    /// [`BusError`] when the router does not take it.
+    ///
+    /// # Panics
+    /// When there are no such keys.
+    pub fn join_as(&self, holder: &str, process: &str, cav: &str) -> Result<Bus, BusError> {
+        let identity = Identity {
+            run: RunId::new("test").expect("an identifier"),
+            process: process.parse().expect("an identifier"),
+            cav: CavId::new(cav).expect("an identifier"),
+        };
+        Bus::join(&self.options(holder), identity)
+    }
+
+    /// An honest process.
+    ///
+    /// # Panics
+    /// When the router does not take it.
+    #[must_use]
+    pub fn join(&self, party: &str) -> Bus {
+        let known: Party = party.parse().expect("a party");
+        self.join_as(party, party, known.cav.as_str()).expect("the router takes those with keys")
+    }
+
+    /// How many messages of one kind it has refused to a peer so far.
+    #[must_use]
+    pub fn refused(&self, peer: &str, message: &str) -> u64 {
+        let mut refusals = Refusals::default();
+        refusals.update(&self.session);
+        let is_it = |refusal: &Refusal| refusal.peer == peer && refusal.message == message;
+        refusals.counts().iter().filter(|(refusal, _)| is_it(refusal)).map(|(_, count)| count).sum()
+    }
+}
