@@ -38,6 +38,8 @@ named! {
         Future = "future",
         /// From a vehicle whose words do not fit what the ego sees itself.
         Distrusted = "distrusted",
+        /// More than its sender may send in that time.
+        RateLimit = "rate_limit",
     }
 }
 

@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use deploy::keys::{KeyPlan, make};
-use protocol::{Gnss, GnssSource, Lidar, Limits, PointCloud, Pose, PoseEstimate, Stamp, Topic, wire};
+use protocol::{Gnss, GnssSource, Limits, Pose, PoseEstimate, Stamp, Topic, wire};
 use sim_replay::bus::{
     self, Barrier, Bus, BusError, BusOptions, Credentials, Event, Inbox, PublisherOptions, Route, unix_nanos,
 };
@@ -307,6 +307,7 @@ fn what_is_too_large_goes_nowhere_and_disturbs_nobody() {
     }
     reaches(&honest, "2/pose", &inbox);
     reaches(&agent, "1/pose", &inbox);
+    assert_eq!(router.refused("agent-1", "put"), 1, "the pose; of the map nothing was ever whole");
     let arrived = |text| {
         ego.books()
             .ledger()
@@ -314,5 +315,4 @@ fn what_is_too_large_goes_nowhere_and_disturbs_nobody() {
             .map_or(0, |counts| counts.dropped_total())
     };
     assert_eq!((arrived("1/bev"), arrived("1/pose")), (0, 0), "not even the ego's own limits had to see it");
-    let _ = Lidar { points: PointCloud { xyzi: Vec::new() } };
 }

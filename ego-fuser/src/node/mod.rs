@@ -14,7 +14,7 @@ use std::time::{Duration, Instant};
 use protocol::{CavId, DropReason, Limits, Role, Stream, Topic};
 use sim_replay::bus::mailbox::Taken;
 use sim_replay::bus::shutdown::Stop;
-use sim_replay::bus::{Bus, BusError, Event, Inbox, Publisher, PublisherOptions, Subscription};
+use sim_replay::bus::{Bus, BusError, Event, Inbox, InboxLimits, Publisher, PublisherOptions, Subscription};
 
 use crate::ego::{Ego, View, own_content};
 use crate::method::{Exchange, Method};
@@ -46,6 +46,8 @@ pub struct NodeOptions {
     pub keeps_running: bool,
     /// What it takes from the bus.
     pub limits: Limits,
+    /// How much of that, from each sender and altogether.
+    pub inbox: InboxLimits,
 }
 
 impl Default for NodeOptions {
@@ -58,6 +60,7 @@ impl Default for NodeOptions {
             over_link: false,
             keeps_running: false,
             limits: Limits::DEFAULT,
+            inbox: InboxLimits::PEERS,
         }
     }
 }
@@ -131,7 +134,7 @@ struct Node<'a> {
 impl<'a> Node<'a> {
     fn open(bus: &'a Bus, cav: &CavId, ego: Ego, options: &'a NodeOptions, stop: &Stop) -> Result<Self, BusError> {
         let stream = stream_of(own_content(ego.method()));
-        let inbox = bus.inbox(PLACES, MAX_TOPICS);
+        let inbox = bus.limited_inbox(PLACES, MAX_TOPICS, options.inbox);
         stop.on_request({
             let inbox = Arc::clone(&inbox);
             move || inbox.close()

@@ -1,13 +1,18 @@
 //! The ledger of one process, shared by its threads, and how long its stages take.
 
 use std::collections::{BTreeMap, VecDeque};
+use std::fmt;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use protocol::{Account, CavId, DropReason, Ledger, ProcessId, RateReason, StageSummary, Topic, WireError};
+use protocol::{
+    Account, CavId, DropReason, Ledger, Limits, ProcessId, RateReason, StageSummary, Topic, WireError,
+};
 
 use super::clock_offset::ClockOffset;
 
+/// Accounts of one process, as many as whoever receives a ledger takes.
+const MAX_ACCOUNTS: usize = Limits::DEFAULT.max_entries;
 /// Vehicles whose clock and standing are remembered at most.
 const MAX_PEERS: usize = 128;
 /// Timings kept per stage: at 10 Hz the last three minutes.
@@ -30,6 +35,7 @@ struct State {
     refused: BTreeMap<Topic, u64>,
     stages: BTreeMap<String, Timings>,
     peers: BTreeMap<CavId, Peer>,
+    is_full: bool,
 }
 
 #[derive(Default)]
@@ -131,16 +137,25 @@ impl Books {
     /// A message that arrived is unsound: counted always, logged ever more rarely, as a hostile peer must not fill the
     /// log.
     pub fn rejected(&self, topic: &Topic, error: &WireError) {
-        let reason = error.drop_reason();
+        self.refused(topic, error.drop_reason(), error);
+    }
+
+    /// A message that arrived is more than its topic may bring; counted and logged like an unsound one.
+    pub(super) fn limited(&self, topic: &Topic, why: &'static str) {
+        self.refused(topic, DropReason::RateLimit, &why);
+    }
+
+    fn refused(&self, topic: &Topic, reason: DropReason, why: &dyn fmt::Display) {
         self.dropped(topic, reason);
         let times = {
             let mut state = self.lock();
-            let times = state.refused.entry(topic.clone()).or_default();
+            let has_room = state.refused.len() < MAX_ACCOUNTS || state.refused.contains_key(topic);
+            let times = state.refused.entry(if has_room { topic.clone() } else { Topic::Truth }).or_default();
             *times += 1;
             *times
         };
         if times.is_power_of_two() {
-            tracing::warn!(%topic, %reason, times, "message refused: {error}");
+            tracing::warn!(%topic, %reason, times, "message refused: {why}");
         }
     }
 
@@ -232,8 +247,18 @@ impl Books {
 
     fn note(&self, topic: &Topic, change: impl FnOnce(&mut State)) {
         if topic.is_booked() {
-            change(&mut self.lock());
+            let mut state = self.lock();
+            // Invented ids must not fill the memory, nor make a ledger that nobody takes.
+            if state.ledger.len() < MAX_ACCOUNTS || self.knows(&state, topic) {
+                change(&mut state);
+            } else if !std::mem::replace(&mut state.is_full, true) {
+                tracing::error!(%topic, "the ledger has {MAX_ACCOUNTS} accounts: what comes on further topics is not counted");
+            }
         }
+    }
+
+    fn knows(&self, state: &State, topic: &Topic) -> bool {
+        [self.here(topic), Account::published(topic.clone())].iter().any(|account| state.ledger.get(account).is_some())
     }
 
     fn here(&self, topic: &Topic) -> Account {
@@ -320,6 +345,23 @@ mod tests {
         agent.handed_over(&topic);
         agent.rejected(&topic, &WireError::Kind { expected: protocol::Kind::Descriptor, found: protocol::Kind::Bev });
         assert!(agent.ledger().is_empty());
+    }
+
+    #[test]
+    fn invented_ids_do_not_fill_the_books() {
+        let books = books("ego-1");
+        let topic = |id: usize| format!("{id}/bev").parse::<Topic>().unwrap();
+        for id in 0..3 * MAX_ACCOUNTS {
+            books.subscribed(&topic(id));
+            books.arrived(&topic(id));
+            books.limited(&topic(id), "too much");
+        }
+        assert_eq!(books.ledger().len(), MAX_ACCOUNTS);
+        books.received(&topic(0));
+        let account = Account::towards(topic(0), books.process());
+        assert_eq!(books.ledger().get(&account).unwrap().received, 1, "those that are there go on");
+        let state = books.lock();
+        assert!(state.refused.len() <= MAX_ACCOUNTS + 1 && state.passed.len() <= MAX_ACCOUNTS);
     }
 
     #[test]

@@ -10,6 +10,7 @@ use protocol::{CavId, Control, Key, ProcessId, Role, RunId, Selector, Topic};
 use zenoh::qos::Priority;
 use zenoh::{Session, Wait};
 
+use super::inbox_limits::InboxLimits;
 use super::liveliness::{Presence, Sighting, Watch};
 use super::metrics::MetricsServer;
 use super::notices::{Notices, Speaker};
@@ -113,6 +114,12 @@ impl Bus {
     #[must_use]
     pub fn inbox(&self, places: usize, max_topics: usize) -> Arc<Inbox> {
         Inbox::new(places, max_topics, &self.books)
+    }
+
+    /// An inbox that takes no more than `limits` from anyone.
+    #[must_use]
+    pub fn limited_inbox(&self, places: usize, max_topics: usize, limits: InboxLimits) -> Arc<Inbox> {
+        Inbox::within(limits, places, max_topics, &self.books)
     }
 
     /// Delivers `topic` into `inbox`.

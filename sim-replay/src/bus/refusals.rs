@@ -57,11 +57,14 @@ impl Refusals {
     }
 }
 
+/// What zenoh calls its count of messages that came over a connection and went no further.
+const DROPPED: &str = "zenoh_rx_network_message_dropped_payload_per_transport_bytes_count";
+
 /// Reads a line of zenoh's such as
-/// `zenoh_rx_network_message_dropped_payload_bytes_count{..,remote_cn="agent-1",message="put",reason="access-control"} 3`.
+/// `zenoh_rx_network_message_dropped_payload_per_transport_bytes_count{message="put",reason="access-control",remote_cn="agent-1"} 3`.
 fn refused(line: &str) -> Option<((Refusal, String), u64)> {
     let (name, rest) = line.split_once('{')?;
-    if name != "zenoh_rx_network_message_dropped_payload_bytes_count" {
+    if name != DROPPED {
         return None;
     }
     let (labels, count) = rest.rsplit_once('}')?;
@@ -74,4 +77,27 @@ fn refused(line: &str) -> Option<((Refusal, String), u64)> {
     let peer = label("remote_cn").filter(|name| !name.is_empty()).unwrap_or_else(|| connection.clone());
     let refusal = Refusal { peer, reason, message: label("message")? };
     Some(((refusal, connection), count.trim().parse().ok()?))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lines_of_zenoh_are_read() {
+        let line = |name: &str, reason: &str, cn: &str| {
+            format!(
+                "{name}{{local_id=\"5b\",priority=\"data\",message=\"put\",protocol=\"\",reason=\"{reason}\",\
+                 remote_zid=\"fb\",remote_whatami=\"client\",remote_group=\"\",remote_cn=\"{cn}\",\
+                 disconnected=\"false\"}} 28"
+            )
+        };
+        let ((refusal, connection), count) = refused(&line(DROPPED, "access-control", "agent-1")).unwrap();
+        assert_eq!((refusal.peer.as_str(), refusal.message.as_str(), connection.as_str()), ("agent-1", "put", "fb"));
+        assert_eq!(count, 28);
+        assert_eq!(refused(&line(DROPPED, "low-pass", "")).unwrap().0.0.peer, "fb", "without a certificate");
+        assert_eq!(refused(&line(DROPPED, "congestion", "agent-1")), None);
+        assert_eq!(refused(&line("zenoh_rx_bytes_total", "access-control", "agent-1")), None);
+        assert_eq!(refused("# EOF"), None);
+    }
 }

@@ -1,5 +1,6 @@
 //! Taking messages off the network's hands at once, and handing them to the thread that works on them.
 
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
 
@@ -9,6 +10,7 @@ use zenoh::bytes::ZBytes;
 use zenoh::sample::Sample;
 
 use super::freshness::{Freshness, Verdict};
+use super::inbox_limits::{InboxLimits, Meters};
 use super::mailbox::{Mailbox, Pushed, Taken};
 use super::notices::Notices;
 use super::publisher::unix_nanos;
@@ -35,6 +37,16 @@ pub enum Event {
         /// Messages it sent.
         sent: u64,
     },
+}
+
+impl Event {
+    /// Bytes that it holds on to.
+    fn bytes(&self) -> usize {
+        match self {
+            Self::Message(arrival) => arrival.payload.len(),
+            Self::End { .. } => 0,
+        }
+    }
 }
 
 /// A message whose header is sound; whether the rest is, decoding tells.
@@ -74,19 +86,41 @@ pub struct Inbox {
     mailbox: Mailbox<Lane, Event>,
     freshness: Mutex<Freshness>,
     books: Books,
+    meters: Meters,
+    max_waiting: usize,
+    waiting_bytes: AtomicUsize,
 }
 
 impl Inbox {
     pub(super) fn new(places: usize, max_topics: usize, books: &Books) -> Arc<Self> {
-        // Two lanes a topic: data and notices.
-        let mailbox = Mailbox::new(places, max_topics.saturating_mul(2));
-        Arc::new(Self { mailbox, freshness: Mutex::default(), books: books.clone() })
+        Self::within(InboxLimits::NONE, places, max_topics, books)
+    }
+
+    pub(super) fn within(limits: InboxLimits, places: usize, max_topics: usize, books: &Books) -> Arc<Self> {
+        Arc::new(Self {
+            // Two lanes a topic: data and notices.
+            mailbox: Mailbox::new(places, max_topics.saturating_mul(2)),
+            freshness: Mutex::default(),
+            books: books.clone(),
+            meters: Meters::new(limits),
+            max_waiting: limits.waiting_bytes,
+            waiting_bytes: AtomicUsize::new(0),
+        })
+    }
+
+    /// Bytes of the messages that wait.
+    #[must_use]
+    pub fn waiting_bytes(&self) -> usize {
+        self.waiting_bytes.load(Ordering::Relaxed)
     }
 
     /// The oldest event, waiting until `deadline` for one.
     pub fn take(&self, deadline: Option<Instant>) -> Taken<Topic, Event> {
         match self.mailbox.take(deadline) {
-            Taken::Item(lane, event) => Taken::Item(lane.topic, event),
+            Taken::Item(lane, event) => {
+                self.waiting_bytes.fetch_sub(event.bytes(), Ordering::Relaxed);
+                Taken::Item(lane.topic, event)
+            }
             Taken::TimedOut => Taken::TimedOut,
             Taken::Closed => Taken::Closed,
         }
@@ -104,6 +138,12 @@ impl Inbox {
 
     fn deliver(&self, topic: &Topic, event: Event, places: Option<usize>) {
         let lane = Lane { topic: topic.clone(), is_notice: matches!(event, Event::End { .. }) };
+        // A bound on what all topics hold together; a message that finds it reached is lost, and so is room for it.
+        let bytes = event.bytes();
+        if self.waiting_bytes.fetch_add(bytes, Ordering::Relaxed).saturating_add(bytes) > self.max_waiting {
+            self.waiting_bytes.fetch_sub(bytes, Ordering::Relaxed);
+            return self.books.limited(topic, "too much waits here already");
+        }
         let pushed = match places {
             Some(places) => self.mailbox.push_within(places, lane, event),
             None => self.mailbox.push(lane, event),
@@ -112,6 +152,7 @@ impl Inbox {
             Pushed::Queued => return,
             Pushed::Displaced(event) | Pushed::NoLane(event) | Pushed::Closed(event) => event,
         };
+        self.waiting_bytes.fetch_sub(lost.bytes(), Ordering::Relaxed);
         if let Event::Message(arrival) = lost {
             self.books.dropped(&arrival.topic, DropReason::Superseded);
         }
@@ -182,6 +223,11 @@ impl Door {
     }
 
     fn admit(&self, topic: Topic, sample: &Sample) {
+        // Before anything of it is looked at: a flood must cost next to nothing.
+        if !self.inbox.meters.admit(&topic, sample.payload().len(), Instant::now()) {
+            self.inbox.books.arrived(&topic);
+            return self.inbox.books.limited(&topic, "more than its sender may send in that time");
+        }
         let header = match wire::decode_header(sample.payload().slices()).and_then(|header| check(&topic, header)) {
             Ok(header) => header,
             Err(error) => return self.refuse(&topic, &error),

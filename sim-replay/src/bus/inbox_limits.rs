@@ -1,0 +1,119 @@
+//! How much a peer may bring: so many messages and bytes a second on each topic, so many bytes that wait altogether.
+//!
+//! A topic names its sender, and the router sees to it that nobody else puts there, so a limit by topic is one by peer.
+
+use std::collections::BTreeMap;
+use std::sync::{Mutex, PoisonError};
+use std::time::Instant;
+
+use protocol::Topic;
+
+/// Topics that are metered apart; those of more peers share one meter.
+const MAX_METERS: usize = 1024;
+/// Seconds of its rate that a peer that was silent may bring at once: what a network held back comes together.
+const BURST_S: f64 = 2.0;
+
+/// What an inbox takes.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct InboxLimits {
+    /// Messages of one topic, a second.
+    pub messages_per_s: f64,
+    /// Bytes of one topic, a second.
+    pub bytes_per_s: f64,
+    /// Bytes that may wait, of all topics together.
+    pub waiting_bytes: usize,
+}
+
+impl InboxLimits {
+    /// For what comes from processes of one's own.
+    pub const NONE: Self =
+        Self { messages_per_s: f64::INFINITY, bytes_per_s: f64::INFINITY, waiting_bytes: usize::MAX };
+    /// For what comes from other vehicles: twenty times what a sender of 10 Hz has to say, maps of 6 MB at that rate.
+    pub const PEERS: Self =
+        Self { messages_per_s: 200.0, bytes_per_s: (64_u64 << 20) as f64, waiting_bytes: 512 << 20 };
+}
+
+/// The meters of an inbox, one for each topic.
+pub(super) struct Meters {
+    limits: InboxLimits,
+    meters: Mutex<BTreeMap<Option<Topic>, Meter>>,
+}
+
+/// What a topic may still bring at a moment.
+struct Meter {
+    messages: f64,
+    bytes: f64,
+    at: Instant,
+}
+
+impl Meters {
+    pub(super) fn new(limits: InboxLimits) -> Self {
+        Self { limits, meters: Mutex::default() }
+    }
+
+    /// Whether a message of `bytes` bytes keeps within the rates, now that it has come.
+    pub(super) fn admit(&self, topic: &Topic, bytes: usize, now: Instant) -> bool {
+        let InboxLimits { messages_per_s, bytes_per_s, .. } = self.limits;
+        if messages_per_s.is_infinite() && bytes_per_s.is_infinite() {
+            return true;
+        }
+        let mut meters = self.meters.lock().unwrap_or_else(PoisonError::into_inner);
+        let own = Some(topic.clone());
+        let key = if meters.len() < MAX_METERS || meters.contains_key(&own) { own } else { None };
+        let full = || Meter { messages: messages_per_s * BURST_S, bytes: bytes_per_s * BURST_S, at: now };
+        let meter = meters.entry(key).or_insert_with(full);
+        let passed = now.saturating_duration_since(meter.at).as_secs_f64();
+        meter.messages = (meter.messages + passed * messages_per_s).min(messages_per_s * BURST_S);
+        meter.bytes = (meter.bytes + passed * bytes_per_s).min(bytes_per_s * BURST_S);
+        meter.at = now;
+        // One message may have more bytes than are left, or no large one could ever come; those after it wait.
+        let fits = meter.messages >= 1.0 && meter.bytes > 0.0;
+        if fits {
+            meter.messages -= 1.0;
+            meter.bytes -= bytes as f64;
+        }
+        fits
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::time::Duration;
+
+    use super::*;
+
+    fn meters(messages_per_s: f64, bytes_per_s: f64) -> Meters {
+        Meters::new(InboxLimits { messages_per_s, bytes_per_s, waiting_bytes: usize::MAX })
+    }
+
+    /// How many of `count` messages get through that come in equal steps.
+    fn admitted(meters: &Meters, topic: &str, count: u32, step: Duration, bytes: usize) -> usize {
+        let (topic, began) = (topic.parse().unwrap(), Instant::now());
+        (0..count).filter(|index| meters.admit(&topic, bytes, began + step * *index)).count()
+    }
+
+    #[test]
+    fn a_flood_is_cut_to_its_rate_and_the_others_do_not_notice() {
+        let meters = meters(20.0, 1e9);
+        let flood = admitted(&meters, "1/bev", 10_000, Duration::from_millis(1), 1 << 10);
+        assert!((230..=241).contains(&flood), "10 s of 20 Hz and the first 2 s' worth: {flood}");
+        assert_eq!(admitted(&meters, "2/bev", 100, Duration::from_millis(100), 1 << 10), 100);
+    }
+
+    #[test]
+    fn bytes_count_too_and_a_large_message_is_paid_for_afterwards() {
+        let meters = meters(1e6, 1e6);
+        assert_eq!(admitted(&meters, "1/bev", 10, Duration::from_nanos(1), 3_000_000), 1);
+        let paid = Instant::now() + Duration::from_secs(2);
+        assert!(meters.admit(&"1/bev".parse().unwrap(), 1, paid), "after 2 s there is room again");
+    }
+
+    #[test]
+    fn invented_topics_share_a_meter() {
+        let meters = meters(1.0, 1e9);
+        let now = Instant::now();
+        let admitted = (0..5_000).filter(|id| meters.admit(&format!("{id}/bev").parse().unwrap(), 1, now)).count();
+        assert_eq!(admitted, MAX_METERS + 2);
+        assert!(meters.meters.lock().unwrap().len() <= MAX_METERS + 1);
+    }
+}
