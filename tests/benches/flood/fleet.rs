@@ -1,0 +1,274 @@
+//! The processes of the flood: each a call of this program with `part NAME ENDPOINT KEYS SECONDS`.
+
+use std::fs;
+use std::io::{BufRead, BufReader, Write};
+use std::path::{Path, PathBuf};
+use std::process::{Child, Command, Stdio};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use anyhow::{Context, Result, bail};
+use protocol::message::Bev;
+use protocol::{
+    Account, BevFeatures, BevGrid, CodecConfig, DropReason, Limits, Party, Pose, PoseEstimate, RunId, Runs, Stamp,
+    Topic, encode_features, wire,
+};
+use serde::{Deserialize, Serialize};
+use sim_replay::bus::mailbox::Taken;
+use sim_replay::bus::{
+    Bus, BusOptions, Credentials, Endpoint, Event, Guard, Identity, InboxLimits, PublisherOptions, open, unix_nanos,
+};
+use tests::bus::free_port;
+use tests::machine;
+use zenoh::Wait;
+use zenoh::bytes::ZBytes;
+use zenoh::qos::CongestionControl;
+
+const HONEST: [&str; 3] = ["1", "2", "3"];
+const FLOODING: &str = "4";
+const PERIOD: Duration = Duration::from_millis(100);
+const FLOOD_PERIOD: Duration = Duration::from_millis(1);
+/// Before anything is measured.
+const WARM_UP: Duration = Duration::from_secs(3);
+
+/// What is measured.
+pub(crate) struct Setting {
+    /// Keys, where TLS is spoken.
+    pub(crate) keys: Option<PathBuf>,
+    pub(crate) flood: bool,
+    pub(crate) duration: Duration,
+}
+
+/// What came of it.
+#[derive(Serialize, Deserialize, Default)]
+pub(crate) struct Measured {
+    /// Of the honest vehicles' maps.
+    pub(crate) latencies_ms: Vec<f64>,
+    /// Of router, ego and honest vehicles together.
+    pub(crate) cpu_ms: f64,
+    pub(crate) ego_mib: f64,
+    pub(crate) router_mib: f64,
+    /// Messages of the flood: that went out, that the ego did not look at, that it decoded.
+    pub(crate) sent: u64,
+    pub(crate) refused: u64,
+    pub(crate) decoded: u64,
+}
+
+pub(crate) fn quantile(values: &[f64], quantile: f64) -> f64 {
+    let mut sorted = values.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    let rank = (quantile * sorted.len() as f64).ceil() as usize;
+    sorted.get(rank.saturating_sub(1)).copied().unwrap_or(f64::NAN)
+}
+
+/// Runs the fleet once.
+pub(crate) fn measure(setting: &Setting) -> Result<Measured> {
+    let endpoint = Endpoint::loopback(free_port());
+    let seconds = (setting.duration + WARM_UP).as_secs_f64();
+    let part = |name: &str, seconds: f64| -> Result<Part> {
+        let keys = setting.keys.as_deref().unwrap_or(Path::new(""));
+        let mut command = Command::new(std::env::current_exe()?);
+        command.args(["part", name, endpoint.as_str()]).arg(keys).arg(seconds.to_string());
+        let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn()?;
+        let mut lines = BufReader::new(child.stdout.take().context("a pipe")?);
+        let mut ready = String::new();
+        lines.read_line(&mut ready)?;
+        if ready.trim() != "ready" {
+            bail!("{name} did not start");
+        }
+        Ok(Part { child, lines })
+    };
+    let router = part("router", 0.0)?;
+    let ego = part("ego", seconds)?;
+    let honest = part("honest", seconds + 1.0)?;
+    let flooding = setting.flood.then(|| part("flood", seconds)).transpose()?;
+    let (ego_id, pids) = (ego.child.id(), [router.child.id(), ego.child.id(), honest.child.id()]);
+    thread::sleep(WARM_UP);
+    let before = cpu_ms(&pids)?;
+    let (mut peaks, until) = ([0.0_f64; 2], Instant::now() + setting.duration);
+    while Instant::now() < until {
+        for (peak, pid) in peaks.iter_mut().zip([ego_id, pids[0]]) {
+            *peak = peak.max(resident_mib(pid));
+        }
+        thread::sleep(Duration::from_millis(200));
+    }
+    let cpu_ms = cpu_ms(&pids)? - before;
+    let mut measured: Measured = serde_json::from_str(&ego.last_line()?)?;
+    measured.sent = flooding.map_or(Ok(0), |flooding| anyhow::Ok(flooding.last_line()?.trim().parse()?))?;
+    [measured.ego_mib, measured.router_mib] = peaks;
+    measured.cpu_ms = cpu_ms;
+    drop((honest, router));
+    Ok(measured)
+}
+
+/// A process; killed with this.
+struct Part {
+    child: Child,
+    lines: BufReader<std::process::ChildStdout>,
+}
+
+impl Part {
+    fn last_line(mut self) -> Result<String> {
+        let mut line = String::new();
+        self.lines.read_line(&mut line)?;
+        Ok(line)
+    }
+}
+
+impl Drop for Part {
+    fn drop(&mut self) {
+        let _ = self.child.kill();
+        let _ = self.child.wait();
+    }
+}
+
+fn cpu_ms(pids: &[u32]) -> Result<f64> {
+    pids.iter().try_fold(0.0, |sum, pid| Ok(sum + machine::cpu_ms(*pid)?))
+}
+
+fn resident_mib(pid: u32) -> f64 {
+    let status = fs::read_to_string(format!("/proc/{pid}/status")).unwrap_or_default();
+    let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));
+    line.and_then(|line| line.split_whitespace().next()?.parse::<f64>().ok()).unwrap_or(0.0) / 1024.0
+}
+
+/// What one process does.
+pub(crate) fn run_part(arguments: &[String]) -> Result<()> {
+    let [name, endpoint, keys, seconds] = arguments else { bail!("part NAME ENDPOINT KEYS SECONDS") };
+    let place = Place { endpoint: Endpoint::new(endpoint)?, keys: (!keys.is_empty()).then(|| PathBuf::from(keys)) };
+    let duration = Duration::from_secs_f64(seconds.parse()?);
+    match name.as_str() {
+        "router" => place.route(),
+        "ego" => place.listen(duration),
+        "honest" => place.send_maps(duration),
+        _ => place.flood(duration),
+    }
+}
+
+struct Place {
+    endpoint: Endpoint,
+    keys: Option<PathBuf>,
+}
+
+impl Place {
+    fn join(&self, party: &str) -> Result<Bus> {
+        let known: Party = party.parse()?;
+        let identity = Identity { run: RunId::new("flood")?, process: known.name(), cav: known.cav };
+        let options = BusOptions::client(self.endpoint.clone());
+        let options = match &self.keys {
+            Some(keys) => options.with_credentials(Credentials::read(&keys.join(party))?),
+            None => options,
+        };
+        Ok(Bus::join(&options, identity)?)
+    }
+
+    fn route(&self) -> Result<()> {
+        let mut options = BusOptions::router(self.endpoint.clone());
+        if let Some(keys) = &self.keys {
+            let credentials = Credentials::read(&keys.join("router"))?;
+            let guard = Guard { members: credentials.members()?, runs: Runs::Any };
+            options = options.with_credentials(credentials).guarded_by(guard);
+        }
+        let _session = open(&options)?;
+        say("ready")?;
+        let _ = std::io::stdin().lines().next();
+        Ok(())
+    }
+
+    fn listen(&self, duration: Duration) -> Result<()> {
+        let ego = self.join("ego-9")?;
+        let inbox = ego.limited_inbox(4, 16, InboxLimits::PEERS);
+        let subscriptions = HONEST.iter().chain([&FLOODING]).map(|cav| ego.subscribe(bev(cav), &inbox));
+        let _subscriptions = subscriptions.collect::<Result<Vec<_>, _>>()?;
+        say("ready")?;
+        let (began, mut measured) = (Instant::now(), Measured::default());
+        let until = began + duration;
+        while Instant::now() < until {
+            let Taken::Item(topic, Event::Message(arrival)) = inbox.take(Some(until)) else { continue };
+            let Some(map) = inbox.decode::<Bev>(&arrival, &Limits::DEFAULT) else { continue };
+            map.features.decode(&Limits::DEFAULT)?;
+            let took_ms = unix_nanos().saturating_sub(arrival.header.stamp.publish_nanos) as f64 / 1e6;
+            ego.books().received(&topic);
+            if topic == bev(FLOODING) {
+                measured.decoded += 1;
+            } else if began.elapsed() > WARM_UP {
+                measured.latencies_ms.push(took_ms);
+            }
+        }
+        let ledger = ego.books().ledger();
+        let here = Account::towards(bev(FLOODING), &ego.identity().process);
+        measured.refused =
+            ledger.get(&here).and_then(|counts| counts.dropped.get(&DropReason::RateLimit)).copied().unwrap_or(0);
+        say(&serde_json::to_string(&measured)?)
+    }
+
+    fn send_maps(&self, duration: Duration) -> Result<()> {
+        let buses = HONEST.iter().map(|cav| self.join(&format!("agent-{cav}"))).collect::<Result<Vec<_>>>()?;
+        let publishers = buses.iter().zip(HONEST).map(|(bus, cav)| bus.publisher(bev(cav), PublisherOptions::FEATURES));
+        let publishers = publishers.collect::<Result<Vec<_>, _>>()?;
+        say("ready")?;
+        let (began, pose) = (Instant::now(), PoseEstimate::new(Pose::IDENTITY, 1.0));
+        let maps: Vec<BevFeatures> = (0..HONEST.len()).map(|_| map_of(64)).collect();
+        for turn in 0.. {
+            let due = PERIOD / HONEST.len() as u32 * turn;
+            if due > duration {
+                break;
+            }
+            thread::sleep(due.saturating_sub(began.elapsed()));
+            let index = turn as usize % HONEST.len();
+            let map = maps[index].clone();
+            publishers[index].offer_encoded(u64::from(turn), move |stamp| {
+                wire::encode(stamp, Bev { pose, features: encode_features(map, &CodecConfig::default(), None)? })
+            });
+        }
+        Ok(())
+    }
+
+    /// Sound messages of its own vehicle, as many as the network takes.
+    fn flood(&self, duration: Duration) -> Result<()> {
+        let bus = self.join(&format!("agent-{FLOODING}"))?;
+        let key = bus.key(bev(FLOODING)).to_string();
+        let pose = PoseEstimate::new(Pose::IDENTITY, 1.0);
+        let features = encode_features(map_of(0), &CodecConfig::default(), None)?;
+        say("ready")?;
+        let began = Instant::now();
+        let mut sent = 0_u64;
+        while began.elapsed() < duration {
+            let stamp = Stamp {
+                cav: FLOODING.parse()?,
+                epoch: 1,
+                sequence: sent,
+                capture_nanos: sent,
+                publish_nanos: unix_nanos(),
+            };
+            let encoded = wire::encode(&stamp, Bev { pose, features: features.clone() })?;
+            let mut bytes = ZBytes::writer();
+            bytes.append(encoded.head.into());
+            bytes.append(encoded.body.as_bytes().to_vec().into());
+            let put = bus.session().put(&key, bytes.finish()).congestion_control(CongestionControl::Block);
+            put.wait().map_err(anyhow::Error::from_boxed)?;
+            sent += 1;
+            let due = FLOOD_PERIOD * u32::try_from(sent)?;
+            thread::sleep(due.saturating_sub(began.elapsed()));
+        }
+        say(&sent.to_string())
+    }
+}
+
+fn bev(cav: &str) -> Topic {
+    format!("{cav}/bev").parse().expect("a topic")
+}
+
+/// A map of 1.6 MB (`rows` 64: 100 x 64 cells of 64 channels), or one of 1 MiB (`rows` 0).
+fn map_of(rows: u32) -> BevFeatures {
+    let (channels, width, height) = if rows == 0 { (64, 64, 64) } else { (64, 100, rows) };
+    let grid = BevGrid { x_min_m: -51.2, y_min_m: -38.4, cell_m: 0.8, width, height };
+    let values = (0..channels * width * height).map(|index| (index % 1009) as f32 * 0.01).collect();
+    BevFeatures { grid, channels, values }
+}
+
+fn say(line: &str) -> Result<()> {
+    let mut out = std::io::stdout();
+    writeln!(out, "{line}")?;
+    Ok(out.flush()?)
+}

@@ -1,0 +1,100 @@
+//! What a flood from one authenticated peer costs the others, and what TLS costs everyone.
+//!
+//! Three vehicles send maps of 1.6 MB ten times a second to an ego; a fourth, with a certificate of the same fleet, sends
+//! 1 MiB as often as it can, up to 1000 times a second. Router, ego, the three and the fourth are processes of this program.
+//!
+//! ```text
+//! cargo bench -p tests --bench flood [-- --seconds 20 --out deploy/results/security-flood.md]
+//! ```
+//!
+//! Latency: from the moment a map is encoded to that in which it is decoded at the ego. Processor time is for each map of the
+//! three. Memory: resident size of the ego and the router, at most.
+
+mod fleet;
+
+use std::fmt::Write as _;
+use std::path::{Path, PathBuf};
+use std::process::ExitCode;
+use std::time::Duration;
+
+use anyhow::{Context, Result, bail};
+use deploy::keys::{KeyPlan, make};
+use tests::machine;
+
+use fleet::{Measured, Setting};
+
+/// Others' 99th percentile under the flood, in times of that without it.
+const AT_MOST: f64 = 2.0;
+
+fn main() -> ExitCode {
+    let arguments: Vec<String> = std::env::args().skip(1).collect();
+    let done = match arguments.first().map(String::as_str) {
+        Some("part") => fleet::run_part(&arguments[1..]).map(|()| true),
+        _ => bench(&arguments),
+    };
+    match done {
+        Ok(true) => ExitCode::SUCCESS,
+        Ok(false) => ExitCode::FAILURE,
+        Err(error) => {
+            eprintln!("{error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn bench(arguments: &[String]) -> Result<bool> {
+    let (mut seconds, mut out) = (20.0, None);
+    let mut arguments = arguments.iter().filter(|argument| *argument != "--bench");
+    while let Some(name) = arguments.next() {
+        let value = arguments.next().with_context(|| format!("{name} needs a value"))?;
+        match name.as_str() {
+            "--seconds" => seconds = value.parse()?,
+            // cargo runs benches in the folder of their package.
+            "--out" => out = Some(Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(value)),
+            _ => bail!("{name} is none of --seconds, --out"),
+        }
+    }
+    let folder = tempfile::tempdir()?;
+    let parties = ["agent-1", "agent-2", "agent-3", "agent-4", "ego-9", "replay"];
+    let parties = parties.map(str::parse).into_iter().collect::<Result<_, _>>()?;
+    make(&KeyPlan::new(folder.path(), parties, 1))?;
+    let mut rows = Vec::new();
+    // They take turns, so that a machine that is busier in one minute than in the next does not decide.
+    for _ in 0..2 {
+        for (tls, flood) in [(false, false), (true, false), (false, true), (true, true)] {
+            let keys = tls.then(|| folder.path().to_path_buf());
+            let setting = Setting { keys, flood, duration: Duration::from_secs_f64(seconds) };
+            rows.push((tls, flood, fleet::measure(&setting)?));
+        }
+    }
+    report(&rows, seconds, out.as_ref())
+}
+
+fn report(rows: &[(bool, bool, Measured)], seconds: f64, out: Option<&PathBuf>) -> Result<bool> {
+    let mut text = format!("{}; {seconds} s for each line\n\n", machine::describe());
+    text += "| link | flood | maps | p50 ms | p99 ms | CPU a map, ms | ego MiB | router MiB | flood: sent | refused | decoded |\n";
+    text += "| --- | --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |\n";
+    for (tls, flood, measured) in rows {
+        let Measured { latencies_ms, cpu_ms, ego_mib, router_mib, sent, refused, decoded } = measured;
+        let [p50, p99] = [0.50, 0.99].map(|quantile| fleet::quantile(latencies_ms, quantile));
+        let (link, maps) = (if *tls { "TLS" } else { "TCP" }, latencies_ms.len());
+        writeln!(
+            text,
+            "| {link} | {} | {maps} | {p50:.1} | {p99:.1} | {:.1} | {ego_mib:.0} | {router_mib:.0} | {sent} | {refused} | {decoded} |",
+            if *flood { "yes" } else { "no" },
+            cpu_ms / maps.max(1) as f64,
+        )?;
+    }
+    let p99 = |tls: bool, flood: bool| {
+        let all = rows.iter().filter(|row| (row.0, row.1) == (tls, flood));
+        let all: Vec<f64> = all.flat_map(|row| row.2.latencies_ms.iter().copied()).collect();
+        fleet::quantile(&all, 0.99)
+    };
+    let ratios = [false, true].map(|tls| p99(tls, true) / p99(tls, false));
+    writeln!(text, "\np99 under the flood over p99 without: TCP {:.2}, TLS {:.2}", ratios[0], ratios[1])?;
+    print!("{text}");
+    if let Some(path) = out {
+        std::fs::write(path, &text).with_context(|| path.display().to_string())?;
+    }
+    Ok(ratios.iter().all(|ratio| *ratio <= AT_MOST))
+}
