@@ -320,6 +320,8 @@ impl Fleet {
         self.model(&mut args);
         args.option("--method", self.scenario.method.name());
         args.option("--deadline-ms", &self.scenario.ego.deadline_ms.to_string());
+        args.option("--peer-messages-per-s", &self.scenario.ego.peer_messages_per_s.to_string());
+        args.option("--peer-mib-per-s", &self.scenario.ego.peer_mib_per_s.to_string());
         args.option("--max-age-ms", &self.scenario.ego.max_age_ms.to_string());
         if self.scenario.ego.trust {
             args.flag("--trust");

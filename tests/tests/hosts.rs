@@ -113,3 +113,50 @@ fn a_fleet_spans_three_hosts_over_tls() {
     assert!(router.end().status.success());
     assert!(!log("router").contains("refused peer="), "{}", log("router"));
 }
+
+/// The words of every command line in the files that start processes, program and subcommand first.
+fn commands(folder: &Path) -> Vec<(String, Vec<String>)> {
+    let mut commands = Vec::new();
+    for entry in fs::read_dir(folder.join("systemd")).unwrap() {
+        let text = fs::read_to_string(entry.unwrap().path()).unwrap();
+        for line in text.lines().filter_map(|line| line.strip_prefix("ExecStart=/opt/v2vloc/bin/")) {
+            let words: Vec<String> = line.split(' ').map(str::to_owned).collect();
+            commands.push((words[0].clone(), words[1..].to_vec()));
+        }
+    }
+    let compose = fs::read_to_string(folder.join("compose/compose.yaml")).unwrap();
+    let programs = ["v2vloc", "agent", "ego-fuser", "sim-replay"];
+    for line in compose.lines().map(|line| line.trim().trim_start_matches("- ").trim_matches('"')) {
+        if let Some(list) = line.strip_prefix("command: [") {
+            let words: Vec<String> =
+                list.trim_end_matches(']').split(", ").map(|word| word.trim_matches('"').into()).collect();
+            commands.push((words[0].clone(), words[1..].to_vec()));
+        } else if programs.contains(&line) {
+            commands.push((line.to_owned(), Vec::new()));
+        } else if let Some((_, words)) = commands.last_mut()
+            && (line.starts_with("--") || (words.is_empty() && !line.contains(':')))
+        {
+            words.push(line.to_owned());
+        }
+    }
+    commands
+}
+
+#[test]
+fn units_and_containers_start_what_there_is() {
+    let commands = commands(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy"));
+    assert_eq!(commands.len(), 8, "{commands:?}");
+    for (program, words) in commands {
+        let output = Command::new(programs().join(&program)).args([&words[0], "--help"]).output().unwrap();
+        let help = String::from_utf8_lossy(&output.stdout);
+        assert!(output.status.success(), "{program} {}", words[0]);
+        for name in words.iter().filter_map(|word| word.strip_prefix("--")).map(|word| word.split('=').next().unwrap())
+        {
+            assert!(
+                help.contains(&format!("--{name} ")) || help.contains(&format!("--{name}\n")),
+                "{program} {}: --{name}",
+                words[0]
+            );
+        }
+    }
+}

@@ -119,6 +119,8 @@ impl Scenario {
             if fits { Ok(()) } else { Err(value(field, number.to_string(), "must be a number above 0")) }
         };
         positive("scene.rate", self.scene.rate)?;
+        positive("ego.peer_messages_per_s", self.ego.peer_messages_per_s)?;
+        positive("ego.peer_mib_per_s", self.ego.peer_mib_per_s)?;
         positive("network.stall_limit_s", self.network.stall_limit_s)?;
         positive("timeouts.ready_s", self.timeouts.ready_s)?;
         positive("timeouts.drain_s", self.timeouts.drain_s)?;

@@ -15,6 +15,7 @@ use ego_fuser::evaluate::stepped::ComputeTimes;
 use ego_fuser::{Exchange, Method};
 use protocol::{CavId, CodecConfig, RunId, Stream};
 use serde::{Deserialize, Serialize};
+use sim_replay::bus::InboxLimits;
 
 pub use load::ScenarioError;
 
@@ -390,11 +391,23 @@ pub struct Ego {
     pub max_age_ms: u64,
     /// Whether neighbours whose words do not fit what the ego sees itself are left out.
     pub trust: bool,
+    /// Messages that each vehicle may bring it a second; what is more is dropped unread (`rate_limit`).
+    pub peer_messages_per_s: f64,
+    /// The same in MiB a second.
+    pub peer_mib_per_s: f64,
 }
 
 impl Default for Ego {
     fn default() -> Self {
-        Self { id: None, deadline_ms: 100, max_age_ms: 150, trust: false }
+        let InboxLimits { messages_per_s, bytes_per_s, .. } = InboxLimits::PEERS;
+        Self {
+            id: None,
+            deadline_ms: 100,
+            max_age_ms: 150,
+            trust: false,
+            peer_messages_per_s: messages_per_s,
+            peer_mib_per_s: bytes_per_s / f64::from(1 << 20),
+        }
     }
 }
 

@@ -226,6 +226,7 @@ impl<'a> Node<'a> {
         for cav in neighbourhood.update(self.bus, &self.inbox)? {
             let topic = self.topic(&cav);
             self.models.forget(&cav);
+            self.ended.remove(&cav);
             for _ in 0..self.pairing.forget(&cav) {
                 self.bus.books().dropped(&topic, DropReason::Stale);
             }

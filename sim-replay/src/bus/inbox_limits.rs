@@ -28,9 +28,9 @@ impl InboxLimits {
     /// For what comes from processes of one's own.
     pub const NONE: Self =
         Self { messages_per_s: f64::INFINITY, bytes_per_s: f64::INFINITY, waiting_bytes: usize::MAX };
-    /// For what comes from other vehicles: twenty times what a sender of 10 Hz has to say, maps of 6 MB at that rate.
+    /// For what comes from other vehicles: ten times what a sender of 10 Hz has to say, in the largest maps there are.
     pub const PEERS: Self =
-        Self { messages_per_s: 200.0, bytes_per_s: (64_u64 << 20) as f64, waiting_bytes: 512 << 20 };
+        Self { messages_per_s: 100.0, bytes_per_s: (256_u64 << 20) as f64, waiting_bytes: 512 << 20 };
 }
 
 /// The meters of an inbox, one for each topic.
