@@ -36,7 +36,7 @@ pub fn programs() -> &'static Path {
             // and everything above it be compiled anew.
             for (name, _) in std::env::vars_os() {
                 let text = name.to_string_lossy();
-                if text.starts_with("CARGO_PKG_") || text.starts_with("CARGO_MANIFEST_") {
+                if text == "OUT_DIR" || text.starts_with("CARGO_PKG_") || text.starts_with("CARGO_MANIFEST_") {
                     build.env_remove(&name);
                 }
             }
