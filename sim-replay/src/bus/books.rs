@@ -5,9 +5,7 @@ use std::fmt;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use protocol::{
-    Account, CavId, DropReason, Ledger, Limits, ProcessId, RateReason, StageSummary, Topic, WireError,
-};
+use protocol::{Account, CavId, DropReason, Ledger, Limits, ProcessId, RateReason, StageSummary, Topic, WireError};
 
 use super::clock_offset::ClockOffset;
 
