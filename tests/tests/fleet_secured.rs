@@ -137,7 +137,16 @@ fn strangers_and_liars_change_nothing() {
     let status = up.wait();
     is_over.store(true, Ordering::Relaxed);
     lying.join().unwrap();
-    assert!(agent.wait().unwrap().success());
+    let came = agent.wait().unwrap();
+    if !came.success() || status.code() != Some(0) {
+        for process in ["replay", "agent-4279", "ego-4279"] {
+            eprintln!(
+                "{process}: {}",
+                fs::read_to_string(up.folder.join(format!("log/{process}.log"))).unwrap_or_default()
+            );
+        }
+    }
+    assert!(came.success());
 
     assert_eq!(boxes(&up.folder), expected, "box for box");
     let ledger: Value = serde_json::from_str(&fs::read_to_string(up.folder.join("ledger.json")).unwrap()).unwrap();
