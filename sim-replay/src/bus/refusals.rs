@@ -73,8 +73,10 @@ fn refused(line: &str) -> Option<((Refusal, String), u64)> {
         known.find(|(name, _)| *name == wanted).map(|(_, value)| value.trim_end_matches('"').to_owned())
     };
     let reason = label("reason").filter(|reason| reason == "access-control" || reason == "low-pass")?;
-    let connection = label("remote_zid").unwrap_or_default();
-    let peer = label("remote_cn").filter(|name| !name.is_empty()).unwrap_or_else(|| connection.clone());
+    let zid = label("remote_zid").unwrap_or_default();
+    let peer = label("remote_cn").filter(|name| !name.is_empty()).unwrap_or_else(|| zid.clone());
+    // Each priority has a count of its own.
+    let connection = format!("{zid} {}", label("priority")?);
     let refusal = Refusal { peer, reason, message: label("message")? };
     Some(((refusal, connection), count.trim().parse().ok()?))
 }
@@ -93,7 +95,10 @@ mod tests {
             )
         };
         let ((refusal, connection), count) = refused(&line(DROPPED, "access-control", "agent-1")).unwrap();
-        assert_eq!((refusal.peer.as_str(), refusal.message.as_str(), connection.as_str()), ("agent-1", "put", "fb"));
+        assert_eq!(
+            (refusal.peer.as_str(), refusal.message.as_str(), connection.as_str()),
+            ("agent-1", "put", "fb data")
+        );
         assert_eq!(count, 28);
         assert_eq!(refused(&line(DROPPED, "low-pass", "")).unwrap().0.0.peer, "fb", "without a certificate");
         assert_eq!(refused(&line(DROPPED, "congestion", "agent-1")), None);
