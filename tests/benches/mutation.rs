@@ -1,9 +1,10 @@
 //! The long run of damaged inputs: `cargo bench -p tests --bench mutation -- [MESSAGES] [FILES] [SEED]`, by default ten
-//! million messages and a million files of each format; prints a table. TMPDIR=/dev/shm spares the disk. With
+//! million messages and a million files of each format; prints a table. With
 //! `-- --seeds FOLDER` it writes the sound inputs down instead, for `fuzz/`.
 
 use peak_alloc::PeakAlloc;
 use tests::mutation::run::{Meter, all, formats};
+use tests::mutation::scratch;
 
 #[global_allocator]
 static MEMORY: PeakAlloc = PeakAlloc;
@@ -28,7 +29,7 @@ fn main() {
     let numbers: Vec<u64> = std::env::args().skip(1).filter_map(|argument| argument.parse().ok()).collect();
     let number = |place: usize, usual| numbers.get(place).copied().unwrap_or(usual);
     let (messages, files, seed) = (number(0, 10_000_000), number(1, 1_000_000), number(2, 7));
-    let scratch = tempfile::tempdir().expect("a temporary folder");
+    let scratch = scratch();
     let folder = std::env::args().skip_while(|argument| argument != "--seeds").nth(1);
     if let Some(folder) = folder {
         return write_seeds(folder.as_ref(), formats(scratch.path()));

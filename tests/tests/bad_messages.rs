@@ -14,16 +14,16 @@ use ego_fuser::ego::Ego;
 use ego_fuser::node::{self, NodeOptions};
 use protocol::message::Bev;
 use protocol::{
-    Account, BevFeatures, BevGrid, Body, CavId, Codec, CodecConfig, Detection, Detections, DropReason, Dtype,
-    EncodedFeatures, HEADER_LEN, Limits, Packing, PoseEstimate, Role, Selection, Stamp, Stream, Topic, encode_features,
-    wire,
+    Account, BevFeatures, BevGrid, Body, CavId, Codec, CodecConfig, Counts, Detection, Detections, DropReason, Dtype,
+    EncodedFeatures, HEADER_LEN, Ledger, Limits, Packing, PoseEstimate, Role, Selection, Stamp, Stream, Topic,
+    encode_features, wire,
 };
 use sim_replay::bus::shutdown::Stop;
 use sim_replay::bus::{Barrier, Bus, Event, Presence, PublisherOptions, Route, process_id, unix_nanos};
 use sim_replay::dataset::{self, LoadOptions, Scenario};
 use tch::Device;
 use tch::nn::VarStore;
-use tests::bus::{PATIENCE, TestRouter, next_event};
+use tests::bus::{PATIENCE, TestRouter, next_event, wait_for};
 use tests::mutation::wire_target::reseal;
 use tests::scene;
 use zenoh::Wait;
@@ -188,15 +188,17 @@ fn bomb(stamp: &Stamp, pose: PoseEstimate, grid: BevGrid) -> Vec<u8> {
 }
 
 /// Plays the scene; what the ego detected, and how it booked what 20 said.
-fn play(scenario: &Scenario, is_hostile: bool) -> (Vec<Vec<Detection>>, protocol::Counts, BTreeMap<DropReason, u64>) {
+fn play(scenario: &Scenario, is_hostile: bool) -> (Vec<Vec<Detection>>, Counts, BTreeMap<DropReason, u64>) {
     let (router, stop) = (TestRouter::open(), Stop::new());
     let scorer = router.join("scorer", "scorer");
     let inbox = scorer.inbox(100, 1);
     let detections = Topic::Stream { cav: cav("10"), stream: Stream::Detections };
     let _subscription = scorer.subscribe(detections, &inbox).unwrap();
     std::thread::scope(|scope| {
+        let bus = router.join("ego-10", "10");
+        let books = bus.books().clone();
         let ego = scope.spawn(|| {
-            let bus = router.join("ego-10", "10");
+            let bus = bus;
             let options = NodeOptions { deadline: PATIENCE, keeps_running: true, ..NodeOptions::default() };
             let ego = Ego::new(network(), Method::Max).unwrap();
             node::run(&bus, &cav("10"), ego, &options, &stop).unwrap();
@@ -209,9 +211,14 @@ fn play(scenario: &Scenario, is_hostile: bool) -> (Vec<Vec<Detection>>, protocol
         let (mut results, mut expected) = (Vec::new(), BTreeMap::new());
         for tick in 0..scenario.ticks.len() {
             if is_hostile && tick > 0 {
-                for (_, reason, bytes) in other.bad(scenario, tick - 1) {
+                for (name, reason, bytes) in other.bad(scenario, tick - 1) {
                     *expected.entry(reason).or_default() += 1;
                     other.put(bytes);
+                    // One at a time: where many wait, the newest takes the place of the oldest unseen.
+                    let all: u64 = expected.values().sum();
+                    wait_for(name, || counts(&books.ledger()).dropped_total() == all);
+                    let counts = counts(&books.ledger());
+                    assert_eq!(counts.dropped.get(&reason), expected.get(&reason), "{name}: {counts:?}");
                 }
             }
             other.send(scenario, tick);
@@ -222,10 +229,14 @@ fn play(scenario: &Scenario, is_hostile: bool) -> (Vec<Vec<Detection>>, protocol
             results.push(result.detections);
         }
         stop.request();
-        let ledger = ego.join().unwrap();
-        let account = Account::towards(bev_of("20"), &process_id(Role::Ego, &cav("10")));
-        (results, ledger.get(&account).unwrap().clone(), expected)
+        (results, counts(&ego.join().unwrap()), expected)
     })
+}
+
+/// What the ego's books say of the messages of 20.
+fn counts(ledger: &Ledger) -> Counts {
+    let account = Account::towards(bev_of("20"), &process_id(Role::Ego, &cav("10")));
+    ledger.get(&account).cloned().unwrap_or_default()
 }
 
 #[test]

@@ -6,6 +6,7 @@ use std::sync::{Mutex, PoisonError};
 use peak_alloc::PeakAlloc;
 use tests::mutation::readers::all as all_readers;
 use tests::mutation::run::{Meter, Report, all, formats};
+use tests::mutation::scratch;
 use tests::mutation::wire_target::{self, LIMITS};
 
 #[global_allocator]
@@ -48,14 +49,14 @@ fn damaged_messages_are_refused_or_sound() {
 #[test]
 fn damaged_files_are_refused_or_sound() {
     let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
-    let scratch = tempfile::tempdir().unwrap();
-    check(&all(scratch.path(), 0, 5_000, 1, &Memory));
+    let scratch = scratch();
+    check(&all(scratch.path(), 0, 3_000, 1, &Memory));
 }
 
 #[test]
 fn every_format_has_a_fuzz_target_with_sound_seeds() {
     let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
-    let scratch = tempfile::tempdir().unwrap();
+    let scratch = scratch();
     let fuzz = std::path::Path::new(env!("CARGO_MANIFEST_DIR")).with_file_name("fuzz");
     let targets = std::fs::read_to_string(fuzz.join("Cargo.toml")).unwrap();
     let readers = all_readers(scratch.path());

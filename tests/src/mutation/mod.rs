@@ -20,6 +20,17 @@ const NUMBERS: [f64; 8] = [f64::NAN, f64::INFINITY, f64::NEG_INFINITY, 1e30, -1e
 const WORDS: [&str; 12] =
     ["nan", "inf", "-inf", "1e30", "-1e400", "0", "-1", "18446744073709551616", "0x7f", "1e-400", "", "4398046511104"];
 
+/// A folder for files that are written over and over: in memory where the system has a place for that, as a disk would
+/// write every one of them down.
+///
+/// # Panics
+/// When the disk refuses.
+#[must_use]
+pub fn scratch() -> tempfile::TempDir {
+    let in_memory = tempfile::tempdir_in("/dev/shm");
+    in_memory.or_else(|_| tempfile::tempdir()).expect("a temporary folder")
+}
+
 /// Damages `bytes` in one to four ways; `other` is a sound input to take pieces from.
 pub fn damage(bytes: &mut Vec<u8>, other: &[u8], random: &mut SplitMix64) {
     let is_text = bytes.iter().take(256).all(|byte| byte.is_ascii_graphic() || byte.is_ascii_whitespace());

@@ -52,6 +52,7 @@ fn compressed() -> Vec<u8> {
 #[must_use]
 pub fn recording(scratch: &Path) -> Vec<u8> {
     let path = scratch.join("seed.mcap");
+    let _ = std::fs::remove_file(&path);
     let mut writer = RecordingWriter::create(&path, RecordingOptions::default()).expect("a writable folder");
     let run = RunId::new("test").expect("an identifier");
     for (number, bytes) in messages().iter().enumerate() {
