@@ -1,8 +1,7 @@
 //! Whom the ego believes: whether what a neighbour says fits what the ego sees itself where both look.
 //!
-//! Every message is looked at alone, by the ego's own head, before any of it is fused ([`seen`]): vehicles that only one
-//! of the two sees, whether each sees the other where it says to be, whether the message is somebody else's
-//! ([`evidence`]). What frames say is averaged, the newest counting half; who falls below a threshold is left out until it
+//! Every message is looked at alone, by the ego's own head, before any of it is fused: vehicles that only one of the two
+//! sees, whether each sees the other where it says to be, whether the message is somebody else's. What frames say is averaged, the newest counting half; who falls below a threshold is left out until it
 //! has been believable for a while. A neighbour of whom nothing can be said keeps the trust that it has. Maps are believed
 //! until something speaks against them, as what is fused must agree with the ego's own in any case; boxes, which count
 //! as they come, only when something speaks for them.
