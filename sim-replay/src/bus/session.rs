@@ -11,6 +11,8 @@ use zenoh::{Config, Session, Wait};
 use super::credentials::{AUTHORITY_FILE, CERTIFICATE_FILE, Credentials, KEY_FILE};
 use super::guard::{self, Guard};
 
+/// How long one attempt to open a connection may take.
+const OPEN_LIMIT: Duration = Duration::from_secs(3);
 /// First and longest pause between two attempts to reach the router again.
 const RETRY_FIRST: Duration = Duration::from_millis(100);
 const RETRY_LONGEST: Duration = Duration::from_secs(1);
@@ -228,6 +230,8 @@ impl BusOptions {
             // It loses messages over 64 KiB without a word.
             ("transport/unicast/lowlatency", json!(false)),
             ("transport/unicast/qos/enabled", json!(true)),
+            // A router that is held up just then answers the next attempt; zenoh would wait 10 s for this one.
+            ("transport/unicast/open_timeout", json!(millis(OPEN_LIMIT))),
             // Tensors: with zenoh's two batches the thread that writes a message and the one that sends it wait for each
             // other after every 64 KiB, which costs a fifth of the time that 8 MiB take.
             ("transport/link/tx/queue/size/data", json!(TENSOR_BATCHES)),

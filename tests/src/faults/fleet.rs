@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use deploy::health::Usage;
 use protocol::HEADER_LEN;
-use sim_replay::bus::{BusOptions, Endpoint, open};
+use sim_replay::bus::{BusError, BusOptions, Endpoint, open};
 use zenoh::{Session, Wait};
 
 use super::{Fault, Findings, Kind, Proxy, Results, Target, VEHICLES, unix_ms, write_scenario};
@@ -22,6 +22,8 @@ const PERIOD_MS: u64 = 100;
 const SETTLED: usize = 5;
 /// Longest that a fleet may take for that.
 const PATIENCE: Duration = Duration::from_secs(60);
+/// How long the router waits for a receiver that takes nothing.
+const STALL: Duration = Duration::from_millis(100);
 /// A process that lives this long has opened what it opens.
 const GROWN_UP: Duration = Duration::from_secs(5);
 
@@ -76,7 +78,7 @@ impl FaultyFleet {
         let shared_memory = shared_memory();
         let port = free_port();
         let router_endpoint = Endpoint::loopback(port);
-        let router = open(&BusOptions::router(router_endpoint.clone())).expect("a router");
+        let router = route(&router_endpoint).expect("a router");
         let proxy = Proxy::open(port);
         let heard = Arc::<Mutex<FirstHeard>>::default();
         let observer = observe(&router_endpoint, &heard);
@@ -152,7 +154,7 @@ impl FaultyFleet {
             thread::sleep(fault.lasts);
             let endpoint = self.router_endpoint.clone();
             wait_for("the router's port", || {
-                self.router = open(&BusOptions::router(endpoint.clone())).ok();
+                self.router = route(&endpoint).ok();
                 self.router.is_some()
             });
             return;
@@ -246,6 +248,11 @@ impl FaultyFleet {
             restarts: status.processes.iter().map(|process| u64::from(process.restarts)).sum(),
         }
     }
+}
+
+/// A router that gives a receiver up before the others have missed two periods.
+fn route(endpoint: &Endpoint) -> std::result::Result<Session, BusError> {
+    open(&BusOptions { stall_limit: STALL, ..BusOptions::router(endpoint.clone()) })
 }
 
 /// Hears every vehicle's pose, and notes when a new life of it began to speak.
