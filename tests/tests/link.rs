@@ -8,7 +8,7 @@ use protocol::{CavId, DropReason, Ledger, Limits, PointCloud, Pose, PoseEstimate
 use sim_replay::bus::shutdown::Stop;
 use sim_replay::bus::{Barrier, Bus, Event, PublisherOptions, Route};
 use sim_replay::link::node::{self, LinkReport, NodeOptions};
-use sim_replay::link::{Air, CapacityConfig, DelayLaw, LinkConfig, LossLaw};
+use sim_replay::link::{Air, CapacityConfig, DelayLaw, DeviceClock, LinkConfig, LossLaw};
 use tests::bus::{PATIENCE, TestRouter, next_event};
 
 /// Sweeps that are sent, and their points: 16 kB each.
@@ -67,11 +67,11 @@ fn cross(config: LinkConfig, options: &NodeOptions) -> Crossing {
         let mut arrivals = Vec::new();
         // What ends on one side of the link ends on the other.
         while let (_, Event::Message(arrival)) = next_event(&inbox) {
-            let tick = arrival.header.stamp.capture_nanos;
-            assert_eq!((&arrival.header.stamp.cav, arrival.header.stamp.sequence), (&cav("7"), tick));
-            assert_eq!(inbox.decode::<Points>(&arrival, &Limits::DEFAULT).unwrap(), points(tick));
+            let stamp = &arrival.header.stamp;
+            assert_eq!((&stamp.cav, stamp.sequence), (&cav("7"), arrivals.len() as u64));
+            assert_eq!(inbox.decode::<Points>(&arrival, &Limits::DEFAULT).unwrap(), points(stamp.sequence));
             ego.books().received(&received);
-            arrivals.push((tick, arrival.at - began));
+            arrivals.push((stamp.capture_nanos, arrival.at - began));
         }
         let report = carrying.join().unwrap();
         presence.withdraw().unwrap();
@@ -105,6 +105,16 @@ fn what_the_air_loses_is_booked_and_never_arrives() {
     assert_eq!((arrivals.len(), report.arrived), (0, 0));
     assert_eq!(report.dropped, [(DropReason::LinkLoss, COUNT)].into());
     assert_eq!(ledger.total().dropped[&DropReason::LinkLoss], COUNT);
+}
+
+#[test]
+fn a_clock_that_is_off_shows_in_the_capture_times() {
+    let clock = DeviceClock { offset_ms: 1.0, drift_ppm: 0.0 };
+    let Crossing { arrivals, ledger, .. } = cross(LinkConfig { clock, ..LinkConfig::default() }, &options());
+    // What tells of no moment has no capture time.
+    let shown: Vec<u64> = (0..COUNT).map(|tick| if tick == 0 { 0 } else { tick + 1_000_000 }).collect();
+    assert_eq!(arrivals.iter().map(|(tick, _)| *tick).collect::<Vec<_>>(), shown);
+    assert!(ledger.balance().is_exact(), "{:?}", ledger.balance());
 }
 
 #[test]

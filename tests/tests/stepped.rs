@@ -16,7 +16,7 @@ use ego_fuser::pairing::PairingConfig;
 use protocol::{CodecConfig, DropReason, Dtype};
 use serde_json::Value;
 use sim_replay::dataset;
-use sim_replay::link::{DelayLaw, LinkConfig, LossLaw};
+use sim_replay::link::{DelayLaw, DeviceClock, LinkConfig, LossLaw};
 use tests::fleet::{alone, programs, results, write_scenario, write_sighted_weights};
 
 const TICKS: usize = 8;
@@ -120,6 +120,24 @@ fn the_ego_fuses_exactly_what_has_come_by_its_deadline() {
     let (frames, ledger) = evaluate(folder.path(), Some(config(link)));
     assert!(frames.iter().all(|frame| frame.result.fused.is_empty() && frame.result.skipped.len() == 2));
     assert!(ledger.total().dropped[&DropReason::Stale] > 0 && ledger.balance().is_exact());
+}
+
+#[test]
+fn a_clock_that_is_off_shifts_what_belongs_together() {
+    let folder = scene();
+    for (offset_ms, drift_ppm, ages_in_ms) in [
+        (-20.0, 0.0, [20, 20, 20]),
+        (-120.0, 0.0, [120, 120, 120]),
+        // 10 ms a frame.
+        (0.0, -1e5, [0, 10, 20]),
+    ] {
+        let clock = DeviceClock { offset_ms, drift_ppm };
+        let (frames, ledger) = evaluate(folder.path(), Some(config(LinkConfig { clock, ..LinkConfig::default() })));
+        for (frame, age_ms) in frames.iter().zip(ages_in_ms) {
+            assert_eq!(ages_ms(frame), [age_ms; 2], "{clock:?}");
+        }
+        assert!(ledger.balance().is_exact(), "{:?}", ledger.balance());
+    }
 }
 
 #[test]

@@ -5,7 +5,7 @@ use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use protocol::wire::{self, Encoded};
-use protocol::{CavId, Control, DropReason, Key, Payload, Stamp, Topic, TopicCount, WireError};
+use protocol::{CavId, Control, DropReason, HEADER_LEN, Key, Payload, Stamp, Topic, TopicCount, WireError};
 use zenoh::Wait;
 use zenoh::bytes::{Encoding, ZBytes};
 use zenoh::qos::{CongestionControl, Priority};
@@ -154,6 +154,21 @@ impl Publisher {
     pub fn relay(&self, arrival: &Arrival) {
         let bytes = arrival.payload().clone();
         self.push(Offer { capture_nanos: arrival.header.stamp.capture_nanos, encode: Box::new(|_| Ok(bytes)) });
+    }
+
+    /// The same with another capture time: that of a clock which is off.
+    pub fn relay_as(&self, arrival: &Arrival, capture_nanos: u64) {
+        if arrival.header.stamp.capture_nanos == capture_nanos {
+            return self.relay(arrival);
+        }
+        let mut header = arrival.header.clone();
+        header.stamp.capture_nanos = capture_nanos;
+        let rest = arrival.payload().to_bytes().get(HEADER_LEN..).unwrap_or_default().to_vec();
+        let mut writer = ZBytes::writer();
+        writer.append(header.to_bytes().to_vec().into());
+        writer.append(rest.into());
+        let bytes = writer.finish();
+        self.push(Offer { capture_nanos, encode: Box::new(|_| Ok(bytes)) });
     }
 
     fn push(&self, offer: Offer) {

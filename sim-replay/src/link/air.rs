@@ -9,6 +9,7 @@ use protocol::{CavId, DropReason, Stream};
 use super::capacity::Capacity;
 use super::chance::{Chance, Purpose};
 use super::config::{CapacityConfig, LinkConfig, LinkError, Medium};
+use super::device_clock::DeviceClock;
 use super::line::{Left, Line, Rules};
 use super::loss::{LossState, SentMessage};
 use super::nanos_of_ms;
@@ -145,6 +146,12 @@ impl Air {
             now_nanos: 0,
             next: 0,
         })
+    }
+
+    /// The clock of those who send.
+    #[must_use]
+    pub fn clock(&self) -> &DeviceClock {
+        &self.config.clock
     }
 
     /// Takes a message. Times never go back: one that is offered before the last one counts as offered with it.

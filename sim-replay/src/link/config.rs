@@ -4,6 +4,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
+use super::device_clock::DeviceClock;
 use super::trace::{Trace, TraceError};
 
 /// Payload of one fragment where loss is drawn per fragment, bytes: what fits an 802.11p frame with its headers.
@@ -268,6 +269,9 @@ pub struct LinkConfig {
     pub duplicate: f64,
     /// When nothing crosses.
     pub outages: Vec<Outage>,
+    /// The clock of every vehicle but the receiver: what stands in its messages as capture time.
+    #[serde(skip_serializing_if = "DeviceClock::is_right")]
+    pub clock: DeviceClock,
 }
 
 impl LinkConfig {
@@ -279,6 +283,8 @@ impl LinkConfig {
         if let CapacityConfig::TokenBucket { rate_mbps, .. } = self.capacity {
             bounded("capacity.rate_mbps", rate_mbps, 1e-6, 1e6, "1e-6 to 1e6")?;
         }
+        bounded("clock.offset_ms", self.clock.offset_ms, -MAX_MS, MAX_MS, "-600,000 to 600,000 ms")?;
+        bounded("clock.drift_ppm", self.clock.drift_ppm, -1e5, 1e5, "-100,000 to 100,000")?;
         match self.delay {
             DelayLaw::None | DelayLaw::Trace => {}
             DelayLaw::ConstantMs(ms) => time("delay", ms)?,
@@ -385,7 +391,8 @@ mod tests {
         let text = "medium: shared\ncapacity: {token_bucket: {rate_mbps: 27, burst_bytes: 3000}}\n\
             queue: {bytes: 100000, drop: head, keep_newest: true}\ndelay: {normal: {mean_ms: 10, std_ms: 3}}\n\
             loss: {gilbert_elliott: {to_bad: 0.01, to_good: 0.2}}\nloss_unit: fragment\n\
-            reorder: {probability: 0.01, extra_ms: 30}\nduplicate: 0.001\noutages: [{from_s: 3, to_s: 13}]\n";
+            reorder: {probability: 0.01, extra_ms: 30}\nduplicate: 0.001\noutages: [{from_s: 3, to_s: 13}]\n\
+            clock: {offset_ms: -20, drift_ppm: 50}\n";
         let config: LinkConfig = serde_saphyr::from_str(text).unwrap();
         config.validate().unwrap();
         assert_eq!(config.medium, Medium::Shared);
@@ -403,6 +410,8 @@ mod tests {
         assert!(message(LinkConfig { capacity: rate, ..LinkConfig::default() }).contains("rate_mbps is 0"));
         let delay = DelayLaw::UniformMs([5.0, 2.0]);
         assert!(message(LinkConfig { delay, ..LinkConfig::default() }).contains("delay is 2"));
+        let clock = DeviceClock { offset_ms: f64::NAN, drift_ppm: 0.0 };
+        assert!(message(LinkConfig { clock, ..LinkConfig::default() }).contains("offset_ms is NaN"));
         let loss = LossLaw::Bernoulli(f64::NAN);
         assert!(message(LinkConfig { loss, ..LinkConfig::default() }).contains("loss is NaN"));
         let loss = LossLaw::Distance(vec![[50.0, 0.1], [20.0, 0.2]]);

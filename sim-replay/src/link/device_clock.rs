@@ -13,12 +13,24 @@ pub struct DeviceClock {
 }
 
 impl DeviceClock {
-    /// What the vehicle's clock shows at a time of the scene; never below 0.
+    /// Whether it shows the scene's time.
     #[must_use]
-    pub fn shown_nanos(&self, scene_nanos: u64) -> u64 {
-        let ahead_nanos = self.offset_ms * 1e6 + self.drift_ppm * 1e-6 * scene_nanos as f64;
-        let shown = i128::from(scene_nanos) + ahead_nanos.round() as i128;
+    pub fn is_right(&self) -> bool {
+        *self == Self::default()
+    }
+
+    /// What the vehicle's clock shows at a time of a scene that began at `began_nanos`: at the beginning it is off by
+    /// its offset. Never below 0.
+    #[must_use]
+    pub fn shown_since(&self, began_nanos: u64, scene_nanos: u64) -> u64 {
+        let ahead_nanos = self.ahead_nanos(scene_nanos.saturating_sub(began_nanos));
+        let shown = i128::from(scene_nanos) + ahead_nanos;
         u64::try_from(shown.max(0)).unwrap_or(u64::MAX)
+    }
+
+    /// How far it is ahead so long after the beginning.
+    fn ahead_nanos(&self, since_nanos: u64) -> i128 {
+        (self.offset_ms * 1e6 + self.drift_ppm * 1e-6 * since_nanos as f64).round() as i128
     }
 }
 
@@ -28,10 +40,10 @@ mod tests {
 
     #[test]
     fn a_clock_is_off_by_its_offset_and_gains_by_its_drift() {
-        assert_eq!(DeviceClock::default().shown_nanos(123), 123);
+        assert_eq!(DeviceClock::default().shown_since(7, 123), 123);
         let clock = DeviceClock { offset_ms: -5.0, drift_ppm: 100.0 };
-        assert_eq!(clock.shown_nanos(0), 0);
-        assert_eq!(clock.shown_nanos(1_000_000_000), 995_100_000);
-        assert_eq!(clock.shown_nanos(1_700_000_000_000_000_000) - 1_700_000_000_000_000_000, 169_999_995_000_000);
+        assert_eq!(clock.shown_since(0, 0), 0, "no time is before 0");
+        assert_eq!(clock.shown_since(0, 1_000_000_000), 995_100_000);
+        assert_eq!(clock.shown_since(1_000_000_000, 2_000_000_000), 1_995_100_000);
     }
 }

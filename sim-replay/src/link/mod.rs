@@ -7,7 +7,7 @@
 //! - [`LinkConfig`]: the stages, with [`LinkConfig::preset`] for links that others have described.
 //! - [`Air`]: takes [`Parcel`]s and says when and whether they arrive.
 //! - [`node`]: the same between the agents and an ego of a live run.
-//! - [`DeviceClock`]: offset and drift of a vehicle's own clock.
+//! - [`DeviceClock`]: offset and drift of the clock of those who send, by which their capture times are off.
 
 mod air;
 mod capacity;

@@ -99,6 +99,8 @@ struct Node<'a> {
     next_id: u64,
     /// When the first message came: time 0 of the air.
     began: Option<Instant>,
+    /// Capture time of the first, from which clocks drift.
+    began_nanos: Option<u64>,
     report: LinkReport,
 }
 
@@ -121,6 +123,7 @@ impl<'a> Node<'a> {
             kept_bytes: 0,
             next_id: 0,
             began: None,
+            began_nanos: None,
             report: LinkReport::default(),
         })
     }
@@ -256,7 +259,14 @@ impl<'a> Node<'a> {
     fn pass_on(&mut self, parcel: &Parcel, is_copy: bool, is_repeated: bool) {
         let publisher = self.vehicles.get(&parcel.from).and_then(|vehicle| vehicle.publishers.get(&parcel.stream));
         let (Some(publisher), Some(arrival)) = (publisher, self.kept.get(&parcel.id)) else { return };
-        publisher.relay(arrival);
+        match arrival.header.stamp.capture_nanos {
+            // What tells of no moment has no capture time.
+            0 => publisher.relay(arrival),
+            scene_nanos => {
+                let began_nanos = *self.began_nanos.get_or_insert(scene_nanos);
+                publisher.relay_as(arrival, self.air.clock().shown_since(began_nanos, scene_nanos));
+            }
+        }
         if is_copy {
             self.report.copies += 1;
         } else {

@@ -76,9 +76,11 @@ impl Courier {
         bytes: u64,
         nanos: u64,
         distance_m: f64,
-        letter: Letter,
+        mut letter: Letter,
     ) {
         self.stream = stream;
+        let clock = self.air.clock();
+        letter.view.capture_nanos = clock.shown_since(self.began_nanos, letter.view.capture_nanos);
         let from = letter.view.cav.clone();
         self.hand_over(&from, stream, sequence, bytes, nanos, distance_m, Some(letter));
     }
