@@ -5,6 +5,7 @@ use std::process::ExitCode;
 use agent::process;
 use anyhow::Context;
 use clap::{Parser, Subcommand};
+use sim_replay::bus::BusError;
 
 use crate::command;
 
@@ -42,7 +43,8 @@ pub(crate) fn run(cli: Cli) -> ExitCode {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("error: {error:#}");
-            if error.is::<BadInput>() { ExitCode::from(2) } else { ExitCode::FAILURE }
+            let is_bad_input = error.is::<BadInput>() || BusError::is_behind(error.as_ref());
+            if is_bad_input { ExitCode::from(2) } else { ExitCode::FAILURE }
         }
     }
 }

@@ -4,6 +4,8 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 
+use sim_replay::bus::BusError;
+
 use crate::command;
 
 /// Scenes: look into recorded ones, generate new ones, stream either as live traffic, record what comes of it.
@@ -51,7 +53,7 @@ pub(crate) fn run(cli: Cli) -> ExitCode {
         Ok(Outcome::DataLost) => ExitCode::from(3),
         Err(error) => {
             eprintln!("error: {error:#}");
-            ExitCode::FAILURE
+            if BusError::is_behind(error.as_ref()) { ExitCode::from(2) } else { ExitCode::FAILURE }
         }
     }
 }

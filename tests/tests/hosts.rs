@@ -143,6 +143,20 @@ fn commands(folder: &Path) -> Vec<(String, Vec<String>)> {
 }
 
 #[test]
+fn keys_that_are_not_there_are_named_and_not_tried_again() {
+    let folder = tempfile::tempdir().unwrap();
+    let output = Command::new(programs().join("sim-replay"))
+        .args(["record", "--run=test", "--connect=tls/127.0.0.1:1"])
+        .arg(format!("--tls={}", folder.path().display()))
+        .arg(format!("--out={}", folder.path().join("recording.mcap").display()))
+        .output()
+        .unwrap();
+    // The code with which the units do not start a process again.
+    assert_eq!(output.status.code(), Some(2));
+    assert!(String::from_utf8_lossy(&output.stderr).contains("ca.pem"), "{output:?}");
+}
+
+#[test]
 fn units_and_containers_start_what_there_is() {
     let commands = commands(&Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy"));
     assert_eq!(commands.len(), 8, "{commands:?}");

@@ -97,7 +97,7 @@ pub(crate) fn exit_code(error: &anyhow::Error) -> ExitCode {
             || cause.is::<FleetError>()
             || cause.is::<EvaluationError>()
             || cause.is::<TableError>()
-            || cause.downcast_ref::<BusError>().is_some_and(BusError::is_bad_input)
+            || BusError::is_behind(cause)
             || cause.downcast_ref::<SweepError>().is_some_and(SweepError::is_bad_input)
             || cause.downcast_ref::<UpError>().is_some_and(UpError::is_bad_input)
     });

@@ -14,6 +14,7 @@ use std::process::ExitCode;
 use agent::process;
 use anyhow::Context;
 use indicatif::{ProgressBar, ProgressStyle};
+use sim_replay::bus::BusError;
 use sim_replay::dataset::{self, Scenario};
 
 /// What `ego-fuser` can be asked to do.
@@ -55,7 +56,8 @@ pub(crate) struct BadInput(pub(crate) String);
 
 /// Exit code of a failed command: 2 for bad usage or input, 1 otherwise.
 pub(crate) fn exit_code(error: &anyhow::Error) -> ExitCode {
-    if error.chain().any(|cause| cause.is::<BadInput>()) { ExitCode::from(2) } else { ExitCode::FAILURE }
+    let is_bad_input = error.chain().any(|cause| cause.is::<BadInput>()) || BusError::is_behind(error.as_ref());
+    if is_bad_input { ExitCode::from(2) } else { ExitCode::FAILURE }
 }
 
 /// All scenarios of some datasets.

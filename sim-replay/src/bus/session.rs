@@ -1,14 +1,14 @@
 //! Opening the bus: explicit endpoints, no discovery, every limit set on purpose.
 
-use std::fmt;
 use std::net::TcpListener;
-use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
 use zenoh::{Config, Session, Wait};
 
 use super::credentials::{AUTHORITY_FILE, CERTIFICATE_FILE, Credentials, KEY_FILE};
+use super::endpoint::Endpoint;
+use super::error::BusError;
 use super::guard::{self, Guard};
 
 /// How long one attempt to open a connection may take.
@@ -31,9 +31,6 @@ pub(super) const LONGEST_MESSAGE: Duration = Duration::from_secs(120);
 /// The same for a router, whose other messages of the same sender wait meanwhile.
 const LONGEST_DELIVERY: Duration = Duration::from_secs(5);
 
-const TCP: &str = "tcp/";
-const TLS: &str = "tls/";
-
 /// Which end of the star a process is.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub enum Role {
@@ -47,71 +44,6 @@ pub enum Role {
         /// The router's endpoint.
         connect: Endpoint,
     },
-}
-
-/// A checked zenoh endpoint: `tcp/HOST:PORT`, or `tls/HOST:PORT` where both ends have keys.
-#[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Endpoint(String);
-
-impl Endpoint {
-    /// Reads `tcp/HOST:PORT` or `tls/HOST:PORT`; IPv6 hosts stand in brackets.
-    ///
-    /// # Errors
-    /// [`BusError::Endpoint`] names what is not one.
-    pub fn new(text: &str) -> Result<Self, BusError> {
-        let bad = || BusError::Endpoint(text.chars().take(100).collect());
-        let address = text.strip_prefix(TCP).or_else(|| text.strip_prefix(TLS)).ok_or_else(bad)?;
-        let (host, port) = address.rsplit_once(':').ok_or_else(bad)?;
-        let bracketed = host.starts_with('[') && host.ends_with(']');
-        let clean = |c: char| c.is_ascii_alphanumeric() || ".-_".contains(c) || (bracketed && "[]:%".contains(c));
-        if host.is_empty() || !host.chars().all(clean) || port.parse::<u16>().is_err() {
-            return Err(bad());
-        }
-        Ok(Self(text.into()))
-    }
-
-    /// The endpoint on this machine's loopback at `port`.
-    #[must_use]
-    pub fn loopback(port: u16) -> Self {
-        Self(format!("tcp/127.0.0.1:{port}"))
-    }
-
-    /// The same place, spoken to with keys. Who has them never falls back to plain TCP.
-    #[must_use]
-    pub fn secured(&self) -> Self {
-        Self(format!("{TLS}{}", self.address()))
-    }
-
-    /// Whether only those with keys speak there.
-    #[must_use]
-    pub fn is_secured(&self) -> bool {
-        self.0.starts_with(TLS)
-    }
-
-    /// The endpoint as zenoh writes it.
-    #[must_use]
-    pub fn as_str(&self) -> &str {
-        &self.0
-    }
-
-    fn address(&self) -> &str {
-        // Checked when it was made.
-        &self.0[TCP.len()..]
-    }
-}
-
-impl fmt::Display for Endpoint {
-    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.write_str(&self.0)
-    }
-}
-
-impl std::str::FromStr for Endpoint {
-    type Err = BusError;
-
-    fn from_str(text: &str) -> Result<Self, BusError> {
-        Self::new(text)
-    }
 }
 
 /// How to open a session.
@@ -280,88 +212,6 @@ fn tls_settings(credentials: &Credentials) -> Vec<(&'static str, Value)> {
     ]
 }
 
-/// Why the bus could not be opened or used.
-#[derive(Debug, thiserror::Error)]
-pub enum BusError {
-    /// Not an endpoint.
-    #[error("{0:?} is not an endpoint: tcp/HOST:PORT, for example tcp/127.0.0.1:7447, or tls/HOST:PORT")]
-    Endpoint(String),
-    /// Keys that are not there, or not right.
-    #[error("{}: {what}", path.display())]
-    Keys {
-        /// The file or folder.
-        path: PathBuf,
-        /// What is wrong with it.
-        what: String,
-    },
-    /// An endpoint where only those with keys speak.
-    #[error("{0} takes keys: name their folder (--tls DIR; v2vloc keys makes them)")]
-    NoKeys(Endpoint),
-    /// zenoh refused or changed a setting.
-    #[error("zenoh setting {key}: wanted {wanted}, {found}")]
-    Setting {
-        /// The key of the configuration.
-        key: &'static str,
-        /// The value that was asked for.
-        wanted: Value,
-        /// What zenoh made of it.
-        found: String,
-    },
-    /// Another process listens there.
-    #[error("cannot listen at {endpoint}: the port is in use; end the other process or choose another port")]
-    PortInUse {
-        /// Where.
-        endpoint: Endpoint,
-    },
-    /// Nothing answers at the router's place.
-    #[error(
-        "no router at {endpoint} after {waited_s:.1} s; start it first (v2vloc up, or zenohd) or correct the endpoint{}",
-        if endpoint.is_secured() { ". It may also have refused this certificate: its log says so" } else { "" }
-    )]
-    Unreachable {
-        /// Where.
-        endpoint: Endpoint,
-        /// Seconds waited.
-        waited_s: f64,
-    },
-    /// The system gives no thread.
-    #[error("no thread for {what}: {cause}")]
-    Thread {
-        /// What it was wanted for.
-        what: String,
-        /// The system's words.
-        cause: std::io::Error,
-    },
-    /// The metrics cannot be served there.
-    #[error("cannot serve metrics at {address}: {cause}")]
-    Metrics {
-        /// Where.
-        address: std::net::SocketAddr,
-        /// The system's words.
-        cause: std::io::Error,
-    },
-    /// Anything else that zenoh says.
-    #[error("zenoh, {doing}: {cause}")]
-    Zenoh {
-        /// What was tried.
-        doing: String,
-        /// zenoh's words.
-        cause: String,
-    },
-}
-
-impl BusError {
-    /// Whether what was asked for is at fault, so that trying again changes nothing.
-    #[must_use]
-    pub fn is_bad_input(&self) -> bool {
-        matches!(self, Self::Endpoint(_) | Self::Keys { .. } | Self::NoKeys(_))
-    }
-
-    pub(super) fn zenoh(doing: impl Into<String>, cause: &zenoh::Error) -> Self {
-        Self::Zenoh { doing: doing.into(), cause: cause.to_string() }
-    }
-}
-
 /// Opens a session, waiting until it listens (router) or is connected (client).
 ///
 /// A client that loses its router later reconnects by itself, at first after 100 ms, then ever more slowly up to 1 s.
@@ -429,19 +279,6 @@ fn same(found: &Value, wanted: &Value) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn reads_endpoints() {
-        for text in ["tcp/127.0.0.1:7447", "tcp/[::1]:7447", "tcp/router.local:1", "tls/router.local:1"] {
-            assert_eq!(Endpoint::new(text).unwrap().as_str(), text);
-        }
-        for text in
-            ["", "127.0.0.1:7447", "tcp/:1", "tcp/host", "tcp/host:70000", "udp/host:1", "tcp/a b:1", "tcp/::1:1"]
-        {
-            let error = Endpoint::new(text).unwrap_err();
-            assert!(error.to_string().contains("tcp/HOST:PORT"), "{text}: {error}");
-        }
-    }
 
     #[test]
     fn every_setting_reads_back() {

@@ -1,0 +1,91 @@
+//! Where routers are.
+
+use std::fmt;
+
+use super::BusError;
+
+const TCP: &str = "tcp/";
+const TLS: &str = "tls/";
+
+/// A checked zenoh endpoint: `tcp/HOST:PORT`, or `tls/HOST:PORT` where both ends have keys.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct Endpoint(String);
+
+impl Endpoint {
+    /// Reads `tcp/HOST:PORT` or `tls/HOST:PORT`; IPv6 hosts stand in brackets.
+    ///
+    /// # Errors
+    /// [`BusError::Endpoint`] names what is not one.
+    pub fn new(text: &str) -> Result<Self, BusError> {
+        let bad = || BusError::Endpoint(text.chars().take(100).collect());
+        let address = text.strip_prefix(TCP).or_else(|| text.strip_prefix(TLS)).ok_or_else(bad)?;
+        let (host, port) = address.rsplit_once(':').ok_or_else(bad)?;
+        let bracketed = host.starts_with('[') && host.ends_with(']');
+        let clean = |c: char| c.is_ascii_alphanumeric() || ".-_".contains(c) || (bracketed && "[]:%".contains(c));
+        if host.is_empty() || !host.chars().all(clean) || port.parse::<u16>().is_err() {
+            return Err(bad());
+        }
+        Ok(Self(text.into()))
+    }
+
+    /// The endpoint on this machine's loopback at `port`.
+    #[must_use]
+    pub fn loopback(port: u16) -> Self {
+        Self(format!("tcp/127.0.0.1:{port}"))
+    }
+
+    /// The same place, spoken to with keys. Who has them never falls back to plain TCP.
+    #[must_use]
+    pub fn secured(&self) -> Self {
+        Self(format!("{TLS}{}", self.address()))
+    }
+
+    /// Whether only those with keys speak there.
+    #[must_use]
+    pub fn is_secured(&self) -> bool {
+        self.0.starts_with(TLS)
+    }
+
+    /// The endpoint as zenoh writes it.
+    #[must_use]
+    pub fn as_str(&self) -> &str {
+        &self.0
+    }
+
+    pub(super) fn address(&self) -> &str {
+        // Checked when it was made.
+        &self.0[TCP.len()..]
+    }
+}
+
+impl fmt::Display for Endpoint {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.0)
+    }
+}
+
+impl std::str::FromStr for Endpoint {
+    type Err = BusError;
+
+    fn from_str(text: &str) -> Result<Self, BusError> {
+        Self::new(text)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn reads_endpoints() {
+        for text in ["tcp/127.0.0.1:7447", "tcp/[::1]:7447", "tcp/router.local:1", "tls/router.local:1"] {
+            assert_eq!(Endpoint::new(text).unwrap().as_str(), text);
+        }
+        for text in
+            ["", "127.0.0.1:7447", "tcp/:1", "tcp/host", "tcp/host:70000", "udp/host:1", "tcp/a b:1", "tcp/::1:1"]
+        {
+            let error = Endpoint::new(text).unwrap_err();
+            assert!(error.to_string().contains("tcp/HOST:PORT"), "{text}: {error}");
+        }
+    }
+}
