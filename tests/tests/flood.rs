@@ -46,7 +46,7 @@ fn a_flood_from_one_peer_costs_the_others_nothing() {
     let router = TestRouter::open();
     let [honest, flooding, ego] = [("agent-1", "1"), ("agent-2", "2"), ("ego-9", "9")].map(|(p, c)| router.join(p, c));
     let limits = InboxLimits { messages_per_s: 20.0, ..InboxLimits::PEERS };
-    let inbox = ego.limited_inbox(4, 4, limits);
+    let inbox = ego.limited_inbox(64, 4, limits);
     let [good, bad] = ["1/lidar", "2/lidar"].map(topic);
     let _subscriptions = [&good, &bad].map(|topic| ego.subscribe(topic.clone(), &inbox).unwrap());
     let [calm, flood] = [(&honest, &good), (&flooding, &bad)].map(|(bus, topic)| {
