@@ -3,27 +3,11 @@
 //! `-- --seeds FOLDER` it writes the sound inputs down instead, for `fuzz/`.
 
 use peak_alloc::PeakAlloc;
-use tests::mutation::run::{Meter, all, formats};
+use tests::mutation::run::{all, formats};
 use tests::mutation::scratch;
 
 #[global_allocator]
 static MEMORY: PeakAlloc = PeakAlloc;
-
-struct Memory;
-
-impl Meter for Memory {
-    fn reset(&self) {
-        MEMORY.reset_peak_usage();
-    }
-
-    fn peak_bytes(&self) -> usize {
-        MEMORY.peak_usage()
-    }
-
-    fn held_bytes(&self) -> usize {
-        MEMORY.current_usage()
-    }
-}
 
 fn main() {
     let numbers: Vec<u64> = std::env::args().skip(1).filter_map(|argument| argument.parse().ok()).collect();
@@ -36,7 +20,7 @@ fn main() {
     }
     println!("| format | damaged | accepted | panics | peak memory of one, KiB | seconds |");
     println!("| --- | --- | --- | --- | --- | --- |");
-    for report in all(scratch.path(), messages, files, seed, &Memory) {
+    for report in all(scratch.path(), messages, files, seed, &MEMORY) {
         let (kib, seconds) = (report.peak_bytes.div_ceil(1024), report.took.as_secs());
         println!(
             "| {} | {} | {} | {} | {kib} | {seconds} |",

@@ -5,7 +5,7 @@ use std::sync::{Mutex, PoisonError};
 
 use peak_alloc::PeakAlloc;
 use tests::mutation::readers::all as all_readers;
-use tests::mutation::run::{Meter, Report, all, formats};
+use tests::mutation::run::{Report, all, formats};
 use tests::mutation::scratch;
 use tests::mutation::wire_target::{self, LIMITS};
 
@@ -14,22 +14,6 @@ static MEMORY: PeakAlloc = PeakAlloc;
 
 /// One at a time: the peak is that of the whole process.
 static ALONE: Mutex<()> = Mutex::new(());
-
-struct Memory;
-
-impl Meter for Memory {
-    fn reset(&self) {
-        MEMORY.reset_peak_usage();
-    }
-
-    fn peak_bytes(&self) -> usize {
-        MEMORY.peak_usage()
-    }
-
-    fn held_bytes(&self) -> usize {
-        MEMORY.current_usage()
-    }
-}
 
 fn check(reports: &[Report]) {
     for report in reports {
@@ -43,14 +27,14 @@ fn check(reports: &[Report]) {
 #[test]
 fn damaged_messages_are_refused_or_sound() {
     let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
-    check(&all(std::path::Path::new(""), 100_000, 0, 1, &Memory));
+    check(&all(std::path::Path::new(""), 100_000, 0, 1, &MEMORY));
 }
 
 #[test]
 fn damaged_files_are_refused_or_sound() {
     let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
     let scratch = scratch();
-    check(&all(scratch.path(), 0, 3_000, 1, &Memory));
+    check(&all(scratch.path(), 0, 3_000, 1, &MEMORY));
 }
 
 #[test]
@@ -77,8 +61,8 @@ fn a_message_of_15_bytes_that_claims_2_to_the_42_takes_no_memory() {
     let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
     let mut bytes = [0; 15];
     bytes[..8].copy_from_slice(&(1_u64 << 42).to_le_bytes());
-    Memory.reset();
-    let held = Memory.held_bytes();
+    MEMORY.reset_peak_usage();
+    let held = MEMORY.current_usage();
     assert!((0..1000).all(|_| !wire_target::read(&bytes)));
-    assert!(Memory.peak_bytes() - held < 4096, "{} bytes", Memory.peak_bytes() - held);
+    assert!(MEMORY.peak_usage() - held < 4096, "{} bytes", MEMORY.peak_usage() - held);
 }

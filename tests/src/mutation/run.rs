@@ -4,19 +4,10 @@ use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::Path;
 use std::time::{Duration, Instant};
 
+use peak_alloc::PeakAlloc;
 use sim_replay::random::SplitMix64;
 
 use super::{damage, readers, seeds, wire_target};
-
-/// Counts memory; the allocator belongs to the program.
-pub trait Meter {
-    /// The peak begins anew.
-    fn reset(&self);
-    /// Bytes held at the peak.
-    fn peak_bytes(&self) -> usize;
-    /// Bytes held now.
-    fn held_bytes(&self) -> usize;
-}
 
 /// What came of one format.
 #[derive(Debug, Clone)]
@@ -40,7 +31,7 @@ pub struct Report {
 /// # Panics
 /// When a seed is not accepted undamaged: then nothing behind the first check would be tried.
 #[must_use]
-pub fn all(scratch: &Path, messages: u64, files: u64, seed: u64, meter: &dyn Meter) -> Vec<Report> {
+pub fn all(scratch: &Path, messages: u64, files: u64, seed: u64, meter: &PeakAlloc) -> Vec<Report> {
     let mut reports = Vec::new();
     if messages > 0 {
         let sound = seeds::messages();
@@ -70,7 +61,7 @@ fn one(
     (name, sound): (&'static str, &[Vec<u8>]),
     cases: u64,
     seed: u64,
-    meter: &dyn Meter,
+    meter: &PeakAlloc,
     damage: fn(&mut Vec<u8>, &[u8], &mut SplitMix64),
     read: &dyn Fn(&[u8]) -> bool,
 ) -> Report {
@@ -82,13 +73,13 @@ fn one(
         let mut random = SplitMix64::derived(seed, &[case]);
         let mut bytes = sound[random.below(sound.len())].clone();
         damage(&mut bytes, &sound[random.below(sound.len())], &mut random);
-        meter.reset();
-        let held = meter.held_bytes();
+        meter.reset_peak_usage();
+        let held = meter.current_usage();
         match catch_unwind(AssertUnwindSafe(|| read(&bytes))) {
             Ok(was_accepted) => accepted += u64::from(was_accepted),
             Err(_) => panics.push(case),
         }
-        peak_bytes = peak_bytes.max(meter.peak_bytes().saturating_sub(held));
+        peak_bytes = peak_bytes.max(meter.peak_usage().saturating_sub(held));
     }
     Report { name, cases, accepted, panics, peak_bytes, took: begun.elapsed() }
 }
