@@ -29,6 +29,9 @@ fn largest_map(dtype: Dtype, selection: Selection, packing: Packing, body: Vec<u
 /// A zstd frame of zeros, written in small parts so that making it takes no memory.
 fn zeros(bytes: u64) -> Vec<u8> {
     let mut encoder = zstd::stream::Encoder::new(Vec::new(), 3).unwrap();
+    encoder.set_pledged_src_size(Some(bytes)).unwrap();
+    // 128 MiB of window, where they are kept.
+    encoder.window_log(27).unwrap();
     for _ in 0..bytes / (64 << 10) {
         encoder.write_all(&[0; 64 << 10]).unwrap();
     }

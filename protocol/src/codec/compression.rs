@@ -16,17 +16,19 @@ pub(super) fn pack(bytes: &[u8], level: i32) -> Result<Option<Vec<u8>>, WireErro
 }
 
 /// Unpacks to exactly `expected` bytes, a size the caller has checked against its limits. The decoder writes into a
-/// buffer of that size and fails at its end, whatever the frame claims: a bomb has nowhere to go off.
+/// buffer of that size and fails at its end, whatever the frame claims: a bomb has nowhere to go off. All at once, so that
+/// zstd reads back what it has written and keeps no window of its own, however large a one the frame asks for.
 ///
 /// # Errors
 /// [`WireError::Compression`] when the frame is broken, or unpacks to more or fewer bytes.
 pub(super) fn unpack(packed: Vec<u8>, expected: usize) -> Result<Vec<u8>, WireError> {
     let refuse =
         |detail: String| WireError::Compression { bytes: packed.len() as u64, expected: expected as u64, detail };
-    // A frame says how much it holds; believing a smaller claim saves the buffer of a message that lies.
-    let claimed = zstd::zstd_safe::get_frame_content_size(&packed).map_err(|_| refuse("no zstd frame".into()))?;
-    if let Some(claimed) = claimed.filter(|claimed| *claimed != expected as u64) {
-        return Err(refuse(format!("the frame holds {claimed}")));
+    // A frame says how much it holds, before anything is allocated for it.
+    match zstd::zstd_safe::get_frame_content_size(&packed).map_err(|_| refuse("no zstd frame".into()))? {
+        Some(claimed) if claimed == expected as u64 => {}
+        Some(claimed) => return Err(refuse(format!("the frame holds {claimed}"))),
+        None => return Err(refuse("the frame does not say how much it holds".into())),
     }
     let mut bytes = Vec::with_capacity(expected);
     let found = zstd::bulk::Decompressor::new()
@@ -62,6 +64,29 @@ mod tests {
         .take(4096)
         .collect();
         assert_eq!(pack(&bytes, 3).unwrap(), None);
+    }
+
+    /// A sound frame of zeros whose window descriptor asks for 2 GiB, with or without its size; the format is RFC 8878's.
+    fn wide(bytes: u32, says_size: bool) -> Vec<u8> {
+        const BLOCK: u32 = 128 << 10;
+        let mut frame = vec![0x28, 0xb5, 0x2f, 0xfd, if says_size { 0x80 } else { 0 }, 21 << 3];
+        frame.extend(bytes.to_le_bytes().iter().filter(|_| says_size));
+        for begin in (0..bytes).step_by(BLOCK as usize) {
+            // One byte, repeated.
+            let len = BLOCK.min(bytes - begin);
+            let head = len << 3 | 1 << 1 | u32::from(begin + len == bytes);
+            frame.extend(&head.to_le_bytes()[..3]);
+            frame.push(0);
+        }
+        frame
+    }
+
+    #[test]
+    fn a_huge_window_takes_nothing_and_a_frame_without_size_is_refused() {
+        let zeros = 300 << 10;
+        assert_eq!(unpack(wide(zeros, true), zeros as usize).unwrap(), vec![0; zeros as usize]);
+        let error = unpack(wide(zeros, false), zeros as usize).unwrap_err();
+        assert!(error.to_string().contains("does not say"), "{error}");
     }
 
     #[test]

@@ -65,7 +65,7 @@ pub enum Selection {
 pub enum Packing {
     /// Not at all.
     Raw,
-    /// One zstd frame.
+    /// One zstd frame that says how much it holds.
     Zstd,
 }
 

@@ -215,40 +215,12 @@ pub(super) mod tests {
         let bytes: Vec<u8> = values.iter().flat_map(|value| value.to_le_bytes()).collect();
         let data = STANDARD.encode(bytes);
         let (first, second) = data.split_at(76);
-        format!(
-            "lidar_pose: &id003 !!python/object/apply:numpy.core.multiarray._reconstruct
-  args:
-  - &id001 !!python/name:numpy.ndarray ''
-  - !!python/tuple
-    - 0
-  - !!binary |
-    Yg==
-  state: !!python/tuple
-  - 1
-  - !!python/tuple
-    - 4
-    - 4
-  - &id002 !!python/object/apply:numpy.dtype
-    args:
-    - f8
-    - false
-    - true
-    state: !!python/tuple
-    - 3
-    - <
-    - null
-    - null
-    - null
-    - -1
-    - -1
-    - 0
-  - false
-  - !!binary |
-    {first}
-    {second}
-"
-        )
+        let (before, _) = MATRIX.trim_end().rsplit_once("!!binary |").unwrap();
+        format!("{before}!!binary |\n    {first}\n    {second}\n")
     }
+
+    /// As Python wrote one.
+    const MATRIX: &str = include_str!("numpy_matrix.yaml");
 
     const NUMBERS: [f64; 16] =
         [0.0, -1.0, 2.5, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0, 10.0, 11.0, 12.0, 13.0, 14.0, 1e-300];

@@ -70,48 +70,11 @@ pub const OPV2V: &str = "lidar_pose: [1.5, -2.0, 1.9, 0.0, 90.0, 0.0]\ntrue_ego_
     center: [0.0, 0.0, 0.8]\n    extent: [2.0, 0.9, 0.8]\n    location: [-8.0, 3.0, 0.0]\n    speed: 0.0\n";
 
 /// The same as V2V4Real does: matrices as Python wrote them.
-pub const V2V4REAL: &str = "lidar_pose: &id003 !!python/object/apply:numpy.core.multiarray._reconstruct
-  args:
-  - &id001 !!python/name:numpy.ndarray ''
-  - !!python/tuple
-    - 0
-  - !!binary |
-    Yg==
-  state: !!python/tuple
-  - 1
-  - !!python/tuple
-    - 4
-    - 4
-  - &id002 !!python/object/apply:numpy.dtype
-    args:
-    - f8
-    - false
-    - true
-    state: !!python/tuple
-    - 3
-    - <
-    - null
-    - null
-    - null
-    - -1
-    - -1
-    - 0
-  - false
-  - !!binary |
-    AAAAAAAA8D8AAAAAAAAAAAAAAAAAAAAAAAAAAAAAFEAAAAAAAAAAAAAAAAAAAPA/AAAAAAAA
-    AAAAAAAAAAAYQAAAAAAAAAAAAAAAAAAAAAAAAAAAAADwPwAAAAAAAAAAAAAAAAAAAAAAAAAA
-    AAAAAAAAAAAAAAAAAAAAAAAA8D8=
-true_ego_pos: [0, 0, 0, 0, 0, 0]
-ego_speed: 3.6
-vehicles:
-  1:
-    angle: [0, 90, 0]
-    center: [0, 0, 0]
-    extent: [2, 1, 0.75]
-    location: [10, 4, -1]
-    ass_id: 5
-    obj_type: Truck
-";
+pub const V2V4REAL: &str = concat!(
+    include_str!("../../../sim-replay/src/dataset/numpy_matrix.yaml"),
+    "true_ego_pos: [0, 0, 0, 0, 0, 0]\nego_speed: 3.6\nvehicles:\n  1:\n    angle: [0, 90, 0]\n    center: [0, 0, 0]\n    \
+     extent: [2, 1, 0.75]\n    location: [10, 4, -1]\n    ass_id: 5\n    obj_type: Truck\n"
+);
 
 /// A road, a junction, a crossing.
 pub const OPENDRIVE: &str = r#"<?xml version="1.0"?><OpenDRIVE><header revMajor="1" revMinor="4"/>

@@ -165,6 +165,19 @@ fn what_is_read_is_what_was_written() {
 }
 
 #[test]
+fn a_chunk_that_asks_for_a_huge_window_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let options = RecordingOptions { zstd_level: Some(1), with_ros: false };
+    let mut bytes = recorded(3, 100, options);
+    let frame = bytes.windows(4).position(|bytes| bytes == [0x28, 0xb5, 0x2f, 0xfd]).unwrap();
+    // The window descriptor of the frame: 2 GiB. zstd itself allows a stream 128 MiB, and looks before it allocates.
+    assert_eq!(bytes[frame + 4] & 0x20, 0, "a frame with a window");
+    bytes[frame + 5] = 21 << 3;
+    let error = Recording::open(&write(folder.path(), &bytes)).unwrap_err();
+    assert!(error.to_string().contains("too much memory"), "{error}");
+}
+
+#[test]
 fn a_recording_is_a_scene() {
     let folder = tempfile::tempdir().unwrap();
     write(folder.path(), &recorded(3, 50, RecordingOptions::default()));
