@@ -4,10 +4,10 @@ use std::collections::BTreeMap;
 
 pub use agent::pose_error::PoseError;
 use agent::statistics::{quantile, sorted};
-use protocol::{Counts, DropReason};
+use protocol::{CavId, Counts, DropReason};
 use serde::{Deserialize, Serialize};
 
-use crate::score::Board;
+use crate::score::{Board, NeighbourRecord};
 
 /// A pose nearer to the truth than this is a success, metres.
 const SUCCESS_M: f64 = 3.0;
@@ -39,6 +39,9 @@ pub struct Metrics {
     pub age_ms: Percentiles,
     /// What crossed the air.
     pub comm: Communication,
+    /// Every neighbour that the ego heard.
+    #[serde(default)]
+    pub neighbours: BTreeMap<CavId, NeighbourRecord>,
     /// The ledger's totals.
     pub messages: Messages,
 }
@@ -65,6 +68,7 @@ impl Metrics {
             latency_ms: board.latencies(),
             age_ms: board.ages(),
             comm: board.communication(),
+            neighbours: board.neighbours().clone(),
             messages,
         }
     }

@@ -77,6 +77,8 @@ fn number(value: Option<f64>, digits: usize) -> String {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeMap;
+
     use super::*;
     use crate::metrics::{Communication, Latencies, Messages, Percentiles, PoseErrors};
 
@@ -93,6 +95,7 @@ mod tests {
             pose: PoseErrors::default(),
             latency_ms: Latencies { capture_to_detection: Percentiles { p50: Some(81.4), ..Percentiles::default() } },
             age_ms: Percentiles::default(),
+            neighbours: BTreeMap::new(),
             comm: Communication::default(),
             messages: Messages::default(),
         };

@@ -5,6 +5,7 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
+use protocol::HeardNeighbour;
 use serde::{Deserialize, Serialize};
 
 use crate::health::{ProcessStatus, State, Usage};
@@ -40,6 +41,9 @@ pub struct RunStatus {
     pub latency_ms: Option<f64>,
     /// Neighbours in the last result.
     pub fused: usize,
+    /// What the ego makes of those it heard for it.
+    #[serde(default)]
+    pub neighbours: Vec<HeardNeighbour>,
     /// Messages dropped so far, by all processes.
     pub dropped: u64,
     /// Its processes.
@@ -161,6 +165,16 @@ impl RunStatus {
                 process.last_fall.as_deref().unwrap_or("")
             );
         }
+        for neighbour in &self.neighbours {
+            let _ = writeln!(
+                text,
+                "neighbour {:10} clock {:>6} ms  trust {:>4}  {}",
+                neighbour.cav.as_str(),
+                optional(neighbour.clock_offset_s.map(|seconds| seconds * 1e3), 1),
+                optional(neighbour.trust, 2),
+                neighbour.doubt.map_or(String::new(), |doubt| format!("left out: {doubt}")),
+            );
+        }
         text
     }
 }
@@ -214,6 +228,7 @@ impl StatusWriter {
             last_result_s: progress.span.map(|(_, last)| now.saturating_duration_since(last).as_secs_f64()),
             latency_ms: progress.latency_ms,
             fused: progress.fused,
+            neighbours: progress.heard.clone(),
             dropped: progress.dropped,
             processes: processes(now),
         };
@@ -264,7 +279,13 @@ mod tests {
         assert!(matches!(RunStatus::newest(folder.path()), Err(StatusError::NoRun(_))));
         assert!(RunStatus::read(&run).unwrap_err().to_string().contains("status.json"));
         let mut writer = StatusWriter::new(&run, "test", "tcp/127.0.0.1:7447");
-        let progress = Progress { frames: 7, ..Progress::default() };
+        let liar = HeardNeighbour {
+            cav: protocol::CavId::new("4279").unwrap(),
+            trust: Some(0.03),
+            doubt: Some(protocol::Doubt::Invented),
+            clock_offset_s: Some(0.0125),
+        };
+        let progress = Progress { frames: 7, heard: vec![liar], ..Progress::default() };
         writer.write(Phase::Running, &progress, |_| vec![process(State::Ready)]);
         // Not time yet.
         writer.write(Phase::Running, &Progress::default(), |_| Vec::new());
@@ -273,6 +294,7 @@ mod tests {
         assert!(status.is_well());
         let table = status.table();
         assert!(table.starts_with("test running for 0 s at tcp/127.0.0.1:7447: 7 frames"), "{table}");
+        assert!(table.contains("clock   12.5 ms  trust 0.03  left out: invented"), "{table}");
         assert!(table.contains("agent-4288") && table.contains("was ended by signal 9"), "{table}");
 
         let dead = RunStatus { pid: u32::MAX, ..status.clone() };

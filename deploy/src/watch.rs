@@ -77,7 +77,7 @@ impl Watch {
             }
             let progress = scorer.progress();
             display.update(&progress);
-            for (name, why) in self.health.look(&progress.heard, Instant::now()) {
+            for (name, why) in self.health.look(&progress.told, Instant::now()) {
                 supervisor.replace(&name, &why);
             }
             self.tell(Phase::Running, &progress);

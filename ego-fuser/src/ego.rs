@@ -21,7 +21,7 @@ use crate::history::{History, KeptMap};
 use crate::method::{Exchange, Method, UnknownMethod};
 use crate::model::{METHOD_KEY, SCORE_THRESHOLD};
 use crate::samples::merge_points;
-use crate::trust::{Trust, TrustConfig};
+use crate::trust::{Belief, Trust, TrustConfig};
 use crate::warp::WarpError;
 
 /// What one vehicle sees, as it arrived.
@@ -86,8 +86,8 @@ pub struct EgoOutput {
     pub fused: Vec<usize>,
     /// The other neighbours, each with its reason.
     pub skipped: Vec<(usize, Skipped)>,
-    /// How far each neighbour that could be fused is believed, 0..1; empty where nobody asks.
-    pub trusts: Vec<(usize, f64)>,
+    /// How far each neighbour that could be fused is believed; empty where nobody asks.
+    pub beliefs: Vec<(usize, Belief)>,
     /// Where the time went.
     pub stages: Vec<StageTiming>,
 }
@@ -247,16 +247,16 @@ impl Ego {
             }
         }
         let mut stages = Stages::start();
-        let mut trusts = Vec::new();
+        let mut beliefs = Vec::new();
         if let Some(trust) = &mut self.trust
             && !fused.is_empty()
         {
             let told: Vec<(&View, Pose)> = aligned[1..].iter().map(|view| (view.view, view.ego_from_cav)).collect();
-            let beliefs = no_grad(|| trust.judge(own, &told, &mut self.detector))?;
-            let is_out: Vec<bool> = beliefs.iter().map(|belief| belief.is_out).collect();
+            let found = no_grad(|| trust.judge(own, &told, &mut self.detector))?;
+            let is_out: Vec<bool> = found.iter().map(Belief::is_out).collect();
             let doubted = fused.iter().zip(&is_out).filter(|(_, is_out)| **is_out);
             skipped.extend(doubted.map(|(&index, _)| (index, Skipped::Unusable(DropReason::Distrusted))));
-            trusts = fused.iter().zip(&beliefs).map(|(&index, belief)| (index, belief.trust)).collect();
+            beliefs = fused.iter().copied().zip(found).collect();
             fused = keep(fused, &is_out);
             let mut others = keep(aligned.split_off(1), &is_out);
             aligned.append(&mut others);
@@ -267,7 +267,7 @@ impl Ego {
             Exchange::Points => self.merge_points(&aligned, &mut stages),
             Exchange::Features | Exchange::Nothing => self.merge_features(&aligned, &mut stages),
         })?;
-        Ok(EgoOutput { detections, fused, skipped, trusts, stages: stages.timings })
+        Ok(EgoOutput { detections, fused, skipped, beliefs, stages: stages.timings })
     }
 
     /// Where a neighbour stands relative to the ego, or why it has no part.

@@ -30,7 +30,7 @@ use tch::Tensor;
 use crate::ego::{Content, Ego, EgoError, EgoOutput, Skipped, View, own_content};
 use crate::feature_store::{FeatureStoreError, MapSource};
 use crate::method::{Exchange, Method};
-use crate::trust::TrustConfig;
+use crate::trust::{TrustConfig, heard};
 
 use stepped::{RemoteCrew, RemoteError, SteppedConfig, VehicleConfig};
 
@@ -329,6 +329,7 @@ impl Evaluator {
             detections: output.detections,
             fused,
             skipped: skipped.collect(),
+            heard: heard(&output.beliefs, neighbours),
             stages: output.stages,
         }
     }

@@ -82,6 +82,7 @@ mod bev;
 mod body;
 mod box3d;
 pub mod codec;
+mod doubt;
 mod drop_reason;
 mod error;
 pub mod header;
@@ -107,6 +108,7 @@ pub use codec::{
     ByteLimit, Codec, CodecConfig, ConfidenceGate, DecodedFeatures, Dtype, EncodedFeatures, LimitedBy, Packing,
     RateChoice, RateReason, Selection, Smoothing, encode_features, encode_within,
 };
+pub use doubt::Doubt;
 pub use drop_reason::DropReason;
 pub use error::WireError;
 pub use header::{HEADER_LEN, Header, Kind, Stamp, WIRE_VERSION};
@@ -115,9 +117,9 @@ pub use key::{Key, KeyError, Selector};
 pub use ledger::{Account, Counts, Ledger};
 pub use limits::Limits;
 pub use message::{
-    AgentTruth, Bev, Boxes, Control, Descriptor, Detections, DetectionsReport, FusedNeighbour, Gnss, GnssSource, Lidar,
-    Message, ModelHash, NoPoseReason, Payload, Points, PoseEstimate, Radar, SkippedNeighbour, StageSummary,
-    StageTiming, Stats, TopicCount, TrueObject, Truth,
+    AgentTruth, Bev, Boxes, Control, Descriptor, Detections, DetectionsReport, FusedNeighbour, Gnss, GnssSource,
+    HeardNeighbour, Lidar, Message, ModelHash, NoPoseReason, Payload, Points, PoseEstimate, Radar, SkippedNeighbour,
+    StageSummary, StageTiming, Stats, TopicCount, TrueObject, Truth,
 };
 pub use point_cloud::{Handedness, PointCloud};
 pub use pose::{Pose, PoseError};

@@ -57,7 +57,7 @@ pub(crate) use {named, written_as_text};
 
 #[cfg(test)]
 mod tests {
-    use crate::{DropReason, RateReason, Role, Verb};
+    use crate::{Doubt, DropReason, RateReason, Role, Verb};
 
     #[test]
     fn values_are_written_by_name_and_the_names_differ() {
@@ -68,6 +68,7 @@ mod tests {
                 assert_eq!(serde_json::to_string(value).unwrap(), format!("\"{value}\""));
             }
         }
+        check(&Doubt::ALL);
         check(&DropReason::ALL);
         check(&RateReason::ALL);
         check(&Role::ALL);

@@ -1,10 +1,13 @@
 //! The score of a run, tick by tick, from what was detected and what was there. Knows no network and no file.
 
+use std::collections::BTreeMap;
+
 use ego_fuser::average_precision::{Ordering, Scorer};
 use protocol::{Box3d, CavId, Detections, DropReason, Pose, PoseEstimate, Stamp, Truth};
 use sim_replay::ground_truth::GroundTruthRule;
 
 use super::frame_record::{FrameRecord, JudgedFrame};
+use super::neighbours::{self, NeighbourRecord};
 use super::open_ticks::{OpenTicks, Part, Tick};
 use super::stage_stamps::StageStamps;
 use super::true_boxes::true_boxes;
@@ -28,6 +31,7 @@ pub struct Board {
     no_pose: u64,
     bytes: Vec<(u64, u64)>,
     ages_ms: Vec<f64>,
+    neighbours: BTreeMap<CavId, NeighbourRecord>,
     missed: u64,
     best: Option<JudgedFrame>,
 }
@@ -48,6 +52,7 @@ impl Board {
             no_pose: 0,
             bytes: Vec::new(),
             ages_ms: Vec::new(),
+            neighbours: BTreeMap::new(),
             missed: 0,
             best: None,
         }
@@ -144,6 +149,12 @@ impl Board {
         Communication::of(&self.bytes, self.nominal_values)
     }
 
+    /// Every neighbour that was heard.
+    #[must_use]
+    pub fn neighbours(&self) -> &BTreeMap<CavId, NeighbourRecord> {
+        &self.neighbours
+    }
+
     fn add(&mut self, stamp: &Stamp, part: Part) {
         if let Some((capture_nanos, tick)) = self.open.add(stamp, part) {
             self.judge(capture_nanos, tick);
@@ -213,6 +224,7 @@ impl Board {
             ego_error_m: ego_error.map(|error| error.distance_m),
             ego_error_deg: ego_error.map(|error| error.angle_deg),
         });
+        neighbours::add(&mut self.neighbours, &result);
         self.bytes.extend(bytes);
         self.ages_ms.extend(ages_ms);
         self.keep_showpiece(frame_index, result, boxes, world_from_lidar);
@@ -264,7 +276,7 @@ fn true_pose<'a>(truth: &'a [(CavId, Pose)], cav: &CavId) -> Option<&'a Pose> {
 
 #[cfg(test)]
 mod tests {
-    use protocol::{AgentTruth, Detection, FusedNeighbour, TrueObject};
+    use protocol::{AgentTruth, Detection, Doubt, FusedNeighbour, HeardNeighbour, SkippedNeighbour, TrueObject};
 
     use super::super::open_ticks::MOST_OPEN;
     use super::*;
@@ -328,6 +340,12 @@ mod tests {
                 wire_bytes: 1300,
             }],
             skipped: vec![],
+            heard: vec![HeardNeighbour {
+                cav: cav("n"),
+                trust: Some(0.5 + 0.25 * tick as f64),
+                doubt: None,
+                clock_offset_s: Some(0.125),
+            }],
             stages: vec![],
         }
     }
@@ -413,5 +431,33 @@ mod tests {
         board.result(&stamp("e", 3, 50), result(3, &[]));
         board.close();
         assert_eq!(board.records().len(), 1_000, "a late second result of a judged tick adds none");
+    }
+
+    #[test]
+    fn neighbours_are_followed_over_the_run() {
+        let mut board = Board::new(cav("e"), RULE, 1);
+        let doubted = Detections {
+            fused: vec![],
+            skipped: vec![SkippedNeighbour { cav: cav("n"), reason: Some(DropReason::Distrusted) }],
+            heard: vec![HeardNeighbour {
+                cav: cav("n"),
+                trust: Some(0.25),
+                doubt: Some(Doubt::Invented),
+                clock_offset_s: None,
+            }],
+            ..result(1, &[])
+        };
+        for (tick, result) in [(0, result(0, &[])), (1, doubted)] {
+            board.truth(&stamp("replay", tick, 100 * tick), truth(tick));
+            board.result(&stamp("e", tick, 100 * tick + 50), result);
+        }
+        board.close();
+        let record = &board.neighbours()[&cav("n")];
+        assert_eq!(
+            (record.fused, record.left_out[&DropReason::Distrusted], record.doubts[&Doubt::Invented]),
+            (1, 1, 1)
+        );
+        assert_eq!((record.trust, record.least_trust), (Some(0.25), Some(0.25)));
+        assert_eq!((record.doubt, record.clock_offset_s), (Some(Doubt::Invented), Some(0.125)));
     }
 }

@@ -2,6 +2,7 @@
 
 mod board;
 mod frame_record;
+mod neighbours;
 mod node;
 mod open_ticks;
 mod stage_stamps;
@@ -9,6 +10,7 @@ mod true_boxes;
 
 pub use board::Board;
 pub use frame_record::{FrameRecord, JudgedFrame};
+pub use neighbours::NeighbourRecord;
 pub use node::{ProcessBooks, Progress, Scored, ScorerError, ScorerNode, scorer_cav};
 pub use stage_stamps::StageStamps;
 pub use true_boxes::true_boxes;

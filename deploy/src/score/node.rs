@@ -9,8 +9,8 @@ use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use protocol::{
-    CavId, Detections, DetectionsReport, Ledger, Limits, PoseEstimate, ProcessId, Role, RunId, Selector, StageSummary,
-    Stats, Stream, Topic, Truth,
+    CavId, Detections, DetectionsReport, HeardNeighbour, Ledger, Limits, PoseEstimate, ProcessId, Role, RunId,
+    Selector, StageSummary, Stats, Stream, Topic, Truth,
 };
 use sim_replay::bus::mailbox::Taken;
 use sim_replay::bus::{Arrival, Bus, BusError, Event, Identity, Inbox, Presence, Subscription, process_id};
@@ -39,6 +39,8 @@ pub struct Progress {
     pub latency_ms: Option<f64>,
     /// Neighbours in the last result.
     pub fused: usize,
+    /// What the ego makes of those it heard for it.
+    pub heard: Vec<HeardNeighbour>,
     /// Bytes of everything that was fused so far.
     pub wire_bytes: u64,
     /// Messages dropped so far, by all processes.
@@ -46,7 +48,7 @@ pub struct Progress {
     /// The replay has said that nothing more will come.
     pub ended: bool,
     /// When each process last told about itself, by name.
-    pub heard: BTreeMap<String, Instant>,
+    pub told: BTreeMap<String, Instant>,
 }
 
 impl Progress {
@@ -276,6 +278,7 @@ impl Worker {
         }
         let began = self.published.get(&stamp.capture_nanos);
         let latency_ms = began.map(|began| (stamp.publish_nanos as f64 - *began as f64) / 1e6);
+        let heard = result.heard.clone();
         let (fused, bytes) =
             (result.fused.len(), result.fused.iter().map(|neighbour| neighbour.wire_bytes).sum::<u64>());
         let at = arrival.at;
@@ -284,6 +287,7 @@ impl Worker {
             progress.span = Some((progress.span.map_or(at, |(first, _)| first), at));
             progress.latency_ms = latency_ms;
             progress.fused = fused;
+            progress.heard = heard;
             progress.wire_bytes += bytes;
         });
         self.board.result(stamp, result);
@@ -309,7 +313,7 @@ impl Worker {
         let dropped = self.books.values().map(|books| books.ledger.total().dropped_total()).sum();
         self.note(|progress| {
             progress.dropped = dropped;
-            progress.heard.insert(name, at);
+            progress.told.insert(name, at);
         });
     }
 

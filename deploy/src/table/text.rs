@@ -165,6 +165,7 @@ mod tests {
             pose: PoseErrors::default(),
             latency_ms: Latencies::default(),
             age_ms: Percentiles::default(),
+            neighbours: BTreeMap::new(),
             comm: Communication {
                 payload_bytes_mean: Some(1024.0),
                 log2_payload: Some(10.0),

@@ -323,7 +323,13 @@ impl Moment {
             .collect();
         let skipped: Vec<Link> =
             result.skipped.iter().map(|neighbour| Link { skipped: neighbour.reason, ..link(&neighbour.cav) }).collect();
-        fused.into_iter().chain(skipped).chain(links.into_values()).collect()
+        let mut all: Vec<Link> = fused.into_iter().chain(skipped).chain(links.into_values()).collect();
+        for link in &mut all {
+            let Some(known) = result.heard.iter().find(|heard| heard.cav.as_str() == link.from) else { continue };
+            (link.trust, link.doubt) = (known.trust, known.doubt);
+            link.clock_ms = known.clock_offset_s.map(|seconds| seconds * 1e3);
+        }
+        all
     }
 }
 

@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use protocol::{Box3d, CavId, DropReason, NoPoseReason, Pose, StageSummary, StageTiming};
+use protocol::{Box3d, CavId, Doubt, DropReason, NoPoseReason, Pose, StageSummary, StageTiming};
 use serde::Serialize;
 
 /// Points of one sweep that the page is given at most: more than a screen has pixels for them.
@@ -109,6 +109,12 @@ pub struct Link {
     pub is_fused: bool,
     /// Why it was not.
     pub skipped: Option<DropReason>,
+    /// How likely the receiver thinks the sender honest, 0..=1, where it asks.
+    pub trust: Option<f64>,
+    /// Why it does not believe it.
+    pub doubt: Option<Doubt>,
+    /// The sender's clock less the receiver's, less the shortest time a message was under way, milliseconds.
+    pub clock_ms: Option<f64>,
 }
 
 /// The stages of a process.

@@ -8,7 +8,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
-use protocol::message::{AgentTruth, FusedNeighbour, StageTiming};
+use protocol::message::{AgentTruth, FusedNeighbour, HeardNeighbour, StageTiming};
 use protocol::{
     Box3d, CavId, Detection, Detections, Key, Lidar, PointCloud, Pose, PoseEstimate, RunId, Stamp, Stream, Topic,
     TrueObject, Truth, wire,
@@ -73,6 +73,7 @@ fn detections(tick: u64) -> Detections {
             wire_bytes: 1_250,
         }],
         skipped: Vec::new(),
+        heard: vec![HeardNeighbour { cav: cav(OTHER), trust: Some(0.75), doubt: None, clock_offset_s: Some(-0.25) }],
         stages: vec![
             StageTiming::new("wait", Duration::from_millis(12)),
             StageTiming::new("fuse", Duration::from_millis(8)),
@@ -137,6 +138,7 @@ fn check(frame: &Value, points: usize) {
     assert!(counted as usize == points && points <= 24_000, "{counted} and {points}");
     let link = &frame["links"][0];
     assert_eq!((&link["from"], &link["wire_bytes"], &link["is_fused"]), (&OTHER.into(), &1_250.into(), &true.into()));
+    assert_eq!((&link["trust"], &link["clock_ms"]), (&0.75.into(), &(-250.0).into()));
 }
 
 #[test]

@@ -2,7 +2,7 @@
 
 use std::time::Duration;
 
-use protocol::message::{DetectionsReport, FusedNeighbour, SkippedNeighbour, StageTiming};
+use protocol::message::{DetectionsReport, FusedNeighbour, HeardNeighbour, SkippedNeighbour, StageTiming};
 use protocol::{Body, CavId, Detections, DropReason, Encoded, wire};
 use sim_replay::bus::unix_nanos;
 
@@ -10,6 +10,7 @@ use super::{Node, OwnFrame};
 use crate::ego::{EgoOutput, Skipped, View};
 use crate::neighbourhood::Neighbourhood;
 use crate::pairing::Paired;
+use crate::trust::{Belief, heard};
 
 /// The neighbours' messages for a frame, and who has none.
 #[derive(Default)]
@@ -60,10 +61,8 @@ impl Node<'_> {
         let mut choice = self.choose(capture_nanos);
         let own_topic = self.topic(&self.cav);
         match self.ego.detect(&own, &choice.views) {
-            Ok(EgoOutput { detections, fused, skipped, trusts, stages }) => {
-                for (index, trust) in trusts {
-                    self.bus.books().trusted(&choice.views[index].cav, trust);
-                }
+            Ok(EgoOutput { detections, fused, skipped, beliefs, stages }) => {
+                let heard = self.heard(&beliefs, &choice.views);
                 self.bus.books().received(&own_topic);
                 self.leave_out(&skipped, &mut choice);
                 let fused = self.take_in(&own, &fused, &choice);
@@ -77,6 +76,7 @@ impl Node<'_> {
                     detections,
                     fused,
                     skipped: choice.skipped,
+                    heard,
                     stages,
                 };
                 self.publish(capture_nanos, result);
@@ -89,6 +89,18 @@ impl Node<'_> {
                 self.take_in(&own, &(0..choice.views.len()).collect::<Vec<_>>(), &choice);
             }
         }
+    }
+
+    /// What is known of those who were heard for a frame.
+    fn heard(&self, beliefs: &[(usize, Belief)], views: &[View]) -> Vec<HeardNeighbour> {
+        let books = self.bus.books();
+        for (index, belief) in beliefs {
+            books.trusted(&views[*index].cav, belief.trust);
+        }
+        let clocks = books.peers();
+        let clock = |cav: &CavId| clocks.iter().find(|peer| peer.cav == *cav)?.clock_offset_s;
+        let heard = heard(beliefs, views).into_iter();
+        heard.map(|neighbour| HeardNeighbour { clock_offset_s: clock(&neighbour.cav), ..neighbour }).collect()
     }
 
     /// The neighbours' messages for a frame, and who has none.

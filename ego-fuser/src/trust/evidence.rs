@@ -5,6 +5,7 @@
 //! of several sorts, and what speaks against one says nothing of another, so the strongest doubt counts.
 
 use nalgebra::{Isometry2, Point2};
+use protocol::Doubt;
 
 use super::seen::Seen;
 
@@ -83,11 +84,18 @@ impl Evidence {
         evidence
     }
 
-    /// The logarithm of how much more likely an honest neighbour says this than a liar of the sort it looks most like;
-    /// nothing where there is nothing to compare.
+    /// The logarithm of how much more likely an honest neighbour says this than a liar of the sort it looks most like,
+    /// and which sort that is; nothing where there is nothing to compare.
+    pub(super) fn judgement(&self) -> Option<(f64, Doubt)> {
+        let elsewhere = self.against_elsewhere().map(|odds| (odds, Doubt::Elsewhere));
+        let invention = self.against_invention().map(|odds| (odds, Doubt::Invented));
+        let doubts = [elsewhere, invention, self.against_other_lies()];
+        doubts.into_iter().flatten().min_by(|(one, _), (other, _)| one.total_cmp(other))
+    }
+
+    /// The logarithm alone.
     pub(super) fn log_odds(&self) -> Option<f64> {
-        let doubts = [self.against_elsewhere(), self.against_invention(), self.against_other_lies()];
-        doubts.into_iter().flatten().reduce(f64::min)
+        self.judgement().map(|(log_odds, _)| log_odds)
     }
 
     /// Against one that is not where it says to be, or sees nothing.
@@ -123,10 +131,15 @@ impl Evidence {
     }
 
     /// Against a copier, one whose maps have nothing to do with each other, one that jumps.
-    fn against_other_lies(&self) -> Option<f64> {
+    fn against_other_lies(&self) -> Option<(f64, Doubt)> {
         let is_torn = !self.boxes_only && self.like_before.is_some_and(|like| like < SUCCESSIVE);
-        let doubts = [(self.like_another > COPY, -8.0), (is_torn, -3.0), (self.jumped, -4.0)];
-        doubts.into_iter().filter_map(|(is_so, odds)| is_so.then_some(odds)).reduce(f64::min)
+        let is_copied = self.like_another > COPY;
+        let sure = [
+            (is_copied, -8.0, Doubt::Copied),
+            (self.jumped, -4.0, Doubt::Jumped),
+            (is_torn, -3.0, Doubt::Inconsistent),
+        ];
+        sure.into_iter().find_map(|(is_so, odds, doubt)| is_so.then_some((odds, doubt)))
     }
 
     /// Whether one of the two sees the other where it says to be: within 35 m an honest one is always seen with more than
@@ -200,7 +213,8 @@ mod tests {
         let theirs = seen(&boxes(&more, WORLD[1]));
         let evidence = Evidence::between(&own, &theirs, &Isometry2::translation(20.0, 3.0), 0.0);
         assert_eq!((evidence.matched, evidence.contradicted), (4, 5));
-        assert!(evidence.log_odds().unwrap() < -3.0);
+        let (log_odds, doubt) = evidence.judgement().unwrap();
+        assert!(log_odds < -3.0 && doubt == Doubt::Invented);
     }
 
     #[test]
@@ -210,7 +224,10 @@ mod tests {
         let copied = Evidence { like_another: 1.0, ..fine.clone() };
         let jumped = Evidence { jumped: true, ..Evidence::default() };
         let torn = Evidence { like_before: Some(0.7), ..Evidence::default() };
-        assert!([copied, jumped, torn].iter().all(|evidence| evidence.log_odds().unwrap() < -2.0));
+        for (evidence, doubt) in [(copied, Doubt::Copied), (jumped, Doubt::Jumped), (torn, Doubt::Inconsistent)] {
+            let (log_odds, found) = evidence.judgement().unwrap();
+            assert!(log_odds < -2.0 && found == doubt, "{found}");
+        }
         assert_eq!(Evidence::default().log_odds(), None, "nothing said, nothing known");
     }
 }

@@ -13,7 +13,8 @@ use std::collections::BTreeMap;
 
 use agent::detector::{Detector, DetectorError};
 use nalgebra::Isometry2;
-use protocol::{CavId, PointCloud, Pose};
+use protocol::message::HeardNeighbour;
+use protocol::{CavId, Doubt, PointCloud, Pose};
 use serde::{Deserialize, Serialize};
 
 use crate::ego::View;
@@ -62,6 +63,8 @@ pub(crate) struct Trust {
 struct Standing {
     log_odds: f64,
     is_out: bool,
+    /// What spoke against it last.
+    doubt: Doubt,
     /// Capture time, place and looks of the message that was judged last.
     last: Option<(u64, Pose, Vec<f32>)>,
 }
@@ -71,8 +74,31 @@ struct Standing {
 pub struct Belief {
     /// How likely it is honest, 0..1.
     pub trust: f64,
+    /// Why it is left out, where it is.
+    pub doubt: Option<Doubt>,
+}
+
+impl Belief {
     /// Whether it is left out.
-    pub is_out: bool,
+    #[must_use]
+    pub fn is_out(&self) -> bool {
+        self.doubt.is_some()
+    }
+}
+
+/// What is said of the neighbours that were looked at, but for their clocks; `beliefs` are those of [`crate::ego::EgoOutput`].
+#[must_use]
+pub fn heard(beliefs: &[(usize, Belief)], views: &[View]) -> Vec<HeardNeighbour> {
+    let of = |(index, view): (usize, &View)| {
+        let belief = beliefs.iter().find(|(known, _)| *known == index).map(|(_, belief)| belief);
+        HeardNeighbour {
+            cav: view.cav.clone(),
+            trust: belief.map(|belief| belief.trust),
+            doubt: belief.and_then(|belief| belief.doubt),
+            clock_offset_s: None,
+        }
+    };
+    views.iter().enumerate().map(of).collect()
 }
 
 impl Trust {
@@ -111,9 +137,9 @@ impl Trust {
         mark_copies(&mut evidence, &all);
         let mut beliefs = Vec::with_capacity(neighbours.len());
         for ((view, _), evidence) in neighbours.iter().zip(evidence) {
-            let log_odds = evidence.as_ref().and_then(Evidence::log_odds);
-            tracing::debug!(cav = %view.cav, log_odds, ?evidence, "neighbour judged");
-            beliefs.push(self.add_up(&view.cav, log_odds, mine.is_boxes()));
+            let judgement = evidence.as_ref().and_then(Evidence::judgement);
+            tracing::debug!(cav = %view.cav, ?judgement, ?evidence, "neighbour judged");
+            beliefs.push(self.add_up(&view.cav, judgement, mine.is_boxes()));
         }
         for ((view, _), seen) in neighbours.iter().zip(all) {
             if let (Some(standing), Some(pose)) = (self.peers.get_mut(&view.cav), view.pose.world_from_cav()) {
@@ -145,25 +171,29 @@ impl Trust {
     }
 
     /// Takes in what a frame says; whoever `must_earn` it is left out until something speaks for it.
-    fn add_up(&mut self, cav: &CavId, log_odds: Option<f64>, must_earn: bool) -> Belief {
+    fn add_up(&mut self, cav: &CavId, judgement: Option<(f64, Doubt)>, must_earn: bool) -> Belief {
         let TrustConfig { leave_out_below, take_back_above } = self.config;
         if self.peers.len() >= MAX_PEERS && !self.peers.contains_key(cav) {
             // Of more vehicles than an ego can listen to, nothing is known.
-            return Belief { trust: 0.5, is_out: must_earn };
+            return Belief { trust: 0.5, doubt: must_earn.then_some(Doubt::Unproven) };
         }
-        let stranger = Standing { log_odds: 0.0, is_out: must_earn, last: None };
+        let stranger = Standing { log_odds: 0.0, is_out: must_earn, doubt: Doubt::Unproven, last: None };
         let standing = self.peers.entry(cav.clone()).or_insert(stranger);
-        if let Some(log_odds) = log_odds {
+        if let Some((log_odds, doubt)) = judgement {
             standing.log_odds += NEWEST * (log_odds - standing.log_odds);
+            if log_odds < 0.0 {
+                standing.doubt = doubt;
+            }
         }
         let was_out = standing.is_out;
         standing.is_out = standing.log_odds < if was_out { take_back_above } else { leave_out_below };
+        let doubt = standing.doubt;
         match (was_out, standing.is_out) {
-            (false, true) => tracing::warn!(%cav, "its words do not fit what the ego sees: it is left out"),
+            (false, true) => tracing::warn!(%cav, %doubt, "its words do not fit what the ego sees: it is left out"),
             (true, false) => tracing::info!(%cav, "its words fit what the ego sees: it is believed"),
             _ => {}
         }
-        Belief { trust: 1.0 / (1.0 + (-standing.log_odds).exp()), is_out: standing.is_out }
+        Belief { trust: 1.0 / (1.0 + (-standing.log_odds).exp()), doubt: standing.is_out.then_some(doubt) }
     }
 }
 
@@ -205,31 +235,31 @@ mod tests {
     fn who_is_left_out_comes_back_after_a_while_and_not_at_once() {
         let mut trust = trust();
         let cav = CavId::new("a").unwrap();
-        let mut hear = |log_odds: Option<f64>| trust.add_up(&cav, log_odds, false);
-        assert!(!hear(None).is_out, "nobody is doubted without a reason");
-        assert!(hear(Some(-3.0)).is_out, "strong evidence counts at once");
-        assert!(hear(None).is_out, "the same message says nothing new");
-        let returns = (0..20).position(|_| !hear(Some(1.5)).is_out).unwrap();
+        let mut hear = |log_odds: Option<f64>| trust.add_up(&cav, log_odds.map(|odds| (odds, Doubt::Copied)), false);
+        assert!(!hear(None).is_out(), "nobody is doubted without a reason");
+        assert_eq!(hear(Some(-3.0)).doubt, Some(Doubt::Copied), "strong evidence counts at once");
+        assert!(hear(None).is_out(), "the same message says nothing new");
+        let returns = (0..20).position(|_| !hear(Some(1.5)).is_out()).unwrap();
         assert!((1..6).contains(&returns), "after {returns} frames");
-        assert!(!hear(Some(-1.0)).is_out, "one doubtful frame is forgiven");
+        assert!(!hear(Some(-1.0)).is_out(), "one doubtful frame is forgiven");
         assert!((0..20).map(|_| hear(Some(4.0))).last().unwrap().trust > 0.97);
-        assert!(hear(Some(-8.0)).is_out, "no trust is so great that a plain lie passes");
+        assert!(hear(Some(-8.0)).is_out(), "no trust is so great that a plain lie passes");
     }
 
     #[test]
     fn boxes_are_believed_when_something_speaks_for_them() {
         let mut trust = trust();
         let cav = CavId::new("a").unwrap();
-        assert!(trust.add_up(&cav, None, true).is_out);
-        assert!(!trust.add_up(&cav, Some(2.0), true).is_out);
-        assert!(!trust.add_up(&cav, None, true).is_out);
+        assert_eq!(trust.add_up(&cav, None, true).doubt, Some(Doubt::Unproven));
+        assert!(!trust.add_up(&cav, Some((2.0, Doubt::Elsewhere)), true).is_out());
+        assert!(!trust.add_up(&cav, None, true).is_out());
     }
 
     #[test]
     fn what_is_remembered_is_bounded() {
         let mut trust = trust();
         for number in 0..1000 {
-            trust.add_up(&CavId::new(&format!("v{number}")).unwrap(), Some(-9.0), false);
+            trust.add_up(&CavId::new(&format!("v{number}")).unwrap(), Some((-9.0, Doubt::Jumped)), false);
         }
         assert_eq!(trust.peers.len(), MAX_PEERS);
     }

@@ -2,8 +2,10 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{PoseEstimate, StageTiming, check_count, check_detections, check_name, check_nanos, metadata_only};
-use crate::{CavId, Detection, DropReason, Limits, Stamp, WireError};
+use super::{
+    PoseEstimate, StageTiming, check_count, check_detections, check_name, check_nanos, check_within, metadata_only,
+};
+use crate::{CavId, Detection, Doubt, DropReason, Limits, Stamp, WireError};
 
 /// The result of one ego frame: ego-fuser to anyone, also as JSON.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -24,6 +26,8 @@ pub struct Detections {
     pub fused: Vec<FusedNeighbour>,
     /// Whose data could not be.
     pub skipped: Vec<SkippedNeighbour>,
+    /// What the ego makes of the neighbours that it heard for this frame.
+    pub heard: Vec<HeardNeighbour>,
     /// How long each stage took.
     pub stages: Vec<StageTiming>,
 }
@@ -53,6 +57,20 @@ pub struct SkippedNeighbour {
     pub reason: Option<DropReason>,
 }
 
+/// A neighbour as the ego knows it.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct HeardNeighbour {
+    /// Who.
+    pub cav: CavId,
+    /// How likely it is honest, 0..=1; `None` where the ego does not ask.
+    pub trust: Option<f64>,
+    /// Why it is left out, where it is not believed.
+    pub doubt: Option<Doubt>,
+    /// Its clock less the ego's, less the shortest time a message of it was under way, seconds; `None` where there is but
+    /// one clock.
+    pub clock_offset_s: Option<f64>,
+}
+
 impl Detections {
     fn check_values(&self, limits: &Limits) -> Result<(), WireError> {
         check_name("method", &self.method)?;
@@ -61,8 +79,14 @@ impl Detections {
         check_count("fused neighbours", self.fused.len(), limits.max_entries)?;
         check_count("skipped neighbours", self.skipped.len(), limits.max_entries)?;
         for neighbour in &self.fused {
-            super::check_within("confidence", neighbour.confidence.into(), 0.0, 1.0)?;
+            check_within("confidence", neighbour.confidence.into(), 0.0, 1.0)?;
             check_nanos("age_nanos", neighbour.age_nanos.unsigned_abs())?;
+        }
+        check_count("heard neighbours", self.heard.len(), limits.max_entries)?;
+        for neighbour in &self.heard {
+            check_within("trust", neighbour.trust.unwrap_or(0.0), 0.0, 1.0)?;
+            // Whoever lies about the time may be off by all of it.
+            check_within("clock offset", neighbour.clock_offset_s.unwrap_or(0.0), -1e11, 1e11)?;
         }
         StageTiming::check_all(&self.stages, limits)
     }

@@ -129,9 +129,13 @@ fn any_detections() -> impl Strategy<Value = Detections> {
     );
     let skipped = (any_cav(), option::of(select(DropReason::ALL.to_vec())))
         .prop_map(|(cav, reason)| SkippedNeighbour { cav, reason });
-    let lists = (vec(any_detection(), 0..20), vec(fused, 0..4), vec(skipped, 0..4), vec(any_timing(), 0..4));
+    let doubt = option::of(select(Doubt::ALL.to_vec()));
+    let heard = (any_cav(), option::of(0.0..=1.0f64), doubt, option::of(-1e9..1e9f64))
+        .prop_map(|(cav, trust, doubt, clock_offset_s)| HeardNeighbour { cav, trust, doubt, clock_offset_s });
+    let neighbours = (vec(fused, 0..4), vec(skipped, 0..4), vec(heard, 0..4));
+    let lists = (vec(any_detection(), 0..20), neighbours, vec(any_timing(), 0..4));
     (any_cav(), any::<u64>(), "[a-z]{1,10}", any_estimate(), lists).prop_map(
-        |(ego, frame_index, method, pose, (detections, fused, skipped, stages))| Detections {
+        |(ego, frame_index, method, pose, (detections, (fused, skipped, heard), stages))| Detections {
             ego,
             frame_index,
             method,
@@ -139,6 +143,7 @@ fn any_detections() -> impl Strategy<Value = Detections> {
             detections,
             fused,
             skipped,
+            heard,
             stages,
         },
     )

@@ -101,6 +101,10 @@ pub(crate) fn detections() -> Detections {
             SkippedNeighbour { cav: cav("-1"), reason: None },
             SkippedNeighbour { cav: cav("7"), reason: Some(DropReason::Stale) },
         ],
+        heard: vec![
+            HeardNeighbour { cav: cav("4288"), trust: Some(0.75), doubt: None, clock_offset_s: Some(-0.002) },
+            HeardNeighbour { cav: cav("7"), trust: Some(0.0), doubt: Some(Doubt::Copied), clock_offset_s: None },
+        ],
         stages: vec![StageTiming::new("fuse", Duration::from_millis(12))],
     }
 }

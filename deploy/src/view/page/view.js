@@ -88,12 +88,14 @@ function facts(frame) {
 function panels(frame) {
   $("vehicles").replaceChildren(...frame.vehicles.map((vehicle) => vehicleCard(vehicle, frame.ego)));
   legend(frame);
-  table("links", ["from", "latency", "size", "age", ""], frame.links.map((link) => [
+  table("links", ["from", "latency", "size", "age", "clock", "trust", ""], frame.links.map((link) => [
     link.from,
     link.latency_ms === null ? "–" : `${ms(link.latency_ms)}`,
     bytes(link.wire_bytes),
     ms(link.age_ms),
-    link.is_fused ? "fused" : [link.skipped ? words(link.skipped) : "silent", "bad"],
+    ms(link.clock_ms),
+    number(link.trust, 2),
+    link.is_fused ? "fused" : [[link.skipped || "silent", link.doubt].filter(Boolean).map(words).join(": "), "bad"],
   ]), "Nobody sends to the ego.");
   stages(frame);
   table("messages", ["topic", "sent", "used", "dropped"], messageRows(frame.messages), "Nothing counted yet.");
