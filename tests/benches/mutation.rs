@@ -3,7 +3,7 @@
 //! `-- --seeds FOLDER` it writes the sound inputs down instead, for `fuzz/`.
 
 use peak_alloc::PeakAlloc;
-use tests::mutation::run::{all, formats};
+use tests::mutation::run::{files, formats, messages};
 use tests::mutation::scratch;
 
 #[global_allocator]
@@ -12,7 +12,7 @@ static MEMORY: PeakAlloc = PeakAlloc;
 fn main() {
     let numbers: Vec<u64> = std::env::args().skip(1).filter_map(|argument| argument.parse().ok()).collect();
     let number = |place: usize, usual| numbers.get(place).copied().unwrap_or(usual);
-    let (messages, files, seed) = (number(0, 10_000_000), number(1, 1_000_000), number(2, 7));
+    let (of_messages, of_files, seed) = (number(0, 10_000_000), number(1, 1_000_000), number(2, 7));
     let scratch = scratch();
     let folder = std::env::args().skip_while(|argument| argument != "--seeds").nth(1);
     if let Some(folder) = folder {
@@ -20,7 +20,9 @@ fn main() {
     }
     println!("| format | damaged | accepted | panics | peak memory of one, KiB | seconds |");
     println!("| --- | --- | --- | --- | --- | --- |");
-    for report in all(scratch.path(), messages, files, seed, &MEMORY) {
+    let told = (of_messages > 0).then(|| messages(of_messages, seed, &MEMORY));
+    let read = (of_files > 0).then(|| files(scratch.path(), of_files, seed, &MEMORY));
+    for report in told.into_iter().chain(read.into_iter().flatten()) {
         let (kib, seconds) = (report.peak_bytes.div_ceil(1024), report.took.as_secs());
         println!(
             "| {} | {} | {} | {} | {kib} | {seconds} |",

@@ -26,25 +26,25 @@ pub struct Report {
     pub took: Duration,
 }
 
-/// Runs `cases` damaged inputs of every format (`files`), or of the messages (`messages`), from `seed` on.
+/// Runs damaged messages from `seed` on.
 ///
 /// # Panics
-/// When a seed is not accepted undamaged: then nothing behind the first check would be tried.
+/// When a sound one is not accepted undamaged: then nothing behind the first check would be tried.
 #[must_use]
-pub fn all(scratch: &Path, messages: u64, files: u64, seed: u64, meter: &PeakAlloc) -> Vec<Report> {
-    let mut reports = Vec::new();
-    if messages > 0 {
-        let sound = seeds::messages();
-        let damage = wire_target::damage_message;
-        reports.push(one(("messages", &sound), messages, seed, meter, damage, &wire_target::read));
-    }
-    if files > 0 {
-        for reader in readers::all(scratch) {
-            let read = |bytes: &[u8]| reader.try_read(bytes);
-            reports.push(one((reader.name, &reader.seeds), files, seed, meter, damage, &read));
-        }
-    }
-    reports
+pub fn messages(cases: u64, seed: u64, meter: &PeakAlloc) -> Report {
+    let damage = wire_target::damage_message;
+    one(("messages", &seeds::messages()), cases, seed, meter, damage, &wire_target::read)
+}
+
+/// Runs damaged files of every format from `seed` on, one format after the other as reports are asked for.
+///
+/// # Panics
+/// As [`messages`].
+pub fn files(scratch: &Path, cases: u64, seed: u64, meter: &PeakAlloc) -> impl Iterator<Item = Report> {
+    readers::all(scratch).into_iter().map(move |reader| {
+        let read = |bytes: &[u8]| reader.try_read(bytes);
+        one((reader.name, &reader.seeds), cases, seed, meter, damage, &read)
+    })
 }
 
 /// Every format with its sound inputs.
