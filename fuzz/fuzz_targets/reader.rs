@@ -1,6 +1,7 @@
 //! The format that the program is called after.
 #![no_main]
 
+use std::path::Path;
 use std::sync::OnceLock;
 
 use libfuzzer_sys::fuzz_target;
@@ -11,7 +12,9 @@ fn reader() -> &'static Reader {
     static READER: OnceLock<(TempDir, Reader)> = OnceLock::new();
     let (_, reader) = READER.get_or_init(|| {
         let scratch = tempfile::tempdir().expect("a temporary folder");
-        let name = env!("CARGO_BIN_NAME").replace('_', " ");
+        // Not as it was compiled: fuzz/run compiles it once and calls it by many names.
+        let program = std::env::args_os().next().unwrap_or_default();
+        let name = Path::new(&program).file_name().unwrap_or_default().to_string_lossy().replace('_', " ");
         let reader = all(scratch.path()).into_iter().find(|reader| reader.name == name);
         (scratch, reader.expect("every target is called after a format"))
     });
