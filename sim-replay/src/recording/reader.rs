@@ -23,7 +23,7 @@ const READ_BYTES: usize = 1 << 20;
 /// Chunks that are kept unpacked: neighbours in time are neighbours in the file.
 const KEPT_CHUNKS: usize = 4;
 /// Opcode and length before every record.
-const RECORD_HEAD: u64 = 9;
+const RECORD_HEAD: usize = 9;
 
 /// A message of a recording, where it lies and what its header says.
 #[derive(Debug, Clone)]
@@ -147,7 +147,7 @@ impl Recording {
         }
         let ChunkPlace { begin, len } = self.chunks[chunk];
         let mut body = vec![0; len];
-        let read = self.file.read_exact_at(&mut body, begin + RECORD_HEAD);
+        let read = self.file.read_exact_at(&mut body, begin + RECORD_HEAD as u64);
         read.map_err(|source| RecordingError::io(&self.path, source))?;
         let messages = unpack(&body, &mut unpacked.channels);
         let messages = messages.map_err(|error| RecordingError::malformed(&self.path, begin, error.to_string()))?;
@@ -183,7 +183,7 @@ impl Contents {
             op::CHUNK => self.take_chunk(body)?,
             _ => {}
         }
-        self.whole_bytes += RECORD_HEAD + body.len() as u64;
+        self.whole_bytes += (RECORD_HEAD + body.len()) as u64;
         Ok(ControlFlow::Continue(()))
     }
 
@@ -208,6 +208,11 @@ impl Contents {
 
 /// The messages of a chunk, once it has been compared with its checksum; its channels are added to `channels`.
 fn unpack(body: &[u8], channels: &mut ChannelAccumulator<'static>) -> McapResult<Vec<Message<'static>>> {
+    if let Record::Chunk { header, data } = parse_record(op::CHUNK, body)?
+        && header.compression.is_empty()
+    {
+        check_lengths(&data)?;
+    }
     let head = [[op::CHUNK].as_slice(), &(body.len() as u64).to_le_bytes()].concat();
     let options = LinearReaderOptions::default().with_skip_start_magic(true).with_prevalidate_chunk_crcs(true);
     let (mut messages, mut unpacked_bytes) = (Vec::new(), 0);
@@ -239,6 +244,17 @@ fn unpack(body: &[u8], channels: &mut ChannelAccumulator<'static>) -> McapResult
         Ok(ControlFlow::Continue(()))
     })?;
     Ok(messages)
+}
+
+/// Whether the records of a chunk that is not packed end where it ends. The `mcap` crate (0.26.0) reads on where something
+/// stands behind them, and counts below nothing.
+fn check_lengths(mut records: &[u8]) -> McapResult<()> {
+    while !records.is_empty() {
+        let (&[_, len @ ..], rest) = records.split_first_chunk::<RECORD_HEAD>().ok_or(McapError::UnexpectedEoc)?;
+        let rest = usize::try_from(u64::from_le_bytes(len)).ok().and_then(|len| rest.get(len..));
+        records = rest.ok_or(McapError::UnexpectedEoc)?;
+    }
+    Ok(())
 }
 
 /// Gives the records of `source` to `visit`, one after the other, until it has had enough or there are no more.

@@ -178,6 +178,25 @@ fn a_chunk_that_asks_for_a_huge_window_is_refused() {
 }
 
 #[test]
+fn a_record_that_reaches_beyond_its_chunk_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let mut bytes = recorded(1, 100, RecordingOptions { zstd_level: None, with_ros: false });
+    let number = |bytes: &[u8], at: usize| u64::from_le_bytes(bytes[at..at + 8].try_into().unwrap());
+    let mut at = mcap::MAGIC.len();
+    while bytes[at] != mcap::records::op::CHUNK {
+        at += 9 + number(&bytes, at + 1) as usize;
+    }
+    // Behind two times come the length unpacked, the checksum (0: none), no name of a packing, the length.
+    let chunk = at + 9;
+    bytes[chunk + 24..chunk + 28].fill(0);
+    assert_eq!(bytes[chunk + 28..chunk + 32], [0; 4]);
+    let shorter = number(&bytes, chunk + 32) - 4;
+    bytes[chunk + 32..chunk + 40].copy_from_slice(&shorter.to_le_bytes());
+    let error = Recording::open(&write(folder.path(), &bytes)).unwrap_err();
+    assert!(error.to_string().contains("in the middle of a record"), "{error}");
+}
+
+#[test]
 fn a_recording_is_a_scene() {
     let folder = tempfile::tempdir().unwrap();
     write(folder.path(), &recorded(3, 50, RecordingOptions::default()));
