@@ -78,7 +78,7 @@ pub fn concerns(away: &BTreeSet<String>, account: &Account) -> bool {
         }
         Topic::Stream { cav, .. } => vec![agent(cav)],
         Topic::Received { ego, cav, .. } => vec![agent(cav), process_id(Role::Link, ego).to_string()],
-        Topic::Control(_) | Topic::Stats(_) | Topic::Alive { .. } => Vec::new(),
+        Topic::Control(_) | Topic::Ready(_) | Topic::Stats(_) | Topic::Alive { .. } => Vec::new(),
     };
     if let Some(to) = &account.to {
         concerned.push(to.to_string());

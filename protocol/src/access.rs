@@ -5,7 +5,7 @@
 //! | `agent-<cav>` | its pose, maps, boxes, points, descriptor | its own sensors |
 //! | `ego-<cav>` | its detections | what all agents publish, directly or behind its link |
 //! | `link-<ego>` | `rx/<ego>/...` | what all agents publish, and where they are |
-//! | `replay` | every vehicle's sensors, the truth, the end of the scene | control, detections |
+//! | `replay` | every vehicle's sensors, the truth, the end of the scene | control, who is ready, detections |
 //! | `scorer` | control | the truth, detections, poses, statistics |
 //! | `recorder` | nothing | everything |
 //! | `viewer` | nothing | results, sensors, statistics |
@@ -90,7 +90,10 @@ impl Party {
             Role::Replay => {
                 let sensors = SENSORS.iter().map(|stream| everyones(stream));
                 let own = [keys(&"*/camera/*"), keys(&Topic::Truth), control(Verb::End)];
-                (sensors.chain(own).collect(), vec![keys(&"control/*"), everyones(&Stream::Detections)])
+                (
+                    sensors.chain(own).collect(),
+                    vec![keys(&"control/*"), keys(&"ready/*"), everyones(&Stream::Detections)],
+                )
             }
             Role::Scorer => {
                 let heard = [everyones(&Stream::Detections), everyones(&Stream::Pose)];
@@ -107,7 +110,7 @@ impl Party {
         };
         let right = |act| move |keys: Selector| Right { act, keys };
         let mut rights: Vec<Right> = publish.into_iter().map(right(Act::Publish)).collect();
-        rights.push(right(Act::Publish)(control(Verb::Ready)));
+        rights.push(right(Act::Publish)(keys(&Topic::Ready(self.name()))));
         rights.push(right(Act::Publish)(keys(&Topic::Stats(self.name()))));
         rights.extend(hear.into_iter().map(right(Act::Hear)));
         rights.push(right(Act::Announce)(keys(&Topic::Alive { role: self.role, cav: self.cav.clone() })));
@@ -133,7 +136,7 @@ pub fn size_limits() -> Vec<(Vec<Selector>, usize)> {
     let keys = |stream| [format!("*/{stream}"), format!("rx/*/*/{stream}")];
     let selectors = |topics: Vec<String>| topics.iter().map(|topics| Selector::within(&Runs::Any, topics)).collect();
     let limit = |stream: Stream| Some((selectors(keys(stream).into()), stream.most_bytes()?));
-    let talk = vec!["control/*".to_owned(), "stats/*".to_owned()];
+    let talk = ["control/*", "ready/*", "stats/*"].map(str::to_owned).into();
     let talk = (selectors(talk), 2 * Limits::HARD_METADATA_BYTES as usize);
     small.into_iter().filter_map(limit).chain([talk]).collect()
 }
@@ -242,8 +245,8 @@ mod tests {
     fn a_vehicle_publishes_under_its_own_name_alone() {
         for party in ["agent-4279", "ego-4279"] {
             for keys in rights(party, Act::Publish) {
-                let own = keys.starts_with("v2v/r1/4279/") || keys == format!("v2v/r1/stats/{party}");
-                assert!(own || keys == "v2v/r1/control/ready", "{party}: {keys}");
+                let own = ["v2v/r1/4279/".to_owned(), format!("v2v/r1/stats/{party}"), format!("v2v/r1/ready/{party}")];
+                assert!(own.iter().any(|own| keys.starts_with(own)), "{party}: {keys}");
                 assert!(!keys.contains('*'), "{party}: {keys}");
             }
         }

@@ -6,7 +6,7 @@ use std::str::FromStr;
 use serde::{Deserialize, Serialize};
 
 /// Words that stand in a key where a CAV could: a vehicle of that name would publish onto somebody else's key.
-pub(crate) const RESERVED_CAV_IDS: [&str; 5] = ["alive", "control", "rx", "stats", "truth"];
+pub(crate) const RESERVED_CAV_IDS: [&str; 6] = ["alive", "control", "ready", "rx", "stats", "truth"];
 
 /// Why a text is not an identifier.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]

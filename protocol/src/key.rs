@@ -7,11 +7,12 @@
 //! | `v2v/<run>/<ego>/detections[/json]` | ego-fuser | anyone | detections |
 //! | `v2v/<run>/truth` | replay | scorer | truth |
 //! | `v2v/<run>/control/<verb>` | operator, processes | replay, operator | control |
+//! | `v2v/<run>/ready/<process>` | every process | whoever holds the clock | control |
 //! | `v2v/<run>/stats/<process>` | every process | operator | stats |
 //! | `v2v/<run>/alive/<role>/<cav>` | every process | anyone | none: a liveliness token |
 //!
-//! A vehicle cannot be called `rx`, `truth`, `control`, `stats` or `alive` ([`CavId`] refuses it), so each key has one
-//! reading. A [`Key`] never holds a wildcard; what subscribes to several keys is a [`Selector`].
+//! A vehicle cannot be called `rx`, `truth`, `control`, `ready`, `stats` or `alive` ([`CavId`] refuses it), so each key has
+//! one reading. A [`Key`] never holds a wildcard; what subscribes to several keys is a [`Selector`].
 
 use std::fmt;
 use std::str::FromStr;
@@ -93,6 +94,12 @@ impl Key {
     #[must_use]
     pub fn control(run: &RunId, verb: Verb) -> Self {
         Topic::Control(verb).in_run(run)
+    }
+
+    /// `v2v/<run>/ready/<process>`.
+    #[must_use]
+    pub fn ready(run: &RunId, process: &ProcessId) -> Self {
+        Topic::Ready(process.clone()).in_run(run)
     }
 
     /// `v2v/<run>/stats/<process>`.
@@ -186,6 +193,12 @@ impl Selector {
         Self(format!("{KEY_ROOT}/{run}/control/*"))
     }
 
+    /// What every process says of the routes it has heard of.
+    #[must_use]
+    pub fn ready(run: &RunId) -> Self {
+        Self(format!("{KEY_ROOT}/{run}/ready/*"))
+    }
+
     /// The statistics of every process.
     #[must_use]
     pub fn stats(run: &RunId) -> Self {
@@ -245,6 +258,7 @@ mod tests {
             (Key::received(run, ego, other, Stream::Bev), "v2v/r1/rx/4279/-1/bev"),
             (Key::truth(run), "v2v/r1/truth"),
             (Key::control(run, Verb::Start), "v2v/r1/control/start"),
+            (Key::ready(run, &ProcessId::new("agent-4279").unwrap()), "v2v/r1/ready/agent-4279"),
             (Key::stats(run, &ProcessId::new("agent-4279").unwrap()), "v2v/r1/stats/agent-4279"),
             (Key::alive(run, Role::Agent, other), "v2v/r1/alive/agent/-1"),
         ]
@@ -310,6 +324,7 @@ mod tests {
         assert_eq!(Selector::truth(&run).as_str(), "v2v/r1/truth");
         assert_eq!(Selector::alive(&run, Role::Agent).as_str(), "v2v/r1/alive/agent/*");
         assert_eq!(Selector::control(&run).as_str(), "v2v/r1/control/*");
+        assert_eq!(Selector::ready(&run).as_str(), "v2v/r1/ready/*");
         assert_eq!(Selector::stats(&run).as_str(), "v2v/r1/stats/*");
         assert_eq!(Selector::run(&run).as_str(), "v2v/r1/**");
         assert!(Selector::run(&run).as_str().parse::<Key>().is_err());

@@ -44,8 +44,6 @@ named! {
         Seek = "seek",
         /// The scene is over.
         End = "end",
-        /// A process is ready, or has heard a route's probe.
-        Ready = "ready",
         /// A process has finished a tick (stepped runs).
         Done = "done",
     }
@@ -75,6 +73,8 @@ pub enum Topic {
     Truth,
     /// `control/<verb>`.
     Control(Verb),
+    /// `ready/<process>`: which routes it has heard of.
+    Ready(ProcessId),
     /// `stats/<process>`.
     Stats(ProcessId),
     /// `alive/<role>/<cav>`: a liveliness token.
@@ -100,7 +100,7 @@ impl Topic {
         match self {
             Self::Stream { stream, .. } | Self::Received { stream, .. } => *stream != Stream::Descriptor,
             Self::Truth => true,
-            Self::Control(_) | Self::Stats(_) | Self::Alive { .. } => false,
+            Self::Control(_) | Self::Ready(_) | Self::Stats(_) | Self::Alive { .. } => false,
         }
     }
 
@@ -108,6 +108,7 @@ impl Topic {
         Ok(match chunks {
             ["truth"] => Some(Self::Truth),
             ["control", verb] => Verb::ALL.into_iter().find(|known| known.as_str() == *verb).map(Self::Control),
+            ["ready", process] => Some(Self::Ready(ProcessId::new(process)?)),
             ["stats", process] => Some(Self::Stats(ProcessId::new(process)?)),
             ["alive", role, cav] => match Role::ALL.into_iter().find(|known| known.as_str() == *role) {
                 Some(role) => Some(Self::Alive { role, cav: CavId::new(cav)? }),
@@ -133,6 +134,7 @@ impl fmt::Display for Topic {
             Self::Received { ego, cav, stream } => write!(f, "rx/{ego}/{cav}/{stream}"),
             Self::Truth => f.write_str("truth"),
             Self::Control(verb) => write!(f, "control/{verb}"),
+            Self::Ready(process) => write!(f, "ready/{process}"),
             Self::Stats(process) => write!(f, "stats/{process}"),
             Self::Alive { role, cav } => write!(f, "alive/{role}/{cav}"),
         }

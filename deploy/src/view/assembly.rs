@@ -1,6 +1,6 @@
 //! From messages, in whatever order they come, to moments.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use protocol::{
     Box3d, Boxes, CavId, Detection, Detections, Header, Ledger, Lidar, Limits, Payload, Pose, PoseEstimate,
@@ -13,6 +13,8 @@ use super::scene_frame::{Link, Messages, Planar, Process, SceneFrame, ShownBox, 
 const MOST_OPEN: usize = 16;
 /// Processes whose books are kept: more than a run of 65 vehicles has.
 const MOST_BOOKS: usize = 1024;
+/// Vehicles that are shown: twice as many as an ego takes in. Those after them are not.
+const MOST_VEHICLES: usize = 128;
 
 /// A message that was seen somewhere.
 #[derive(Debug, Clone, Copy)]
@@ -35,6 +37,8 @@ pub struct Assembly {
     /// Which replay tells the truth.
     replay_epoch: Option<u64>,
     books: BTreeMap<String, (Ledger, Vec<StageSummary>)>,
+    /// Those of whom something came.
+    vehicles: BTreeSet<CavId>,
 }
 
 /// What has come of one moment.
@@ -66,6 +70,11 @@ impl Assembly {
             self.keep_books(seen);
             return None;
         }
+        if let Topic::Stream { cav, .. } | Topic::Received { cav, .. } = seen.topic
+            && !self.admits(cav)
+        {
+            return None;
+        }
         if *seen.topic == Topic::Truth {
             self.begin_again_with(seen.header.stamp.epoch);
         }
@@ -81,6 +90,11 @@ impl Assembly {
             return self.show(oldest);
         }
         None
+    }
+
+    fn admits(&mut self, cav: &CavId) -> bool {
+        let is_known = self.vehicles.contains(cav);
+        is_known || (self.vehicles.len() < MOST_VEHICLES && self.vehicles.insert(cav.clone()))
     }
 
     /// The moment at `capture_nanos` as far as it has come; older ones are given up.
@@ -149,7 +163,7 @@ impl Assembly {
                 self.arrived(at, cav, *stream, 0, seen);
             }
             Topic::Received { cav, stream, .. } => self.arrived(at, cav, *stream, 2, seen),
-            Topic::Control(_) | Topic::Stats(_) | Topic::Alive { .. } => {}
+            Topic::Control(_) | Topic::Ready(_) | Topic::Stats(_) | Topic::Alive { .. } => {}
         }
         false
     }

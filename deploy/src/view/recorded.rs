@@ -81,7 +81,7 @@ impl RecordedRun {
                 Topic::Stream { .. } | Topic::Received { .. } | Topic::Truth => {
                     moments.entry(entry.header.stamp.capture_nanos).or_default().push(index);
                 }
-                Topic::Control(_) | Topic::Alive { .. } => {}
+                Topic::Control(_) | Topic::Ready(_) | Topic::Alive { .. } => {}
             }
         }
         let mut run = Self { recording, name, moments: Vec::new(), stats, assembly: Mutex::default() };

@@ -35,7 +35,7 @@ pub enum Control {
         /// What was published, so that each receiver can tell what it lacks.
         sent: Vec<TopicCount>,
     },
-    /// Any process to all: models are loaded, subscriptions stand.
+    /// Any process, on a key of its own: models are loaded, subscriptions stand.
     Ready {
         /// Who.
         process: ProcessId,
@@ -63,7 +63,7 @@ pub struct TopicCount {
 }
 
 impl Control {
-    /// The control key this goes to; a probe goes to the data key it proves.
+    /// The control key this goes to; a probe goes to the data key it proves, its answer to `ready/<process>`.
     #[must_use]
     pub fn verb(&self) -> Option<Verb> {
         Some(match self {
@@ -73,9 +73,8 @@ impl Control {
             Self::Step { .. } => Verb::Step,
             Self::Seek { .. } => Verb::Seek,
             Self::End { .. } => Verb::End,
-            Self::Ready { .. } => Verb::Ready,
             Self::Done { .. } => Verb::Done,
-            Self::Probe => return None,
+            Self::Ready { .. } | Self::Probe => return None,
         })
     }
 

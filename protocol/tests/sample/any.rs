@@ -38,6 +38,7 @@ fn any_topic() -> impl Strategy<Value = Topic> {
         (any_cav(), any_cav(), any_stream()).prop_map(|(ego, cav, stream)| Topic::Received { ego, cav, stream }),
         Just(Topic::Truth),
         select(Verb::ALL.to_vec()).prop_map(Topic::Control),
+        any_process().prop_map(Topic::Ready),
         any_process().prop_map(Topic::Stats),
         (select(Role::ALL.to_vec()), any_cav()).prop_map(|(role, cav)| Topic::Alive { role, cav }),
     ]

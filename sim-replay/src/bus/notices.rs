@@ -123,7 +123,9 @@ impl Speaker {
         shared.answer_due.store(false, Ordering::Release);
         let heard: Vec<Topic> = shared.heard.lock().unwrap_or_else(PoisonError::into_inner).iter().cloned().collect();
         if !heard.is_empty() {
-            self.control(Control::Ready { process: self.books.process().clone(), heard }, 0, sequence);
+            let process = self.books.process().clone();
+            let key = Key::ready(&self.run, &process);
+            self.put(&key, Priority::InteractiveHigh, 0, Control::Ready { process, heard }, sequence);
         }
     }
 

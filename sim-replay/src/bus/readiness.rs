@@ -2,7 +2,7 @@
 //!
 //! A message published before its route exists is lost without a word, and knowing that *some* subscriber matches does
 //! not tell which. So every publisher sends probes on its real key until its first real message, every subscriber
-//! answers each probe on `control/ready`, and the process that holds the clock waits until all the routes it expects
+//! answers each probe on `ready/<process>`, and the process that holds the clock waits until all the routes it expects
 //! have been heard of.
 
 use std::collections::BTreeSet;
@@ -12,13 +12,15 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use protocol::{CavId, Control, Limits, Party, ProcessId, Role, Topic, Verb};
+use protocol::{CavId, Control, Limits, Party, ProcessId, Role, Selector, Topic};
 
 use super::mailbox::Taken;
 use super::{Bus, BusError, Event, Inbox, Subscription};
 
-/// Answers that may wait at once; each repeats what the one before it from the same process said.
-const PLACES: usize = 256;
+/// Answers of one process that may wait: each repeats what the one before it said.
+const PLACES: usize = 1;
+/// Processes whose answers may wait at once; a run of 64 vehicles has fewer.
+const MAX_PROCESSES: usize = 256;
 
 /// How often a waiting barrier asks whether it should still wait.
 const ASK_AGAIN: Duration = Duration::from_millis(100);
@@ -99,8 +101,8 @@ impl Barrier {
     /// # Errors
     /// [`BusError`] when the bus is closed or the system gives no thread.
     pub fn attend(self, bus: &Bus) -> Result<Attended, BusError> {
-        let (barrier, inbox) = (Arc::new(self), bus.inbox(PLACES, 1));
-        let subscription = bus.subscribe(Topic::Control(Verb::Ready), &inbox)?;
+        let (barrier, inbox) = (Arc::new(self), bus.inbox(PLACES, MAX_PROCESSES));
+        let subscription = bus.subscribe_all(&Selector::ready(&bus.identity().run), &inbox)?;
         let attending = (Arc::clone(&barrier), Arc::clone(&inbox));
         thread::Builder::new()
             .name("readiness".into())
@@ -110,16 +112,17 @@ impl Barrier {
     }
 
     fn listen(&self, inbox: &Inbox) {
-        while let Taken::Item(_, event) = inbox.take(None) {
-            let Event::Message(arrival) = event else { continue };
-            match arrival.decode(&Limits::DEFAULT) {
-                Ok(Control::Ready { process, heard }) => {
+        while let Taken::Item(topic, event) = inbox.take(None) {
+            let (Topic::Ready(sender), Event::Message(arrival)) = (topic, event) else { continue };
+            match inbox.decode(&arrival, &Limits::DEFAULT) {
+                // Nobody says for another what that one has heard.
+                Some(Control::Ready { process, heard }) if process == sender => {
                     for topic in heard {
-                        self.heard(&Route { topic, receiver: process.clone() });
+                        self.heard(&Route { topic, receiver: sender.clone() });
                     }
                 }
-                Ok(other) => tracing::warn!(?other, "not a notice of readiness"),
-                Err(error) => tracing::warn!("notice of readiness refused: {error}"),
+                Some(other) => tracing::warn!(%sender, ?other, "not its own notice of readiness: not taken"),
+                None => {}
             }
         }
     }

@@ -205,7 +205,7 @@ impl Subscription {
 pub(super) fn has_notices(topic: &Topic) -> bool {
     match topic {
         Topic::Stream { .. } | Topic::Received { .. } | Topic::Truth => true,
-        Topic::Control(_) | Topic::Stats(_) | Topic::Alive { .. } => false,
+        Topic::Control(_) | Topic::Ready(_) | Topic::Stats(_) | Topic::Alive { .. } => false,
     }
 }
 
@@ -294,7 +294,7 @@ fn check(topic: &Topic, header: Header) -> Result<Header, WireError> {
             stream.kind()
         }
         Topic::Truth => Some(Kind::Truth),
-        Topic::Control(_) => Some(Kind::Control),
+        Topic::Control(_) | Topic::Ready(_) => Some(Kind::Control),
         Topic::Stats(_) => Some(Kind::Stats),
         Topic::Alive { .. } => None,
     };
