@@ -320,8 +320,7 @@ impl Fleet {
         self.model(&mut args);
         args.option("--method", self.scenario.method.name());
         args.option("--deadline-ms", &self.scenario.ego.deadline_ms.to_string());
-        args.option("--peer-messages-per-s", &self.scenario.ego.peer_messages_per_s.to_string());
-        args.option("--peer-mib-per-s", &self.scenario.ego.peer_mib_per_s.to_string());
+        self.peers(&mut args);
         args.option("--max-age-ms", &self.scenario.ego.max_age_ms.to_string());
         if self.scenario.ego.trust {
             args.flag("--trust");
@@ -330,6 +329,12 @@ impl Fleet {
             args.flag("--over-link");
         }
         meeting.process(format!("ego-{}", self.ego), "ego-fuser", args, Life::Service)
+    }
+
+    /// How much each vehicle may bring those who listen to it.
+    fn peers(&self, args: &mut Arguments) {
+        args.option("--peer-messages-per-s", &self.scenario.ego.peer_messages_per_s.to_string());
+        args.option("--peer-mib-per-s", &self.scenario.ego.peer_mib_per_s.to_string());
     }
 
     /// The emulated air, where the scenario has one and the method sends anything through it.
@@ -345,6 +350,7 @@ impl Fleet {
         args.option("--link", &link.air);
         args.option("--seed", &link.seed.to_string());
         args.option("--streams", &streams.join(","));
+        self.peers(&mut args);
         Some(meeting.process(format!("link-{}", self.ego), "sim-replay", args, Life::Service))
     }
 

@@ -6,10 +6,10 @@ use std::time::Duration;
 use protocol::message::Points;
 use protocol::{CavId, DropReason, Ledger, Limits, PointCloud, Pose, PoseEstimate, Role, Stream, Topic};
 use sim_replay::bus::shutdown::Stop;
-use sim_replay::bus::{Barrier, Bus, Event, PublisherOptions, Route};
+use sim_replay::bus::{Barrier, Bus, Event, InboxLimits, PublisherOptions, Route};
 use sim_replay::link::node::{self, LinkReport, NodeOptions};
 use sim_replay::link::{Air, CapacityConfig, DelayLaw, DeviceClock, LinkConfig, LossLaw};
-use tests::bus::{PATIENCE, TestRouter, next_event};
+use tests::bus::{PATIENCE, TestRouter, next_event, wait_for};
 
 /// Sweeps that are sent, and their points: 16 kB each.
 const COUNT: u64 = 6;
@@ -127,6 +127,30 @@ fn a_long_delay_keeps_no_more_than_it_may() {
     assert_eq!((report.offered, report.arrived), (COUNT, 2));
     assert_eq!(report.dropped, [(DropReason::LinkQueue, COUNT - 2)].into());
     assert_eq!(ledger.total().dropped[&DropReason::LinkQueue], COUNT - 2);
+}
+
+#[test]
+fn a_flood_ends_in_front_of_the_air() {
+    let router = TestRouter::open();
+    let [agent, link] = [("agent-7", "7"), ("link-9", "9")].map(|(name, id)| router.join(name, id));
+    let air = Air::new(LinkConfig::default(), Path::new("."), 1).unwrap();
+    let (sent, stop) = (Topic::Stream { cav: cav("7"), stream: Stream::Points }, Stop::new());
+    // Little more than the one that shows the route.
+    let narrow = NodeOptions { inbox: InboxLimits { messages_per_s: 0.6, ..InboxLimits::PEERS }, ..options() };
+    let report = std::thread::scope(|scope| {
+        let carrying = scope.spawn(|| node::run(&link, air, &narrow, &stop).unwrap());
+        let _presence = agent.announce(Role::Agent).unwrap();
+        let publisher = agent.publisher(sent.clone(), PublisherOptions::FEATURES.lossless(16)).unwrap();
+        wait_for_route(&agent, &sent, "link-9");
+        (0..COUNT).for_each(|tick| publisher.offer(tick, points(tick)));
+        publisher.finish();
+        let refused =
+            || link.books().ledger().total().dropped.get(&DropReason::RateLimit).is_some_and(|count| *count > 0);
+        wait_for("a refusal", refused);
+        stop.request();
+        carrying.join().unwrap()
+    });
+    assert!(report.offered < COUNT, "{report:?}");
 }
 
 #[test]

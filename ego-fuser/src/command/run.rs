@@ -11,7 +11,7 @@ use ego_fuser::node::{self, NodeOptions};
 use ego_fuser::pairing::PairingConfig;
 use ego_fuser::trust::TrustConfig;
 use protocol::{CavId, Role};
-use sim_replay::bus::{BusArgs, InboxLimits, STOP_LIMIT, log_to_stderr};
+use sim_replay::bus::{BusArgs, PeerArgs, STOP_LIMIT, log_to_stderr};
 
 use super::BadInput;
 
@@ -44,15 +44,8 @@ pub(crate) struct Arguments {
     /// Leave out neighbours whose words do not fit what the ego sees itself.
     #[arg(long)]
     trust: bool,
-    /// Messages that each sender may bring a second; what is more is dropped unread (rate_limit in the ledger).
-    #[arg(long, value_name = "N", default_value_t = InboxLimits::PEERS.messages_per_s, value_parser = above_zero)]
-    peer_messages_per_s: f64,
-    /// The same in MiB a second, on each of its streams.
-    #[arg(long, value_name = "MIB", default_value_t = InboxLimits::PEERS.bytes_per_s / MIB, value_parser = above_zero)]
-    peer_mib_per_s: f64,
-    /// MiB that may wait to be decoded, of all senders together.
-    #[arg(long, value_name = "MIB", default_value_t = InboxLimits::PEERS.waiting_bytes >> 20)]
-    waiting_mib: usize,
+    #[command(flatten)]
+    peers: PeerArgs,
     /// Threads to compute with; the same number gives the same bits.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
     threads: u16,
@@ -62,13 +55,6 @@ pub(crate) struct Arguments {
     /// Print a JSON summary at the end.
     #[arg(long)]
     json: bool,
-}
-
-const MIB: f64 = (1 << 20) as f64;
-
-fn above_zero(text: &str) -> Result<f64, String> {
-    let number: f64 = text.parse().map_err(|_| "not a number".to_owned())?;
-    if number > 0.0 { Ok(number) } else { Err("must be above 0".to_owned()) }
 }
 
 impl Arguments {
@@ -112,11 +98,7 @@ impl Arguments {
             neighbours,
             over_link: self.over_link,
             keeps_running: self.keep_running || self.bus.supervised,
-            inbox: InboxLimits {
-                messages_per_s: self.peer_messages_per_s,
-                bytes_per_s: self.peer_mib_per_s * MIB,
-                waiting_bytes: self.waiting_mib.saturating_mul(1 << 20),
-            },
+            inbox: self.peers.limits(),
             ..NodeOptions::default()
         })
     }

@@ -2,7 +2,7 @@
 
 use anyhow::Context;
 use protocol::{CavId, Role, Stream};
-use sim_replay::bus::{BusArgs, STOP_LIMIT, log_to_stderr};
+use sim_replay::bus::{BusArgs, PeerArgs, STOP_LIMIT, log_to_stderr};
 use sim_replay::link::node::{self, LinkReport, NodeOptions};
 use sim_replay::link::{Air, PRESETS};
 
@@ -25,6 +25,8 @@ pub(crate) struct Args {
     /// What crosses the link.
     #[arg(long, value_delimiter = ',', default_value = "pose,bev,descriptor")]
     streams: Vec<Stream>,
+    #[command(flatten)]
+    peers: PeerArgs,
     /// Go on when all agents have ended, for the next ones; always so with --supervised.
     #[arg(long)]
     keep_running: bool,
@@ -52,6 +54,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     let bus = args.bus.join(Role::Link, &args.ego)?;
     let options = NodeOptions {
         keeps_running: args.keep_running || args.bus.supervised,
+        inbox: args.peers.limits(),
         ..NodeOptions::new(args.ego.clone(), args.streams.clone())
     };
     let report = node::run(&bus, air, &options, &stop)?;

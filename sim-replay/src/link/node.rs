@@ -13,7 +13,9 @@ use serde::Serialize;
 use super::air::{Air, Fate, Outcome, Parcel};
 use crate::bus::mailbox::Taken;
 use crate::bus::shutdown::Stop;
-use crate::bus::{Arrival, Bus, BusError, Event, Inbox, Publisher, PublisherOptions, RollCall, Subscription};
+use crate::bus::{
+    Arrival, Bus, BusError, Event, Inbox, InboxLimits, Publisher, PublisherOptions, RollCall, Subscription,
+};
 
 /// Messages of one topic that may wait to be looked at, and that may wait to be passed on.
 const PLACES: usize = 64;
@@ -33,13 +35,15 @@ pub struct NodeOptions {
     pub keeps_running: bool,
     /// Bytes of messages that are kept at most: under a long delay the air itself has no bound.
     pub max_kept_bytes: u64,
+    /// What each topic may bring, and what may wait to be looked at.
+    pub inbox: InboxLimits,
 }
 
 impl NodeOptions {
     /// Until all agents of a run have ended, with at most 1 GiB on the way.
     #[must_use]
     pub const fn new(ego: CavId, streams: Vec<Stream>) -> Self {
-        Self { ego, streams, keeps_running: false, max_kept_bytes: 1 << 30 }
+        Self { ego, streams, keeps_running: false, max_kept_bytes: 1 << 30, inbox: InboxLimits::PEERS }
     }
 }
 
@@ -106,7 +110,7 @@ struct Node<'a> {
 
 impl<'a> Node<'a> {
     fn open(bus: &'a Bus, air: Air, options: &'a NodeOptions, stop: &Stop) -> Result<Self, BusError> {
-        let inbox = bus.inbox(PLACES, MAX_VEHICLES * (options.streams.len() + 1));
+        let inbox = bus.limited_inbox(PLACES, MAX_VEHICLES * (options.streams.len() + 1), options.inbox);
         stop.on_request({
             let inbox = Arc::clone(&inbox);
             move || inbox.close()
