@@ -1,6 +1,6 @@
 //! Where the processes of a run meet: a router inside this process, or one that runs elsewhere.
 
-use std::net::TcpListener;
+use std::net::{SocketAddr, TcpListener, UdpSocket};
 use std::time::Duration;
 
 use sim_replay::bus::shutdown::{self, Overdue};
@@ -26,7 +26,7 @@ pub struct MeetingPlace {
 }
 
 impl MeetingPlace {
-    /// Opens the router of this run, or connects to the one that the scenario names; with keys over TLS.
+    /// Opens the router of this run, or connects to the one that the scenario names; with keys over QUIC.
     ///
     /// # Errors
     /// [`BusError`] when the port is in use, nothing answers there, the endpoint is none or the keys are not right.
@@ -39,7 +39,7 @@ impl MeetingPlace {
                 })
             }
             None => {
-                let mut options = BusOptions::router(with_port(&network.listen)?);
+                let mut options = BusOptions::router(with_port(&network.listen, keys.is_some())?);
                 options.stall_limit = Duration::from_secs_f64(network.stall_limit_s);
                 keys.map_or(Ok(options.clone()), |keys| keys.for_router(options, run))
             }
@@ -61,13 +61,16 @@ impl MeetingPlace {
 }
 
 /// The endpoint with port 0 replaced by a port that is free right now.
-fn with_port(listen: &str) -> Result<Endpoint, BusError> {
-    let endpoint = |text: &str| Endpoint::new(text);
-    let Some(host) = listen.strip_suffix(":0") else { return endpoint(listen) };
-    let address = format!("{}:0", host.trim_start_matches("tcp/").trim_start_matches("tls/"));
+fn with_port(listen: &str, secured: bool) -> Result<Endpoint, BusError> {
+    let Some(place) = listen.strip_suffix(":0") else { return Endpoint::new(listen) };
+    let host = place.split_once('/').map_or(place, |(_, host)| host);
     // Asking the system beats guessing; should another program take the port in between, the router says so.
-    let port = TcpListener::bind(&address).and_then(|listener| listener.local_addr()).map(|address| address.port());
-    endpoint(&format!("{host}:{}", port.unwrap_or(0)))
+    let bound = if secured {
+        UdpSocket::bind(format!("{host}:0")).and_then(|socket| socket.local_addr())
+    } else {
+        TcpListener::bind(format!("{host}:0")).and_then(|listener| listener.local_addr())
+    };
+    Endpoint::new(&format!("{place}:{}", bound.as_ref().map_or(0, SocketAddr::port)))
 }
 
 #[cfg(test)]
@@ -76,9 +79,11 @@ mod tests {
 
     #[test]
     fn port_zero_becomes_a_free_one() {
-        let endpoint = with_port("tcp/127.0.0.1:0").unwrap();
-        assert!(!endpoint.as_str().ends_with(":0"), "{}", endpoint.as_str());
-        assert_eq!(with_port("tcp/127.0.0.1:7447").unwrap().as_str(), "tcp/127.0.0.1:7447");
+        for (listen, secured) in [("tcp/127.0.0.1:0", false), ("tcp/127.0.0.1:0", true), ("quic/127.0.0.1:0", true)] {
+            let endpoint = with_port(listen, secured).unwrap();
+            assert!(!endpoint.as_str().ends_with(":0"), "{}", endpoint.as_str());
+        }
+        assert_eq!(with_port("tcp/127.0.0.1:7447", false).unwrap().as_str(), "tcp/127.0.0.1:7447");
     }
 
     #[test]

@@ -6,7 +6,7 @@ use std::time::Duration;
 use deploy::keys::{KeyPlan, make};
 use protocol::{CavId, Party, RunId, Runs};
 use sim_replay::bus::{self, Bus, BusError, BusOptions, Credentials, Endpoint, Guard, Identity, Refusal, Refusals};
-use zenoh::Session;
+use zenoh::{Config, Session, Wait};
 
 use crate::bus::free_port;
 
@@ -19,6 +19,36 @@ pub fn keys_for(folder: &Path, parties: &[&str]) -> PathBuf {
     let parties = parties.iter().map(|name| name.parse::<Party>().expect("a party")).collect();
     make(&KeyPlan::new(folder, parties, 1)).expect("a writable folder");
     folder.to_path_buf()
+}
+
+/// Long enough for a connection on loopback, and how long each refused one is tried.
+pub const TRIED_FOR: Duration = Duration::from_secs(2);
+
+/// A session over QUIC that shows whatever certificate it likes, or none; without the checks of ours.
+///
+/// # Errors
+/// zenoh's words, when the router does not take it.
+///
+/// # Panics
+/// When zenoh does not know a setting.
+pub fn stranger(router: &Endpoint, authority: &Path, own: Option<&Path>) -> Result<Session, String> {
+    let quoted = |path: &Path| format!("{:?}", path.to_str().unwrap());
+    let mut settings = vec![
+        ("mode", r#""client""#.to_owned()),
+        ("connect/endpoints", format!(r#"["{}"]"#, router)),
+        ("connect/timeout_ms", TRIED_FOR.as_millis().to_string()),
+        ("connect/exit_on_failure", "true".to_owned()),
+        ("scouting/multicast/enabled", "false".to_owned()),
+        ("transport/link/tls/root_ca_certificate", quoted(&authority.join("ca.pem"))),
+        ("transport/link/tls/enable_mtls", own.is_some().to_string()),
+    ];
+    if let Some(own) = own {
+        settings.push(("transport/link/tls/connect_certificate", quoted(&own.join("cert.pem"))));
+        settings.push(("transport/link/tls/connect_private_key", quoted(&own.join("key.pem"))));
+    }
+    let mut config = Config::default();
+    settings.iter().for_each(|(key, value)| config.insert_json5(key, value).unwrap());
+    zenoh::open(config).wait().map_err(|cause| cause.to_string())
 }
 
 /// A router that lets in those with keys of `folder`, each for what is its to do in the run `test`.

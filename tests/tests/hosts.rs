@@ -1,4 +1,4 @@
-//! A fleet on three hosts over TLS: a router, a vehicle and an ego, each in a network namespace with a cable to the router.
+//! A fleet on three hosts over QUIC: a router, a vehicle and an ego, each in a network namespace with a cable to the router.
 //! What `deploy/hosts.md` tells to type is what runs here.
 
 use std::fs;
@@ -45,7 +45,7 @@ fn start(command: &mut Command, log: &Path) -> Running {
 }
 
 #[test]
-fn a_fleet_spans_three_hosts_over_tls() {
+fn a_fleet_spans_three_hosts_over_quic() {
     let _alone = alone();
     let hosts = match Hosts::lay(&["vehicle", "ego"]) {
         Ok(hosts) => hosts,
@@ -67,16 +67,16 @@ fn a_fleet_spans_three_hosts_over_tls() {
 
     let run = |host: &str, program: &str, words: &[&str], holder: &str| {
         let mut command = hosts.command(host, &programs().join(program));
-        command.args(words).arg(format!("--tls={}", keys.join(holder).display()));
+        command.args(words).arg(format!("--keys={}", keys.join(holder).display()));
         if program != "v2vloc" {
             let index = usize::from(host == "ego");
-            command.args(["--run=test".to_owned(), format!("--connect=tls/{}:{PORT}", router_address(index))]);
+            command.args(["--run=test".to_owned(), format!("--connect=quic/{}:{PORT}", router_address(index))]);
             command.arg("--connect-timeout=60");
         }
         start(&mut command, &path(&format!("{holder}.log")))
     };
     let weights = format!("--weights={}", path("weights.safetensors").display());
-    let router = run("router", "v2vloc", &["router", &format!("--listen=tls/0.0.0.0:{PORT}")], "router");
+    let router = run("router", "v2vloc", &["router", &format!("--listen=quic/0.0.0.0:{PORT}")], "router");
     let far = run("vehicle", "agent", &["run", "--cav=4288", &weights], "agent-4288");
     let near = run("ego", "agent", &["run", "--cav=4279", &weights], "agent-4279");
     let words = ["run", "--ego=4279", "--method=max", "--deadline-ms=60000", "--json", &weights];
@@ -146,8 +146,8 @@ fn commands(folder: &Path) -> Vec<(String, Vec<String>)> {
 fn keys_that_are_not_there_are_named_and_not_tried_again() {
     let folder = tempfile::tempdir().unwrap();
     let output = Command::new(programs().join("sim-replay"))
-        .args(["record", "--run=test", "--connect=tls/127.0.0.1:1"])
-        .arg(format!("--tls={}", folder.path().display()))
+        .args(["record", "--run=test", "--connect=quic/127.0.0.1:1"])
+        .arg(format!("--keys={}", folder.path().display()))
         .arg(format!("--out={}", folder.path().join("recording.mcap").display()))
         .output()
         .unwrap();

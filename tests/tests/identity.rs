@@ -1,22 +1,19 @@
-//! Key, header and certificate: who may say what, through real sessions over TLS.
+//! Key, header and certificate: who may say what, through real sessions over QUIC.
 
 use std::collections::BTreeSet;
-use std::path::Path;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
 use deploy::keys::{KeyPlan, make};
-use protocol::{Gnss, GnssSource, Limits, Pose, PoseEstimate, Stamp, Topic, wire};
+use protocol::message::Points;
+use protocol::{Gnss, GnssSource, Limits, PointCloud, Pose, PoseEstimate, Stamp, Topic, wire};
 use sim_replay::bus::{
     self, Barrier, Bus, BusError, BusOptions, Credentials, Event, Inbox, PublisherOptions, Route, unix_nanos,
 };
 use tests::bus::{PATIENCE, next_event, wait_for};
-use tests::keys::{GuardedRouter, keys_for};
+use tests::keys::{GuardedRouter, TRIED_FOR, keys_for, stranger};
 use zenoh::qos::CongestionControl;
-use zenoh::{Config, Session, Wait};
-
-/// Long enough for a connection on loopback, and how long each refused one is tried.
-const TRIED_FOR: Duration = Duration::from_secs(2);
+use zenoh::{Session, Wait};
 
 fn topic(text: &str) -> Topic {
     text.parse().unwrap()
@@ -149,6 +146,7 @@ fn a_certificate_speaks_for_its_own_vehicle_alone() {
         "rx/1/2/pose", // behind another's link
         "truth",
         "control/start",
+        "ready/agent-2",
         "stats/agent-2",
         "nobody",
     ];
@@ -183,9 +181,7 @@ fn a_certificate_speaks_for_its_own_vehicle_alone() {
     });
     let heard = heard.lock().unwrap().clone();
     let own = |key: &String| {
-        ["v2v/test/1/", "v2v/test/2/", "v2v/test/stats/", "v2v/test/control/ready"]
-            .iter()
-            .any(|own| key.starts_with(own))
+        ["v2v/test/1/", "v2v/test/2/", "v2v/test/stats/", "v2v/test/ready/"].iter().any(|own| key.starts_with(own))
     };
     assert!(heard.iter().all(own), "{heard:?}");
     assert!(!heard.contains("v2v/test/1/detections") && !heard.contains("v2v/test/1/lidar"), "{heard:?}");
@@ -209,27 +205,6 @@ fn a_header_under_another_name_is_counted_as_such() {
     });
 }
 
-/// A session over TLS that shows whatever certificate it likes, or none; without the checks of ours.
-fn stranger(router: &GuardedRouter, authority: &Path, own: Option<&Path>) -> Result<Session, String> {
-    let quoted = |path: &Path| format!("{:?}", path.to_str().unwrap());
-    let mut settings = vec![
-        ("mode", r#""client""#.to_owned()),
-        ("connect/endpoints", format!(r#"["{}"]"#, router.endpoint)),
-        ("connect/timeout_ms", TRIED_FOR.as_millis().to_string()),
-        ("connect/exit_on_failure", "true".to_owned()),
-        ("scouting/multicast/enabled", "false".to_owned()),
-        ("transport/link/tls/root_ca_certificate", quoted(&authority.join("ca.pem"))),
-        ("transport/link/tls/enable_mtls", own.is_some().to_string()),
-    ];
-    if let Some(own) = own {
-        settings.push(("transport/link/tls/connect_certificate", quoted(&own.join("cert.pem"))));
-        settings.push(("transport/link/tls/connect_private_key", quoted(&own.join("key.pem"))));
-    }
-    let mut config = Config::default();
-    settings.iter().for_each(|(key, value)| config.insert_json5(key, value).unwrap());
-    zenoh::open(config).wait().map_err(|cause| cause.to_string())
-}
-
 #[test]
 fn strangers_are_not_let_in() {
     let folder = tempfile::tempdir().unwrap();
@@ -247,19 +222,21 @@ fn strangers_are_not_let_in() {
     let expired = Credentials::read(&keys.join("agent-3")).unwrap_err().to_string();
     assert!(expired.contains("agent-3 expired"), "{expired}");
     let plain = || {
-        // Past our own check of endpoints: the same port, without TLS.
-        let text = router.endpoint.as_str().replace("tls/", "tcp/");
+        // Past our own check of endpoints: the same port, of TCP.
+        let text = router.endpoint.as_str().replace("quic/", "tcp/");
         let mut options = BusOptions::client(text.parse().unwrap());
         options.patience = TRIED_FOR;
         bus::open(&options)
     };
     std::thread::scope(|scope| {
-        let other_authority = scope.spawn(|| stranger(&router, &keys.join("agent-1"), Some(&theirs.join("agent-1"))));
-        let expired = scope.spawn(|| stranger(&router, &keys.join("agent-1"), Some(&keys.join("agent-3"))));
-        let no_certificate = scope.spawn(|| stranger(&router, &keys.join("agent-1"), None));
+        let other_authority =
+            scope.spawn(|| stranger(&router.endpoint, &keys.join("agent-1"), Some(&theirs.join("agent-1"))));
+        let expired = scope.spawn(|| stranger(&router.endpoint, &keys.join("agent-1"), Some(&keys.join("agent-3"))));
+        let no_certificate = scope.spawn(|| stranger(&router.endpoint, &keys.join("agent-1"), None));
         let plain = scope.spawn(plain);
         // Nor do we speak to a router of another authority.
-        let our_side = scope.spawn(|| stranger(&router, &theirs.join("agent-1"), Some(&theirs.join("agent-1"))));
+        let our_side =
+            scope.spawn(|| stranger(&router.endpoint, &theirs.join("agent-1"), Some(&theirs.join("agent-1"))));
         for (what, tried) in
             [("other", other_authority), ("expired", expired), ("none", no_certificate), ("our side", our_side)]
         {
@@ -291,6 +268,31 @@ fn a_certificate_that_runs_out_ends_its_connection() {
     });
     let _presence = agent.announce(protocol::Role::Agent).unwrap();
     wait_for("the end of a certificate", || watched.lock().unwrap().iter().any(|text| text.starts_with("Vanished")));
+}
+
+#[test]
+fn large_messages_come_whole_and_in_order() {
+    const COUNT: u64 = 8;
+    let folder = tempfile::tempdir().unwrap();
+    let router = GuardedRouter::open(&keys_for(folder.path(), &["agent-1", "ego-1"]));
+    let [agent, ego] = ["agent-1", "ego-1"].map(|party| router.join(party));
+    let inbox = ego.inbox(64, 8);
+    // 8 MiB each. Whoever is told of the second subscription has been told of the first.
+    let cloud = |tick: u64| PointCloud { xyzi: vec![[tick as f32, 2.0, 3.0, 0.5]; 1 << 19] };
+    let _subscriptions = ["1/points", "1/pose"].map(|text| ego.subscribe(topic(text), &inbox).unwrap());
+    reaches(&agent, "1/pose", &inbox);
+    let publisher = agent.publisher(topic("1/points"), PublisherOptions::FEATURES.lossless(COUNT as usize)).unwrap();
+    (0..COUNT).for_each(|tick| publisher.offer(tick, Points { pose: estimate(), points: cloud(tick) }));
+    for tick in 0..COUNT {
+        let arrival = loop {
+            match next_event(&inbox) {
+                (heard, Event::Message(arrival)) if heard == topic("1/points") => break arrival,
+                _ => {}
+            }
+        };
+        assert!(arrival.decode::<Points>(&Limits::DEFAULT).unwrap().points == cloud(tick), "{tick}");
+    }
+    publisher.finish();
 }
 
 #[test]

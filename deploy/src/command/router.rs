@@ -17,13 +17,13 @@ const LOOK_ROUND: Duration = Duration::from_secs(5);
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct Arguments {
-    /// Where to listen, tcp/HOST:PORT; with --tls the same place speaks TLS.
+    /// Where to listen, tcp/HOST:PORT; with --keys the same place speaks QUIC (UDP).
     #[arg(long, default_value = "tcp/127.0.0.1:7447")]
     listen: Endpoint,
     /// Folder with the router's keys (`v2vloc keys` writes DIR/router): every process has to show a certificate, and may
     /// do only what is its to do.
     #[arg(long, value_name = "DIR")]
-    tls: Option<PathBuf>,
+    keys: Option<PathBuf>,
     /// The only run that is let through [default: any].
     #[arg(long)]
     run: Option<RunId>,
@@ -94,7 +94,7 @@ impl Arguments {
         let mut options = BusOptions::router(self.listen.clone());
         options.stall_limit = Duration::from_secs_f64(self.stall_limit);
         options.max_message_bytes = self.max_message_mib.max(1) << 20;
-        let Some(folder) = &self.tls else { return Ok(options) };
+        let Some(folder) = &self.keys else { return Ok(options) };
         let credentials = Credentials::read(folder)?;
         credentials.check_name(ROUTER)?;
         let runs = self.run.clone().map_or(Runs::Any, Runs::One);

@@ -32,7 +32,7 @@ pub(crate) struct Arguments {
     connect: Option<Endpoint>,
     /// Folder with the viewer's keys, where the live run has security (`v2vloc keys` writes DIR/viewer).
     #[arg(long, value_name = "DIR")]
-    tls: Option<PathBuf>,
+    keys: Option<PathBuf>,
     /// Where to serve the page.
     #[arg(long, value_name = "HOST:PORT", default_value = "127.0.0.1:8088")]
     listen: SocketAddr,
@@ -58,7 +58,7 @@ impl Arguments {
                 let cav = CavId::new("viewer")?;
                 let identity = Identity { run: name.clone(), process: process_id(Role::Viewer, &cav), cav };
                 let mut options = BusOptions::client(router);
-                if let Some(folder) = &self.tls {
+                if let Some(folder) = &self.keys {
                     let credentials = Credentials::read(folder)?;
                     credentials.check_name(identity.process.as_str())?;
                     options = options.with_credentials(credentials);

@@ -27,7 +27,7 @@ pub(super) struct Meeting<'a> {
 impl Meeting<'_> {
     pub(super) fn process(&self, name: String, program: &str, mut args: Arguments, life: Life) -> ProcessSpec {
         if let Some(keys) = self.keys {
-            args.option("--tls", &keys.of_process(&name));
+            args.option("--keys", &keys.of_process(&name));
         }
         ProcessSpec { name, program: self.programs.join(program), args: args.0, life }
     }

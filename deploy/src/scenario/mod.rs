@@ -442,7 +442,7 @@ impl Default for Network {
     }
 }
 
-/// TLS between all processes, and for each of them only what is its to say.
+/// QUIC between all processes, and for each of them only what is its to say.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Security {

@@ -5,20 +5,20 @@ use std::fmt;
 use super::BusError;
 
 const TCP: &str = "tcp/";
-const TLS: &str = "tls/";
+const QUIC: &str = "quic/";
 
-/// A checked zenoh endpoint: `tcp/HOST:PORT`, or `tls/HOST:PORT` where both ends have keys.
+/// A checked zenoh endpoint: `tcp/HOST:PORT`, or `quic/HOST:PORT` where both ends have keys.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct Endpoint(String);
 
 impl Endpoint {
-    /// Reads `tcp/HOST:PORT` or `tls/HOST:PORT`; IPv6 hosts stand in brackets.
+    /// Reads `tcp/HOST:PORT` or `quic/HOST:PORT`; IPv6 hosts stand in brackets.
     ///
     /// # Errors
     /// [`BusError::Endpoint`] names what is not one.
     pub fn new(text: &str) -> Result<Self, BusError> {
         let bad = || BusError::Endpoint(text.chars().take(100).collect());
-        let address = text.strip_prefix(TCP).or_else(|| text.strip_prefix(TLS)).ok_or_else(bad)?;
+        let address = text.strip_prefix(TCP).or_else(|| text.strip_prefix(QUIC)).ok_or_else(bad)?;
         let (host, port) = address.rsplit_once(':').ok_or_else(bad)?;
         let bracketed = host.starts_with('[') && host.ends_with(']');
         let clean = |c: char| c.is_ascii_alphanumeric() || ".-_".contains(c) || (bracketed && "[]:%".contains(c));
@@ -37,24 +37,30 @@ impl Endpoint {
     /// The same place, spoken to with keys. Who has them never falls back to plain TCP.
     #[must_use]
     pub fn secured(&self) -> Self {
-        Self(format!("{TLS}{}", self.address()))
+        Self(format!("{QUIC}{}", self.address()))
     }
 
     /// Whether only those with keys speak there.
     #[must_use]
     pub fn is_secured(&self) -> bool {
-        self.0.starts_with(TLS)
+        self.0.starts_with(QUIC)
     }
 
-    /// The endpoint as zenoh writes it.
+    /// The endpoint as it is written.
     #[must_use]
     pub fn as_str(&self) -> &str {
         &self.0
     }
 
+    /// The same as zenoh is told. Over QUIC everything takes one stream and comes in the order in which it was sent, as
+    /// over TCP: were there one for each priority, a receipt would say nothing of what went with another.
+    pub(super) fn for_zenoh(&self) -> String {
+        if self.is_secured() { format!("{}?multistream=0", self.0) } else { self.0.clone() }
+    }
+
     pub(super) fn address(&self) -> &str {
         // Checked when it was made.
-        &self.0[TCP.len()..]
+        self.0.split_once('/').map_or("", |(_, address)| address)
     }
 }
 
@@ -78,12 +84,20 @@ mod tests {
 
     #[test]
     fn reads_endpoints() {
-        for text in ["tcp/127.0.0.1:7447", "tcp/[::1]:7447", "tcp/router.local:1", "tls/router.local:1"] {
+        for text in ["tcp/127.0.0.1:7447", "tcp/[::1]:7447", "tcp/router.local:1", "quic/router.local:1"] {
             assert_eq!(Endpoint::new(text).unwrap().as_str(), text);
         }
-        for text in
-            ["", "127.0.0.1:7447", "tcp/:1", "tcp/host", "tcp/host:70000", "udp/host:1", "tcp/a b:1", "tcp/::1:1"]
-        {
+        for text in [
+            "",
+            "127.0.0.1:7447",
+            "tcp/:1",
+            "tcp/host",
+            "tcp/host:70000",
+            "udp/host:1",
+            "tls/host:1",
+            "tcp/a b:1",
+            "tcp/::1:1",
+        ] {
             let error = Endpoint::new(text).unwrap_err();
             assert!(error.to_string().contains("tcp/HOST:PORT"), "{text}: {error}");
         }

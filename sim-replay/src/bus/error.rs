@@ -10,7 +10,7 @@ use super::endpoint::Endpoint;
 #[derive(Debug, thiserror::Error)]
 pub enum BusError {
     /// Not an endpoint.
-    #[error("{0:?} is not an endpoint: tcp/HOST:PORT, for example tcp/127.0.0.1:7447, or tls/HOST:PORT")]
+    #[error("{0:?} is not an endpoint: tcp/HOST:PORT, for example tcp/127.0.0.1:7447, or quic/HOST:PORT with keys")]
     Endpoint(String),
     /// Keys that are not there, or not right.
     #[error("{}: {what}", path.display())]
@@ -21,7 +21,7 @@ pub enum BusError {
         what: String,
     },
     /// An endpoint where only those with keys speak.
-    #[error("{0} takes keys: name their folder (--tls DIR; v2vloc keys makes them)")]
+    #[error("{0} takes keys: name their folder (--keys DIR; v2vloc keys makes them)")]
     NoKeys(Endpoint),
     /// zenoh refused or changed a setting.
     #[error("zenoh setting {key}: wanted {wanted}, {found}")]

@@ -36,7 +36,7 @@ impl Guard {
             let names: Vec<Value> =
                 [json!(LISTENERS)].into_iter().chain(own.iter().map(|rule| rule["id"].clone())).collect();
             rules.extend(own);
-            subjects.push(json!({"id": name, "cert_common_names": [name], "link_protocols": ["tls"]}));
+            subjects.push(json!({"id": name, "cert_common_names": [name], "link_protocols": ["quic"]}));
             policies.push(json!({"id": name, "rules": names, "subjects": [name]}));
         }
         json!({

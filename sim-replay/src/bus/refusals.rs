@@ -1,23 +1,28 @@
-//! What a router has refused, by the certificate of the one who tried.
+//! What a router has refused, by the certificate of the one who tried, and whom it did not let in.
 
 use std::collections::BTreeMap;
 use std::time::Duration;
 
 use zenoh::{Session, Wait};
 
+use super::handshakes;
+
 /// A router answers for itself.
 const ANSWER_LIMIT: Duration = Duration::from_secs(1);
 /// Peers and reasons that are told apart; names are of certificates that our authority has signed.
 const MAX_REFUSALS: usize = 1024;
 
+/// Whoever did not get as far as having a name.
+pub const STRANGER: &str = "stranger";
+
 /// Why a router did not pass something on.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
 pub struct Refusal {
-    /// Common name of the certificate, or the session's own id where there was none.
+    /// Common name of the certificate, or the session's own id where there was none; [`STRANGER`] for those not let in.
     pub peer: String,
-    /// `access-control` or `low-pass`.
+    /// `access-control`, `low-pass` or `handshake`.
     pub reason: String,
-    /// What it was: `put`, `declare`, `query`.
+    /// What it was: `put`, `declare`, `query`; or what was wrong with the handshake.
     pub message: String,
 }
 
@@ -26,11 +31,14 @@ pub struct Refusal {
 pub struct Refusals {
     // zenoh forgets a connection that has ended.
     seen: BTreeMap<(Refusal, String), u64>,
+    /// Handshakes that failed, by cause.
+    strangers: BTreeMap<&'static str, u64>,
 }
 
 impl Refusals {
     /// Asks the router of this process. What could not be asked stays as it was.
     pub fn update(&mut self, router: &Session) {
+        self.strangers = handshakes::failed();
         let key = format!("@/{}/router/metrics", router.zid());
         let asked =
             router.get(format!("{key}?descriptors=false;compression=false;per_key=false")).timeout(ANSWER_LIMIT);
@@ -53,6 +61,10 @@ impl Refusals {
         for ((refusal, _), count) in &self.seen {
             *counts.entry(refusal.clone()).or_default() += count;
         }
+        counts.extend(self.strangers.iter().map(|(cause, count)| {
+            let [peer, reason, message] = [STRANGER, "handshake", *cause].map(str::to_owned);
+            (Refusal { peer, reason, message }, *count)
+        }));
         counts
     }
 }

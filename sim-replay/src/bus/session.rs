@@ -1,6 +1,6 @@
 //! Opening the bus: explicit endpoints, no discovery, every limit set on purpose.
 
-use std::net::TcpListener;
+use std::net::{TcpListener, UdpSocket};
 use std::time::{Duration, Instant};
 
 use serde_json::{Value, json};
@@ -61,7 +61,7 @@ pub struct BusOptions {
     /// How long handing over one message may take before the connection is closed. Meanwhile a router delivers nothing
     /// else that the same sender sends, so this bounds what one stuck receiver costs the others.
     pub stall_limit: Duration,
-    /// Keys: all traffic goes over TLS, and both ends show certificates of the same authority.
+    /// Keys: all traffic goes over QUIC, and both ends show certificates of the same authority.
     pub credentials: Option<Credentials>,
     /// What a router lets through, by certificate; everything when absent.
     pub guard: Option<Guard>,
@@ -93,7 +93,7 @@ impl BusOptions {
         }
     }
 
-    /// The same with keys: the endpoint is one of TLS from here on.
+    /// The same with keys: the endpoint is one of QUIC from here on.
     #[must_use]
     pub fn with_credentials(mut self, credentials: Credentials) -> Self {
         let (Role::Router { listen: endpoint } | Role::Client { connect: endpoint }) = &mut self.role;
@@ -132,8 +132,8 @@ impl BusOptions {
     /// The keys of zenoh's configuration that differ from its defaults, or on which this crate relies.
     fn settings(&self) -> Vec<(&'static str, Value)> {
         let (mode, listen, connect) = match &self.role {
-            Role::Router { listen } => ("router", vec![listen.as_str()], vec![]),
-            Role::Client { connect } => ("client", vec![], vec![connect.as_str()]),
+            Role::Router { listen } => ("router", vec![listen.for_zenoh()], vec![]),
+            Role::Client { connect } => ("client", vec![], vec![connect.for_zenoh()]),
         };
         let millis = |duration: Duration| u64::try_from(duration.as_millis()).unwrap_or(u64::MAX);
         let mut settings = vec![
@@ -169,7 +169,7 @@ impl BusOptions {
             ("transport/link/tx/queue/size/data", json!(TENSOR_BATCHES)),
             ("transport/link/tx/queue/size/data_low", json!(TENSOR_BATCHES)),
             ("transport/link/rx/max_message_size", json!(self.max_message_bytes)),
-            ("transport/link/protocols", json!([if self.credentials.is_some() { "tls" } else { "tcp" }])),
+            ("transport/link/protocols", json!([if self.credentials.is_some() { "quic" } else { "tcp" }])),
             ("transport/unicast/max_sessions", json!(MAX_SESSIONS)),
             ("transport/unicast/max_links", json!(1)),
             ("transport/unicast/accept_pending", json!(MAX_STRANGERS)),
@@ -197,6 +197,7 @@ impl BusOptions {
     }
 }
 
+/// QUIC's handshake is that of TLS 1.3, and so are its settings.
 fn tls_settings(credentials: &Credentials) -> Vec<(&'static str, Value)> {
     let path = |file| json!(credentials.path(file));
     vec![
@@ -236,7 +237,10 @@ pub fn open(options: &BusOptions) -> Result<Session, BusError> {
 }
 
 fn port_in_use(endpoint: &Endpoint) -> bool {
-    TcpListener::bind(endpoint.address()).is_err_and(|error| error.kind() == std::io::ErrorKind::AddrInUse)
+    let address = endpoint.address();
+    let bound =
+        if endpoint.is_secured() { UdpSocket::bind(address).map(drop) } else { TcpListener::bind(address).map(drop) };
+    bound.is_err_and(|error| error.kind() == std::io::ErrorKind::AddrInUse)
 }
 
 fn config(options: &BusOptions) -> Result<Config, BusError> {
@@ -292,7 +296,7 @@ mod tests {
     #[test]
     fn without_keys_nobody_goes_where_keys_are_asked_for() {
         let endpoint = Endpoint::loopback(7447).secured();
-        assert_eq!(endpoint.as_str(), "tls/127.0.0.1:7447");
+        assert_eq!(endpoint.as_str(), "quic/127.0.0.1:7447");
         assert!(matches!(open(&BusOptions::client(endpoint)), Err(BusError::NoKeys(_))));
     }
 

@@ -33,7 +33,7 @@ const WARM_UP: Duration = Duration::from_secs(3);
 
 /// What is measured.
 pub(crate) struct Setting {
-    /// Keys, where TLS is spoken.
+    /// Keys, where QUIC is spoken.
     pub(crate) keys: Option<PathBuf>,
     pub(crate) flood: bool,
     pub(crate) duration: Duration,

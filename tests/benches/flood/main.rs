@@ -1,4 +1,4 @@
-//! What a flood from one authenticated peer costs the others, and what TLS costs everyone.
+//! What a flood from one authenticated peer costs the others, and what QUIC costs everyone.
 //!
 //! Three vehicles send maps of 1.6 MB ten times a second to an ego; a fourth, with a certificate of the same fleet, sends
 //! 1 MiB as often as it can, up to 1000 times a second. Router, ego, the three and the fourth are processes of this program.
@@ -61,10 +61,10 @@ fn bench(arguments: &[String]) -> Result<bool> {
     let mut rows = Vec::new();
     // They take turns, so that a machine that is busier in one minute than in the next does not decide.
     for _ in 0..2 {
-        for (tls, flood) in [(false, false), (true, false), (false, true), (true, true)] {
-            let keys = tls.then(|| folder.path().to_path_buf());
+        for (secured, flood) in [(false, false), (true, false), (false, true), (true, true)] {
+            let keys = secured.then(|| folder.path().to_path_buf());
             let setting = Setting { keys, flood, duration: Duration::from_secs_f64(seconds) };
-            rows.push((tls, flood, fleet::measure(&setting)?));
+            rows.push((secured, flood, fleet::measure(&setting)?));
         }
     }
     report(&rows, seconds, out.as_ref())
@@ -74,10 +74,10 @@ fn report(rows: &[(bool, bool, Measured)], seconds: f64, out: Option<&PathBuf>) 
     let mut text = format!("{}; {seconds} s for each line\n\n", machine::describe());
     text += "| link | flood | maps | p50 ms | p99 ms | CPU a map, ms | ego MiB | router MiB | flood: sent | refused | decoded |\n";
     text += "| --- | --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |\n";
-    for (tls, flood, measured) in rows {
+    for (secured, flood, measured) in rows {
         let Measured { latencies_ms, cpu_ms, ego_mib, router_mib, sent, refused, decoded } = measured;
         let [p50, p99] = [0.50, 0.99].map(|quantile| fleet::quantile(latencies_ms, quantile));
-        let (link, maps) = (if *tls { "TLS" } else { "TCP" }, latencies_ms.len());
+        let (link, maps) = (if *secured { "QUIC" } else { "TCP" }, latencies_ms.len());
         writeln!(
             text,
             "| {link} | {} | {maps} | {p50:.1} | {p99:.1} | {:.1} | {ego_mib:.0} | {router_mib:.0} | {sent} | {refused} | {decoded} |",
@@ -85,13 +85,13 @@ fn report(rows: &[(bool, bool, Measured)], seconds: f64, out: Option<&PathBuf>) 
             cpu_ms / maps.max(1) as f64,
         )?;
     }
-    let p99 = |tls: bool, flood: bool| {
-        let all = rows.iter().filter(|row| (row.0, row.1) == (tls, flood));
+    let p99 = |secured: bool, flood: bool| {
+        let all = rows.iter().filter(|row| (row.0, row.1) == (secured, flood));
         let all: Vec<f64> = all.flat_map(|row| row.2.latencies_ms.iter().copied()).collect();
         fleet::quantile(&all, 0.99)
     };
-    let ratios = [false, true].map(|tls| p99(tls, true) / p99(tls, false));
-    writeln!(text, "\np99 under the flood over p99 without: TCP {:.2}, TLS {:.2}", ratios[0], ratios[1])?;
+    let ratios = [false, true].map(|secured| p99(secured, true) / p99(secured, false));
+    writeln!(text, "\np99 under the flood over p99 without: TCP {:.2}, QUIC {:.2}", ratios[0], ratios[1])?;
     print!("{text}");
     if let Some(path) = out {
         std::fs::write(path, &text).with_context(|| path.display().to_string())?;
