@@ -28,6 +28,9 @@ const MAX_STRANGERS: usize = 64;
 /// How long a client may take to hand over one message: 8 MiB at 1 Mbit/s, and then some. A router that hangs is noticed
 /// much sooner, by its silence.
 pub(super) const LONGEST_MESSAGE: Duration = Duration::from_secs(120);
+/// The same over QUIC: there nobody tells a client that its router was killed, and a message under way keeps zenoh from
+/// connecting anew until this has passed. 8 MiB at 2.3 Mbit/s.
+const LONGEST_SECURED: Duration = Duration::from_secs(30);
 /// The same for a router, whose other messages of the same sender wait meanwhile.
 const LONGEST_DELIVERY: Duration = Duration::from_secs(5);
 
@@ -98,6 +101,7 @@ impl BusOptions {
     pub fn with_credentials(mut self, credentials: Credentials) -> Self {
         let (Role::Router { listen: endpoint } | Role::Client { connect: endpoint }) = &mut self.role;
         *endpoint = endpoint.secured();
+        self.stall_limit = self.stall_limit.min(LONGEST_SECURED);
         self.credentials = Some(credentials);
         self
     }
