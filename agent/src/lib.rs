@@ -33,6 +33,7 @@ pub mod rotated_iou;
 pub mod shrink;
 pub mod sparse;
 pub mod statistics;
+pub mod sweep_log;
 pub mod sweep_pairing;
 pub mod training;
 pub mod weights;

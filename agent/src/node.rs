@@ -3,6 +3,7 @@
 //! It subscribes to the sensors of its own vehicle and to nothing else; the truth in particular it cannot see. One
 //! thread receives, computes and offers; encoding and sending have threads of their own.
 
+use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
@@ -17,6 +18,7 @@ use sim_replay::bus::{
 
 use crate::agent::{Agent, AgentInput, Perception};
 use crate::rate::{RateConfig, RateControl, Turn};
+use crate::sweep_log::SweepLog;
 use crate::sweep_pairing::{PairedSweep, SweepPairing};
 
 /// How long a sweep waits for its pose, which was sent before it.
@@ -39,6 +41,8 @@ pub struct NodeOptions {
     pub keeps_running: bool,
     /// What it takes from the bus.
     pub limits: Limits,
+    /// Where it notes when each sweep came, if anywhere.
+    pub sweep_log: Option<PathBuf>,
 }
 
 impl Default for NodeOptions {
@@ -50,6 +54,7 @@ impl Default for NodeOptions {
             rate: RateConfig::default(),
             keeps_running: false,
             limits: Limits::DEFAULT,
+            sweep_log: None,
         }
     }
 }
@@ -91,6 +96,7 @@ struct Node<'a> {
     pairing: SweepPairing<Arrival>,
     outlet: Outlet,
     report: NodeReport,
+    sweep_log: Option<SweepLog>,
     _subscriptions: [Subscription; 2],
 }
 
@@ -108,8 +114,24 @@ impl<'a> Node<'a> {
         let subscriptions =
             [bus.subscribe_keeping(gnss.clone(), POSE_PLACES, &inbox)?, bus.subscribe(lidar.clone(), &inbox)?];
         let pairing = SweepPairing::new(POSE_PATIENCE);
-        let report = NodeReport::default();
-        Ok(Self { bus, agent, options, inbox, lidar, gnss, pairing, outlet, report, _subscriptions: subscriptions })
+        let sweep_log = options.sweep_log.as_deref().map(SweepLog::open).transpose();
+        let sweep_log = sweep_log.unwrap_or_else(|error| {
+            tracing::warn!("when sweeps come is not noted: {error}");
+            None
+        });
+        Ok(Self {
+            bus,
+            agent,
+            options,
+            inbox,
+            lidar,
+            gnss,
+            pairing,
+            outlet,
+            report: NodeReport::default(),
+            sweep_log,
+            _subscriptions: subscriptions,
+        })
     }
 
     fn listen(&mut self, stop: &Stop) {
@@ -158,7 +180,13 @@ impl<'a> Node<'a> {
             let Some(Lidar { points }) = self.inbox.decode(&sweep, &self.options.limits) else { continue };
             self.bus.books().timed("lidar transport", Duration::from_nanos(transport));
             self.bus.books().received(&self.lidar);
+            let arrived_nanos = unix_nanos().saturating_sub(nanos(sweep.at.elapsed()));
             self.process(&AgentInput { capture_nanos, cloud: &points, measured_pose: pose.as_ref() });
+            // When everything is on its way.
+            if let Some(Err(error)) = self.sweep_log.as_mut().map(|log| log.note(capture_nanos, arrived_nanos)) {
+                tracing::warn!("when sweeps come is not noted any more: {error}");
+                self.sweep_log = None;
+            }
         }
     }
 
@@ -189,6 +217,10 @@ impl<'a> Node<'a> {
             }
         }
     }
+}
+
+fn nanos(time: Duration) -> u64 {
+    u64::try_from(time.as_nanos()).unwrap_or(u64::MAX)
 }
 
 /// Everything an agent publishes.

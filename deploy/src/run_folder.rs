@@ -1,5 +1,6 @@
 //! `runs/<name>/`: everything that is kept of a run.
 
+use std::collections::BTreeMap;
 use std::fmt::Write as _;
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -88,20 +89,20 @@ impl RunFolder {
         self.write(name, &(text + "\n"))
     }
 
-    /// Writes `frames.csv`.
+    /// Writes `frames.csv`; `swept` says when the sweep of each capture time reached the ego's agent, Unix nanoseconds.
     ///
     /// # Errors
     /// [`RunFolderError::Write`].
-    pub fn write_frames(&self, records: &[FrameRecord]) -> Result<(), RunFolderError> {
-        self.write("frames.csv", &frames_csv(records))
+    pub fn write_frames(&self, records: &[FrameRecord], swept: &BTreeMap<u64, u64>) -> Result<(), RunFolderError> {
+        self.write("frames.csv", &frames_csv(records, swept))
     }
 }
 
 /// The table of a run's frames: a header line, then a line per frame.
-fn frames_csv(records: &[FrameRecord]) -> String {
+fn frames_csv(records: &[FrameRecord], swept: &BTreeMap<u64, u64>) -> String {
     let mut text = String::from(
         "frame_index,capture_nanos,latency_ms,detected,truth,found,fused,skipped,oldest_ms,stale,payload_bytes,wire_bytes,ego_error_m,\
-         ego_error_deg,posed_ms,published_ms,arrived_ms,decided_ms,fused_ms,detected_ms\n",
+         ego_error_deg,swept_ms,posed_ms,published_ms,arrived_ms,decided_ms,fused_ms,detected_ms\n",
     );
     let optional = |number: &Option<f64>| number.map_or(String::new(), |number| format!("{number:.4}"));
     for record in records {
@@ -125,8 +126,11 @@ fn frames_csv(records: &[FrameRecord]) -> String {
         } = record;
         let [latency_ms, oldest_ms, error_m, error_deg] =
             [latency_ms, oldest_ms, ego_error_m, ego_error_deg].map(optional);
-        let StageStamps { posed_ms, published_ms, arrived_ms, decided_ms, fused_ms, detected_ms } = stamps;
-        let stamps = [posed_ms, published_ms, arrived_ms, decided_ms, fused_ms, detected_ms].map(optional).join(",");
+        let swept_ms = swept.get(capture_nanos).and_then(|swept| stamps.since_began_ms(*swept));
+        let StageStamps { began_nanos: _, posed_ms, published_ms, arrived_ms, decided_ms, fused_ms, detected_ms } =
+            stamps;
+        let stamps =
+            [&swept_ms, posed_ms, published_ms, arrived_ms, decided_ms, fused_ms, detected_ms].map(optional).join(",");
         // Writing to a string cannot fail.
         let _ = writeln!(
             text,
@@ -185,7 +189,12 @@ mod tests {
             frame_index: 3,
             capture_nanos: 300_000_000,
             latency_ms: Some(81.25),
-            stamps: StageStamps { posed_ms: Some(40.5), detected_ms: Some(81.25), ..StageStamps::default() },
+            stamps: StageStamps {
+                began_nanos: Some(1_000_000_000),
+                posed_ms: Some(40.5),
+                detected_ms: Some(81.25),
+                ..StageStamps::default()
+            },
             detected: 20,
             truth: 22,
             found: 18,
@@ -198,9 +207,12 @@ mod tests {
             ego_error_m: Some(0.25),
             ego_error_deg: None,
         };
-        let text = frames_csv(&[record]);
+        let text = frames_csv(&[record], &BTreeMap::from([(300_000_000, 1_002_500_000)]));
         let lines: Vec<&str> = text.lines().collect();
-        assert_eq!(lines[1], "3,300000000,81.2500,20,22,18,1,0,100.0000,1,1000,1300,0.2500,,40.5000,,,,,81.2500");
+        assert_eq!(
+            lines[1],
+            "3,300000000,81.2500,20,22,18,1,0,100.0000,1,1000,1300,0.2500,,2.5000,40.5000,,,,,81.2500"
+        );
         assert_eq!(lines[0].matches(',').count(), lines[1].matches(',').count());
     }
 

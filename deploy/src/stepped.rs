@@ -179,7 +179,7 @@ fn write(
     let names = [fleet.scenario.method.name(), fleet.pose_source()];
     let metrics = Metrics::of(board, "stepped", names, board.seconds(), Messages::of(&ledger.total()));
     folder.write_json("metrics.json", &metrics)?;
-    folder.write_frames(board.records())?;
+    folder.write_frames(board.records(), &std::collections::BTreeMap::new())?;
     folder.write_json("ledger.json", &LedgerReport::new(&[], ledger, &balance, (&BTreeSet::new(), 0)))?;
     let models = &fleet.scenario.models;
     let localizer = models.localizer.as_ref().filter(|_| fleet.scenario.uses_localizer());

@@ -8,9 +8,9 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use ego_fuser::evaluate::EvaluateError;
-use protocol::{Balance, Ledger, RunId};
+use protocol::{Balance, Ledger, Role, RunId};
 use sim_replay::bus::shutdown::Stop;
-use sim_replay::bus::{BusError, Endpoint, Refusal};
+use sim_replay::bus::{BusError, Endpoint, Refusal, process_id};
 
 use crate::absences;
 use crate::fingerprint::Provenance;
@@ -37,6 +37,9 @@ const DRAIN_SHARE: f64 = 0.5;
 
 /// For writing the index of a recording, after all others have ended.
 const RECORDER_SHARE: Duration = Duration::from_millis(800);
+
+/// Where the ego's agent notes when each sweep came.
+pub const SWEEP_LOG: &str = "sweeps.csv";
 
 /// What a run needs beside its scenario.
 #[derive(Debug, Clone)]
@@ -195,6 +198,12 @@ fn watch(
     let (events, happened) = channel();
     let mut specs = fleet.processes(run, endpoint.as_str(), keys, programs);
     specs.extend(fleet.recorder(run, endpoint.as_str(), keys, programs, &folder.file("recording.mcap")));
+    let ego_agent = process_id(Role::Agent, &fleet.ego);
+    if let Some(spec) = specs.iter_mut().find(|spec| spec.name == ego_agent.as_str()) {
+        let mut option = std::ffi::OsString::from("--sweep-log=");
+        option.push(folder.file(SWEEP_LOG));
+        spec.args.push(option);
+    }
     let mut display = Display::new(fleet.ticks);
     if let Some(first) = fleet.scenario.network.metrics {
         for (spec, address) in specs.iter_mut().zip(ports_behind(first)) {
@@ -300,7 +309,9 @@ fn write(
     let balance = sum.balance();
     let metrics = metrics(fleet, &board, &progress, &sum);
     folder.write_json("metrics.json", &metrics)?;
-    folder.write_frames(board.records())?;
+    // An agent on another host notes nothing here, and a run may have no sweep at all.
+    let swept = agent::sweep_log::read(&folder.file(SWEEP_LOG)).unwrap_or_default();
+    folder.write_frames(board.records(), &swept)?;
     let report = LedgerReport::new(&books, &sum, &balance, (&watched.away, excused)).with_refused(refused);
     folder.write_json("ledger.json", &report)?;
     let provenance = match fingerprint.join() {

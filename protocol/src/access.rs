@@ -5,10 +5,10 @@
 //! | `agent-<cav>` | its pose, maps, boxes, points, descriptor | its own sensors |
 //! | `ego-<cav>` | its detections | what all agents publish, directly or behind its link |
 //! | `link-<ego>` | `rx/<ego>/...` | what all agents publish, and where they are |
-//! | `replay` | every vehicle's sensors, the truth, the end of the scene | control, who is ready, detections |
+//! | `replay` | every vehicle's sensors and previews of them, the truth, the end of the scene | control, who is ready, detections |
 //! | `scorer` | control | the truth, detections, poses, statistics |
-//! | `recorder` | nothing | everything |
-//! | `viewer` | nothing | results, sensors, statistics |
+//! | `recorder` | nothing | everything but previews |
+//! | `viewer` | nothing | results, previews of sweeps, statistics |
 //!
 //! Beside that everyone says that it is there, that it is ready and how its books stand, each under its own name.
 
@@ -89,7 +89,8 @@ impl Party {
             }
             Role::Replay => {
                 let sensors = SENSORS.iter().map(|stream| everyones(stream));
-                let own = [keys(&"*/camera/*"), keys(&Topic::Truth), control(Verb::End)];
+                let previews = everyones(&Stream::Preview);
+                let own = [keys(&"*/camera/*"), previews, keys(&Topic::Truth), control(Verb::End)];
                 (
                     sensors.chain(own).collect(),
                     vec![keys(&"control/*"), keys(&"ready/*"), everyones(&Stream::Detections)],
@@ -102,8 +103,8 @@ impl Party {
             }
             Role::Recorder => (Vec::new(), vec![keys(&"**")]),
             Role::Viewer => {
-                let results = [Stream::Pose, Stream::Boxes, Stream::Detections];
-                let shown = results.iter().chain(&SENSORS).map(|stream| everyones(stream));
+                let shown = [Stream::Pose, Stream::Boxes, Stream::Detections, Stream::Preview];
+                let shown = shown.iter().map(|stream| everyones(stream));
                 let rest = ["rx/*/*/pose", "truth", "stats/*", "control/*"].map(|topic| keys(&topic));
                 (Vec::new(), shown.chain(rest).collect::<Vec<_>>())
             }
@@ -132,7 +133,7 @@ impl Party {
 /// Keys of which no message has more than so many bytes, in whatever run.
 #[must_use]
 pub fn size_limits() -> Vec<(Vec<Selector>, usize)> {
-    let small = [Stream::Pose, Stream::Gnss, Stream::Descriptor, Stream::Boxes, Stream::Detections];
+    let small = [Stream::Pose, Stream::Gnss, Stream::Preview, Stream::Descriptor, Stream::Boxes, Stream::Detections];
     let keys = |stream| [format!("*/{stream}"), format!("rx/*/*/{stream}")];
     let selectors = |topics: Vec<String>| topics.iter().map(|topics| Selector::within(&Runs::Any, topics)).collect();
     let limit = |stream: Stream| Some((selectors(keys(stream).into()), stream.most_bytes()?));

@@ -3,6 +3,7 @@
 //! | key | from | to | message |
 //! | --- | --- | --- | --- |
 //! | `v2v/<run>/<cav>/<stream>` | replay, agent | that vehicle's agent, link | by [`Stream`] |
+//! | `v2v/<run>/<cav>/@preview` | replay | viewer | a few points of a sweep |
 //! | `v2v/<run>/rx/<ego>/<cav>/<stream>` | link | the ego-fuser of `<ego>` | the same, after the link |
 //! | `v2v/<run>/<ego>/detections[/json]` | ego-fuser | anyone | detections |
 //! | `v2v/<run>/truth` | replay | scorer | truth |
@@ -145,13 +146,13 @@ impl Selector {
         Self(format!("{KEY_ROOT}/{runs}/{topics}"))
     }
 
-    /// Everything of some runs.
+    /// Everything of some runs, in two expressions: the wildcard of the first passes over chunks that begin with `@`.
     #[must_use]
-    pub fn all_of(runs: &Runs) -> Self {
-        Self::within(runs, &"**")
+    pub fn all_of(runs: &Runs) -> [Self; 2] {
+        [Self::within(runs, &"**"), Self::within(runs, &format_args!("*/{}", Stream::Preview))]
     }
 
-    /// Everything of a run.
+    /// Everything of a run but previews.
     #[must_use]
     pub fn run(run: &RunId) -> Self {
         Self(format!("{KEY_ROOT}/{run}/**"))
@@ -245,6 +246,7 @@ mod tests {
         let (ego, other) = (&cav("4279"), &cav("-1"));
         vec![
             (Key::stream(run, ego, Stream::Lidar), "v2v/r1/4279/lidar"),
+            (Key::stream(run, ego, Stream::Preview), "v2v/r1/4279/@preview"),
             (Key::stream(run, ego, Stream::Gnss), "v2v/r1/4279/gnss"),
             (Key::stream(run, ego, Stream::Camera(2)), "v2v/r1/4279/camera/2"),
             (Key::stream(run, ego, Stream::Radar), "v2v/r1/4279/radar"),

@@ -14,6 +14,9 @@ use crate::{KeyError, Kind};
 pub enum Stream {
     /// `lidar`: sweeps.
     Lidar,
+    /// `@preview`: a few points of every sweep, for people who look on. The `@` keeps it from whoever listens to everything: a
+    /// recording has whole sweeps.
+    Preview,
     /// `gnss`: recorded or GNSS poses.
     Gnss,
     /// `camera/<k>`: images of camera `k`.
@@ -41,7 +44,7 @@ impl Stream {
     #[must_use]
     pub fn kind(self) -> Option<Kind> {
         Some(match self {
-            Self::Lidar => Kind::Lidar,
+            Self::Lidar | Self::Preview => Kind::Lidar,
             Self::Gnss => Kind::Gnss,
             Self::Radar => Kind::Radar,
             Self::Pose => Kind::Pose,
@@ -60,6 +63,7 @@ impl Stream {
     pub fn most_bytes(self) -> Option<usize> {
         match self {
             Self::Pose | Self::Gnss => Some(16 << 10),
+            Self::Preview => Some(64 << 10),
             Self::Descriptor | Self::Boxes | Self::Detections => Some(4 << 20),
             Self::Lidar | Self::Camera(_) | Self::Radar | Self::Bev | Self::Points | Self::DetectionsJson => None,
         }
@@ -69,6 +73,7 @@ impl Stream {
     pub(crate) fn from_chunks(chunks: &[&str]) -> Option<Self> {
         Some(match chunks {
             ["lidar"] => Self::Lidar,
+            ["@preview"] => Self::Preview,
             ["gnss"] => Self::Gnss,
             ["camera", index] => Self::Camera(camera_index(index)?),
             ["radar"] => Self::Radar,
@@ -94,6 +99,7 @@ impl fmt::Display for Stream {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::Lidar => f.write_str("lidar"),
+            Self::Preview => f.write_str("@preview"),
             Self::Gnss => f.write_str("gnss"),
             Self::Camera(index) => write!(f, "camera/{index}"),
             Self::Radar => f.write_str("radar"),

@@ -94,11 +94,13 @@ impl Topic {
     }
 
     /// Whether the ledger covers it: data, but neither the talk about the run itself nor what is said again and again
-    /// for those who come later, of whom nobody knows how much of it they should have heard.
+    /// for those who come later, of whom nobody knows how much of it they should have heard, nor what is only looked at.
     #[must_use]
     pub fn is_booked(&self) -> bool {
         match self {
-            Self::Stream { stream, .. } | Self::Received { stream, .. } => *stream != Stream::Descriptor,
+            Self::Stream { stream, .. } | Self::Received { stream, .. } => {
+                !matches!(stream, Stream::Descriptor | Stream::Preview)
+            }
             Self::Truth => true,
             Self::Control(_) | Self::Ready(_) | Self::Stats(_) | Self::Alive { .. } => false,
         }

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 
 use deploy::keys::{KeyPlan, make};
 use protocol::message::Points;
-use protocol::{Gnss, GnssSource, Limits, PointCloud, Pose, PoseEstimate, Stamp, Topic, wire};
+use protocol::{Gnss, GnssSource, Lidar, Limits, PointCloud, Pose, PoseEstimate, Stamp, Stream, Topic, wire};
 use sim_replay::bus::{
     self, Barrier, Bus, BusError, BusOptions, Credentials, Event, Inbox, PublisherOptions, Route, unix_nanos,
 };
@@ -99,6 +99,17 @@ fn a_fleet_with_keys_says_what_it_has_to() {
         is_gnss(tap.take(Some(Instant::now())))
     });
     publisher.finish();
+
+    // The replay sees that somebody looks.
+    let looking = viewer.tap(&[protocol::Selector::stream(&viewer.identity().run, Stream::Preview)], 4).unwrap();
+    let preview = replay.publisher(topic("1/@preview"), PublisherOptions::PREVIEW).unwrap();
+    wait_for("an onlooker", || preview.is_wanted());
+    wait_for("a preview", || {
+        preview.offer(3, Lidar::default());
+        matches!(looking.take(Some(Instant::now())), bus::mailbox::Taken::Item(..))
+    });
+    preview.finish();
+    drop(looking);
 
     // Who is there is seen by those who follow it.
     let seen = Arc::<Mutex<Vec<String>>>::default();

@@ -5,12 +5,12 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use protocol::{CavId, Control, Gnss, Lidar, Limits, Stream, Topic, Truth};
+use protocol::{CavId, Control, Gnss, Lidar, Limits, Selector, Stream, Topic, Truth, wire};
 use sim_replay::bus::shutdown::Stop;
-use sim_replay::bus::{Bus, Event, Inbox, Subscription, mailbox::Taken};
+use sim_replay::bus::{Bus, Event, Inbox, PublisherOptions, Subscription, mailbox::Taken};
 use sim_replay::dataset::{self, Scenario};
 use sim_replay::stream::{Replay, StreamError, StreamOptions, StreamReport};
-use tests::bus::{PATIENCE, TestRouter, next_event};
+use tests::bus::{PATIENCE, TestRouter, next_event, wait_for};
 use tests::scene;
 
 const AGENTS: [&str; 2] = ["10", "20"];
@@ -115,6 +115,44 @@ fn what_is_published_is_what_was_recorded() {
             seen += 1;
         }
     }
+}
+
+#[test]
+fn previews_are_for_onlookers_alone() {
+    let folder = tempfile::tempdir().unwrap();
+    scene::write(folder.path(), &AGENTS, 6);
+    let (router, scenario) = (TestRouter::open(), scenario(folder.path()));
+    let bus = router.join("replay", "replay");
+    let preview = bus.publisher(topic("10", Stream::Preview), PublisherOptions::PREVIEW).unwrap();
+    let recorder = router.join("recorder", "recorder");
+    let everything = recorder.tap(&[Selector::run(&recorder.identity().run)], 64).unwrap();
+    assert!(!preview.is_wanted(), "a recorder has whole sweeps");
+    let viewer = router.join("viewer", "viewer");
+    let looking = viewer.tap(&[Selector::stream(&viewer.identity().run, Stream::Preview)], 64).unwrap();
+    wait_for("somebody looks", || preview.is_wanted());
+    let _listener = Listener::new(&router);
+    play(&router, &scenario, StreamOptions::default());
+
+    let at_once = || Some(Instant::now());
+    let mut previews = 0;
+    while let Taken::Item(found, preview) = looking.take(at_once()) {
+        assert!(matches!(found, Topic::Stream { stream: Stream::Preview, .. }), "{found}");
+        let (header, Lidar { points }) = wire::decode([preview.bytes().as_ref()], &Limits::DEFAULT).unwrap();
+        let agent = AGENTS.iter().position(|cav| header.stamp.cav.as_str() == *cav).unwrap();
+        let tick = scenario.ticks.iter().position(|tick| tick.capture_nanos == header.stamp.capture_nanos).unwrap();
+        let frame = scenario.load(agent, tick, &dataset::LoadOptions::default()).unwrap();
+        assert_eq!(points, frame.points.thinned(4_000));
+        previews += 1;
+    }
+    assert!((1..=12).contains(&previews), "{previews}");
+    let mut recorded = 0;
+    while let Taken::Item(found, _) = everything.take(at_once()) {
+        assert!(!matches!(found, Topic::Stream { stream: Stream::Preview, .. }));
+        recorded += 1;
+    }
+    assert!(recorded > 12, "{recorded}");
+    drop(looking);
+    wait_for("nobody looks any more", || !preview.is_wanted());
 }
 
 #[test]

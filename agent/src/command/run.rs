@@ -67,6 +67,9 @@ pub(crate) struct Args {
     /// Go on when the replay ends, for the next one; always so with --supervised.
     #[arg(long)]
     keep_running: bool,
+    /// Note in this file when each sweep came: capture time and arrival, nanoseconds.
+    #[arg(long, value_name = "FILE")]
+    sweep_log: Option<PathBuf>,
     /// Print a JSON summary at the end.
     #[arg(long)]
     json: bool,
@@ -264,6 +267,7 @@ impl Args {
             codec: CodecConfig { dtype, gate, budget_bytes: self.budget, zstd_level: self.zstd },
             rate: self.rate.config(),
             keeps_running: self.keep_running || self.bus.supervised,
+            sweep_log: self.sweep_log.clone(),
             ..NodeOptions::default()
         }
     }

@@ -13,7 +13,8 @@ use sim_replay::web::WebServer;
 
 use super::{BadInput, Outcome};
 
-/// How far behind the processes of a run its viewer stands for the processor.
+/// How far behind the processes of a run its viewer stands for the processor. Not last of all: on a machine with nothing to
+/// spare a page would show nothing.
 const VIEWER_NICENESS: i32 = 15;
 
 #[derive(Debug, clap::Args)]
@@ -43,7 +44,7 @@ impl Arguments {
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
         let stop = Stop::new();
         stop.on_signals()?;
-        let server = match (&self.run, &self.name, self.connect) {
+        let server = match (&self.run, &self.name, &self.connect) {
             (Some(path), _, _) => {
                 let run = RecordedRun::open(path).map_err(|error| match error {
                     ViewError::NotRecorded(_) | ViewError::Empty(_) => anyhow::Error::from(BadInput(error.to_string())),
@@ -57,7 +58,7 @@ impl Arguments {
                 let _ = rustix::process::nice(VIEWER_NICENESS);
                 let cav = CavId::new("viewer")?;
                 let identity = Identity { run: name.clone(), process: process_id(Role::Viewer, &cav), cav };
-                let mut options = BusOptions::client(router);
+                let mut options = BusOptions::client(router.clone());
                 if let Some(folder) = &self.keys {
                     let credentials = Credentials::read(folder)?;
                     credentials.check_name(identity.process.as_str())?;

@@ -5,6 +5,9 @@ use protocol::StageTiming;
 /// Milliseconds after the publication of the tick; each is `None` where it is not known.
 #[derive(Debug, Clone, Copy, PartialEq, Default, serde::Serialize)]
 pub struct StageStamps {
+    /// When the tick was published, Unix nanoseconds: where all others count from.
+    #[serde(skip)]
+    pub began_nanos: Option<u64>,
     /// The ego's agent knew where it was and said so.
     pub posed_ms: Option<f64>,
     /// It handed its map, boxes or points to the network.
@@ -24,7 +27,7 @@ impl StageStamps {
     /// detections, with their `stages`, at `detected_nanos`.
     #[must_use]
     pub fn of(began_nanos: u64, posed_nanos: Option<u64>, detected_nanos: u64, stages: &[StageTiming]) -> Self {
-        let since = |nanos: u64| (nanos as f64 - began_nanos as f64) / 1e6;
+        let since = |nanos: u64| ms_between(began_nanos, nanos);
         let took =
             |name: &str| stages.iter().find(|timing| timing.stage == name).map(|timing| timing.nanos as f64 / 1e6);
         let fusing: f64 = stages
@@ -39,6 +42,7 @@ impl StageStamps {
         let arrived = decided.zip(took("wait")).map(|(decided, wait)| decided - wait);
         let published = arrived.zip(took("transport")).map(|(arrived, transport)| arrived - transport);
         Self {
+            began_nanos: Some(began_nanos),
             posed_ms: posed_nanos.map(since),
             published_ms: published,
             arrived_ms: arrived,
@@ -47,6 +51,16 @@ impl StageStamps {
             detected_ms: Some(detected),
         }
     }
+
+    /// Milliseconds from the publication of the tick to `nanos`.
+    #[must_use]
+    pub fn since_began_ms(&self, nanos: u64) -> Option<f64> {
+        self.began_nanos.map(|began| ms_between(began, nanos))
+    }
+}
+
+fn ms_between(began_nanos: u64, nanos: u64) -> f64 {
+    (nanos as f64 - began_nanos as f64) / 1e6
 }
 
 #[cfg(test)]
@@ -62,6 +76,7 @@ mod tests {
             [timing("transport", 4), timing("wait", 20), timing("warp", 3), timing("fuse", 7), timing("send", 1)];
         let stamps = StageStamps::of(1_000_000_000, Some(1_030_000_000), 1_100_000_000, &stages);
         let expected = StageStamps {
+            began_nanos: Some(1_000_000_000),
             posed_ms: Some(30.0),
             published_ms: Some(65.0),
             arrived_ms: Some(69.0),
@@ -75,6 +90,6 @@ mod tests {
     #[test]
     fn what_an_ego_does_not_tell_stays_open() {
         let stamps = StageStamps::of(0, None, 5_000_000, &[]);
-        assert_eq!(stamps, StageStamps { detected_ms: Some(5.0), ..StageStamps::default() });
+        assert_eq!(stamps, StageStamps { began_nanos: Some(0), detected_ms: Some(5.0), ..StageStamps::default() });
     }
 }

@@ -7,7 +7,7 @@ use protocol::{
     StageSummary, Stats, Stream, Topic, TrueObject, Truth, wire,
 };
 
-use super::scene_frame::{Link, Messages, Planar, Process, SceneFrame, ShownBox, Vehicle, rows, thinned};
+use super::scene_frame::{Link, Messages, POINT_BYTES, Planar, Process, SceneFrame, ShownBox, Vehicle, thinned};
 
 /// Moments that may still be waiting for something.
 const MOST_OPEN: usize = 16;
@@ -46,7 +46,8 @@ pub struct Assembly {
 struct Moment {
     truth: Option<(u64, Truth)>,
     result: Option<(u64, Detections)>,
-    poses: BTreeMap<CavId, PoseEstimate>,
+    /// And when they were published.
+    poses: BTreeMap<CavId, (u64, PoseEstimate)>,
     /// As they came: most moments of a busy run are never shown, and decoding is what costs.
     sweeps: BTreeMap<CavId, Vec<u8>>,
     own_boxes: BTreeMap<CavId, Boxes>,
@@ -141,7 +142,7 @@ impl Assembly {
                     return true;
                 }
             }
-            Topic::Stream { cav, stream: Stream::Lidar } => {
+            Topic::Stream { cav, stream: Stream::Lidar | Stream::Preview } => {
                 if let Some(payload) = seen.payload {
                     self.moment(at).sweeps.insert(cav.clone(), payload.to_vec());
                 }
@@ -150,7 +151,7 @@ impl Assembly {
                 match stream {
                     Stream::Pose => {
                         if let Some(estimate) = decode(seen) {
-                            self.moment(at).poses.insert(cav.clone(), estimate);
+                            self.moment(at).poses.insert(cav.clone(), (published, estimate));
                         }
                     }
                     Stream::Boxes => {
@@ -194,13 +195,17 @@ impl Moment {
     fn frame(&self, capture_nanos: u64, books: &BTreeMap<String, (Ledger, Vec<StageSummary>)>) -> SceneFrame {
         let result = self.result.as_ref().map(|(_, result)| result);
         let (vehicles, points) = self.vehicles();
-        let latency = self.truth.as_ref().zip(self.result.as_ref());
+        let began = self.truth.as_ref().map(|(began, _)| *began);
+        let since_began_ms = |nanos: u64| began.map(|began| (nanos as f64 - began as f64) / 1e6);
+        let posed = result.and_then(|result| self.poses.get(&result.ego)).map(|(posed, _)| *posed);
         SceneFrame {
             capture_s: capture_nanos as f64 / 1e9,
             frame_index: self.truth.as_ref().map(|(_, truth)| truth.frame_index),
             ego: result.map(|result| result.ego.clone()),
             method: result.map(|result| result.method.clone()),
-            latency_ms: latency.map(|((began, _), (done, _))| (*done as f64 - *began as f64) / 1e6),
+            latency_ms: self.result.as_ref().and_then(|(done, _)| since_began_ms(*done)),
+            swept_ms: None,
+            posed_ms: posed.and_then(since_began_ms),
             vehicles,
             truth: self.true_boxes(),
             detections: self.detections(),
@@ -234,7 +239,7 @@ impl Moment {
     fn vehicle(&self, cav: &CavId, points: &mut Vec<u8>) -> Vehicle {
         let agents = self.truth.iter().flat_map(|(_, truth)| &truth.agents);
         let truth = agents.into_iter().find(|agent| agent.cav == *cav).map(|agent| &agent.world_from_lidar);
-        let estimate = self.poses.get(cav).or_else(|| {
+        let estimate = self.poses.get(cav).map(|(_, estimate)| estimate).or_else(|| {
             self.result
                 .as_ref()
                 .map(|(_, result)| result)
@@ -257,15 +262,15 @@ impl Moment {
             },
             truth: truth.map(Planar::of),
             error_m: pose.zip(truth).map(|(found, truth)| distance(found, truth)),
-            world_from_lidar: pose.or(truth).map(rows),
-            points: sweep.len() / 6,
+            world_from_lidar: pose.or(truth).copied(),
+            points: sweep.len() / POINT_BYTES,
         }
     }
 
     fn sweep(&self, cav: &CavId) -> Vec<u8> {
         let payload = self.sweeps.get(cav).map(Vec::as_slice);
         let decoded = payload.and_then(|payload| wire::decode::<Lidar>([payload], &Limits::DEFAULT).ok());
-        decoded.map_or(Vec::new(), |(_, Lidar { points })| thinned(&points.xyzi))
+        decoded.map_or(Vec::new(), |(_, Lidar { points })| thinned(&points))
     }
 
     fn true_boxes(&self) -> Vec<ShownBox> {

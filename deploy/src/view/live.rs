@@ -13,10 +13,13 @@ use sim_replay::bus::{Bus, BusError, Overheard, Tap};
 use tokio::sync::watch;
 use tokio::time::{sleep, timeout};
 
+use super::SceneFrame;
 use super::assembly::{Assembly, Seen};
 
 /// Messages of one key that may wait to be looked at.
 const PLACES: usize = 4;
+/// The same of previews, which are taken only with the next other message.
+const PREVIEW_PLACES: usize = 2;
 /// A page is given no more than this: ten moments a second.
 const SHORTEST_PERIOD: Duration = Duration::from_millis(95);
 /// How often a page is told that nothing has come, which also finds out that it is gone.
@@ -26,8 +29,11 @@ const NOTHING_NEW: [u8; 4] = [0; 4];
 /// How often the thread looks whether somebody looks.
 const LOOK_ROUND: Duration = Duration::from_millis(100);
 
-/// The newest moment of a run, for any number of pages. Sweeps are listened to only while somebody looks: nobody pays for a
-/// page that is not open.
+/// Somebody to whom every moment is shown.
+pub type Onlooker = Box<dyn FnMut(&SceneFrame) + Send>;
+
+/// The newest moment of a run, for any number of pages. The run is listened to only while somebody looks: nobody pays for a
+/// page that is not open. Points are those of previews, which are sent only while somebody listens to them.
 pub struct LiveRun {
     /// The newest moment behind its length; empty: none so far.
     newest: Arc<watch::Sender<Bytes>>,
@@ -40,17 +46,17 @@ impl LiveRun {
     /// Listens to the run of `bus`.
     ///
     /// # Errors
-    /// [`BusError`] when the bus refuses or the system gives no thread.
+    /// [`BusError`] when the system gives no thread.
     pub fn start(bus: Bus) -> Result<Self, BusError> {
+        Self::start_for(bus, None)
+    }
+
+    /// The same with somebody who looks at every moment, whether a page is open or not.
+    ///
+    /// # Errors
+    /// As [`Self::start`].
+    pub fn start_for(bus: Bus, onlooker: Option<Onlooker>) -> Result<Self, BusError> {
         let run = bus.identity().run.clone();
-        let streams = [Stream::Pose, Stream::Boxes, Stream::Detections];
-        let mut selectors: Vec<Selector> = streams.map(|stream| Selector::stream(&run, stream)).into();
-        selectors.extend([
-            Selector::received_by_anyone(&run, Stream::Pose),
-            Selector::truth(&run),
-            Selector::stats(&run),
-        ]);
-        let tap = bus.tap(&selectors, PLACES)?;
         let newest = Arc::new(watch::Sender::default());
         let ending = Arc::<AtomicBool>::default();
         let listener = Listener {
@@ -58,11 +64,12 @@ impl LiveRun {
             run: run.clone(),
             newest: Arc::clone(&newest),
             ending: Arc::clone(&ending),
+            onlooker,
             assembly: Assembly::default(),
         };
         let thread = thread::Builder::new()
             .name("view".into())
-            .spawn(move || listener.run(&tap))
+            .spawn(move || listener.run())
             .map_err(|cause| BusError::Thread { what: "the view".into(), cause })?;
         Ok(Self { newest, run, ending, thread: Some(thread) })
     }
@@ -117,36 +124,61 @@ struct Listener {
     run: RunId,
     newest: Arc<watch::Sender<Bytes>>,
     ending: Arc<AtomicBool>,
+    onlooker: Option<Onlooker>,
     assembly: Assembly,
 }
 
+/// What is listened to while somebody looks.
+struct Ears {
+    previews: Tap,
+    rest: Tap,
+}
+
+impl Ears {
+    fn open(bus: &Bus, run: &RunId) -> Result<Self, BusError> {
+        let streams = [Stream::Pose, Stream::Boxes, Stream::Detections];
+        let mut selectors: Vec<Selector> = streams.map(|stream| Selector::stream(run, stream)).into();
+        selectors.extend([Selector::received_by_anyone(run, Stream::Pose), Selector::truth(run), Selector::stats(run)]);
+        let previews = bus.tap(&[Selector::stream(run, Stream::Preview)], PREVIEW_PLACES)?;
+        Ok(Self { previews, rest: bus.tap(&selectors, PLACES)? })
+    }
+}
+
 impl Listener {
-    fn run(mut self, tap: &Tap) {
-        let mut sweeps: Option<Tap> = None;
+    fn run(mut self) {
+        let mut ears: Option<Ears> = None;
         while !self.ending.load(Ordering::Relaxed) {
-            let is_watched = self.is_watched();
-            if is_watched && sweeps.is_none() {
-                let opened = self.bus.tap(&[Selector::stream(&self.run, Stream::Lidar)], 2);
-                sweeps = opened.map_err(|error| tracing::error!("no points are shown: {error}")).ok();
-            } else if !is_watched {
-                sweeps = None;
+            if !self.is_watched() {
+                ears = None;
+                thread::sleep(LOOK_ROUND);
+                continue;
             }
-            // Sweeps first: a moment is shown when its result is taken, and its sweeps have come long before.
-            if let Taken::Item(_, overheard) = tap.take(Some(Instant::now() + LOOK_ROUND)) {
-                while let Some(Taken::Item(_, sweep)) = sweeps.as_ref().map(|tap| tap.take(Some(Instant::now()))) {
-                    self.take(&sweep);
+            let Some(Ears { previews, rest }) = &ears else {
+                match Ears::open(&self.bus, &self.run) {
+                    Ok(opened) => ears = Some(opened),
+                    Err(error) => {
+                        tracing::error!("nothing is shown: {error}");
+                        thread::sleep(HEARTBEAT);
+                    }
+                }
+                continue;
+            };
+            // Previews first: a moment is shown when its result is taken, and its sweeps have come long before.
+            if let Taken::Item(_, overheard) = rest.take(Some(Instant::now() + LOOK_ROUND)) {
+                while let Taken::Item(_, preview) = previews.take(Some(Instant::now())) {
+                    self.take(&preview);
                 }
                 self.take(&overheard);
             }
         }
-        drop(sweeps);
+        drop(ears);
         if let Err(overdue) = self.bus.leave(Duration::from_millis(500)) {
             tracing::warn!("{overdue}");
         }
     }
 
     fn is_watched(&self) -> bool {
-        self.newest.receiver_count() > 0
+        self.onlooker.is_some() || self.newest.receiver_count() > 0
     }
 
     fn take(&mut self, overheard: &Overheard) {
@@ -159,6 +191,9 @@ impl Listener {
         let (arrived_nanos, payload) = (overheard.arrived_nanos, Some(bytes.as_ref()));
         let seen = Seen { topic, header: &header, arrived_nanos, payload };
         if let Some(frame) = self.assembly.add(&seen).filter(|_| self.is_watched()) {
+            if let Some(onlooker) = &mut self.onlooker {
+                onlooker(&frame);
+            }
             let frame = frame.to_bytes();
             let len = (frame.len() as u32).to_le_bytes();
             self.newest.send_replace([len.as_slice(), &frame].concat().into());

@@ -13,7 +13,7 @@ mod server;
 mod tests;
 
 pub use assembly::{Assembly, Seen};
-pub use live::LiveRun;
+pub use live::{LiveRun, Onlooker};
 pub use recorded::{RecordedRun, ViewError};
 pub use scene_frame::SceneFrame;
 pub use server::{serve_live, serve_recorded};

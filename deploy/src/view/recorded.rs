@@ -1,5 +1,6 @@
 //! A recorded run, moment by moment, in any order.
 
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
@@ -9,6 +10,7 @@ use sim_replay::recording::{Entry, Recording, RecordingError};
 
 use super::assembly::{Assembly, Seen};
 use super::scene_frame::SceneFrame;
+use crate::up::SWEEP_LOG;
 
 /// Why a run cannot be shown.
 #[derive(Debug, thiserror::Error)]
@@ -29,6 +31,8 @@ pub struct RecordedRun {
     recording: Recording,
     name: String,
     moments: Vec<Moment>,
+    /// When the sweep of each capture time reached the ego's agent, where the run noted that.
+    swept: BTreeMap<u64, u64>,
     /// Where every process tells of its books.
     stats: Vec<usize>,
     assembly: Mutex<Assembly>,
@@ -37,6 +41,8 @@ pub struct RecordedRun {
 /// One moment: its messages in the recording, and what the timeline shows of it.
 struct Moment {
     capture_nanos: u64,
+    /// When its truth was published.
+    began_nanos: Option<u64>,
     entries: Vec<usize>,
     summary: MomentSummary,
 }
@@ -71,7 +77,7 @@ impl RecordedRun {
             tracing::warn!("{}: {} bytes at its end are lost: {}", file.display(), damage.lost_bytes, damage.reason);
         }
         let name = recording.entries().first().map_or(String::new(), |entry| entry.key.run.to_string());
-        let mut moments = std::collections::BTreeMap::<u64, Vec<usize>>::new();
+        let mut moments = BTreeMap::<u64, Vec<usize>>::new();
         let mut stats = Vec::new();
         for (index, entry) in recording.entries().iter().enumerate() {
             match &entry.key.topic {
@@ -84,10 +90,13 @@ impl RecordedRun {
                 Topic::Control(_) | Topic::Ready(_) | Topic::Alive { .. } => {}
             }
         }
-        let mut run = Self { recording, name, moments: Vec::new(), stats, assembly: Mutex::default() };
+        let swept = agent::sweep_log::read(&file.with_file_name(SWEEP_LOG)).unwrap_or_default();
+        let mut run = Self { recording, name, moments: Vec::new(), swept, stats, assembly: Mutex::default() };
         for (capture_nanos, entries) in moments {
             if let Some(summary) = run.summary(capture_nanos, &entries)? {
-                run.moments.push(Moment { capture_nanos, entries, summary });
+                let truth = entries.iter().map(|index| run.entry(*index)).find(|entry| entry.key.topic == Topic::Truth);
+                let began_nanos = truth.map(|entry| entry.header.stamp.publish_nanos);
+                run.moments.push(Moment { capture_nanos, began_nanos, entries, summary });
             }
         }
         if run.moments.is_empty() { Err(ViewError::Empty(file)) } else { Ok(run) }
@@ -135,10 +144,15 @@ impl RecordedRun {
             let (topic, payload) = (&key.topic, payload.as_deref());
             let shown = assembly.add(&Seen { topic, header, arrived_nanos: *arrived_nanos, payload });
             if shown.is_some() {
-                return Ok(shown);
+                return Ok(shown.map(|frame| self.with_sweep(frame, moment)));
             }
         }
-        Ok(assembly.show(moment.capture_nanos))
+        Ok(assembly.show(moment.capture_nanos).map(|frame| self.with_sweep(frame, moment)))
+    }
+
+    fn with_sweep(&self, frame: SceneFrame, moment: &Moment) -> SceneFrame {
+        let swept = self.swept.get(&moment.capture_nanos).zip(moment.began_nanos);
+        SceneFrame { swept_ms: swept.map(|(swept, began)| (*swept as f64 - began as f64) / 1e6), ..frame }
     }
 
     fn entry(&self, index: usize) -> &Entry {
@@ -147,7 +161,7 @@ impl RecordedRun {
 
     /// The last word of every process until `nanos`.
     fn books_until(&self, nanos: u64) -> Vec<usize> {
-        let mut last = std::collections::BTreeMap::new();
+        let mut last = BTreeMap::new();
         for index in self.stats.iter().copied().filter(|index| self.entry(*index).arrived_nanos <= nanos) {
             last.insert(&self.entry(index).key.topic, index);
         }

@@ -2,11 +2,13 @@
 
 use std::collections::BTreeMap;
 
-use protocol::{Box3d, CavId, Doubt, DropReason, NoPoseReason, Pose, StageSummary, StageTiming};
-use serde::Serialize;
+use protocol::{Box3d, CavId, Doubt, DropReason, NoPoseReason, PointCloud, Pose, StageSummary, StageTiming};
+use serde::{Serialize, Serializer};
 
 /// Points of one sweep that the page is given at most: more than a screen has pixels for them.
 const MAX_POINTS: usize = 12_000;
+/// Bytes of a point on its way to the page.
+pub(super) const POINT_BYTES: usize = 6;
 
 /// One moment: numbers for the panels, boxes and poses in the world's frame, and everyone's points.
 ///
@@ -23,6 +25,10 @@ pub struct SceneFrame {
     pub method: Option<String>,
     /// From the publication of the tick to that of its detections, milliseconds.
     pub latency_ms: Option<f64>,
+    /// From the publication of the tick until its sweep had reached the ego's agent, milliseconds; known only afterwards.
+    pub swept_ms: Option<f64>,
+    /// From the publication of the tick until the ego's agent said where it is, milliseconds.
+    pub posed_ms: Option<f64>,
     /// Every vehicle that was heard of.
     pub vehicles: Vec<Vehicle>,
     /// What is there, every object once.
@@ -59,8 +65,9 @@ pub struct Vehicle {
     pub truth: Option<Planar>,
     /// Distance between the two, metres.
     pub error_m: Option<f64>,
-    /// First two rows of the transform from its LiDAR to the world, by which its points are shown.
-    pub world_from_lidar: Option<[f64; 8]>,
+    /// By which its points are shown; the page gets the first two rows of it.
+    #[serde(serialize_with = "first_two_rows")]
+    pub world_from_lidar: Option<Pose>,
     /// How many points of it follow.
     pub points: usize,
 }
@@ -142,6 +149,18 @@ pub struct Messages {
 }
 
 impl SceneFrame {
+    /// Every vehicle with its points, metres in the frame of its LiDAR.
+    pub fn clouds(&self) -> impl Iterator<Item = (&Vehicle, Vec<[f32; 3]>)> {
+        let mut rest = self.points.as_slice();
+        self.vehicles.iter().map(move |vehicle| {
+            let (points, behind) = rest.split_at((vehicle.points * POINT_BYTES).min(rest.len()));
+            rest = behind;
+            let metres = |bytes: &[u8]| f32::from(i16::from_le_bytes([bytes[0], bytes[1]])) / 100.0;
+            let point = |bytes: &[u8]| [metres(&bytes[..2]), metres(&bytes[2..4]), metres(&bytes[4..])];
+            (vehicle, points.chunks_exact(POINT_BYTES).map(point).collect())
+        })
+    }
+
     /// The frame as the page gets it.
     ///
     /// # Panics
@@ -162,19 +181,21 @@ impl Planar {
     }
 }
 
-/// First two rows of a transform.
-pub(super) fn rows(pose: &Pose) -> [f64; 8] {
-    let isometry = pose.isometry();
-    let rotation = isometry.rotation.to_rotation_matrix();
-    let [x, y, _] = pose.translation_m;
-    let row = |index: usize, shift: f64| [rotation[(index, 0)], rotation[(index, 1)], rotation[(index, 2)], shift];
-    let ([a, b, c, d], [e, f, g, h]) = (row(0, x), row(1, y));
-    [a, b, c, d, e, f, g, h]
+fn first_two_rows<S: Serializer>(pose: &Option<Pose>, serializer: S) -> Result<S::Ok, S::Error> {
+    let rows = |pose: &Pose| {
+        let rotation = pose.isometry().rotation.to_rotation_matrix();
+        let row = |index: usize| {
+            [rotation[(index, 0)], rotation[(index, 1)], rotation[(index, 2)], pose.translation_m[index]]
+        };
+        let ([a, b, c, d], [e, f, g, h]) = (row(0), row(1));
+        [a, b, c, d, e, f, g, h]
+    };
+    pose.as_ref().map(rows).serialize(serializer)
 }
 
 /// The points of a sweep as the page gets them, evenly thinned out where there are many.
-pub(super) fn thinned(xyzi: &[[f32; 4]]) -> Vec<u8> {
-    let step = xyzi.len().div_ceil(MAX_POINTS).max(1);
+pub(super) fn thinned(points: &PointCloud) -> Vec<u8> {
     let centimetres = |metres: f32| ((metres * 100.0).round() as i16).to_le_bytes();
-    xyzi.iter().step_by(step).flat_map(|[x, y, z, _]| [*x, *y, *z].map(centimetres)).flatten().collect()
+    let thinned = points.thinned(MAX_POINTS);
+    thinned.xyzi.iter().flat_map(|[x, y, z, _]| [*x, *y, *z].map(centimetres)).flatten().collect()
 }

@@ -33,9 +33,9 @@ fn pose_of(cav_id: &str, tick: u64) -> Pose {
     Pose::from_xyz_yaw([tick as f64, if cav_id == EGO { 0.0 } else { 15.0 }, 1.9], 0.2)
 }
 
-fn cloud(tick: u64) -> PointCloud {
+fn cloud(tick: u64, count: u64) -> PointCloud {
     PointCloud {
-        xyzi: (0..30_000)
+        xyzi: (0..count)
             .map(|k| [(k % 173) as f32 * 0.4 - 34.0, (k / 173) as f32 * 0.4 - 34.0, tick as f32, 0.5])
             .collect(),
     }
@@ -81,8 +81,8 @@ fn detections(tick: u64) -> Detections {
     }
 }
 
-/// The messages of a tick, published at `now`; the result half a tick later.
-fn messages(tick: u64, now: u64) -> Vec<(Topic, Vec<u8>)> {
+/// The messages of a tick, published at `now`; the result half a tick later. Live, there are previews only.
+fn messages(tick: u64, now: u64, sweeps: Stream) -> Vec<(Topic, Vec<u8>)> {
     let stamp = |who: &str, late_ms: u64| Stamp {
         cav: cav(who),
         epoch: 1,
@@ -93,8 +93,9 @@ fn messages(tick: u64, now: u64) -> Vec<(Topic, Vec<u8>)> {
     let stream = |who: &str, stream| Topic::Stream { cav: cav(who), stream };
     let mut all = vec![(Topic::Truth, wire::encode(&stamp("replay", 0), truth(tick)).unwrap().to_vec())];
     for who in [EGO, OTHER] {
-        let lidar = Lidar { points: cloud(tick) };
-        all.push((stream(who, Stream::Lidar), wire::encode(&stamp(who, 0), lidar).unwrap().to_vec()));
+        let count = if sweeps == Stream::Preview { 4_000 } else { 30_000 };
+        let lidar = Lidar { points: cloud(tick, count) };
+        all.push((stream(who, sweeps), wire::encode(&stamp(who, 0), lidar).unwrap().to_vec()));
         let estimate = PoseEstimate::new(pose_of(who, tick), 0.9);
         all.push((stream(who, Stream::Pose), wire::encode(&stamp(who, 20), estimate).unwrap().to_vec()));
     }
@@ -107,12 +108,14 @@ fn record(folder: &Path) -> RecordedRun {
     let mut writer = RecordingWriter::create(&file, RecordingOptions::default()).unwrap();
     let run = RunId::new("test").unwrap();
     for tick in 0..TICKS {
-        for (topic, payload) in messages(tick, 1_000_000_000 * tick) {
+        for (topic, payload) in messages(tick, 1_000_000_000 * tick, Stream::Lidar) {
             let key: Key = topic.in_run(&run);
             writer.write(&key, 1_000_000_000 * tick + 60_000_000, &payload).unwrap();
         }
     }
     writer.finish().unwrap();
+    let mut sweeps = agent::sweep_log::SweepLog::open(&folder.join(crate::up::SWEEP_LOG)).unwrap();
+    (0..TICKS).for_each(|tick| sweeps.note(100_000_000 * (tick + 1), 1_000_000_000 * tick + 3_000_000).unwrap());
     RecordedRun::open(folder).unwrap()
 }
 
@@ -131,6 +134,7 @@ fn check(frame: &Value, points: usize) {
     let x = frame["detections"][0]["center_m"][0].as_f64().unwrap();
     assert!((x - (tick + 10.0 * 0.2_f64.cos())).abs() < 1e-9, "{x}");
     assert!((frame["latency_ms"].as_f64().unwrap() - 50.0).abs() < 1.0, "{}", frame["latency_ms"]);
+    assert!(frame["posed_ms"].as_f64().is_none_or(|posed| (posed - 20.0).abs() < 1.0), "{}", frame["posed_ms"]);
     let vehicles = frame["vehicles"].as_array().unwrap();
     assert_eq!(vehicles.len(), 2);
     assert!((vehicles[0]["confidence"].as_f64().unwrap() - 0.9).abs() < 1e-6 && vehicles[0]["error_m"] == 0.0);
@@ -151,6 +155,7 @@ fn a_recorded_run_is_shown_in_any_order() {
         assert_eq!(frame["frame_index"], index);
         check(&frame, points);
         assert!(points > 10_000, "two sweeps");
+        assert_eq!((&frame["swept_ms"], &frame["posed_ms"]), (&3.0.into(), &20.0.into()));
     }
     assert!(run.frame(5).unwrap().is_none());
     let server = serve_recorded("127.0.0.1:0".parse().unwrap(), Arc::new(run)).unwrap();
@@ -172,7 +177,7 @@ fn a_replay_that_begins_anew_is_shown_from_its_beginning() {
     let mut assembly = Assembly::default();
     let mut shown = |epoch: u64, tick: u64| {
         let mut frames = Vec::new();
-        for (topic, payload) in messages(tick, 0) {
+        for (topic, payload) in messages(tick, 0, Stream::Lidar) {
             let mut header = wire::decode_header([payload.as_slice()]).unwrap();
             header.stamp.epoch = epoch;
             let seen = Seen { topic: &topic, header: &header, arrived_nanos: 0, payload: Some(&payload) };
@@ -220,14 +225,14 @@ fn join(options: &BusOptions, name: &str) -> Bus {
 fn publish(bus: Bus, ending: &AtomicBool) {
     let mut publishers = std::collections::BTreeMap::new();
     for tick in 0.. {
-        for (topic, payload) in messages(tick, sim_replay::bus::unix_nanos()) {
+        for (topic, payload) in messages(tick, sim_replay::bus::unix_nanos(), Stream::Preview) {
             if matches!(topic, Topic::Stream { stream: Stream::Detections, .. }) {
                 // As long as perception takes: sweeps are far ahead of what comes of them.
                 std::thread::sleep(Duration::from_millis(50));
             }
-            let publisher = publishers
-                .entry(topic.clone())
-                .or_insert_with(|| bus.publisher(topic, PublisherOptions::SENSOR).unwrap());
+            let is_preview = matches!(topic, Topic::Stream { stream: Stream::Preview, .. });
+            let options = if is_preview { PublisherOptions::PREVIEW } else { PublisherOptions::SENSOR };
+            let publisher = publishers.entry(topic.clone()).or_insert_with(|| bus.publisher(topic, options).unwrap());
             // As it is: stamp and all.
             publisher.offer_encoded(0, move |_| Ok(protocol::Encoded { head: payload, body: protocol::Body::Empty }));
         }
@@ -244,13 +249,13 @@ fn a_live_run_is_shown_as_it_goes_and_nobody_waits_for_a_page() {
     let run = Arc::new(LiveRun::start(join(&BusOptions::client(traffic.endpoint.clone()), "viewer")).unwrap());
     let server = serve_live("127.0.0.1:0".parse().unwrap(), Arc::clone(&run)).unwrap();
 
-    // Sweeps are listened to only once somebody looks.
+    // Anything is listened to only once somebody looks.
     let moments: Vec<_> = moments_of(server.address(), 20).iter().map(|bytes| parsed(bytes)).collect();
     let captures: Vec<f64> = moments.iter().map(|(frame, _)| frame["capture_s"].as_f64().unwrap()).collect();
     assert!(captures.windows(2).all(|pair| pair[0] < pair[1]), "always a newer one: {captures:?}");
     // On a busy machine the tap drops parts of some moments, but hardly ever of all.
     let whole =
-        |frame: &Value, points: usize| !frame["ego"].is_null() && !frame["truth"][0].is_null() && points > 10_000;
+        |frame: &Value, points: usize| !frame["ego"].is_null() && !frame["truth"][0].is_null() && points == 8_000;
     let (frame, points) = moments.iter().find(|(frame, points)| whole(frame, *points)).expect("a whole moment");
     check(frame, *points);
     wait_for("nobody looks any more", || run.watchers() == 0);

@@ -28,7 +28,7 @@ fn any_stream() -> impl Strategy<Value = Stream> {
     prop_oneof![
         any::<u8>().prop_map(Stream::Camera),
         select(vec![Stream::Lidar, Stream::Gnss, Stream::Radar, Stream::Pose, Stream::Bev, Stream::Boxes]),
-        select(vec![Stream::Points, Stream::Descriptor, Stream::Detections, Stream::DetectionsJson]),
+        select(vec![Stream::Preview, Stream::Points, Stream::Descriptor, Stream::Detections, Stream::DetectionsJson]),
     ]
 }
 

@@ -26,7 +26,7 @@ impl Guard {
             "permission": "allow",
             "flows": ["egress"],
             "messages": ["declare_subscriber"],
-            "key_exprs": [Selector::all_of(&self.runs).as_str()],
+            "key_exprs": Selector::all_of(&self.runs).each_ref().map(Selector::as_str),
         });
         let mut rules = vec![who_listens];
         let (mut subjects, mut policies) = (Vec::new(), Vec::new());

@@ -1,6 +1,7 @@
 //! Publishing without ever waiting for the network on the caller's thread.
 
 use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
@@ -40,6 +41,9 @@ pub struct PublisherOptions {
     pub priority: Priority,
     /// Sends at once rather than after the batching timer.
     pub express: bool,
+    /// For people who look on: zenoh may throw a message away rather than wait for anyone, there are no probes and no end
+    /// markers, and [`Publisher::is_wanted`] tells whether somebody listens.
+    pub is_for_onlookers: bool,
 }
 
 impl PublisherOptions {
@@ -52,8 +56,11 @@ impl PublisherOptions {
     /// Sensor data on their way to an agent.
     pub const SENSOR: Self = Self::new(Priority::DataLow, false);
 
+    /// What people look at, and nobody computes with.
+    pub const PREVIEW: Self = Self { is_for_onlookers: true, ..Self::new(Priority::Background, false) };
+
     const fn new(priority: Priority, express: bool) -> Self {
-        Self { overflow: Overflow::KeepNewest(1), priority, express }
+        Self { overflow: Overflow::KeepNewest(1), priority, express, is_for_onlookers: false }
     }
 
     /// The same, but the producer waits rather than that anything be dropped.
@@ -83,6 +90,8 @@ pub struct Publisher {
     overflow: Overflow,
     queue: Arc<Mailbox<(), Offer>>,
     books: Books,
+    /// Whether somebody listens, where that matters.
+    audience: Option<Arc<AtomicBool>>,
     thread: Option<JoinHandle<()>>,
 }
 
@@ -94,15 +103,16 @@ impl Publisher {
         books: &Books,
         options: PublisherOptions,
     ) -> Result<Self, BusError> {
-        let PublisherOptions { overflow, priority, express } = options;
+        let PublisherOptions { overflow, priority, express, is_for_onlookers } = options;
         let topic = key.topic.clone();
         // JSON has readers outside this program, to whom a probe would be noise.
-        let is_ours = !matches!(&topic, Topic::Stream { stream, .. } if stream.kind().is_none());
-        let encoding = if is_ours { Encoding::APPLICATION_OCTET_STREAM } else { Encoding::APPLICATION_JSON };
+        let is_json = matches!(&topic, Topic::Stream { stream, .. } if stream.kind().is_none());
+        let encoding = if is_json { Encoding::APPLICATION_JSON } else { Encoding::APPLICATION_OCTET_STREAM };
+        let congestion = if is_for_onlookers { CongestionControl::Drop } else { CongestionControl::Block };
         let publisher = session
             .declare_publisher(key.to_string())
             .encoding(encoding)
-            .congestion_control(CongestionControl::Block)
+            .congestion_control(congestion)
             .priority(priority)
             .express(express)
             .wait()
@@ -110,24 +120,32 @@ impl Publisher {
         let places = match overflow {
             Overflow::KeepNewest(places) | Overflow::Wait(places) => places,
         };
+        let audience = is_for_onlookers.then(|| audience(&publisher)).transpose();
+        let audience = audience.map_err(|cause| BusError::zenoh(format!("asking who listens to {key}"), &cause))?;
         let queue = Arc::new(Mailbox::new(places, 1));
         let sender = Sender {
             topic: topic.clone(),
             cav: cav.clone(),
             epoch,
             sequence: 0,
-            is_ours,
+            has_notices: !is_json && !is_for_onlookers,
             queue: Arc::clone(&queue),
             books: books.clone(),
             publisher,
             receipt: Receipt::new(session, &key.run, priority),
-            is_one_at_a_time: matches!(overflow, Overflow::KeepNewest(_)),
+            is_one_at_a_time: matches!(overflow, Overflow::KeepNewest(_)) && !is_for_onlookers,
         };
         let thread = thread::Builder::new()
             .name(format!("send {topic}"))
             .spawn(move || sender.run())
             .map_err(|cause| BusError::Thread { what: format!("sending {key}"), cause })?;
-        Ok(Self { topic, overflow, queue, books: books.clone(), thread: Some(thread) })
+        Ok(Self { topic, overflow, queue, books: books.clone(), audience, thread: Some(thread) })
+    }
+
+    /// Whether it is worth while to offer anything: always, but for what is for onlookers when there are none.
+    #[must_use]
+    pub fn is_wanted(&self) -> bool {
+        self.audience.as_ref().is_none_or(|audience| audience.load(Ordering::Relaxed))
     }
 
     /// What is published here.
@@ -209,7 +227,7 @@ struct Sender {
     cav: CavId,
     epoch: u64,
     sequence: u64,
-    is_ours: bool,
+    has_notices: bool,
     queue: Arc<Mailbox<(), Offer>>,
     books: Books,
     publisher: zenoh::pubsub::Publisher<'static>,
@@ -221,18 +239,18 @@ struct Sender {
 impl Sender {
     fn run(mut self) {
         yielding::let_others_finish();
-        if self.is_ours {
+        if self.has_notices {
             self.notify(Control::Probe);
         }
         loop {
-            let probing = self.is_ours && self.sequence == 0;
+            let probing = self.has_notices && self.sequence == 0;
             match self.queue.take(probing.then(|| Instant::now() + PROBE_PERIOD)) {
                 Taken::Item((), offer) => self.send(offer),
                 Taken::TimedOut => self.notify(Control::Probe),
                 Taken::Closed => break,
             }
         }
-        if self.is_ours {
+        if self.has_notices {
             let sent = vec![TopicCount { topic: self.topic.clone(), messages: self.sequence }];
             self.notify(Control::End { ticks: self.sequence, sent });
         }
@@ -286,6 +304,18 @@ impl Sender {
             publish_nanos: unix_nanos(),
         }
     }
+}
+
+/// Whether somebody listens, kept up to date for as long as the publisher lives.
+fn audience(publisher: &zenoh::pubsub::Publisher<'_>) -> zenoh::Result<Arc<AtomicBool>> {
+    let audience = Arc::<AtomicBool>::default();
+    let noted = Arc::clone(&audience);
+    let listener = publisher.matching_listener();
+    listener.callback(move |status| noted.store(status.matching(), Ordering::Relaxed)).background().wait()?;
+    if publisher.matching_status().wait()?.matching() {
+        audience.store(true, Ordering::Relaxed);
+    }
+    Ok(audience)
 }
 
 /// Head and body one after the other, without copying the body.

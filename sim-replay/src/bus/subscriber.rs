@@ -4,7 +4,7 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
 
-use protocol::{Control, DropReason, Header, Key, Kind, Limits, Payload, Selector, Topic, WireError, wire};
+use protocol::{Control, DropReason, Header, Key, Kind, Limits, Payload, Selector, Stream, Topic, WireError, wire};
 use zenoh::Wait;
 use zenoh::bytes::ZBytes;
 use zenoh::sample::Sample;
@@ -204,6 +204,7 @@ impl Subscription {
 /// Whether notices about a topic's publisher travel on it too: not where notices are all there is.
 pub(super) fn has_notices(topic: &Topic) -> bool {
     match topic {
+        Topic::Stream { stream: Stream::Preview, .. } => false,
         Topic::Stream { .. } | Topic::Received { .. } | Topic::Truth => true,
         Topic::Control(_) | Topic::Ready(_) | Topic::Stats(_) | Topic::Alive { .. } => false,
     }

@@ -8,12 +8,15 @@ use crate::frame::{Frame, Object};
 
 /// Places in the queue of a topic of which nothing may be lost.
 const LOSSLESS_PLACES: usize = 16;
+/// Points of a preview: so many that it still fits into one batch of zenoh's.
+const PREVIEW_POINTS: usize = 4_000;
 
 /// The sensors of one vehicle.
 struct Sensors {
     lidar: Publisher,
     gnss: Publisher,
     radar: Option<Publisher>,
+    preview: Publisher,
 }
 
 /// Everything a replay publishes.
@@ -34,6 +37,10 @@ impl Outlet {
                 lidar: publisher(Stream::Lidar)?,
                 gnss: publisher(Stream::Gnss)?,
                 radar: with_radar.then(|| publisher(Stream::Radar)).transpose()?,
+                preview: bus.publisher(
+                    Topic::Stream { cav: cav.clone(), stream: Stream::Preview },
+                    PublisherOptions::PREVIEW,
+                )?,
             })
         });
         let truth = bus.publisher(Topic::Truth, PublisherOptions::FEATURES.lossless(LOSSLESS_PLACES))?;
@@ -49,6 +56,9 @@ impl Outlet {
             let gnss = Gnss { world_from_lidar, position_std_m: 0.0, heading_std_rad: 0.0, source };
             sensors.gnss.offer(capture_nanos, gnss);
             count(&mut self.sent, sensors.gnss.topic());
+        }
+        if sensors.preview.is_wanted() {
+            sensors.preview.offer(capture_nanos, Lidar { points: frame.points.thinned(PREVIEW_POINTS) });
         }
         sensors.lidar.offer(capture_nanos, Lidar { points: frame.points });
         count(&mut self.sent, sensors.lidar.topic());
@@ -66,8 +76,8 @@ impl Outlet {
 
     /// Sends what is queued and ends every topic; says how much was published on each.
     pub(super) fn finish(self) -> Vec<TopicCount> {
-        for Sensors { lidar, gnss, radar } in self.sensors {
-            [Some(lidar), Some(gnss), radar].into_iter().flatten().for_each(Publisher::finish);
+        for Sensors { lidar, gnss, radar, preview } in self.sensors {
+            [Some(lidar), Some(gnss), radar, Some(preview)].into_iter().flatten().for_each(Publisher::finish);
         }
         self.truth.finish();
         self.sent

@@ -139,11 +139,20 @@ function table(id, heads, rows, empty) {
 
 const STAGE_COLOURS = ["--cav5", "--cav0", "--cav1", "--cav3", "--cav2", "--cav4", "--detection"];
 
-/// The time from capture to detections: what the ego tells of, and before it what its agent took, sensors included.
+/// The time from capture to detections: what the ego tells of, and before it how far its agent was when.
 function stages(frame) {
   const told = frame.stages.map(({ stage, nanos }) => [stage, nanos / 1e6]);
   const rest = frame.latency_ms === null ? null : frame.latency_ms - told.reduce((sum, [, time]) => sum + time, 0);
-  const parts = (rest !== null && rest > 0 ? [["agent", rest]] : []).concat(told).filter(([, time]) => time >= 0.05);
+  const posed = frame.posed_ms !== null;
+  const marks = [["sweep", frame.swept_ms], [frame.swept_ms === null ? "sweep and pose" : "pose", frame.posed_ms], [posed ? "map" : "agent", rest]];
+  let before = 0;
+  const agent = marks.flatMap(([stage, until]) => {
+    if (until === null || until <= before) return [];
+    const time = until - before;
+    before = until;
+    return [[stage, time]];
+  });
+  const parts = agent.concat(told).filter(([, time]) => time >= 0.05);
   if (!parts.length) return $("stages").replaceChildren(element("p", { class: "empty" }, "No detections of this moment."));
   const sum = parts.reduce((total, [, time]) => total + time, 0);
   const shade = (index) => `var(${STAGE_COLOURS[index % STAGE_COLOURS.length]})`;
