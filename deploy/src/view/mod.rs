@@ -2,11 +2,13 @@
 //!
 //! The page is part of this program and loads nothing from anywhere else. What it shows comes from a live run
 //! ([`LiveRun`]), over a tap that nobody's books know of, or from a recorded one ([`RecordedRun`]); both put their messages
-//! through the same [`Assembly`], and a [`SceneFrame`] is what comes out.
+//! through the same [`Assembly`], and a [`SceneFrame`] is what comes out. With the feature `rerun` moments are written for Rerun, too.
 
 mod assembly;
 mod live;
 mod recorded;
+#[cfg(feature = "rerun")]
+mod rerun;
 mod scene_frame;
 mod server;
 #[cfg(test)]
@@ -15,5 +17,7 @@ mod tests;
 pub use assembly::{Assembly, Seen};
 pub use live::{LiveRun, Onlooker};
 pub use recorded::{RecordedRun, ViewError};
+#[cfg(feature = "rerun")]
+pub use rerun::{RerunError, RerunLog, write_for_rerun};
 pub use scene_frame::SceneFrame;
 pub use server::{serve_live, serve_recorded};
