@@ -23,6 +23,9 @@ const EMPTY: f32 = 0.06;
 const COPY: f64 = 0.98;
 /// Maps of one vehicle 0.1 s apart are more alike than this: 0.92 nearly always. Noise is not.
 const SUCCESSIVE: f64 = 0.85;
+/// Points without a single vehicle, where the ego sees some: those of an honest neighbour hardly ever, those of noise
+/// always. Of noise far away nothing else tells, as such maps are alike.
+const BLIND: f64 = -1.5;
 
 /// What a neighbour's message and the ego's own have to say to each other.
 #[derive(Debug, Clone, Default, PartialEq)]
@@ -47,6 +50,8 @@ pub(super) struct Evidence {
     pub(super) like_before: Option<f64>,
     /// Whether it stands where it cannot have driven to.
     pub(super) jumped: bool,
+    /// Whether it sees no vehicle in its points, and the ego does in its own.
+    pub(super) is_blind: bool,
     /// Whether all this is from boxes, which do not tell an empty place from a doubtful one.
     pub(super) boxes_only: bool,
 }
@@ -61,6 +66,7 @@ impl Evidence {
             it_sees_ego: theirs.sure_at(cav_from_ego.translation.vector.into(), radius_m),
             distance_m: ego_from_cav.translation.vector.norm(),
             boxes_only: own.is_boxes(),
+            is_blind: theirs.is_blind && !own.vehicles.is_empty(),
             ..Self::default()
         };
         let sender = Point2::from(ego_from_cav.translation.vector);
@@ -102,6 +108,9 @@ impl Evidence {
     fn against_elsewhere(&self) -> Option<f64> {
         let seen = [self.ego_sees_it, self.it_sees_ego].into_iter().flatten();
         let seen = seen.map(|sure| self.seeing(sure)).collect::<Vec<_>>();
+        if self.is_blind {
+            return Some(BLIND.min(-0.3 * f64::from(self.missed)));
+        }
         if seen.iter().all(|odds| *odds == 0.0) && self.matched + self.contradicted + self.missed == 0 {
             return None;
         }
@@ -228,6 +237,8 @@ mod tests {
             let (log_odds, found) = evidence.judgement().unwrap();
             assert!(log_odds < -2.0 && found == doubt, "{found}");
         }
+        let blind = Evidence { is_blind: true, ego_sees_it: Some(0.6), ..Evidence::default() };
+        assert_eq!(blind.judgement(), Some((BLIND, Doubt::Elsewhere)));
         assert_eq!(Evidence::default().log_odds(), None, "nothing said, nothing known");
     }
 }

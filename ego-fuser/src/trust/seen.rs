@@ -25,6 +25,8 @@ pub(super) struct Seen {
     sure: Sure,
     /// Enough of it to tell a copy.
     pub(super) print: Vec<f32>,
+    /// Whether these are points in which there is not one vehicle.
+    pub(super) is_blind: bool,
 }
 
 #[derive(Debug)]
@@ -46,7 +48,8 @@ impl Seen {
             Content::Points(points) => {
                 let map = detector.encode(points)?.features;
                 let features = detector.to_message(&map)?;
-                Self::in_map(&DecodedFeatures { features, sent: None }, detector, empty)
+                let seen = Self::in_map(&DecodedFeatures { features, sent: None }, detector, empty)?;
+                Ok(Self { is_blind: seen.vehicles.is_empty(), ..seen })
             }
         }
     }
@@ -54,7 +57,7 @@ impl Seen {
     pub(super) fn of_boxes(all: Vec<([f64; 2], f32)>) -> Self {
         let vehicles: Vec<_> = all.iter().filter(|(_, score)| *score >= SURE).map(|(at_m, _)| *at_m).collect();
         let print = all.iter().flat_map(|([x, y], score)| [*x as f32, *y as f32, *score]).collect();
-        Self { vehicles, sure: Sure::Boxes(all), print }
+        Self { vehicles, sure: Sure::Boxes(all), print, is_blind: false }
     }
 
     fn in_map(map: &DecodedFeatures, detector: &Detector, empty: &[f32]) -> Result<Self, DetectorError> {
@@ -81,7 +84,8 @@ impl Seen {
         }
         let mut cells = heads.confidence;
         cells.iter_mut().enumerate().filter(|(cell, _)| !was_sent(*cell)).for_each(|(_, sure)| *sure = 0.0);
-        Ok(Self { vehicles: found.into_iter().map(|(at_m, _)| at_m).collect(), sure: Sure::Cells(grid, cells), print })
+        let vehicles = found.into_iter().map(|(at_m, _)| at_m).collect();
+        Ok(Self { vehicles, sure: Sure::Cells(grid, cells), print, is_blind: false })
     }
 
     /// Whether only boxes are known: then a place without one may be empty or merely doubtful.
@@ -144,7 +148,7 @@ mod tests {
         assert_eq!(around(&grid, [9.0, 0.0], 6.0).count(), 0);
         let mut sure = vec![0.0; 128];
         sure[cell_of(&grid, 1.2, 0.7).unwrap()] = 0.8;
-        let seen = Seen { vehicles: vec![], sure: Sure::Cells(grid, sure), print: vec![] };
+        let seen = Seen { vehicles: vec![], sure: Sure::Cells(grid, sure), print: vec![], is_blind: false };
         assert_eq!(seen.sure_at([1.0, 0.5], 1.0), Some(0.8));
         assert_eq!(seen.sure_at([-2.0, 0.5], 1.0), Some(0.0));
         assert_eq!(seen.sure_at([20.0, 0.5], 1.0), None);
