@@ -9,9 +9,14 @@ use std::process::Command;
 pub type Setting = (&'static str, &'static str);
 
 /// Memory that was given back is kept by the process for what comes next. Maps are megabytes each and come and go with every
-/// frame: fetched anew from the system, page by page, they cost as much time as what is computed on them.
-pub const KEPT_MEMORY: [Setting; 3] =
-    [("MALLOC_MMAP_MAX_", "0"), ("MALLOC_TRIM_THRESHOLD_", "17179869184"), ("MALLOC_TOP_PAD_", "67108864")];
+/// frame: fetched anew from the system, page by page, they cost as much time as what is computed on them. Two heaps are
+/// enough for few busy threads; with one for each, a process went on growing by a page here and there for hours.
+pub const KEPT_MEMORY: [Setting; 4] = [
+    ("MALLOC_MMAP_MAX_", "0"),
+    ("MALLOC_TRIM_THRESHOLD_", "17179869184"),
+    ("MALLOC_TOP_PAD_", "67108864"),
+    ("MALLOC_ARENA_MAX", "2"),
+];
 
 /// Few compiled products. libtorch and the library it computes with in bfloat16 compile one for every shape of its
 /// matrices and keep 1024 of them, megabytes each. No two batches of sparse sweeps have the same shape: a training would

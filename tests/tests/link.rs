@@ -109,7 +109,7 @@ fn what_the_air_loses_is_booked_and_never_arrives() {
 
 #[test]
 fn a_clock_that_is_off_shows_in_the_capture_times() {
-    let clock = DeviceClock { offset_ms: 1.0, drift_ppm: 0.0 };
+    let clock = DeviceClock { offset_ms: 1.0, ..DeviceClock::default() };
     let Crossing { arrivals, ledger, .. } = cross(LinkConfig { clock, ..LinkConfig::default() }, &options());
     // What tells of no moment has no capture time.
     let shown: Vec<u64> = (0..COUNT).map(|tick| if tick == 0 { 0 } else { tick + 1_000_000 }).collect();

@@ -16,7 +16,7 @@ use ego_fuser::pairing::PairingConfig;
 use protocol::{CodecConfig, DropReason, Dtype};
 use serde_json::Value;
 use sim_replay::dataset;
-use sim_replay::link::{DelayLaw, DeviceClock, LinkConfig, LossLaw};
+use sim_replay::link::{ClockStep, DelayLaw, DeviceClock, LinkConfig, LossLaw};
 use tests::fleet::{alone, programs, results, write_scenario, write_sighted_weights};
 
 const TICKS: usize = 8;
@@ -131,7 +131,7 @@ fn a_clock_that_is_off_shifts_what_belongs_together() {
         // 5 ms a frame.
         (0.0, -5e4, [10, 15, 20]),
     ] {
-        let clock = DeviceClock { offset_ms, drift_ppm };
+        let clock = DeviceClock { offset_ms, drift_ppm, step: None };
         let (frames, ledger) = evaluate(folder.path(), Some(config(LinkConfig { clock, ..LinkConfig::default() })));
         // The scene begins at 0, and no clock shows less.
         for (frame, age_ms) in frames[2..].iter().zip(ages_in_ms) {
@@ -139,6 +139,27 @@ fn a_clock_that_is_off_shifts_what_belongs_together() {
         }
         assert!(ledger.balance().is_exact(), "{:?}", ledger.balance());
     }
+}
+
+#[test]
+fn a_clock_that_is_set_costs_its_vehicle_and_nobody_else() {
+    let folder = scene();
+    let run = |by_ms| {
+        let clock = DeviceClock { step: Some(ClockStep { at_s: 0.2, by_ms }), ..DeviceClock::default() };
+        let (frames, ledger) = evaluate(folder.path(), Some(config(LinkConfig { clock, ..LinkConfig::default() })));
+        assert!(frames.len() == TICKS && ledger.balance().is_exact(), "by {by_ms} ms: {ledger:?}");
+        (frames.iter().map(ages_ms).collect::<Vec<_>>(), ledger)
+    };
+    let (ages_ms, ledger) = run(10_000.0);
+    // What it said before serves until it is too old.
+    let expected: Vec<Vec<i64>> = [0, 0, 100, 200, 300].map(|age_ms| vec![age_ms; 2]).into();
+    assert_eq!(ages_ms[..5], expected);
+    assert!(ages_ms[5..].iter().all(Vec::is_empty), "{ages_ms:?}");
+    // What it says since waits for a time that the scene does not see.
+    assert_eq!(ledger.total().in_flight, 2 * (TICKS as u64 - 2), "{ledger:?}");
+    let (ages_ms, _) = run(-30.0);
+    assert!(ages_ms[..2].iter().all(|ages| ages == &[0, 0]), "{ages_ms:?}");
+    assert!(ages_ms[2..].iter().all(|ages| ages == &[30, 30]), "{ages_ms:?}");
 }
 
 #[test]

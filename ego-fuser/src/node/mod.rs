@@ -22,8 +22,11 @@ use crate::neighbourhood::{Neighbourhood, heard_on, sender_of};
 use crate::pairing::{Pairing, PairingConfig};
 use crate::peer_models::PeerModels;
 
-/// Messages of one sender that may wait while a frame is fused.
-const PLACES: usize = 4;
+/// Messages of one sender that may wait while a frame is fused. An ego that needs longer than its frames' period answers
+/// frames that have waited this long, so no more than what a short pause costs.
+const PLACES: usize = 2;
+/// Results that may wait to be sent.
+const RESULTS: usize = 4;
 /// Topics an ego listens to at most: of 65 vehicles, what they see and what they say of themselves.
 const MAX_TOPICS: usize = 130;
 /// How often the node looks for newcomers though no message has come.
@@ -158,7 +161,7 @@ impl<'a> Node<'a> {
             frames: VecDeque::new(),
             own_nanos: None,
             ended: BTreeSet::new(),
-            detections: bus.publisher(topic(Stream::Detections), PublisherOptions::DETECTIONS.lossless(PLACES))?,
+            detections: bus.publisher(topic(Stream::Detections), PublisherOptions::DETECTIONS.lossless(RESULTS))?,
             json: bus.publisher(topic(Stream::DetectionsJson), PublisherOptions::DETECTIONS)?,
             report: NodeReport::default(),
             _own: own,

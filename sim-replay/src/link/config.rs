@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use serde::{Deserialize, Serialize};
 
-use super::device_clock::DeviceClock;
+use super::device_clock::{ClockStep, DeviceClock};
 use super::trace::{Trace, TraceError};
 
 /// Payload of one fragment where loss is drawn per fragment, bytes: what fits an 802.11p frame with its headers.
@@ -285,6 +285,10 @@ impl LinkConfig {
         }
         bounded("clock.offset_ms", self.clock.offset_ms, -MAX_MS, MAX_MS, "-600,000 to 600,000 ms")?;
         bounded("clock.drift_ppm", self.clock.drift_ppm, -1e5, 1e5, "-100,000 to 100,000")?;
+        if let Some(ClockStep { at_s, by_ms }) = self.clock.step {
+            bounded("clock.step.at_s", at_s, 0.0, 1e9, "0 to 1e9 s")?;
+            bounded("clock.step.by_ms", by_ms, -MAX_MS, MAX_MS, "-600,000 to 600,000 ms")?;
+        }
         match self.delay {
             DelayLaw::None | DelayLaw::Trace => {}
             DelayLaw::ConstantMs(ms) => time("delay", ms)?,
@@ -392,7 +396,7 @@ mod tests {
             queue: {bytes: 100000, drop: head, keep_newest: true}\ndelay: {normal: {mean_ms: 10, std_ms: 3}}\n\
             loss: {gilbert_elliott: {to_bad: 0.01, to_good: 0.2}}\nloss_unit: fragment\n\
             reorder: {probability: 0.01, extra_ms: 30}\nduplicate: 0.001\noutages: [{from_s: 3, to_s: 13}]\n\
-            clock: {offset_ms: -20, drift_ppm: 50}\n";
+            clock: {offset_ms: -20, drift_ppm: 50, step: {at_s: 3, by_ms: 200}}\n";
         let config: LinkConfig = serde_saphyr::from_str(text).unwrap();
         config.validate().unwrap();
         assert_eq!(config.medium, Medium::Shared);
@@ -410,7 +414,7 @@ mod tests {
         assert!(message(LinkConfig { capacity: rate, ..LinkConfig::default() }).contains("rate_mbps is 0"));
         let delay = DelayLaw::UniformMs([5.0, 2.0]);
         assert!(message(LinkConfig { delay, ..LinkConfig::default() }).contains("delay is 2"));
-        let clock = DeviceClock { offset_ms: f64::NAN, drift_ppm: 0.0 };
+        let clock = DeviceClock { offset_ms: f64::NAN, ..DeviceClock::default() };
         assert!(message(LinkConfig { clock, ..LinkConfig::default() }).contains("offset_ms is NaN"));
         let loss = LossLaw::Bernoulli(f64::NAN);
         assert!(message(LinkConfig { loss, ..LinkConfig::default() }).contains("loss is NaN"));

@@ -26,7 +26,7 @@ pub use config::{
     CapacityConfig, DelayLaw, LinkConfig, LinkError, LossLaw, LossUnit, Medium, Outage, QueueConfig, QueueDrop,
     ReorderConfig,
 };
-pub use device_clock::DeviceClock;
+pub use device_clock::{ClockStep, DeviceClock};
 pub use preset::PRESETS;
 pub use trace::{Step, Trace, TraceError};
 
