@@ -23,7 +23,7 @@ const SETTLED: usize = 5;
 /// Longest that a fleet may take for that.
 const PATIENCE: Duration = Duration::from_secs(60);
 /// How long the router waits for a receiver that takes nothing.
-const STALL: Duration = Duration::from_millis(100);
+const STALL: Duration = Duration::from_millis(50);
 /// A process that lives this long has opened what it opens.
 const GROWN_UP: Duration = Duration::from_secs(5);
 
