@@ -16,6 +16,7 @@
 //! [`recover`] makes an indexed file of it again.
 
 mod error;
+mod lengths;
 mod reader;
 mod recorder;
 mod recover;

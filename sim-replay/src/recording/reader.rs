@@ -14,6 +14,7 @@ use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
 use mcap::{McapError, McapResult, Message, parse_record};
 use protocol::{Header, Key, wire};
 
+use super::lengths::{self, RECORD_HEAD};
 use super::{OWN_ENCODING, RecordingError};
 
 /// A chunk that claims more than this, packed or not, is not ours: we close them at a few MiB and one message.
@@ -22,8 +23,6 @@ const MAX_CHUNK_BYTES: usize = 256 << 20;
 const READ_BYTES: usize = 1 << 20;
 /// Chunks that are kept unpacked: neighbours in time are neighbours in the file.
 const KEPT_CHUNKS: usize = 4;
-/// Opcode and length before every record.
-const RECORD_HEAD: usize = 9;
 
 /// A message of a recording, where it lies and what its header says.
 #[derive(Debug, Clone)]
@@ -208,11 +207,7 @@ impl Contents {
 
 /// The messages of a chunk, once it has been compared with its checksum; its channels are added to `channels`.
 fn unpack(body: &[u8], channels: &mut ChannelAccumulator<'static>) -> McapResult<Vec<Message<'static>>> {
-    if let Record::Chunk { header, data } = parse_record(op::CHUNK, body)?
-        && header.compression.is_empty()
-    {
-        check_lengths(&data)?;
-    }
+    lengths::check(op::CHUNK, body)?;
     let head = [[op::CHUNK].as_slice(), &(body.len() as u64).to_le_bytes()].concat();
     let options = LinearReaderOptions::default().with_skip_start_magic(true).with_prevalidate_chunk_crcs(true);
     let (mut messages, mut unpacked_bytes) = (Vec::new(), 0);
@@ -225,6 +220,7 @@ fn unpack(body: &[u8], channels: &mut ChannelAccumulator<'static>) -> McapResult
         if !matches!(opcode, op::SCHEMA | op::CHANNEL | op::MESSAGE) {
             return Ok(ControlFlow::Continue(()));
         }
+        lengths::check(opcode, data)?;
         match parse_record(opcode, data)? {
             Record::Schema { header, data } => channels.add_schema_from_slice(header, &data)?,
             Record::Channel(channel) => channels.add_channel(channel)?,
@@ -244,17 +240,6 @@ fn unpack(body: &[u8], channels: &mut ChannelAccumulator<'static>) -> McapResult
         Ok(ControlFlow::Continue(()))
     })?;
     Ok(messages)
-}
-
-/// Whether the records of a chunk that is not packed end where it ends. The `mcap` crate (0.26.0) reads on where something
-/// stands behind them, and counts below nothing.
-fn check_lengths(mut records: &[u8]) -> McapResult<()> {
-    while !records.is_empty() {
-        let (&[_, len @ ..], rest) = records.split_first_chunk::<RECORD_HEAD>().ok_or(McapError::UnexpectedEoc)?;
-        let rest = usize::try_from(u64::from_le_bytes(len)).ok().and_then(|len| rest.get(len..));
-        records = rest.ok_or(McapError::UnexpectedEoc)?;
-    }
-    Ok(())
 }
 
 /// Gives the records of `source` to `visit`, one after the other, until it has had enough or there are no more.

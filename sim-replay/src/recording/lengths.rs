@@ -1,0 +1,93 @@
+//! Lengths that stand in a record, compared with what is there: the `mcap` crate (0.26.0) allocates as much as a text says to
+//! be long, and counts below nothing where a record reaches beyond its chunk.
+
+use mcap::records::op;
+use mcap::{McapError, McapResult};
+
+/// Opcode and length before every record.
+pub(super) const RECORD_HEAD: usize = 9;
+/// Times, size and checksum before a chunk's first text.
+const CHUNK_HEAD: usize = 28;
+
+/// Checks the lengths in a chunk, a schema or a channel. Of a chunk that is packed the records are checked when they are
+/// unpacked.
+///
+/// # Errors
+/// [`McapError::UnexpectedEoc`] where something reaches beyond its record.
+pub(super) fn check(opcode: u8, record: &[u8]) -> McapResult<()> {
+    let fits = match opcode {
+        op::CHUNK => chunk_fits(record),
+        // Its number; name and encoding.
+        op::SCHEMA => record.get(2..).and_then(text).and_then(|(_, rest)| text(rest)).map(|_| ()),
+        op::CHANNEL => channel_fits(record),
+        _ => Some(()),
+    };
+    fits.ok_or(McapError::UnexpectedEoc)
+}
+
+fn chunk_fits(chunk: &[u8]) -> Option<()> {
+    let (compression, rest) = text(chunk.get(CHUNK_HEAD..)?)?;
+    let (&len, rest) = rest.split_first_chunk()?;
+    let mut records = rest.get(..usize::try_from(u64::from_le_bytes(len)).ok()?)?;
+    while compression.is_empty() && !records.is_empty() {
+        let (&[_, len @ ..], rest) = records.split_first_chunk::<RECORD_HEAD>()?;
+        records = rest.get(usize::try_from(u64::from_le_bytes(len)).ok()?..)?;
+    }
+    Some(())
+}
+
+/// Its number and its schema's; topic, encoding, and texts within a text.
+fn channel_fits(channel: &[u8]) -> Option<()> {
+    let (_, rest) = text(channel.get(4..)?)?;
+    let (_, rest) = text(rest)?;
+    let (mut metadata, _) = text(rest)?;
+    while !metadata.is_empty() {
+        metadata = text(metadata)?.1;
+    }
+    Some(())
+}
+
+/// The text at the beginning, after its length, and what follows.
+fn text(bytes: &[u8]) -> Option<(&[u8], &[u8])> {
+    let (&len, rest) = bytes.split_first_chunk()?;
+    rest.split_at_checked(usize::try_from(u32::from_le_bytes(len)).ok()?)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn with_len(text: &[u8], len: usize) -> Vec<u8> {
+        [&u32::try_from(len).unwrap().to_le_bytes(), text].concat()
+    }
+
+    fn chunk(compression: &[u8], len: u64, records: &[u8]) -> Vec<u8> {
+        [&[0; CHUNK_HEAD], compression, &len.to_le_bytes(), records].concat()
+    }
+
+    #[test]
+    fn what_reaches_beyond_its_record_is_refused() {
+        let word = with_len(b"abc", 3);
+        let long = with_len(b"abc", 4);
+        let pair = with_len(&[word.clone(), word.clone()].concat(), 14);
+        let broken_pair = with_len(&[word.clone(), long.clone()].concat(), 14);
+        let cases = [
+            (op::SCHEMA, [&[0; 2][..], &word, &word].concat(), true),
+            (op::SCHEMA, [&[0; 2][..], &word, &long].concat(), false),
+            (op::SCHEMA, vec![0], false),
+            (op::CHANNEL, [&[0; 4][..], &word, &word, &pair].concat(), true),
+            (op::CHANNEL, [&[0; 4][..], &long, &[0; 9]].concat(), true),
+            (op::CHANNEL, [&[0; 4][..], &word, &word, &broken_pair].concat(), false),
+            (op::CHANNEL, [&[0; 4][..], &word, &with_len(b"", 1 << 31)].concat(), false),
+            (op::CHUNK, chunk(&with_len(b"", 1 << 31), 0, b""), false),
+            (op::CHUNK, chunk(&with_len(b"zstd", 4), 8, b"anything"), true),
+            (op::CHUNK, chunk(&with_len(b"zstd", 4), 9, b"anything"), false),
+            (op::CHUNK, chunk(&with_len(b"", 0), 10, &[5, 1, 0, 0, 0, 0, 0, 0, 0, 7]), true),
+            (op::CHUNK, chunk(&with_len(b"", 0), 10, &[5, 2, 0, 0, 0, 0, 0, 0, 0, 7]), false),
+            (op::MESSAGE, vec![], true),
+        ];
+        for (opcode, record, is_sound) in cases {
+            assert_eq!(check(opcode, &record).is_ok(), is_sound, "{opcode} {record:?}");
+        }
+    }
+}
