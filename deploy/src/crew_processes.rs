@@ -11,7 +11,7 @@ use protocol::{CavId, ProcessId, RunId};
 use sim_replay::bus::shutdown::Stop;
 use sim_replay::bus::{Bus, Identity};
 
-use crate::fleet::Fleet;
+use crate::fleet::{Fleet, Meeting};
 use crate::network::MeetingPlace;
 use crate::run_folder::RunFolder;
 use crate::security::RunKeys;
@@ -45,7 +45,8 @@ impl CrewProcesses {
     ) -> Result<(Self, RemoteCrew), UpError> {
         let keys = fleet.keys(folder)?;
         let place = MeetingPlace::open(&fleet.scenario.network, run, keys.as_ref())?;
-        let mut specs = fleet.processes(run, place.endpoint.as_str(), keys.as_ref(), programs);
+        let endpoint = place.endpoint.as_str();
+        let mut specs = fleet.processes(&Meeting { run, endpoint, keys: keys.as_ref(), programs, folder });
         specs.retain(|spec| spec.program.ends_with("agent"));
         let identity = Identity {
             run: run.clone(),

@@ -9,17 +9,18 @@ use agent::localizer::{EndToEndLocalizer, Localizer, LocalizerError};
 use agent::model_config::DetectorConfig;
 use agent::weights::{Weights, WeightsError};
 use ego_fuser::Exchange;
-use protocol::{CavId, Party, ProcessId, Role, RunId, Stream, Topic};
+use protocol::{CavId, Party, ProcessId, Role, Stream, Topic};
 use sim_replay::bus::{Route, process_id};
 use sim_replay::dataset::{self, ReadError};
 use sim_replay::ground_truth::GroundTruthRule;
 use sim_replay::link::{Air, LinkError};
 use tch::Device;
 
-use self::arguments::{Arguments, Meeting, dtype, noise_mode, rate_options, smoothing};
+pub use self::arguments::Meeting;
+use self::arguments::{Arguments, dtype, noise_mode, rate_options, smoothing};
 use crate::keys::KeyError;
-use crate::run_folder::RunFolder;
-use crate::scenario::{Launch, PoseSource, Publish, Scenario};
+use crate::run_folder::{RECORDING, RunFolder, SWEEP_LOG};
+use crate::scenario::{Clock, Launch, PoseSource, Publish, Scenario};
 use crate::score::scorer_cav;
 use crate::security::RunKeys;
 use crate::supervise::{Life, ProcessSpec};
@@ -223,46 +224,16 @@ impl Fleet {
         security.map(|security| RunKeys::of(security, self.parties(), folder.path())).transpose()
     }
 
-    /// Every process to start, which all meet at `endpoint`, with their keys if there are any; the programs lie in
-    /// `programs`.
+    /// Every process to start, the recorder last where the scenario asks for one.
     #[must_use]
-    pub fn processes(&self, run: &RunId, endpoint: &str, keys: Option<&RunKeys>, programs: &Path) -> Vec<ProcessSpec> {
-        let shared_memory_mib = self.scenario.network.shared_memory_mib;
-        let meeting = Meeting { run, endpoint, programs, keys, shared_memory_mib };
+    pub fn processes(&self, meeting: &Meeting<'_>) -> Vec<ProcessSpec> {
         let here = |cav: &&CavId| self.scenario.settings_of(cav).launch == Launch::Here;
-        let mut specs: Vec<ProcessSpec> =
-            self.agents.iter().filter(here).map(|cav| self.agent(cav, &meeting)).collect();
-        specs.push(self.ego_fuser(&meeting));
-        specs.extend(self.link(&meeting));
-        specs.push(self.replay(&meeting));
+        let mut specs: Vec<ProcessSpec> = self.agents.iter().filter(here).map(|cav| self.agent(cav, meeting)).collect();
+        specs.push(self.ego_fuser(meeting));
+        specs.extend(self.link(meeting));
+        specs.push(self.replay(meeting));
+        specs.extend(self.recorder(meeting));
         specs
-    }
-
-    /// The process that writes the run to `file`, where the scenario asks for one.
-    #[must_use]
-    pub fn recorder(
-        &self,
-        run: &RunId,
-        endpoint: &str,
-        keys: Option<&RunKeys>,
-        programs: &Path,
-        file: &Path,
-    ) -> Option<ProcessSpec> {
-        let record = self.scenario.record.as_ref()?;
-        let shared_memory_mib = self.scenario.network.shared_memory_mib;
-        let meeting = Meeting { run, endpoint, programs, keys, shared_memory_mib };
-        let mut args = Arguments::of("record", &meeting);
-        args.option("--out", file);
-        if !record.without.is_empty() {
-            let without: Vec<String> = record.without.iter().map(ToString::to_string).collect();
-            args.option("--without", &without.join(","));
-        }
-        if let Some(level) = record.zstd_level {
-            args.option("--zstd", &level.to_string());
-        }
-        args.flag("--json");
-        // A recording cannot be taken up in the middle.
-        Some(meeting.process(RECORDER.into(), "sim-replay", args, Life::Optional))
     }
 
     /// The executables of a fleet.
@@ -271,9 +242,19 @@ impl Fleet {
         ["agent", "ego-fuser", "sim-replay", "v2vloc"].iter().map(|name| programs.join(name)).collect()
     }
 
+    /// What every process of this fleet is told.
+    fn arguments(&self, command: &str, meeting: &Meeting<'_>) -> Arguments {
+        let mut args = Arguments::of(command, meeting);
+        let shared_memory_mib = self.scenario.network.shared_memory_mib;
+        if shared_memory_mib > 0 {
+            args.option("--shm-mib", &shared_memory_mib.to_string());
+        }
+        args
+    }
+
     fn agent(&self, cav: &CavId, meeting: &Meeting<'_>) -> ProcessSpec {
         let settings = self.scenario.settings_of(cav);
-        let mut args = Arguments::of("run", meeting);
+        let mut args = self.arguments("run", meeting);
         args.option("--cav", cav.as_str());
         self.model(&mut args);
         args.option("--publish", self.publish(cav).name());
@@ -310,12 +291,14 @@ impl Fleet {
         // Nor does that map cross the air.
         if *cav != self.ego {
             rate_options(&mut args, &settings.rate);
+        } else if self.scenario.clock == Clock::Wall {
+            args.option("--sweep-log", &meeting.folder.file(SWEEP_LOG));
         }
         meeting.process(format!("agent-{cav}"), "agent", args, Life::Service)
     }
 
     fn ego_fuser(&self, meeting: &Meeting<'_>) -> ProcessSpec {
-        let mut args = Arguments::of("run", meeting);
+        let mut args = self.arguments("run", meeting);
         args.option("--ego", self.ego.as_str());
         self.model(&mut args);
         args.option("--method", self.scenario.method.name());
@@ -345,7 +328,7 @@ impl Fleet {
         streams.sort_unstable();
         streams.dedup();
         let streams: Vec<String> = streams.iter().map(ToString::to_string).collect();
-        let mut args = Arguments::of("link", meeting);
+        let mut args = self.arguments("link", meeting);
         args.option("--ego", self.ego.as_str());
         args.option("--link", &link.air);
         args.option("--seed", &link.seed.to_string());
@@ -364,7 +347,7 @@ impl Fleet {
 
     fn replay(&self, meeting: &Meeting<'_>) -> ProcessSpec {
         let scene = &self.scenario.scene;
-        let mut args = Arguments::of("stream", meeting);
+        let mut args = self.arguments("stream", meeting);
         args.0.push(scene.dir.clone().into());
         if let Some(name) = &scene.scenario {
             args.option("--scenario", name);
@@ -390,6 +373,22 @@ impl Fleet {
         }
         args.option("--ready-timeout", &self.scenario.timeouts.ready_s.to_string());
         meeting.process(REPLAY.into(), "sim-replay", args, Life::Task)
+    }
+
+    fn recorder(&self, meeting: &Meeting<'_>) -> Option<ProcessSpec> {
+        let record = self.scenario.record.as_ref()?;
+        let mut args = self.arguments("record", meeting);
+        args.option("--out", &meeting.folder.file(RECORDING));
+        if !record.without.is_empty() {
+            let without: Vec<String> = record.without.iter().map(ToString::to_string).collect();
+            args.option("--without", &without.join(","));
+        }
+        if let Some(level) = record.zstd_level {
+            args.option("--zstd", &level.to_string());
+        }
+        args.flag("--json");
+        // A recording cannot be taken up in the middle.
+        Some(meeting.process(RECORDER.into(), "sim-replay", args, Life::Optional))
     }
 
     /// What has to stand before the clock starts, beside the routes from the replay to the agents that it knows itself.

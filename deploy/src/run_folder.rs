@@ -27,6 +27,11 @@ pub enum RunFolderError {
     },
 }
 
+/// The recording of a run.
+pub const RECORDING: &str = "recording.mcap";
+/// Where the ego's agent notes when each sweep came.
+pub const SWEEP_LOG: &str = "sweeps.csv";
+
 /// The folder of one run.
 #[derive(Debug, Clone)]
 pub struct RunFolder {

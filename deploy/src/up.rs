@@ -8,22 +8,22 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use ego_fuser::evaluate::EvaluateError;
-use protocol::{Balance, Ledger, Role, RunId};
+use protocol::{Balance, Ledger, RunId};
 use sim_replay::bus::shutdown::Stop;
-use sim_replay::bus::{BusError, Endpoint, Refusal, process_id};
+use sim_replay::bus::{BusError, Endpoint, Refusal};
 
 use crate::absences;
 use crate::fingerprint::Provenance;
-use crate::fleet::{Fleet, FleetError, RECORDER, REPLAY};
+use crate::fleet::{Fleet, FleetError, Meeting, RECORDER, REPLAY};
 use crate::keys::KeyError;
 use crate::ledger_report::LedgerReport;
 use crate::metrics::{Messages, Metrics};
 use crate::network::MeetingPlace;
 use crate::progress::Display;
-use crate::run_folder::{RunFolder, RunFolderError, name_of_now};
+use crate::run_folder::{RunFolder, RunFolderError, SWEEP_LOG, name_of_now};
 use crate::scenario::{Clock, Scenario};
 use crate::score::{Board, Progress, Scored, ScorerError, ScorerNode};
-use crate::security::{RefusalWatch, RunKeys};
+use crate::security::RefusalWatch;
 use crate::status::Phase;
 use crate::supervise::{SuperviseError, Supervisor};
 use crate::watch::{Ending, Watch};
@@ -37,9 +37,6 @@ const DRAIN_SHARE: f64 = 0.5;
 
 /// For writing the index of a recording, after all others have ended.
 const RECORDER_SHARE: Duration = Duration::from_millis(800);
-
-/// Where the ego's agent notes when each sweep came.
-pub const SWEEP_LOG: &str = "sweeps.csv";
 
 /// What a run needs beside its scenario.
 #[derive(Debug, Clone)]
@@ -156,8 +153,9 @@ pub fn up(scenario: &Scenario, options: &UpOptions) -> Result<RunResult, UpError
     if let Some(address) = fleet.scenario.network.metrics {
         scorer.serve_metrics(address)?;
     }
-    let meeting = (&place.endpoint, keys.as_ref());
-    let watched = watch(&fleet, &run, meeting, &options.programs, &folder, &scorer, &stop);
+    let (endpoint, programs) = (place.endpoint.as_str(), options.programs.as_path());
+    let meeting = Meeting { run: &run, endpoint, keys: keys.as_ref(), programs, folder: &folder };
+    let watched = watch(&fleet, &meeting, &place.endpoint, &scorer, &stop);
     // Before the scorer closes the session.
     let refused = refused.finish();
     let scored = scorer.finish();
@@ -185,25 +183,27 @@ struct Watched {
     away: BTreeSet<String>,
 }
 
+/// When each sweep came to the ego's agent. One on another host notes nothing here.
+fn swept(log: &Path) -> BTreeMap<u64, u64> {
+    agent::sweep_log::read(log).unwrap_or_else(|error| {
+        if error.kind() != std::io::ErrorKind::NotFound {
+            tracing::warn!("{}: {error}; frames.csv does not say when sweeps came", log.display());
+        }
+        BTreeMap::new()
+    })
+}
+
 /// Starts the processes, follows the run to its end, and ends the processes.
 fn watch(
     fleet: &Fleet,
-    run: &RunId,
-    (endpoint, keys): (&Endpoint, Option<&RunKeys>),
-    programs: &Path,
-    folder: &RunFolder,
+    meeting: &Meeting<'_>,
+    endpoint: &Endpoint,
     scorer: &ScorerNode,
     stop: &Stop,
 ) -> Result<Watched, UpError> {
+    let Meeting { run, folder, .. } = *meeting;
     let (events, happened) = channel();
-    let mut specs = fleet.processes(run, endpoint.as_str(), keys, programs);
-    specs.extend(fleet.recorder(run, endpoint.as_str(), keys, programs, &folder.file("recording.mcap")));
-    let ego_agent = process_id(Role::Agent, &fleet.ego);
-    if let Some(spec) = specs.iter_mut().find(|spec| spec.name == ego_agent.as_str()) {
-        let mut option = std::ffi::OsString::from("--sweep-log=");
-        option.push(folder.file(SWEEP_LOG));
-        spec.args.push(option);
-    }
+    let mut specs = fleet.processes(meeting);
     let mut display = Display::new(fleet.ticks);
     if let Some(first) = fleet.scenario.network.metrics {
         for (spec, address) in specs.iter_mut().zip(ports_behind(first)) {
@@ -309,9 +309,7 @@ fn write(
     let balance = sum.balance();
     let metrics = metrics(fleet, &board, &progress, &sum);
     folder.write_json("metrics.json", &metrics)?;
-    // An agent on another host notes nothing here, and a run may have no sweep at all.
-    let swept = agent::sweep_log::read(&folder.file(SWEEP_LOG)).unwrap_or_default();
-    folder.write_frames(board.records(), &swept)?;
+    folder.write_frames(board.records(), &swept(&folder.file(SWEEP_LOG)))?;
     let report = LedgerReport::new(&books, &sum, &balance, (&watched.away, excused)).with_refused(refused);
     folder.write_json("ledger.json", &report)?;
     let provenance = match fingerprint.join() {

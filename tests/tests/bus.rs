@@ -4,7 +4,8 @@ use std::sync::mpsc;
 use std::time::{Duration, Instant};
 
 use protocol::{
-    Account, CavId, DropReason, Gnss, GnssSource, Ledger, Lidar, Limits, PointCloud, Pose, Role, Stream, Topic,
+    Account, CavId, Control, DropReason, Gnss, GnssSource, Ledger, Lidar, Limits, PointCloud, Pose, Role, Stamp,
+    Stream, Topic,
 };
 use sim_replay::bus::{
     self, Barrier, Bus, BusError, BusOptions, Endpoint, Event, Overflow, Publisher, PublisherOptions, Route, Sighting,
@@ -124,6 +125,30 @@ fn a_missing_pair_is_named() {
 }
 
 #[test]
+fn nobody_says_for_another_what_that_one_has_heard() {
+    let router = TestRouter::open();
+    let (replay, agent) = (router.join("replay", "replay"), router.join("agent-8", "8"));
+    let routes = ["7/lidar>agent-7", "7/lidar>agent-8"].map(|route| route.parse::<Route>().unwrap());
+    let barrier = Barrier::new(routes.clone()).attend(&replay).unwrap();
+    let key = agent.key(Topic::Ready(agent.identity().process.clone())).to_string();
+    let mut sequence = 0;
+    let mut say = |process: &str| {
+        let stamp = Stamp { cav: cav("8"), epoch: u64::MAX, sequence, capture_nanos: 0, publish_nanos: 0 };
+        sequence += 1;
+        let ready = Control::Ready { process: process.parse().unwrap(), heard: vec![topic("7/lidar")] };
+        let bytes = protocol::wire::encode(&stamp, ready).unwrap().to_vec();
+        agent.session().put(&key, bytes).congestion_control(CongestionControl::Block).wait().unwrap();
+    };
+    // In this order: when the second is heard, the first has been.
+    wait_for("its own notice", || {
+        say("agent-7");
+        say("agent-8");
+        !barrier.missing().contains(&routes[1])
+    });
+    assert_eq!(barrier.missing(), routes[..1]);
+}
+
+#[test]
 fn a_slow_consumer_gets_the_newest_and_every_loss_is_counted() {
     let router = TestRouter::open();
     let (replay, agent) = (router.join("replay", "replay"), router.join("agent-7", "7"));
@@ -227,17 +252,17 @@ fn wrong_bytes_are_counted_and_survived() {
     // Everything a broken or hostile peer may put under this key.
     let enemy = router.join("enemy", "8");
     let key = enemy.key(topic.clone()).to_string();
-    let stamp = protocol::Stamp { cav: cav("7"), epoch: 1, sequence: 0, capture_nanos: 0, publish_nanos: 0 };
+    let stamp = Stamp { cav: cav("7"), epoch: 1, sequence: 0, capture_nanos: 0, publish_nanos: 0 };
     let sound = protocol::wire::encode(&stamp, gnss(0.0)).unwrap().to_vec();
     let changed = |at: usize, to: u8| {
         let mut bytes = sound.clone();
         bytes[at] = to;
         bytes
     };
-    let next = protocol::Stamp { sequence: 1, ..stamp.clone() };
+    let next = Stamp { sequence: 1, ..stamp.clone() };
     let mut flipped = protocol::wire::encode(&next, gnss(0.0)).unwrap().to_vec();
     *flipped.last_mut().unwrap() ^= 1;
-    let impostor = protocol::wire::encode(&protocol::Stamp { cav: cav("8"), ..stamp.clone() }, gnss(0.0)).unwrap();
+    let impostor = protocol::wire::encode(&Stamp { cav: cav("8"), ..stamp.clone() }, gnss(0.0)).unwrap();
     let other_kind = protocol::wire::encode(&stamp, sweep(3)).unwrap();
     let hostile = [
         vec![],

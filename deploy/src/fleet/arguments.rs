@@ -6,22 +6,24 @@ use std::path::Path;
 use agent::rate::RateConfig;
 use protocol::{Dtype, RunId, Smoothing};
 
+use crate::run_folder::RunFolder;
 use crate::scenario::NoiseMode;
 use crate::security::RunKeys;
 use crate::supervise::{Life, ProcessSpec};
 
-/// Where the processes of a run meet, and where their programs lie.
-pub(super) struct Meeting<'a> {
+/// Where the processes of a run meet, where their programs lie, and where they write.
+#[derive(Debug, Clone, Copy)]
+pub struct Meeting<'a> {
     /// The run that they join.
     pub run: &'a RunId,
     /// Of the router.
     pub endpoint: &'a str,
-    /// Folder of the programs.
-    pub programs: &'a Path,
     /// Where the processes find their keys, where they have some.
     pub keys: Option<&'a RunKeys>,
-    /// Memory for large messages between processes of one machine, MiB; 0: none.
-    pub shared_memory_mib: usize,
+    /// Folder of the programs.
+    pub programs: &'a Path,
+    /// Folder of the run.
+    pub folder: &'a RunFolder,
 }
 
 impl Meeting<'_> {
@@ -43,9 +45,6 @@ impl Arguments {
         args.option("--connect", meeting.endpoint);
         args.option("--run", meeting.run.as_str());
         args.flag("--supervised");
-        if meeting.shared_memory_mib > 0 {
-            args.option("--shm-mib", &meeting.shared_memory_mib.to_string());
-        }
         args
     }
 

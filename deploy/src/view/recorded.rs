@@ -10,7 +10,7 @@ use sim_replay::recording::{Entry, Recording, RecordingError};
 
 use super::assembly::{Assembly, Seen};
 use super::scene_frame::SceneFrame;
-use crate::up::SWEEP_LOG;
+use crate::run_folder::{RECORDING, SWEEP_LOG};
 
 /// Why a run cannot be shown.
 #[derive(Debug, thiserror::Error)]
@@ -68,7 +68,7 @@ impl RecordedRun {
     /// # Errors
     /// [`ViewError`] when there is none, or nothing to show in it.
     pub fn open(path: &Path) -> Result<Self, ViewError> {
-        let file = if path.is_dir() { path.join("recording.mcap") } else { path.to_path_buf() };
+        let file = if path.is_dir() { path.join(RECORDING) } else { path.to_path_buf() };
         if !file.is_file() {
             return Err(ViewError::NotRecorded(path.into()));
         }

@@ -104,7 +104,7 @@ fn messages(tick: u64, now: u64, sweeps: Stream) -> Vec<(Topic, Vec<u8>)> {
 }
 
 fn record(folder: &Path) -> RecordedRun {
-    let file = folder.join("recording.mcap");
+    let file = folder.join(crate::run_folder::RECORDING);
     let mut writer = RecordingWriter::create(&file, RecordingOptions::default()).unwrap();
     let run = RunId::new("test").unwrap();
     for tick in 0..TICKS {
@@ -114,7 +114,7 @@ fn record(folder: &Path) -> RecordedRun {
         }
     }
     writer.finish().unwrap();
-    let mut sweeps = agent::sweep_log::SweepLog::open(&folder.join(crate::up::SWEEP_LOG)).unwrap();
+    let mut sweeps = agent::sweep_log::SweepLog::open(&folder.join(crate::run_folder::SWEEP_LOG)).unwrap();
     (0..TICKS).for_each(|tick| sweeps.note(100_000_000 * (tick + 1), 1_000_000_000 * tick + 3_000_000).unwrap());
     RecordedRun::open(folder).unwrap()
 }

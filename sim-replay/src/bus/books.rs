@@ -143,6 +143,11 @@ impl Books {
         self.refused(topic, DropReason::RateLimit, &why);
     }
 
+    /// A sound message says what is not its sender's to say; counted and logged like an unsound one.
+    pub(super) fn misused(&self, topic: &Topic, why: &'static str) {
+        self.refused(topic, DropReason::Identity, &why);
+    }
+
     fn refused(&self, topic: &Topic, reason: DropReason, why: &dyn fmt::Display) {
         self.dropped(topic, reason);
         let times = {

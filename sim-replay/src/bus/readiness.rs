@@ -113,15 +113,15 @@ impl Barrier {
 
     fn listen(&self, inbox: &Inbox) {
         while let Taken::Item(topic, event) = inbox.take(None) {
-            let (Topic::Ready(sender), Event::Message(arrival)) = (topic, event) else { continue };
+            let (Topic::Ready(sender), Event::Message(arrival)) = (&topic, event) else { continue };
             match inbox.decode(&arrival, &Limits::DEFAULT) {
                 // Nobody says for another what that one has heard.
-                Some(Control::Ready { process, heard }) if process == sender => {
+                Some(Control::Ready { process, heard }) if process == *sender => {
                     for topic in heard {
                         self.heard(&Route { topic, receiver: sender.clone() });
                     }
                 }
-                Some(other) => tracing::warn!(%sender, ?other, "not its own notice of readiness: not taken"),
+                Some(_) => inbox.misused(&topic, "not the sender's own notice of readiness"),
                 None => {}
             }
         }

@@ -136,6 +136,11 @@ impl Inbox {
         arrival.decode(limits).map_err(|error| self.books.rejected(&arrival.topic, &error)).ok()
     }
 
+    /// `topic` brought what is not its sender's to say: counted and logged.
+    pub(super) fn misused(&self, topic: &Topic, why: &'static str) {
+        self.books.misused(topic, why);
+    }
+
     fn deliver(&self, topic: &Topic, event: Event, places: Option<usize>) {
         let lane = Lane { topic: topic.clone(), is_notice: matches!(event, Event::End { .. }) };
         // A bound on what all topics hold together; a message that finds it reached is lost, and so is room for it.
