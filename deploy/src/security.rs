@@ -100,8 +100,8 @@ impl RefusalWatch {
             return Ok(Self { stop, thread: None });
         }
         let (session, ending) = (place.session.clone(), stop.clone());
+        let mut refusals = Refusals::of(&place.endpoint);
         let look = move || {
-            let mut refusals = Refusals::default();
             loop {
                 let ended = ending.wait_until(Instant::now() + LOOK_ROUND);
                 refusals.update(&session);

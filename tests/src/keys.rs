@@ -121,7 +121,7 @@ impl GuardedRouter {
     /// How many messages of one kind it has refused to a peer so far.
     #[must_use]
     pub fn refused(&self, peer: &str, message: &str) -> u64 {
-        let mut refusals = Refusals::default();
+        let mut refusals = Refusals::of(&self.endpoint);
         refusals.update(&self.session);
         let is_it = |refusal: &Refusal| refusal.peer == peer && refusal.message == message;
         refusals.counts().iter().filter(|(refusal, _)| is_it(refusal)).map(|(_, count)| count).sum()

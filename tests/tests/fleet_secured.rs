@@ -165,8 +165,7 @@ fn strangers_and_liars_change_nothing() {
     assert!(count("put", "access-control") >= FORGED.len() as u64, "{refused:?}");
     assert!(count("put", "low-pass") >= 1, "{refused:?}");
     assert!(count("declare", "access-control") >= 2, "{refused:?}");
-    // Who spoke plain TCP met nobody: where a fleet with keys listens there is no TCP.
-    for cause in ["expired certificate", "certificate of another authority", "no certificate"] {
+    for cause in ["expired certificate", "certificate of another authority", "no certificate", "plain TCP"] {
         let is_it =
             |line: &Value| line["peer"] == "stranger" && line["reason"] == "handshake" && line["message"] == cause;
         assert!(refused.iter().any(is_it), "{cause}: {refused:?}");

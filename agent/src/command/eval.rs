@@ -21,25 +21,28 @@ use clap::ValueEnum;
 use indicatif::{ProgressBar, ProgressStyle};
 use tch::Device;
 
+use super::town_heads::{TownHead, by_head};
 use crate::cli::BadInput;
 
 /// Localise recorded sweeps and compare with their true poses.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Data sets, splits or scenarios of the head's town; the layout is found out.
+    /// Data sets, splits or scenarios of the heads' towns; the layout is found out.
     #[arg(long, value_name = "DIR", num_args = 1.., required = true)]
     scene: Vec<PathBuf>,
-    /// Weights of the encoder [default: pgc-encoder.safetensors beside the head].
+    /// Weights of the encoder [default: pgc-encoder.safetensors beside each head].
     #[arg(long, value_name = "FILE")]
     encoder: Option<PathBuf>,
-    /// Weights of the town's head.
+    /// Weights of the heads: FILE for all scenes, or TOWN=FILE and TOWN:SEED=FILE for generated ones [SEED: 0]. What is
+    /// reported is of all scenes together.
     #[arg(
         long,
         visible_alias = "weights",
-        value_name = "FILE",
+        value_name = "[TOWN=]FILE",
+        num_args = 1..,
         default_value = "deploy/weights/pgc-town1.safetensors"
     )]
-    head: PathBuf,
+    head: Vec<TownHead>,
     /// Instead of encoder and head: weights of a network that `agent train end-to-end` wrote.
     #[arg(long, value_name = "FILE", conflicts_with_all = ["encoder", "head", "fit_confidence"])]
     end_to_end: Option<PathBuf>,
@@ -61,7 +64,7 @@ pub(crate) struct Args {
     /// Take every N-th sweep of each vehicle.
     #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
     every: u32,
-    /// Most sweeps, evenly over all there are [default: all].
+    /// Most sweeps for each head, evenly over all there are [default: all].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
     sweeps: Option<u32>,
     /// Which search finds the pose.
@@ -124,9 +127,20 @@ enum Subject {
 /// Localises, fits, writes and prints.
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     tch::set_num_threads(i32::from(args.threads));
-    let mut sweeps = args.evaluate(args.subject()?)?;
+    let groups = by_head(&args.head, &args.scene)?;
+    let mut sweeps = Vec::new();
+    for (head, scenes) in &groups {
+        sweeps.extend(args.evaluate(args.subject(head)?, scenes)?);
+    }
     if args.fit_confidence {
-        let report = args.fit(&mut sweeps)?;
+        let [(head, _)] = groups[..] else {
+            return Err(BadInput(anyhow::anyhow!(
+                "--fit-confidence fits one head, and {} are asked for",
+                groups.len()
+            ))
+            .into());
+        };
+        let report = args.fit(head, &mut sweeps)?;
         eprintln!("{}", report_line(&report));
     }
     args.write(&sweeps)?;
@@ -140,9 +154,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
 }
 
 impl Args {
-    fn subject(&self) -> Result<Subject, BadInput> {
+    fn subject(&self, head: &Path) -> Result<Subject, BadInput> {
         if self.icp_map.is_empty() {
-            return Ok(Subject::Localizer(self.localizer().map_err(|error| BadInput(error.into()))?));
+            return Ok(Subject::Localizer(self.localizer(head).map_err(|error| BadInput(error.into()))?));
         }
         if !self.map_spacing.is_finite() || self.map_spacing < 0.0 {
             return Err(BadInput(anyhow::anyhow!("--map-spacing is {}, must be 0 or more", self.map_spacing)));
@@ -152,7 +166,7 @@ impl Args {
         Ok(Subject::Source(Box::new(IcpMapPose::new(Arc::new(map), config))))
     }
 
-    fn localizer(&self) -> Result<Box<dyn Localize>, LocalizerError> {
+    fn localizer(&self, head: &Path) -> Result<Box<dyn Localize>, LocalizerError> {
         let device = match self.device {
             ComputeOn::Cpu => Device::Cpu,
             ComputeOn::Cuda => Device::Cuda(0),
@@ -167,20 +181,20 @@ impl Args {
             return Ok(Box::new(localizer));
         }
         let load = if self.fit_confidence { Localizer::load_without_confidence } else { Localizer::load };
-        let mut localizer = load(&self.encoder(), &self.head, device)?;
+        let mut localizer = load(&self.encoder(head), head, device)?;
         let confidence = localizer.solver().confidence.clone();
         localizer.set_solver(PoseSolver { solver, confidence });
         Ok(Box::new(localizer))
     }
 
-    fn encoder(&self) -> PathBuf {
-        self.encoder.clone().unwrap_or_else(|| self.head.with_file_name("pgc-encoder.safetensors"))
+    fn encoder(&self, head: &Path) -> PathBuf {
+        self.encoder.clone().unwrap_or_else(|| head.with_file_name("pgc-encoder.safetensors"))
     }
 
-    fn evaluate(&self, subject: Subject) -> anyhow::Result<Vec<EvaluatedSweep>> {
+    fn evaluate(&self, subject: Subject, scenes: &[PathBuf]) -> anyhow::Result<Vec<EvaluatedSweep>> {
         let count = |number: u32| usize::try_from(number).unwrap_or(usize::MAX);
         let options = EvaluationOptions {
-            scenes: self.scene.clone(),
+            scenes: scenes.to_vec(),
             variant: self.variant.clone(),
             every: count(self.every),
             sweeps: self.sweeps.map(count),
@@ -203,12 +217,12 @@ impl Args {
         }
     }
 
-    fn fit(&self, sweeps: &mut [EvaluatedSweep]) -> anyhow::Result<FitReport> {
+    fn fit(&self, head: &Path, sweeps: &mut [EvaluatedSweep]) -> anyhow::Result<FitReport> {
         let labelled: Vec<_> = sweeps.iter().filter_map(EvaluatedSweep::labelled).collect();
         let (model, report) =
             ConfidenceModel::fit(&labelled, self.good_loss).map_err(|error| BadInput(error.into()))?;
-        let sha256 = annotate(&self.head, CONFIDENCE_KEY, &serde_json::to_string(&model)?)?;
-        eprintln!("{}: confidence written, SHA-256 is now {sha256}", self.head.display());
+        let sha256 = annotate(head, CONFIDENCE_KEY, &serde_json::to_string(&model)?)?;
+        eprintln!("{}: confidence written, SHA-256 is now {sha256}", head.display());
         let confidence = Confidence::Calibrated(model);
         sweeps.iter_mut().for_each(|sweep| sweep.judge_again(&confidence));
         Ok(report)

@@ -1,16 +1,14 @@
 //! `agent localize`: the poses of recorded sweeps, found once and kept.
 
 use std::path::{Path, PathBuf};
-use std::str::FromStr;
 
 use agent::pose_source::sanity::SanityConfig;
 use agent::pose_source::{LocalizedPose, PgcConfig, PoseInput, PoseRow, PoseSource, PoseTable};
-use anyhow::Context;
 use indicatif::{ProgressBar, ProgressStyle};
 use protocol::PoseEstimate;
-use serde::Deserialize;
 use sim_replay::dataset::{self, LoadOptions, Scenario};
 
+use super::town_heads::{TownHead, head_of};
 use crate::cli::BadInput;
 
 /// Localise every sweep of scenes once and write poses and confidences as a table, for trainings and evaluations.
@@ -35,40 +33,6 @@ pub(crate) struct Args {
     threads: u16,
 }
 
-/// A generated town: the name of its map and the seed of all that stands on it.
-#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
-struct Town {
-    #[serde(rename = "town")]
-    name: String,
-    town_seed: u64,
-}
-
-/// Weights, and the town they are of.
-#[derive(Debug, Clone, PartialEq, Eq)]
-struct TownHead {
-    town: Option<Town>,
-    weights: PathBuf,
-}
-
-impl FromStr for TownHead {
-    type Err = String;
-
-    fn from_str(text: &str) -> Result<Self, String> {
-        let Some((town, weights)) = text.split_once('=') else {
-            return Ok(Self { town: None, weights: text.into() });
-        };
-        let (name, seed) = town.split_once(':').unwrap_or((town, "0"));
-        let town_seed = seed.parse().map_err(|_| format!("{seed:?} is no seed of a town"))?;
-        Ok(Self { town: Some(Town { name: name.to_owned(), town_seed }), weights: weights.into() })
-    }
-}
-
-/// The part of `data_protocol.yaml` that tells the town.
-#[derive(Debug, Deserialize)]
-struct ProtocolFile {
-    generator: Town,
-}
-
 /// Localises what the table does not have yet.
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     tch::set_num_threads(i32::from(args.threads));
@@ -79,7 +43,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     }
     scenarios.retain(|scenario| !done.has(&scenario.name));
     // Which head each needs is known before any is computed with.
-    let heads: Vec<&Path> = scenarios.iter().map(|scenario| args.head_of(scenario)).collect::<anyhow::Result<_>>()?;
+    let heads: Vec<&Path> = scenarios.iter().map(|scenario| head_of(&args.head, scenario)).collect::<Result<_, _>>()?;
     let sweeps: usize = scenarios.iter().map(|scenario| scenario.agents.len() * scenario.ticks.len()).sum();
     let bar = ProgressBar::new(sweeps as u64)
         .with_style(ProgressStyle::with_template("{bar:30} {pos}/{len} sweeps  {eta} left")?);
@@ -93,17 +57,6 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
 }
 
 impl Args {
-    fn head_of(&self, scenario: &Scenario) -> anyhow::Result<&Path> {
-        if let Some(head) = self.head.iter().find(|head| head.town.is_none()) {
-            return Ok(&head.weights);
-        }
-        let town = town_of(scenario).with_context(|| format!("the town of scenario {}", scenario.name)).map_err(bad)?;
-        let head = self.head.iter().find(|head| head.town.as_ref() == Some(&town));
-        let Town { name, town_seed } = &town;
-        let missing = || bad(anyhow::anyhow!("{}: no --head for town {name}:{town_seed}", scenario.name));
-        Ok(&head.ok_or_else(missing)?.weights)
-    }
-
     /// Localises a scenario, vehicle by vehicle in the order of time, and appends it; how many sweeps have a pose.
     fn localize(&self, scenario: &Scenario, head: &Path, bar: &ProgressBar) -> anyhow::Result<usize> {
         let sanity = SanityConfig::default();
@@ -124,38 +77,6 @@ impl Args {
     }
 }
 
-/// Reads which generated town a scenario lies in.
-fn town_of(scenario: &Scenario) -> anyhow::Result<Town> {
-    let points = scenario.points_path(0, 0, None)?;
-    let folder = points.ancestors().nth(2).context("it lies in no folder")?;
-    let path = folder.join("data_protocol.yaml");
-    let text = std::fs::read_to_string(&path).with_context(|| path.display().to_string())?;
-    let file: ProtocolFile = serde_saphyr::from_str(&text).with_context(|| path.display().to_string())?;
-    Ok(file.generator)
-}
-
 fn bad(error: impl Into<anyhow::Error>) -> anyhow::Error {
     BadInput(error.into()).into()
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn heads_are_of_one_town_or_of_all() {
-        let town = |name: &str, town_seed| Some(Town { name: name.into(), town_seed });
-        for (text, expected) in [("h.st", None), ("town1=h.st", town("town1", 0)), ("town4:3=h.st", town("town4", 3))] {
-            let head: TownHead = text.parse().unwrap();
-            assert_eq!((head.town, head.weights), (expected, PathBuf::from("h.st")), "{text}");
-        }
-        assert!("town1:x=h".parse::<TownHead>().unwrap_err().contains('x'));
-    }
-
-    #[test]
-    fn the_town_of_a_generated_scene_is_read_from_its_protocol() {
-        let text = "description: x\ngenerator:\n  name: synth\n  town: 'town4'\n  town_seed: 5\nworld:\n  seed: 1\n";
-        let file: ProtocolFile = serde_saphyr::from_str(text).unwrap();
-        assert_eq!(file.generator, Town { name: "town4".into(), town_seed: 5 });
-    }
 }

@@ -3,4 +3,5 @@
 pub(crate) mod eval;
 pub(crate) mod localize;
 pub(crate) mod run;
+mod town_heads;
 pub(crate) mod train;

@@ -64,7 +64,7 @@ impl Arguments {
         stop.enforce(STOP_LIMIT);
         let session = open(&options)?;
         eprintln!("routing at {} (Ctrl-C ends it)", options.endpoint());
-        let (mut refusals, mut said) = (Refusals::default(), BTreeMap::new());
+        let (mut refusals, mut said) = (Refusals::of(options.endpoint()), BTreeMap::new());
         loop {
             let ended = stop.wait_until(Instant::now() + LOOK_ROUND);
             if options.guard.is_some() {

@@ -27,6 +27,7 @@ pub mod mailbox;
 mod membership;
 mod metrics;
 mod notices;
+mod plain_tcp;
 mod publisher;
 mod readiness;
 mod receipt;

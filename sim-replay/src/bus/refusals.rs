@@ -5,7 +5,9 @@ use std::time::Duration;
 
 use zenoh::{Session, Wait};
 
+use super::endpoint::Endpoint;
 use super::handshakes;
+use super::plain_tcp::PlainTcp;
 
 /// A router answers for itself.
 const ANSWER_LIMIT: Duration = Duration::from_secs(1);
@@ -26,19 +28,34 @@ pub struct Refusal {
     pub message: String,
 }
 
+/// What whoever spoke plain TCP to a router with keys did wrong.
+const PLAIN_TCP: &str = "plain TCP";
+
 /// Counts of refused messages since the router opened; of peers that have left since as far as they were seen before.
-#[derive(Debug, Default)]
+#[derive(Debug)]
 pub struct Refusals {
     // zenoh forgets a connection that has ended.
     seen: BTreeMap<(Refusal, String), u64>,
     /// Handshakes that failed, by cause.
     strangers: BTreeMap<&'static str, u64>,
+    plain_tcp: Option<PlainTcp>,
 }
 
 impl Refusals {
+    /// Nothing yet, of the router of this process, which listens at `router`. Where that takes QUIC, whoever comes over
+    /// plain TCP is turned away by the next [`Self::update`].
+    #[must_use]
+    pub fn of(router: &Endpoint) -> Self {
+        Self { seen: BTreeMap::new(), strangers: BTreeMap::new(), plain_tcp: PlainTcp::beside(router) }
+    }
+
     /// Asks the router of this process. What could not be asked stays as it was.
     pub fn update(&mut self, router: &Session) {
         self.strangers = handshakes::failed();
+        let plain = self.plain_tcp.as_mut().map_or(0, PlainTcp::turn_away);
+        if plain > 0 {
+            self.strangers.insert(PLAIN_TCP, plain);
+        }
         let key = format!("@/{}/router/metrics", router.zid());
         let asked =
             router.get(format!("{key}?descriptors=false;compression=false;per_key=false")).timeout(ANSWER_LIMIT);

@@ -1,0 +1,119 @@
+//! Heads of several towns, and which of them a scene is for.
+
+use std::path::{Path, PathBuf};
+use std::str::FromStr;
+
+use anyhow::Context;
+use serde::Deserialize;
+use sim_replay::dataset::{self, Scenario};
+
+use crate::cli::BadInput;
+
+/// A generated town: the name of its map and the seed of all that stands on it.
+#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+struct Town {
+    #[serde(rename = "town")]
+    name: String,
+    town_seed: u64,
+}
+
+/// Weights, and the town they are of: `FILE` for all scenes, `TOWN=FILE` and `TOWN:SEED=FILE` for generated ones.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub(crate) struct TownHead {
+    town: Option<Town>,
+    weights: PathBuf,
+}
+
+impl FromStr for TownHead {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        let Some((town, weights)) = text.split_once('=') else {
+            return Ok(Self { town: None, weights: text.into() });
+        };
+        let (name, seed) = town.split_once(':').unwrap_or((town, "0"));
+        let town_seed = seed.parse().map_err(|_| format!("{seed:?} is no seed of a town"))?;
+        Ok(Self { town: Some(Town { name: name.to_owned(), town_seed }), weights: weights.into() })
+    }
+}
+
+/// The weights of the head for a scenario.
+///
+/// # Errors
+/// [`BadInput`] when its town cannot be read, or has no head.
+pub(crate) fn head_of<'a>(heads: &'a [TownHead], scenario: &Scenario) -> Result<&'a Path, BadInput> {
+    if let Some(head) = heads.iter().find(|head| head.town.is_none()) {
+        return Ok(&head.weights);
+    }
+    let town =
+        town_of(scenario).with_context(|| format!("the town of scenario {}", scenario.name)).map_err(BadInput)?;
+    let head = heads.iter().find(|head| head.town.as_ref() == Some(&town));
+    let Town { name, town_seed } = &town;
+    let missing = || BadInput(anyhow::anyhow!("{}: no --head for town {name}:{town_seed}", scenario.name));
+    Ok(&head.ok_or_else(missing)?.weights)
+}
+
+/// Each head that scenes need, with those scenes: in the order in which they come up.
+///
+/// # Errors
+/// [`BadInput`] as [`head_of`], and when the scenarios of one folder are of several towns.
+pub(crate) fn by_head<'a>(
+    heads: &'a [TownHead],
+    scenes: &[PathBuf],
+) -> Result<Vec<(&'a Path, Vec<PathBuf>)>, BadInput> {
+    if let [TownHead { town: None, weights }] = heads {
+        return Ok(vec![(weights, scenes.to_vec())]);
+    }
+    let mut groups: Vec<(&Path, Vec<PathBuf>)> = Vec::new();
+    for folder in scenes {
+        let scenarios = dataset::open(folder).map_err(|error| BadInput(error.into()))?.scenarios;
+        let needed = scenarios.iter().map(|scenario| head_of(heads, scenario)).collect::<Result<Vec<_>, _>>()?;
+        let Some(&head) = needed.first() else { continue };
+        if needed.iter().any(|other| *other != head) {
+            return Err(BadInput(anyhow::anyhow!("{}: scenarios of several towns", folder.display())));
+        }
+        match groups.iter_mut().find(|(of, _)| *of == head) {
+            Some((_, folders)) => folders.push(folder.clone()),
+            None => groups.push((head, vec![folder.clone()])),
+        }
+    }
+    Ok(groups)
+}
+
+/// The part of `data_protocol.yaml` that tells the town.
+#[derive(Debug, Deserialize)]
+struct ProtocolFile {
+    generator: Town,
+}
+
+/// Reads which generated town a scenario lies in.
+fn town_of(scenario: &Scenario) -> anyhow::Result<Town> {
+    let points = scenario.points_path(0, 0, None)?;
+    let folder = points.ancestors().nth(2).context("it lies in no folder")?;
+    let path = folder.join("data_protocol.yaml");
+    let text = std::fs::read_to_string(&path).with_context(|| path.display().to_string())?;
+    let file: ProtocolFile = serde_saphyr::from_str(&text).with_context(|| path.display().to_string())?;
+    Ok(file.generator)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn heads_are_of_one_town_or_of_all() {
+        let town = |name: &str, town_seed| Some(Town { name: name.into(), town_seed });
+        for (text, expected) in [("h.st", None), ("town1=h.st", town("town1", 0)), ("town4:3=h.st", town("town4", 3))] {
+            let head: TownHead = text.parse().unwrap();
+            assert_eq!((head.town, head.weights), (expected, PathBuf::from("h.st")), "{text}");
+        }
+        assert!("town1:x=h".parse::<TownHead>().unwrap_err().contains('x'));
+    }
+
+    #[test]
+    fn the_town_of_a_generated_scene_is_read_from_its_protocol() {
+        let text = "description: x\ngenerator:\n  name: synth\n  town: 'town4'\n  town_seed: 5\nworld:\n  seed: 1\n";
+        let file: ProtocolFile = serde_saphyr::from_str(text).unwrap();
+        assert_eq!(file.generator, Town { name: "town4".into(), town_seed: 5 });
+    }
+}
