@@ -98,6 +98,8 @@ fn town_of(scenario: &Scenario) -> anyhow::Result<Town> {
 
 #[cfg(test)]
 mod tests {
+    use sim_replay::synth::{Subset, SynthOptions, generate};
+
     use super::*;
 
     #[test]
@@ -115,5 +117,26 @@ mod tests {
         let text = "description: x\ngenerator:\n  name: synth\n  town: 'town4'\n  town_seed: 5\nworld:\n  seed: 1\n";
         let file: ProtocolFile = serde_saphyr::from_str(text).unwrap();
         assert_eq!(file.generator, Town { name: "town4".into(), town_seed: 5 });
+    }
+
+    #[test]
+    fn scenes_are_taken_together_by_the_head_of_their_town() {
+        let folder = tempfile::tempdir().unwrap();
+        let scene = |subset, name: &str| {
+            let out = folder.path().join(name);
+            let options = SynthOptions { traversals: 1, frames: 1, ..SynthOptions::new(subset, 11, out.clone()) };
+            generate(&options, &|_| {}).unwrap();
+            out
+        };
+        let [a, b, c] = [(Subset::Town1loc, "a"), (Subset::Town4loc, "b"), (Subset::Town1loc, "c")]
+            .map(|(subset, name)| scene(subset, name));
+        let scenes = [a.clone(), b.clone(), c.clone()];
+        let heads: Vec<TownHead> = ["town1=1.st", "town4=4.st"].map(|head| head.parse().unwrap()).into();
+        let groups = by_head(&heads, &scenes).unwrap();
+        assert_eq!(groups, [(Path::new("1.st"), vec![a, c]), (Path::new("4.st"), vec![b])]);
+        let error = by_head(&heads[..1], &scenes).unwrap_err().to_string();
+        assert!(error.contains("no --head for town town4:0"), "{error}");
+        let any = ["h.st".parse().unwrap()];
+        assert_eq!(by_head(&any, &scenes).unwrap(), [(Path::new("h.st"), scenes.to_vec())]);
     }
 }
