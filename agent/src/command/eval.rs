@@ -128,18 +128,15 @@ enum Subject {
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     tch::set_num_threads(i32::from(args.threads));
     let groups = by_head(&args.head, &args.scene)?;
+    if args.fit_confidence && groups.len() > 1 {
+        let count = groups.len();
+        return Err(BadInput(anyhow::anyhow!("--fit-confidence fits one head, and {count} are asked for")).into());
+    }
     let mut sweeps = Vec::new();
     for (head, scenes) in &groups {
         sweeps.extend(args.evaluate(args.subject(head)?, scenes)?);
     }
-    if args.fit_confidence {
-        let [(head, _)] = groups[..] else {
-            return Err(BadInput(anyhow::anyhow!(
-                "--fit-confidence fits one head, and {} are asked for",
-                groups.len()
-            ))
-            .into());
-        };
+    if let ([(head, _)], true) = (&groups[..], args.fit_confidence) {
         let report = args.fit(head, &mut sweeps)?;
         eprintln!("{}", report_line(&report));
     }

@@ -40,10 +40,16 @@ impl FromStr for TownHead {
 /// The weights of the head for a scenario.
 ///
 /// # Errors
-/// [`BadInput`] when its town cannot be read, or has no head.
+/// [`BadInput`] when its town cannot be read or has no head, and when one of several heads names no town.
 pub(crate) fn head_of<'a>(heads: &'a [TownHead], scenario: &Scenario) -> Result<&'a Path, BadInput> {
-    if let Some(head) = heads.iter().find(|head| head.town.is_none()) {
-        return Ok(&head.weights);
+    if let [TownHead { town: None, weights }] = heads {
+        return Ok(weights);
+    }
+    if let Some(TownHead { weights, .. }) = heads.iter().find(|head| head.town.is_none()) {
+        let (weights, count) = (weights.display(), heads.len());
+        return Err(BadInput(anyhow::anyhow!(
+            "--head {weights}: of {count} heads each needs its town, TOWN={weights}"
+        )));
     }
     let town =
         town_of(scenario).with_context(|| format!("the town of scenario {}", scenario.name)).map_err(BadInput)?;
@@ -56,7 +62,7 @@ pub(crate) fn head_of<'a>(heads: &'a [TownHead], scenario: &Scenario) -> Result<
 /// Each head that scenes need, with those scenes: in the order in which they come up.
 ///
 /// # Errors
-/// [`BadInput`] as [`head_of`], and when the scenarios of one folder are of several towns.
+/// [`BadInput`] as [`head_of`], and when a folder has no scenario, or scenarios of several towns.
 pub(crate) fn by_head<'a>(
     heads: &'a [TownHead],
     scenes: &[PathBuf],
@@ -68,7 +74,8 @@ pub(crate) fn by_head<'a>(
     for folder in scenes {
         let scenarios = dataset::open(folder).map_err(|error| BadInput(error.into()))?.scenarios;
         let needed = scenarios.iter().map(|scenario| head_of(heads, scenario)).collect::<Result<Vec<_>, _>>()?;
-        let Some(&head) = needed.first() else { continue };
+        let missing = || BadInput(anyhow::anyhow!("{}: there is no scenario in it", folder.display()));
+        let &head = needed.first().ok_or_else(missing)?;
         if needed.iter().any(|other| *other != head) {
             return Err(BadInput(anyhow::anyhow!("{}: scenarios of several towns", folder.display())));
         }
@@ -136,6 +143,9 @@ mod tests {
         assert_eq!(groups, [(Path::new("1.st"), vec![a, c]), (Path::new("4.st"), vec![b])]);
         let error = by_head(&heads[..1], &scenes).unwrap_err().to_string();
         assert!(error.contains("no --head for town town4:0"), "{error}");
+        let unclear = ["town1=1.st", "h.st"].map(|head| head.parse().unwrap());
+        let error = by_head(&unclear, &scenes).unwrap_err().to_string();
+        assert!(error.contains("h.st: of 2 heads each needs its town"), "{error}");
         let any = ["h.st".parse().unwrap()];
         assert_eq!(by_head(&any, &scenes).unwrap(), [(Path::new("h.st"), scenes.to_vec())]);
     }
