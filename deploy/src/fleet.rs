@@ -19,7 +19,7 @@ use tch::Device;
 pub use self::arguments::Meeting;
 use self::arguments::{Arguments, dtype, noise_mode, rate_options, smoothing};
 use crate::keys::KeyError;
-use crate::run_folder::{RECORDING, RunFolder, SWEEP_LOG};
+use crate::run_folder::{BOOKMARK, RECORDING, RunFolder, SWEEP_LOG};
 use crate::scenario::{Clock, Launch, PoseSource, Publish, Scenario};
 use crate::score::scorer_cav;
 use crate::security::RunKeys;
@@ -372,6 +372,7 @@ impl Fleet {
             args.option("--expect", &route.to_string());
         }
         args.option("--ready-timeout", &self.scenario.timeouts.ready_s.to_string());
+        args.option("--bookmark", &meeting.folder.file(BOOKMARK));
         meeting.process(REPLAY.into(), "sim-replay", args, Life::Task)
     }
 

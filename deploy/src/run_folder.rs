@@ -31,6 +31,8 @@ pub enum RunFolderError {
 pub const RECORDING: &str = "recording.mcap";
 /// Where the ego's agent notes when each sweep came.
 pub const SWEEP_LOG: &str = "sweeps.csv";
+/// Where the replay notes how far it is, for one that falls and is started again.
+pub const BOOKMARK: &str = "replay.json";
 
 /// The folder of one run.
 #[derive(Debug, Clone)]

@@ -325,7 +325,16 @@ fn write(
     let picture = crate::showcase::draw(fleet, &board, &folder.file("frame.png"));
     let interrupted = matches!(watched.ending, Ending::Asked);
     let killed = watched.killed.clone();
-    Ok(RunResult { folder, metrics, balance, missed: board.missed(), interrupted, killed, picture })
+    let missed = missed(fleet, &board, &watched.ending);
+    Ok(RunResult { folder, metrics, balance, missed, interrupted, killed, picture })
+}
+
+/// Ticks without a result. Those that nobody told of at all, as the replay fell with them on its way, are known by their
+/// number alone, once the scene is over.
+fn missed(fleet: &Fleet, board: &Board, ending: &Ending) -> u64 {
+    let told = board.records().len() as u64 + board.missed();
+    let played = fleet.ticks.filter(|_| matches!(ending, Ending::Over)).unwrap_or(0) as u64;
+    board.missed() + played.saturating_sub(told)
 }
 
 fn metrics(fleet: &Fleet, board: &Board, progress: &Progress, sum: &Ledger) -> Metrics {

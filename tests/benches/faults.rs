@@ -7,6 +7,7 @@
 //! cargo build --release --workspace --bins
 //! cargo bench -p tests --bench faults -- --faults 500 --seed 1     # about 25 minutes
 //! cargo bench -p tests --bench faults -- --starts 100              # about 10 minutes
+//! cargo bench -p tests --bench faults -- --secured-starts 100      # the same with keys, over QUIC
 //! cargo bench -p tests --bench faults -- --soak 3600               # an hour
 //! ```
 //!
@@ -29,9 +30,10 @@ fn main() -> Result<()> {
         match name.as_str() {
             "--seed" => seed = value,
             "--faults" => misses.extend(under_faults(seed, value as usize)),
-            "--starts" => misses.extend(starts(value as usize)),
+            "--starts" => misses.extend(starts(value as usize, false)),
+            "--secured-starts" => misses.extend(starts(value as usize, true)),
             "--soak" => misses.extend(for_long(Duration::from_secs(value))),
-            _ => bail!("{name} is none of --seed, --faults, --starts, --soak"),
+            _ => bail!("{name} is none of --seed, --faults, --starts, --secured-starts, --soak"),
         }
     }
     if !misses.is_empty() {
@@ -84,11 +86,11 @@ fn under_faults(seed: u64, count: usize) -> Vec<String> {
     ])
 }
 
-fn starts(count: usize) -> Vec<String> {
+fn starts(count: usize, is_secured: bool) -> Vec<String> {
     let all: Vec<_> = (0..count)
         .map(|number| {
             let folder = tempfile::tempdir().expect("a temporary folder");
-            let start = cold_start(folder.path());
+            let start = cold_start(folder.path(), is_secured);
             eprintln!("{number}: {start:?}");
             start
         })
@@ -97,7 +99,7 @@ fn starts(count: usize) -> Vec<String> {
     first.sort_unstable();
     let slowest = first.last().copied().unwrap_or(0);
     let stop = all.iter().map(|start| start.stop).max().unwrap_or_default();
-    println!("## {count} cold starts\n");
+    println!("## {count} cold starts{}\n", if is_secured { ", with keys" } else { "" });
     println!("first fused result: median {} ms, longest {slowest} ms", first[first.len() / 2]);
     missed(&[
         (slowest < 3000, format!("first fused frame under 3 s after the start (longest {slowest} ms)")),

@@ -26,9 +26,9 @@ fn a_fleet_gets_over_a_dozen_faults() {
 #[test]
 fn a_fleet_starts_and_ends_again_and_again() {
     let _alone = alone();
-    for _ in 0..2 {
+    for is_secured in [false, true] {
         let folder = tempfile::tempdir().unwrap();
-        let start = cold_start(folder.path());
+        let start = cold_start(folder.path(), is_secured);
         assert!(start.lost_before == 0 && start.left == 0 && start.stop < Duration::from_secs(10), "{start:?}");
     }
 }

@@ -114,6 +114,29 @@ fn a_killed_agent_is_started_again_and_fused_again() {
 }
 
 #[test]
+fn a_killed_replay_goes_on_where_it_was() {
+    let _alone = alone();
+    let folder = tempfile::tempdir().unwrap();
+    let scenario = write_scenario(folder.path(), 40, "loop: false", "");
+    let mut up = Up::start(folder.path(), &scenario);
+    up.wait_for_results("five results", |results| results.len() >= 5);
+    let heard = results(&up.folder).len();
+    signal(up.pids()["replay"], "KILL");
+    let fallen = up.wait_for_line("replay was ended by signal 9");
+    assert!(fallen.contains("starting it again"), "{fallen}");
+    let code = up.wait().code();
+    // The tick that was on its way when it fell may be lost; then that is said.
+    let judged = json(&up.folder.join("metrics.json"))["frames"].as_u64().unwrap();
+    assert!(judged == 40 && matches!(code, Some(0 | 3)) || judged == 39 && code == Some(3), "{judged}, {code:?}");
+    let results = results(&up.folder);
+    let capture = |result: &Value| result["capture_nanos"].as_u64().unwrap();
+    assert!(results.len() > heard && results.windows(2).all(|pair| capture(&pair[0]) < capture(&pair[1])));
+    assert_eq!(results.last().unwrap()["frame_index"], 39, "to the end of the scene, which is the run's");
+    let ledger = json(&up.folder.join("ledger.json"));
+    assert_eq!(ledger["balances"], true, "{}", ledger["balance"]);
+}
+
+#[test]
 fn the_death_of_the_launcher_ends_the_fleet() {
     let _alone = alone();
     let folder = tempfile::tempdir().unwrap();

@@ -215,6 +215,42 @@ fn pause_step_seek_and_resume_steer_the_clock() {
 }
 
 #[test]
+fn a_second_life_goes_on_where_the_first_was_and_does_not_wait_for_those_who_are_away() {
+    let folder = tempfile::tempdir().unwrap();
+    scene::write(folder.path(), &AGENTS, 12);
+    let (router, scenario) = (TestRouter::open(), scenario(folder.path()));
+    let bookmark = folder.path().join("replay.json");
+    let options = StreamOptions { rate: 4.0, bookmark: Some(bookmark.clone()), ..StreamOptions::default() };
+    let (listener, stop) = (Listener::new(&router), Stop::new());
+    let next_truth = || loop {
+        if let (Topic::Truth, Event::Message(arrival)) = next_event(&listener.inbox) {
+            return arrival.header.stamp.capture_nanos;
+        }
+    };
+    let mut seen: Vec<u64> = std::thread::scope(|scope| {
+        let playing = scope.spawn(|| play_until(&router, &scenario, options.clone(), &stop));
+        let mut seen = vec![next_truth(), next_truth(), next_truth()];
+        stop.request();
+        let ticks = playing.join().unwrap().ticks as usize;
+        assert!((3..12).contains(&ticks), "{ticks}");
+        seen.resize_with(ticks, next_truth);
+        seen
+    });
+    // One more that never comes: a first life would wait for it for a minute.
+    let missing = "99/lidar>agent-99".parse().unwrap();
+    let report = play(&router, &scenario, StreamOptions { expect: vec![missing], ..options.clone() });
+    seen.resize_with(12, next_truth);
+    let recorded: Vec<u64> = scenario.ticks.iter().map(|tick| tick.capture_nanos).collect();
+    assert_eq!((seen, report.ticks), (recorded, 12));
+    assert_eq!(play(&router, &scenario, options.clone()).ticks, 12, "there is nothing left to play");
+
+    std::fs::write(&bookmark, "{}").unwrap();
+    let bus = router.join("replay", "replay");
+    let error = Replay::prepare(&bus, &scenario, options, &Stop::new()).err().unwrap().to_string();
+    assert!(error.contains("replay.json: not the place of a replay: missing field"), "{error}");
+}
+
+#[test]
 fn an_agent_that_does_not_come_is_named() {
     let folder = tempfile::tempdir().unwrap();
     scene::write(folder.path(), &AGENTS, 1);

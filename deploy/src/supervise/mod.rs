@@ -36,9 +36,10 @@ pub struct ProcessSpec {
 pub enum Life {
     /// It works until the run is over; when it ends before, it is started again.
     Service,
-    /// It has one job, which cannot be taken up in the middle; when it fails, it stays down.
+    /// It has one job. When something ends it before that is done it is started again and takes it up where it was; when it
+    /// says itself that it cannot do it, it stays down.
     Task,
-    /// Like a task, but the run goes on without it.
+    /// It has one job, which cannot be taken up in the middle; when it fails, it stays down, and the run goes on without it.
     Optional,
 }
 

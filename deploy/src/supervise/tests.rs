@@ -120,3 +120,24 @@ fn a_service_that_ends_well_but_too_early_is_started_again() {
     assert!(matches!(next(&events), Happening::Started { .. }));
     assert!(matches!(next(&events), Happening::Fell { how, .. } if how.contains("nobody here had asked")));
 }
+
+#[test]
+fn a_task_that_is_struck_down_takes_up_its_job_and_one_that_cannot_do_it_stays_down() {
+    let (supervisor, events, _folder) = start(shell("replay", Life::Task, "exec sleep 600"), 3);
+    let Happening::Started { pid } = next(&events) else { panic!("not started") };
+    kill_process(Pid::from_raw(pid as i32).unwrap(), Signal::KILL).unwrap();
+    assert!(matches!(next(&events), Happening::Fell { restart: 1, .. }));
+    assert!(matches!(next(&events), Happening::Started { .. }));
+    assert!(supervisor.stop(PATIENCE).killed.is_empty());
+
+    let (_supervisor, events, _folder) = start(shell("replay", Life::Task, "echo no scene; exit 1"), 3);
+    assert!(matches!(next(&events), Happening::Started { .. }));
+    assert_eq!(next(&events), Happening::GaveUp { how: "ended with code 1: no scene".into(), is_optional: false });
+}
+
+#[test]
+fn who_cannot_take_up_its_job_stays_down() {
+    let (_supervisor, events, _folder) = start(shell("recorder", Life::Optional, "kill -KILL $$"), 3);
+    assert!(matches!(next(&events), Happening::Started { .. }));
+    assert!(matches!(next(&events), Happening::GaveUp { is_optional: true, .. }));
+}

@@ -17,6 +17,8 @@ use super::{Happening, Life, ProcessEvent, ProcessSpec, SuperviseError};
 const BAD_INPUT: i32 = 2;
 /// Exit code of our programs when all was done but data were lost.
 const DATA_LOST: i32 = 3;
+/// Exit code of a Rust program that panics.
+const PANIC: i32 = 101;
 /// A process that has lived this long has recovered; its next fall is a first one again.
 const RECOVERED: Duration = Duration::from_secs(10);
 /// First pause before a restart; it doubles up to [`LONGEST_PAUSE`].
@@ -67,6 +69,7 @@ impl Watcher {
     pub(super) async fn run(mut self) -> bool {
         loop {
             let born = Instant::now();
+            let mut can_go_on = self.spec.life != Life::Optional;
             let how = match self.spawn() {
                 Err(error) => format!("cannot be started: {error}"),
                 Ok(mut child) => {
@@ -89,7 +92,10 @@ impl Watcher {
                             }
                             Ok(status) if is_done(status) => "ended, though nobody here had asked it to".into(),
                             Ok(status) if status.code() == Some(BAD_INPUT) => return self.give_up(&in_words(status)),
-                            Ok(status) => in_words(status),
+                            Ok(status) => {
+                                can_go_on &= self.spec.life == Life::Service || is_struck(status);
+                                in_words(status)
+                            }
                             Err(error) => error.to_string(),
                         },
                         deadline = asked_to_stop(stop) => return end(child, deadline).await,
@@ -100,7 +106,7 @@ impl Watcher {
                 self.falls = 0;
             }
             self.falls += 1;
-            if self.spec.life != Life::Service || self.falls > self.restarts {
+            if !can_go_on || self.falls > self.restarts {
                 return self.give_up(&how);
             }
             let pause = LONGEST_PAUSE.min(FIRST_PAUSE * (1 << (self.falls - 1).min(5)));
@@ -165,6 +171,11 @@ async fn end(mut child: Child, deadline: Instant) -> bool {
 
 fn is_done(status: ExitStatus) -> bool {
     status.success() || status.code() == Some(DATA_LOST)
+}
+
+/// Whether it has not ended by itself: by a signal, or in a panic.
+fn is_struck(status: ExitStatus) -> bool {
+    matches!(status.code(), None | Some(PANIC))
 }
 
 fn in_words(status: ExitStatus) -> String {

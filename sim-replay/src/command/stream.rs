@@ -77,6 +77,9 @@ pub(crate) struct Args {
     /// Same seed, same delays and losses.
     #[arg(long, default_value_t = 0)]
     seed: u64,
+    /// Note here after each tick how far the replay is, and go on from there where the file is there already.
+    #[arg(long, value_name = "FILE")]
+    bookmark: Option<PathBuf>,
     /// Print a JSON summary.
     #[arg(long)]
     json: bool,
@@ -97,6 +100,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
             error @ (StreamError::NoAgent { .. }
             | StreamError::NoTick { .. }
             | StreamError::Rate(_)
+            | StreamError::Bookmark(_)
             | StreamError::Link(_)
             | StreamError::LinkInLockstep),
         ) => {
@@ -134,6 +138,7 @@ impl Args {
             lockstep: self.lockstep.clone(),
             answer_patience: seconds(self.answer_timeout),
             link: self.link().map(|link| (link, self.seed)),
+            bookmark: self.bookmark.clone(),
         }
     }
 

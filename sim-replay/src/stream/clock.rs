@@ -37,6 +37,11 @@ impl ReplayClock {
         self.state = State::Halted { steps: 0 };
     }
 
+    /// Whether it is halted, with nothing more to let through.
+    pub(super) fn is_halted(&self) -> bool {
+        self.state == State::Halted { steps: 0 }
+    }
+
     /// Halts, but lets `ticks` more through, each at once.
     pub fn step(&mut self, ticks: u64) {
         let steps = match self.state {

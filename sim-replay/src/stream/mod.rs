@@ -4,8 +4,10 @@
 //! - [`ReplayClock`]: when that is on the wall; pause, step, rate.
 //! - [`ReadAhead`]: the next ticks are read while the current one is waited for.
 //! - [`AirReport`]: what became of frames that cross an emulated link on their way.
+//! - [`Place`]: how far it is, for one that falls and is started again.
 //! - [`Replay`]: the loop over them, steered over `control/*`.
 
+mod bookmark;
 mod clock;
 mod outlet;
 mod read_ahead;
@@ -14,9 +16,10 @@ mod report;
 mod schedule;
 mod sensor_air;
 
+pub use bookmark::{BookmarkError, Place};
 pub use clock::ReplayClock;
 pub use read_ahead::{ReadAhead, TickFrames};
 pub use replay::{Replay, StreamError, StreamOptions};
 pub use report::{Lateness, StreamReport, Unreadable};
-pub use schedule::{Planned, Schedule};
+pub use schedule::{Planned, Position, Schedule};
 pub use sensor_air::AirReport;

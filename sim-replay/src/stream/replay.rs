@@ -1,12 +1,14 @@
 //! The loop that plays a scene.
 
 use std::collections::BTreeSet;
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use protocol::{CavId, Control, Limits, Role, Stream, Topic, Truth, Verb};
 
 use super::ReplayClock;
+use super::bookmark::{Bookmark, BookmarkError, Place};
 use super::outlet::{Outlet, truth_of};
 use super::read_ahead::{ReadAhead, TickFrames};
 use super::report::StreamReport;
@@ -22,6 +24,9 @@ use crate::link::{LinkConfig, LinkError};
 const READ_AHEAD: usize = 4;
 /// Commands that may wait.
 const COMMANDS: usize = 64;
+/// How long one that goes on where an earlier life was waits for the routes: the others have their own troubles, and the
+/// world does not wait for them.
+const RESUME_PATIENCE: Duration = Duration::from_secs(2);
 
 /// How to play a scene.
 #[derive(Debug, Clone)]
@@ -50,6 +55,9 @@ pub struct StreamOptions {
     pub answer_patience: Duration,
     /// A link that sensor frames cross on their way to the agents, and its seed; none: they arrive at once.
     pub link: Option<(LinkConfig, u64)>,
+    /// Where to note after each tick how far the replay is, and to go on from where the file is there; the scene begins
+    /// elsewhere then than `seek` says.
+    pub bookmark: Option<PathBuf>,
 }
 
 impl Default for StreamOptions {
@@ -67,6 +75,7 @@ impl Default for StreamOptions {
             lockstep: Vec::new(),
             answer_patience: Duration::from_secs(60),
             link: None,
+            bookmark: None,
         }
     }
 }
@@ -103,6 +112,9 @@ pub enum StreamError {
     /// A frame that is lost is never answered.
     #[error("a link and lockstep exclude each other: a tick whose frames are late or lost is not answered")]
     LinkInLockstep,
+    /// The place to go on from makes no sense.
+    #[error("bookmark: {0}")]
+    Bookmark(#[from] BookmarkError),
     /// Not every route came up.
     #[error("the fleet is not ready: {0}")]
     NotReady(#[from] NotReady),
@@ -118,7 +130,10 @@ pub enum StreamError {
 pub struct Replay<'a> {
     bus: &'a Bus,
     options: StreamOptions,
+    scenario: String,
     tick_count: usize,
+    bookmark: Option<Bookmark>,
+    is_resumed: bool,
     reading: ReadAhead,
     schedule: Schedule,
     clock: ReplayClock,
@@ -146,7 +161,19 @@ impl<'a> Replay<'a> {
         check(scenario, &options)?;
         let cavs: Vec<CavId> = agents.iter().map(|&index| scenario.agents[index].clone()).collect();
         let options = StreamOptions { agents: cavs, ..options };
+        let bookmark = options.bookmark.clone().map(Bookmark::new);
+        let place =
+            bookmark.as_ref().map(|bookmark| bookmark.read(&scenario.name, scenario.ticks.len())).transpose()?;
+        let place = place.flatten();
         let schedule = Schedule::new(&scenario.ticks, options.seek, options.frames, options.repeats);
+        let mut clock = ReplayClock::new(options.rate);
+        let schedule = match &place {
+            Some(place) => schedule.resumed(place.position),
+            None => schedule,
+        };
+        if place.as_ref().is_some_and(|place| place.is_halted) {
+            clock.pause();
+        }
         let reading = ReadAhead::start(scenario.clone(), agents, options.load.clone()).map_err(StreamError::Thread)?;
         reading.want(&schedule.ahead(READ_AHEAD));
 
@@ -162,29 +189,42 @@ impl<'a> Replay<'a> {
         let is_paced = options.rate == 0.0 || !options.lockstep.is_empty();
         Ok(Self {
             bus,
+            scenario: scenario.name.clone(),
             tick_count: scenario.ticks.len(),
+            bookmark,
+            is_resumed: place.is_some(),
             reading,
             schedule,
-            clock: ReplayClock::new(options.rate),
+            clock,
             outlet: Outlet::open(bus, &options.agents, options.load.radar, is_paced)?,
             _subscriptions: subscriptions.collect::<Result<_, _>>()?,
             air,
             inbox,
             stop: stop.clone(),
-            report: StreamReport::default(),
+            report: place.as_ref().map(Place::report).unwrap_or_default(),
             _presence: bus.announce(Role::Replay)?,
             options,
         })
     }
 
-    /// Waits until every expected route has carried a probe.
+    /// Waits until every expected route has carried a probe. One that goes on where an earlier life was waits for a moment
+    /// only.
     ///
     /// # Errors
     /// [`StreamError::NotReady`] names the routes that have not.
     pub fn wait_until_ready(&self) -> Result<(), StreamError> {
         let barrier = Barrier::new(self.expected_routes()).attend(self.bus)?;
         let stop = self.stop.clone();
-        Ok(barrier.wait_unless(self.options.patience, || stop.requested())?)
+        let wait = |patience| barrier.wait_unless(patience, || stop.requested());
+        if !self.is_resumed {
+            return Ok(wait(self.options.patience)?);
+        }
+        let (tick, ticks) = (self.schedule.position().next_tick, self.tick_count);
+        tracing::warn!(tick, ticks, "going on where an earlier life was");
+        if let Err(not_ready) = wait(RESUME_PATIENCE.min(self.options.patience)) {
+            tracing::warn!("the world goes on, though {not_ready}");
+        }
+        Ok(())
     }
 
     /// Plays the scene to its end, or until someone asks to stop. Sends the end markers, and returns when the network
@@ -197,6 +237,7 @@ impl<'a> Replay<'a> {
             self.publish(planned, due);
             last = Instant::now();
             self.wait_for_answers(planned.capture_nanos);
+            self.note_place();
         }
         self.await_the_last();
         let Self { bus, outlet, air, mut report, .. } = self;
@@ -241,6 +282,7 @@ impl<'a> Replay<'a> {
                 Taken::Item(_, Event::Message(arrival)) => {
                     if let Ok(command) = arrival.decode(&Limits::DEFAULT) {
                         self.obey(command);
+                        self.note_place();
                     }
                 }
                 Taken::Item(_, Event::End { .. }) | Taken::TimedOut => {}
@@ -270,6 +312,20 @@ impl<'a> Replay<'a> {
             }
             self.deliver();
         }
+    }
+
+    /// After everything of a tick was handed over: what comes next is for the next life.
+    fn note_place(&mut self) {
+        let Some(bookmark) = &mut self.bookmark else { return };
+        let StreamReport { ticks, unanswered, unreadable_frames, .. } = self.report;
+        bookmark.write(&Place {
+            scenario: self.scenario.clone(),
+            position: self.schedule.position(),
+            is_halted: self.clock.is_halted(),
+            ticks,
+            unanswered,
+            unreadable_frames,
+        });
     }
 
     fn obey(&mut self, command: Control) {

@@ -2,6 +2,8 @@
 
 use std::sync::Arc;
 
+use serde::{Deserialize, Serialize};
+
 use crate::dataset::Tick;
 
 /// Between two ticks where a scene has only one, nanoseconds.
@@ -14,6 +16,20 @@ pub struct Planned {
     pub tick_index: usize,
     /// Capture time on the clock of the replay, nanoseconds: the recorded one until the replay first goes back.
     pub capture_nanos: u64,
+}
+
+/// Where a schedule is.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Position {
+    /// The tick that comes next.
+    pub next_tick: usize,
+    /// Ticks that are left to play; `None`: to the end of the scene, or for ever.
+    pub left: Option<usize>,
+    /// By how much capture times are shifted, nanoseconds.
+    pub shift_nanos: u64,
+    /// Capture time of the last tick, nanoseconds.
+    pub last_nanos: Option<u64>,
 }
 
 /// The order of ticks under seeking, looping and a limit. A clone of it looks ahead.
@@ -43,6 +59,19 @@ impl Schedule {
             shift_nanos: 0,
             last_nanos: None,
         }
+    }
+
+    /// Goes on where an earlier life has been, with its capture times.
+    #[must_use]
+    pub(super) fn resumed(self, position: Position) -> Self {
+        let Position { next_tick, left, shift_nanos, last_nanos } = position;
+        Self { next_index: next_tick, left, shift_nanos, last_nanos, ..self }
+    }
+
+    /// Where it is.
+    pub(super) fn position(&self) -> Position {
+        let Self { next_index: next_tick, left, shift_nanos, last_nanos, .. } = *self;
+        Position { next_tick, left, shift_nanos, last_nanos }
     }
 
     /// Goes on from tick `index` instead.
@@ -76,11 +105,11 @@ impl Iterator for Schedule {
         let tick_index = self.next_index;
         let recorded = *self.captures.get(tick_index)?;
         if let Some(last) = self.last_nanos
-            && recorded + self.shift_nanos <= last
+            && recorded.saturating_add(self.shift_nanos) <= last
         {
-            self.shift_nanos = last + self.period_nanos() - recorded;
+            self.shift_nanos = last.saturating_add(self.period_nanos()).saturating_sub(recorded);
         }
-        let capture_nanos = recorded + self.shift_nanos;
+        let capture_nanos = recorded.saturating_add(self.shift_nanos);
         self.next_index += 1;
         self.left = self.left.map(|left| left - 1);
         self.last_nanos = Some(capture_nanos);
@@ -96,8 +125,8 @@ mod tests {
         captures.iter().map(|&capture_nanos| Tick { stem: capture_nanos.to_string(), capture_nanos }).collect()
     }
 
-    fn plan(schedule: Schedule, count: usize) -> Vec<(usize, u64)> {
-        schedule.take(count).map(|planned| (planned.tick_index, planned.capture_nanos)).collect()
+    fn plan(schedule: impl IntoIterator<Item = Planned>, count: usize) -> Vec<(usize, u64)> {
+        schedule.into_iter().take(count).map(|planned| (planned.tick_index, planned.capture_nanos)).collect()
     }
 
     #[test]
@@ -113,6 +142,17 @@ mod tests {
         let schedule = Schedule::new(&ticks(&[100, 200, 350]), 1, Some(6), true);
         assert_eq!(plan(schedule, 9), [(1, 200), (2, 350), (0, 500), (1, 600), (2, 750), (0, 900)]);
         assert_eq!(plan(Schedule::new(&ticks(&[7]), 0, None, true), 2), [(0, 7), (0, 100_000_007)]);
+    }
+
+    #[test]
+    fn a_second_life_goes_on_where_the_first_was() {
+        let ticks = ticks(&[100, 200, 350]);
+        let whole = Schedule::new(&ticks, 1, Some(9), true);
+        let mut first = whole.clone();
+        let mut seen = plan(first.by_ref().take(4).collect::<Vec<_>>(), 9);
+        let second = Schedule::new(&ticks, 0, None, true).resumed(first.position());
+        seen.extend(plan(second, 9));
+        assert_eq!(seen, plan(whole, 9));
     }
 
     #[test]

@@ -1,4 +1,4 @@
-//! The processes of the flood: each a call of this program with `part NAME ENDPOINT KEYS SECONDS`.
+//! The processes of the flood: each a call of this program with `part NAME ENDPOINT KEYS SHM_MIB SECONDS`.
 
 use std::fs;
 use std::io::{BufRead, BufReader, Write};
@@ -30,12 +30,16 @@ const PERIOD: Duration = Duration::from_millis(100);
 const FLOOD_PERIOD: Duration = Duration::from_millis(1);
 /// Before anything is measured.
 const WARM_UP: Duration = Duration::from_secs(3);
+/// For a process to end.
+const PATIENCE: Duration = Duration::from_secs(5);
 
 /// What is measured.
 pub(crate) struct Setting {
     /// Keys, where QUIC is spoken.
     pub(crate) keys: Option<PathBuf>,
     pub(crate) flood: bool,
+    /// Shared memory of each process; 0: none.
+    pub(crate) shm_mib: usize,
     pub(crate) duration: Duration,
 }
 
@@ -68,7 +72,8 @@ pub(crate) fn measure(setting: &Setting) -> Result<Measured> {
     let part = |name: &str, seconds: f64| -> Result<Part> {
         let keys = setting.keys.as_deref().unwrap_or(Path::new(""));
         let mut command = Command::new(std::env::current_exe()?);
-        command.args(["part", name, endpoint.as_str()]).arg(keys).arg(seconds.to_string());
+        command.args(["part", name, endpoint.as_str()]).arg(keys);
+        command.args([setting.shm_mib.to_string(), seconds.to_string()]);
         let mut child = command.stdin(Stdio::piped()).stdout(Stdio::piped()).spawn()?;
         let mut lines = BufReader::new(child.stdout.take().context("a pipe")?);
         let mut ready = String::new();
@@ -98,10 +103,12 @@ pub(crate) fn measure(setting: &Setting) -> Result<Measured> {
     [measured.ego_mib, measured.router_mib] = peaks;
     measured.cpu_ms = cpu_ms;
     drop((honest, router));
+    // Processes that end together leave what the others still held.
+    zenoh::shm::cleanup_orphaned_shm_segments();
     Ok(measured)
 }
 
-/// A process; killed with this.
+/// A process; ended with this, and killed if that takes long. One that is killed leaves its shared memory behind.
 struct Part {
     child: Child,
     lines: BufReader<std::process::ChildStdout>,
@@ -117,7 +124,15 @@ impl Part {
 
 impl Drop for Part {
     fn drop(&mut self) {
-        let _ = self.child.kill();
+        drop(self.child.stdin.take());
+        let until = Instant::now() + PATIENCE;
+        while Instant::now() < until && matches!(self.child.try_wait(), Ok(None)) {
+            thread::sleep(Duration::from_millis(20));
+        }
+        if matches!(self.child.try_wait(), Ok(None)) {
+            eprintln!("process {} does not end, it is killed", self.child.id());
+            let _ = self.child.kill();
+        }
         let _ = self.child.wait();
     }
 }
@@ -126,16 +141,24 @@ fn cpu_ms(pids: &[u32]) -> Result<f64> {
     pids.iter().try_fold(0.0, |sum, pid| Ok(sum + machine::cpu_ms(*pid)?))
 }
 
+/// Without what is shared: that is the size of the pools, which everyone maps.
 fn resident_mib(pid: u32) -> f64 {
     let status = fs::read_to_string(format!("/proc/{pid}/status")).unwrap_or_default();
-    let line = status.lines().find_map(|line| line.strip_prefix("VmRSS:"));
-    line.and_then(|line| line.split_whitespace().next()?.parse::<f64>().ok()).unwrap_or(0.0) / 1024.0
+    let kib = |name: &str| {
+        let line = status.lines().find_map(|line| line.strip_prefix(name));
+        line.and_then(|line| line.split_whitespace().next()?.parse::<f64>().ok()).unwrap_or(0.0)
+    };
+    (kib("RssAnon:") + kib("RssFile:")) / 1024.0
 }
 
 /// What one process does.
 pub(crate) fn run_part(arguments: &[String]) -> Result<()> {
-    let [name, endpoint, keys, seconds] = arguments else { bail!("part NAME ENDPOINT KEYS SECONDS") };
-    let place = Place { endpoint: Endpoint::new(endpoint)?, keys: (!keys.is_empty()).then(|| PathBuf::from(keys)) };
+    let [name, endpoint, keys, shm_mib, seconds] = arguments else { bail!("part NAME ENDPOINT KEYS SHM_MIB SECONDS") };
+    let place = Place {
+        endpoint: Endpoint::new(endpoint)?,
+        keys: (!keys.is_empty()).then(|| PathBuf::from(keys)),
+        shm: Some(shm_mib.parse::<usize>()? << 20).filter(|bytes| *bytes > 0),
+    };
     let duration = Duration::from_secs_f64(seconds.parse()?);
     match name.as_str() {
         "router" => place.route(),
@@ -148,13 +171,18 @@ pub(crate) fn run_part(arguments: &[String]) -> Result<()> {
 struct Place {
     endpoint: Endpoint,
     keys: Option<PathBuf>,
+    shm: Option<usize>,
 }
 
 impl Place {
+    fn with_memory(&self, options: BusOptions) -> BusOptions {
+        BusOptions { shared_memory_pool: self.shm, ..options }
+    }
+
     fn join(&self, party: &str) -> Result<Bus> {
         let known: Party = party.parse()?;
         let identity = Identity { run: RunId::new("flood")?, process: known.name(), cav: known.cav };
-        let options = BusOptions::client(self.endpoint.clone());
+        let options = self.with_memory(BusOptions::client(self.endpoint.clone()));
         let options = match &self.keys {
             Some(keys) => options.with_credentials(Credentials::read(&keys.join(party))?),
             None => options,
@@ -163,23 +191,23 @@ impl Place {
     }
 
     fn route(&self) -> Result<()> {
-        let mut options = BusOptions::router(self.endpoint.clone());
+        let mut options = self.with_memory(BusOptions::router(self.endpoint.clone()));
         if let Some(keys) = &self.keys {
             let credentials = Credentials::read(&keys.join("router"))?;
             let guard = Guard { members: credentials.members()?, runs: Runs::Any };
             options = options.with_credentials(credentials).guarded_by(guard);
         }
-        let _session = open(&options)?;
+        let session = open(&options)?;
         say("ready")?;
         let _ = std::io::stdin().lines().next();
-        Ok(())
+        session.close().wait().map_err(anyhow::Error::from_boxed)
     }
 
     fn listen(&self, duration: Duration) -> Result<()> {
         let ego = self.join("ego-9")?;
         let inbox = ego.limited_inbox(4, 16, InboxLimits::PEERS);
         let subscriptions = HONEST.iter().chain([&FLOODING]).map(|cav| ego.subscribe(bev(cav), &inbox));
-        let _subscriptions = subscriptions.collect::<Result<Vec<_>, _>>()?;
+        let subscriptions = subscriptions.collect::<Result<Vec<_>, _>>()?;
         say("ready")?;
         let (began, mut measured) = (Instant::now(), Measured::default());
         let until = began + duration;
@@ -199,7 +227,9 @@ impl Place {
         let here = Account::towards(bev(FLOODING), &ego.identity().process);
         measured.refused =
             ledger.get(&here).and_then(|counts| counts.dropped.get(&DropReason::RateLimit)).copied().unwrap_or(0);
-        say(&serde_json::to_string(&measured)?)
+        say(&serde_json::to_string(&measured)?)?;
+        drop(subscriptions);
+        Ok(ego.leave(PATIENCE)?)
     }
 
     fn send_maps(&self, duration: Duration) -> Result<()> {
@@ -221,7 +251,8 @@ impl Place {
                 wire::encode(stamp, Bev { pose, features: encode_features(map, &CodecConfig::default(), None)? })
             });
         }
-        Ok(())
+        drop(publishers);
+        buses.into_iter().try_for_each(|bus| Ok(bus.leave(PATIENCE)?))
     }
 
     /// Sound messages of its own vehicle, as many as the network takes.
@@ -251,7 +282,8 @@ impl Place {
             let due = FLOOD_PERIOD * u32::try_from(sent)?;
             thread::sleep(due.saturating_sub(began.elapsed()));
         }
-        say(&sent.to_string())
+        say(&sent.to_string())?;
+        Ok(bus.leave(PATIENCE)?)
     }
 }
 

@@ -45,13 +45,14 @@ pub struct ColdStart {
     pub left: usize,
 }
 
-/// Starts a fleet of [`VEHICLES`] with nothing running, waits until all are fused for a moment, and ends it.
+/// Starts a fleet of [`VEHICLES`] with nothing running, waits until all are fused for a moment, and ends it. One that is
+/// secured makes its keys first, and speaks QUIC.
 ///
 /// # Panics
 /// When it does not come that far.
 #[must_use]
-pub fn cold_start(folder: &Path) -> ColdStart {
-    let scenario = write_scenario(folder, "");
+pub fn cold_start(folder: &Path, is_secured: bool) -> ColdStart {
+    let scenario = write_scenario(folder, if is_secured { "security: {}" } else { "" });
     // Built before the clock runs: looking for what there is to build takes seconds.
     crate::fleet::programs();
     let began_ms = unix_ms();

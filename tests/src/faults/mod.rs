@@ -100,9 +100,9 @@ pub fn plan(seed: u64, count: usize) -> Vec<Fault> {
         let Some(name) = targets.get(place).cloned() else {
             return Fault { kind: Kind::Stop, target: Target::Router, lasts: lasts.min(Duration::from_secs(2)), after };
         };
-        // The replay is the world: it may stand still or be out of reach, but it cannot be taken up in the middle.
+        // The replay is the world: whoever ends it, instead of striking it down, ends the run.
         let kinds: &[Kind] = if name == "replay" {
-            &[Kind::Stop, Kind::Cut, Kind::Silence]
+            &[Kind::Kill, Kind::Stop, Kind::Cut, Kind::Silence]
         } else {
             &[Kind::Kill, Kind::Kill, Kind::End, Kind::Stop, Kind::Cut, Kind::Silence]
         };
@@ -125,8 +125,8 @@ mod tests {
         assert_eq!(faults[..20], plan(1, 20));
         assert_ne!(faults, plan(2, 500));
         let hit: BTreeSet<_> = faults.iter().map(|fault| (&fault.target, fault.kind)).collect();
-        // Six processes in five ways, the replay in three, the router.
-        assert_eq!(hit.len(), 6 * 5 + 3 + 1);
+        // Six processes in five ways, the replay in four, the router.
+        assert_eq!(hit.len(), 6 * 5 + 4 + 1);
         assert!(faults.iter().all(|fault| fault.lasts <= Duration::from_secs(10)));
     }
 }
