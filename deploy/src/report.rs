@@ -37,6 +37,9 @@ pub fn run_notes(result: &RunResult) -> String {
     for process in &result.killed {
         let _ = writeln!(text, "killed    {process} did not end in time");
     }
+    for what in &result.unwritten {
+        let _ = writeln!(text, "unwritten {what}");
+    }
     if let Some(picture) = &result.picture {
         let _ = writeln!(text, "picture   {}", picture.display());
     }

@@ -83,7 +83,11 @@ impl RunFolder {
     /// [`RunFolderError::Write`].
     pub fn write(&self, name: &str, text: &str) -> Result<(), RunFolderError> {
         let path = self.file(name);
-        fs::write(&path, text).map_err(|source| RunFolderError::Write { path, source })
+        fs::write(&path, text).map_err(|source| {
+            // Half a file is worse than none.
+            let _ = fs::remove_file(&path);
+            RunFolderError::Write { path, source }
+        })
     }
 
     /// Writes `value` as indented JSON.

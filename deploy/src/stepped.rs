@@ -190,7 +190,8 @@ fn write(
     let resolved = Scenario { provenance, ..fleet.scenario.clone() };
     folder.write("scenario.yaml", &resolved.to_yaml())?;
     let picture = crate::showcase::draw(fleet, board, &folder.file("frame.png"));
-    Ok(RunResult { folder, metrics, balance, missed: 0, interrupted: false, killed: Vec::new(), picture })
+    let (killed, unwritten) = (Vec::new(), Vec::new());
+    Ok(RunResult { folder, metrics, balance, missed: 0, interrupted: false, killed, unwritten, picture })
 }
 
 impl From<EvaluateError> for UpError {

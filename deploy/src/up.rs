@@ -64,6 +64,8 @@ pub struct RunResult {
     pub interrupted: bool,
     /// Processes that did not end in time and were killed.
     pub killed: Vec<String>,
+    /// What could not be written of the run, in words: the disk is full, perhaps.
+    pub unwritten: Vec<String>,
     /// The picture of one fused frame, where there was one to draw.
     pub picture: Option<PathBuf>,
 }
@@ -73,7 +75,7 @@ impl RunResult {
     #[must_use]
     pub fn lost_data(&self) -> bool {
         let dropped = self.metrics.messages.dropped.iter().any(|(reason, count)| reason.is_loss() && *count > 0);
-        dropped || self.missed > 0 || !self.balance.is_exact()
+        dropped || self.missed > 0 || !self.balance.is_exact() || !self.unwritten.is_empty()
     }
 }
 
@@ -164,7 +166,7 @@ pub fn up(scenario: &Scenario, options: &UpOptions) -> Result<RunResult, UpError
     }
     let watched = watched?;
 
-    let result = write(&fleet, &run, folder, (scored, &refused), &watched, fingerprint)?;
+    let result = write(&fleet, &run, folder, (scored, &refused), &watched, fingerprint);
     match watched.ending {
         Ending::Over | Ending::Asked => Ok(result),
         Ending::Failed { process, how } => {
@@ -291,7 +293,7 @@ fn fingerprint(fleet: &Fleet, programs: &Path) -> JoinHandle<std::io::Result<Pro
     })
 }
 
-/// Writes the run folder.
+/// Writes the run folder; what cannot be written is told with the result, which is not lost with it.
 fn write(
     fleet: &Fleet,
     run: &RunId,
@@ -299,8 +301,17 @@ fn write(
     (scored, refused): (Scored, &BTreeMap<Refusal, u64>),
     watched: &Watched,
     fingerprint: JoinHandle<std::io::Result<Provenance>>,
-) -> Result<RunResult, UpError> {
-    let Scored { board, books, progress } = scored;
+) -> RunResult {
+    let Scored { board, books, progress, unwritten: lines } = scored;
+    let mut unwritten = Vec::new();
+    if lines > 0 {
+        unwritten.push(format!("{lines} results are missing in {}", folder.file("detections.jsonl").display()));
+    }
+    let mut note = |written: Result<(), RunFolderError>| {
+        if let Err(error) = written {
+            unwritten.push(error.to_string());
+        }
+    };
     let mut sum = Ledger::default();
     for process in &books {
         sum.merge(&process.ledger);
@@ -308,10 +319,10 @@ fn write(
     let excused = sum.excuse(|account| absences::concerns(&watched.away, account));
     let balance = sum.balance();
     let metrics = metrics(fleet, &board, &progress, &sum);
-    folder.write_json("metrics.json", &metrics)?;
-    folder.write_frames(board.records(), &swept(&folder.file(SWEEP_LOG)))?;
+    note(folder.write_json("metrics.json", &metrics));
+    note(folder.write_frames(board.records(), &swept(&folder.file(SWEEP_LOG))));
     let report = LedgerReport::new(&books, &sum, &balance, (&watched.away, excused)).with_refused(refused);
-    folder.write_json("ledger.json", &report)?;
+    note(folder.write_json("ledger.json", &report));
     let provenance = match fingerprint.join() {
         Ok(Ok(provenance)) => Some(provenance),
         Ok(Err(error)) => {
@@ -321,12 +332,12 @@ fn write(
         Err(_) => None,
     };
     let resolved = Scenario { run: Some(run.clone()), provenance, ..fleet.scenario.clone() };
-    folder.write("scenario.yaml", &resolved.to_yaml())?;
+    note(folder.write("scenario.yaml", &resolved.to_yaml()));
     let picture = crate::showcase::draw(fleet, &board, &folder.file("frame.png"));
     let interrupted = matches!(watched.ending, Ending::Asked);
     let killed = watched.killed.clone();
     let missed = missed(fleet, &board, &watched.ending);
-    Ok(RunResult { folder, metrics, balance, missed, interrupted, killed, picture })
+    RunResult { folder, metrics, balance, missed, interrupted, killed, unwritten, picture }
 }
 
 /// Ticks without a result. Those that nobody told of at all, as the replay fell with them on its way, are known by their

@@ -1,9 +1,11 @@
 //! A fleet under faults: whatever happens to its processes, its cables and its router, it goes on and accounts for it.
 
+use std::path::{Path, PathBuf};
+use std::process::{Command, Stdio};
 use std::time::Duration;
 
 use tests::faults::{FaultyFleet, cold_start, plan, soak};
-use tests::fleet::alone;
+use tests::fleet::{alone, programs, write_scenario};
 
 #[test]
 fn a_fleet_gets_over_a_dozen_faults() {
@@ -42,4 +44,42 @@ fn a_fleet_that_lasts_opens_nothing_more_and_more() {
     for (name, [before, after, threads_before, threads_after]) in &soak.handles {
         assert!(*after <= before + 8 && *threads_after <= threads_before + 4, "{name}: {soak:?}");
     }
+}
+
+/// A file system of its own with room for so many KiB, while this lives.
+struct SmallDisk(PathBuf);
+
+impl SmallDisk {
+    fn mount(at: &Path, kib: u32) -> Option<Self> {
+        std::fs::create_dir(at).unwrap();
+        let mut mount = Command::new("mount");
+        mount.args(["-t", "tmpfs", "-o", &format!("size={kib}k"), "tmpfs"]).arg(at).stderr(Stdio::null());
+        mount.status().is_ok_and(|status| status.success()).then(|| Self(at.to_path_buf()))
+    }
+}
+
+impl Drop for SmallDisk {
+    fn drop(&mut self) {
+        let _ = Command::new("umount").arg("--lazy").arg(&self.0).status();
+    }
+}
+
+#[test]
+fn a_full_disk_ends_no_run_and_takes_no_result_with_it() {
+    let _alone = alone();
+    let folder = tempfile::tempdir().unwrap();
+    let Some(disk) = SmallDisk::mount(&folder.path().join("runs"), 24) else {
+        return eprintln!("skipped: file systems cannot be mounted here");
+    };
+    let scenario = write_scenario(folder.path(), 60, "rate: 2", "");
+    let run = Command::new(programs().join("v2vloc")).arg("up").arg(&scenario).arg("--runs").arg(&disk.0).output();
+    let output = run.unwrap();
+    let [told, said] = [&output.stdout, &output.stderr].map(|bytes| String::from_utf8_lossy(bytes));
+    assert_eq!(output.status.code(), Some(3), "{told}{said}");
+    assert!(told.contains("every message is accounted for"), "{told}{said}");
+    assert!(told.contains("unwritten cannot write") && told.contains("metrics.json: No space left"), "{told}{said}");
+    let frames = told.lines().nth(1).and_then(|row| row.split_whitespace().nth(2)?.parse::<u32>().ok());
+    assert!(frames.is_some_and(|frames| frames > 40), "{told}{said}");
+    assert_eq!(said.matches("detections.jsonl waits").count(), 1, "said once: {said}");
+    assert!(!disk.0.join("test/metrics.json").exists(), "half a file is worse than none");
 }

@@ -5,6 +5,7 @@ mod frame_record;
 mod neighbours;
 mod node;
 mod open_ticks;
+mod result_lines;
 mod stage_stamps;
 mod true_boxes;
 

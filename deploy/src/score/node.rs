@@ -1,8 +1,6 @@
 //! The scorer's place on the bus: takes truth, detections, poses and everyone's books, and keeps the board.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::fs::File;
-use std::io::{BufWriter, Write};
 use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
@@ -17,6 +15,7 @@ use sim_replay::bus::{Arrival, Bus, BusError, Event, Identity, Inbox, Presence, 
 use zenoh::Session;
 
 use super::Board;
+use super::result_lines::ResultLines;
 use crate::absences::Absences;
 
 /// Name of the scorer in keys, ledgers and routes.
@@ -86,6 +85,8 @@ pub struct Scored {
     pub books: Vec<ProcessBooks>,
     /// How it went.
     pub progress: Progress,
+    /// Results that are not in the file, as there was no room for them.
+    pub unwritten: u64,
 }
 
 /// Why the scorer cannot work.
@@ -109,7 +110,7 @@ pub struct ScorerNode {
     bus: Bus,
     inbox: Arc<Inbox>,
     progress: Arc<Mutex<Progress>>,
-    thread: JoinHandle<(Board, Books)>,
+    thread: JoinHandle<(Board, Books, u64)>,
     absences: Absences,
     _subscriptions: Vec<Subscription>,
     _presence: Presence,
@@ -145,7 +146,7 @@ impl ScorerNode {
         let presence = bus.announce(Role::Scorer)?;
         let absences = Absences::watch(&bus)?;
         let io = |what: String| move |source| ScorerError::Io { what, source };
-        let file = File::create(&detections_file).map_err(io(detections_file.display().to_string()))?;
+        let detections = ResultLines::create(&detections_file).map_err(io(detections_file.display().to_string()))?;
         let progress = Arc::<Mutex<Progress>>::default();
         let worker = Worker {
             inbox: Arc::clone(&inbox),
@@ -153,7 +154,7 @@ impl ScorerNode {
             board,
             books: BTreeMap::new(),
             progress: Arc::clone(&progress),
-            detections: BufWriter::new(file),
+            detections,
             published: BTreeMap::new(),
         };
         let thread = thread::Builder::new().name(SCORER.into()).spawn(move || worker.run());
@@ -189,7 +190,7 @@ impl ScorerNode {
     #[must_use]
     pub fn finish(self) -> Scored {
         self.inbox.close();
-        let (board, books) = self.thread.join().expect("the scorer's thread has no reason to panic");
+        let (board, books, unwritten) = self.thread.join().expect("the scorer's thread has no reason to panic");
         let own = ProcessBooks {
             process: self.bus.identity().process.clone(),
             ledger: self.bus.books().ledger(),
@@ -202,7 +203,7 @@ impl ScorerNode {
         }
         // Its own books went out like everyone's and came back; those in hand are newer.
         let others = books.into_values().filter(|books| books.process != own.process);
-        Scored { board, books: others.chain([own.clone()]).collect(), progress }
+        Scored { board, books: others.chain([own.clone()]).collect(), progress, unwritten }
     }
 }
 
@@ -222,13 +223,13 @@ struct Worker {
     board: Board,
     books: Books,
     progress: Arc<Mutex<Progress>>,
-    detections: BufWriter<File>,
+    detections: ResultLines,
     // When each recent tick was published, by capture time: for the latency that is shown while the run goes.
     published: BTreeMap<u64, u64>,
 }
 
 impl Worker {
-    fn run(mut self) -> (Board, Books) {
+    fn run(mut self) -> (Board, Books, u64) {
         loop {
             match self.inbox.take(None) {
                 Taken::Item(topic, Event::Message(arrival)) => self.take(&topic, &arrival),
@@ -238,7 +239,7 @@ impl Worker {
             }
         }
         self.board.close();
-        (self.board, self.books)
+        (self.board, self.books, self.detections.finish())
     }
 
     fn take(&mut self, topic: &Topic, arrival: &Arrival) {
@@ -270,12 +271,7 @@ impl Worker {
     fn result(&mut self, arrival: &Arrival) -> Option<()> {
         let result: Detections = self.inbox.decode(arrival, &Limits::DEFAULT)?;
         let stamp = &arrival.header.stamp;
-        let report = DetectionsReport::new(stamp, result.clone());
-        // Flushed line by line: someone may be following the file.
-        let written = writeln!(self.detections, "{}", report.to_json()).and_then(|()| self.detections.flush());
-        if let Err(error) = written {
-            tracing::error!("detections.jsonl is incomplete: {error}");
-        }
+        self.detections.add(&DetectionsReport::new(stamp, result.clone()));
         let began = self.published.get(&stamp.capture_nanos);
         let latency_ms = began.map(|began| (stamp.publish_nanos as f64 - *began as f64) / 1e6);
         let heard = result.heard.clone();

@@ -1,0 +1,147 @@
+//! `detections.jsonl`: a line per result, as they come.
+
+use std::fs::File;
+use std::io::{self, BufWriter, Write};
+use std::path::Path;
+
+use protocol::DetectionsReport;
+
+/// What waits for a disk that is full: some hundred results.
+const WAITING: usize = 1 << 20;
+
+/// The file. A disk that is full ends no run: what finds no room any more is counted.
+pub(super) struct ResultLines<W: Write = File> {
+    out: BufWriter<W>,
+    /// Lines since everything was last on the disk.
+    waiting: u64,
+    lost: u64,
+    has_complained: bool,
+}
+
+impl ResultLines {
+    pub(super) fn create(path: &Path) -> io::Result<Self> {
+        File::create(path).map(Self::over)
+    }
+}
+
+impl<W: Write> ResultLines<W> {
+    fn over(out: W) -> Self {
+        Self { out: BufWriter::with_capacity(WAITING, out), waiting: 0, lost: 0, has_complained: false }
+    }
+
+    /// Adds a line; someone may be following the file.
+    pub(super) fn add(&mut self, report: &DetectionsReport) {
+        let line = report.to_json() + "\n";
+        // Whole or not at all: what does not fit beside what waits is not begun.
+        let has_room = self.out.buffer().len() + line.len() <= WAITING || self.out.flush().is_ok();
+        match has_room.then(|| self.out.write_all(line.as_bytes())) {
+            Some(Ok(())) => self.waiting += 1,
+            Some(Err(_)) | None => self.lost += 1,
+        }
+        match self.out.flush() {
+            Ok(()) => (self.waiting, self.has_complained) = (0, false),
+            Err(error) if !self.has_complained => {
+                self.has_complained = true;
+                tracing::error!("detections.jsonl waits: {error}");
+            }
+            Err(_) => {}
+        }
+    }
+
+    /// How many results are not in the file.
+    pub(super) fn finish(mut self) -> u64 {
+        let is_written = self.out.flush().is_ok();
+        // What is left in the buffer is not tried once more.
+        let _ = self.out.into_parts();
+        self.lost + if is_written { 0 } else { self.waiting }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::sync::{Arc, Mutex};
+
+    use protocol::{CavId, Detections, Pose, PoseEstimate, Stamp};
+
+    use super::*;
+
+    /// A disk with room for so many bytes, and what is on it.
+    #[derive(Clone, Default)]
+    struct Disk(Arc<Mutex<(usize, Vec<u8>)>>);
+
+    impl Disk {
+        fn make_room(&self, bytes: usize) {
+            self.0.lock().unwrap().0 = bytes;
+        }
+
+        fn lines(&self) -> Vec<serde_json::Value> {
+            let text = String::from_utf8(self.0.lock().unwrap().1.clone()).unwrap();
+            text.lines().map(|line| serde_json::from_str(line).unwrap()).collect()
+        }
+    }
+
+    impl Write for Disk {
+        fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+            let (room, written) = &mut *self.0.lock().unwrap();
+            let count = bytes.len().min(*room);
+            *room -= count;
+            written.extend_from_slice(&bytes[..count]);
+            if count == 0 { Err(io::ErrorKind::StorageFull.into()) } else { Ok(count) }
+        }
+
+        fn flush(&mut self) -> io::Result<()> {
+            Ok(())
+        }
+    }
+
+    fn report(tick: u64) -> DetectionsReport {
+        let ego = CavId::new("e").unwrap();
+        let stamp = Stamp { cav: ego.clone(), epoch: 1, sequence: tick, capture_nanos: tick, publish_nanos: tick };
+        let result = Detections {
+            ego,
+            frame_index: tick,
+            method: "max".into(),
+            pose: PoseEstimate::new(Pose::IDENTITY, 1.0),
+            detections: vec![],
+            fused: vec![],
+            skipped: vec![],
+            heard: vec![],
+            stages: vec![],
+        };
+        DetectionsReport::new(&stamp, result)
+    }
+
+    #[test]
+    fn what_waits_for_a_full_disk_is_written_whole_when_there_is_room_again() {
+        let disk = Disk::default();
+        let mut lines = ResultLines::over(disk.clone());
+        disk.make_room(report(0).to_json().len() + 7);
+        (0..5).for_each(|tick| lines.add(&report(tick)));
+        disk.make_room(1 << 30);
+        lines.add(&report(5));
+        assert_eq!((lines.finish(), disk.lines().len()), (0, 6));
+    }
+
+    #[test]
+    fn what_finds_no_room_is_counted() {
+        let disk = Disk::default();
+        let mut lines = ResultLines::over(disk.clone());
+        let fitting = WAITING / (report(0).to_json().len() + 1);
+        (0..fitting + 30).for_each(|tick| lines.add(&report(10 + tick as u64 % 10)));
+        assert!((20..=30).contains(&lines.lost) && lines.waiting as usize + lines.lost as usize == fitting + 30);
+        disk.make_room(1 << 30);
+        let lost = lines.lost;
+        lines.add(&report(99));
+        assert_eq!(lines.finish(), lost);
+        let written = disk.lines();
+        assert_eq!(
+            (written.len() + lost as usize, &written[written.len() - 1]["frame_index"]),
+            (fitting + 31, &99.into())
+        );
+
+        let full = Disk::default();
+        let mut lines = ResultLines::over(full.clone());
+        (0..3).for_each(|tick| lines.add(&report(tick)));
+        assert_eq!((lines.finish(), full.lines().len()), (3, 0));
+    }
+}
