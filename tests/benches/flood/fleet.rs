@@ -25,7 +25,7 @@ use zenoh::bytes::ZBytes;
 use zenoh::qos::CongestionControl;
 
 const HONEST: [&str; 3] = ["1", "2", "3"];
-const FLOODING: &str = "4";
+pub(crate) const FLOODING: [&str; 4] = ["4", "5", "6", "7"];
 const PERIOD: Duration = Duration::from_millis(100);
 const FLOOD_PERIOD: Duration = Duration::from_millis(1);
 /// Before anything is measured.
@@ -37,7 +37,8 @@ const PATIENCE: Duration = Duration::from_secs(5);
 pub(crate) struct Setting {
     /// Keys, where QUIC is spoken.
     pub(crate) keys: Option<PathBuf>,
-    pub(crate) flood: bool,
+    /// How many of [`FLOODING`] do.
+    pub(crate) floods: usize,
     /// Shared memory of each process; 0: none.
     pub(crate) shm_mib: usize,
     pub(crate) duration: Duration,
@@ -86,7 +87,8 @@ pub(crate) fn measure(setting: &Setting) -> Result<Measured> {
     let router = part("router", 0.0)?;
     let ego = part("ego", seconds)?;
     let honest = part("honest", seconds + 1.0)?;
-    let flooding = setting.flood.then(|| part("flood", seconds)).transpose()?;
+    let flooding = FLOODING[..setting.floods].iter().map(|cav| part(&format!("flood-{cav}"), seconds));
+    let flooding = flooding.collect::<Result<Vec<_>>>()?;
     let (ego_id, pids) = (ego.child.id(), [router.child.id(), ego.child.id(), honest.child.id()]);
     thread::sleep(WARM_UP);
     let before = cpu_ms(&pids)?;
@@ -99,7 +101,9 @@ pub(crate) fn measure(setting: &Setting) -> Result<Measured> {
     }
     let cpu_ms = cpu_ms(&pids)? - before;
     let mut measured: Measured = serde_json::from_str(&ego.last_line()?)?;
-    measured.sent = flooding.map_or(Ok(0), |flooding| anyhow::Ok(flooding.last_line()?.trim().parse()?))?;
+    for flooding in flooding {
+        measured.sent += flooding.last_line()?.trim().parse::<u64>()?;
+    }
     [measured.ego_mib, measured.router_mib] = peaks;
     measured.cpu_ms = cpu_ms;
     drop((honest, router));
@@ -164,7 +168,7 @@ pub(crate) fn run_part(arguments: &[String]) -> Result<()> {
         "router" => place.route(),
         "ego" => place.listen(duration),
         "honest" => place.send_maps(duration),
-        _ => place.flood(duration),
+        _ => place.flood(name.trim_start_matches("flood-"), duration),
     }
 }
 
@@ -206,7 +210,8 @@ impl Place {
     fn listen(&self, duration: Duration) -> Result<()> {
         let ego = self.join("ego-9")?;
         let inbox = ego.limited_inbox(4, 16, InboxLimits::PEERS);
-        let subscriptions = HONEST.iter().chain([&FLOODING]).map(|cav| ego.subscribe(bev(cav), &inbox));
+        let flooding = FLOODING.map(bev);
+        let subscriptions = HONEST.iter().chain(&FLOODING).map(|cav| ego.subscribe(bev(cav), &inbox));
         let subscriptions = subscriptions.collect::<Result<Vec<_>, _>>()?;
         say("ready")?;
         let (began, mut measured) = (Instant::now(), Measured::default());
@@ -217,16 +222,18 @@ impl Place {
             map.features.decode(&Limits::DEFAULT)?;
             let took_ms = unix_nanos().saturating_sub(arrival.header.stamp.publish_nanos) as f64 / 1e6;
             ego.books().received(&topic);
-            if topic == bev(FLOODING) {
+            if flooding.contains(&topic) {
                 measured.decoded += 1;
             } else if began.elapsed() > WARM_UP {
                 measured.latencies_ms.push(took_ms);
             }
         }
         let ledger = ego.books().ledger();
-        let here = Account::towards(bev(FLOODING), &ego.identity().process);
-        measured.refused =
-            ledger.get(&here).and_then(|counts| counts.dropped.get(&DropReason::RateLimit)).copied().unwrap_or(0);
+        for topic in flooding {
+            let here = Account::towards(topic, &ego.identity().process);
+            let refused = ledger.get(&here).and_then(|counts| counts.dropped.get(&DropReason::RateLimit));
+            measured.refused += refused.copied().unwrap_or(0);
+        }
         say(&serde_json::to_string(&measured)?)?;
         drop(subscriptions);
         Ok(ego.leave(PATIENCE)?)
@@ -256,22 +263,17 @@ impl Place {
     }
 
     /// Sound messages of its own vehicle, as many as the network takes.
-    fn flood(&self, duration: Duration) -> Result<()> {
-        let bus = self.join(&format!("agent-{FLOODING}"))?;
-        let key = bus.key(bev(FLOODING)).to_string();
+    fn flood(&self, cav: &str, duration: Duration) -> Result<()> {
+        let bus = self.join(&format!("agent-{cav}"))?;
+        let key = bus.key(bev(cav)).to_string();
         let pose = PoseEstimate::new(Pose::IDENTITY, 1.0);
         let features = encode_features(map_of(0), &CodecConfig::default(), None)?;
         say("ready")?;
         let began = Instant::now();
         let mut sent = 0_u64;
         while began.elapsed() < duration {
-            let stamp = Stamp {
-                cav: FLOODING.parse()?,
-                epoch: 1,
-                sequence: sent,
-                capture_nanos: sent,
-                publish_nanos: unix_nanos(),
-            };
+            let stamp =
+                Stamp { cav: cav.parse()?, epoch: 1, sequence: sent, capture_nanos: sent, publish_nanos: unix_nanos() };
             let encoded = wire::encode(&stamp, Bev { pose, features: features.clone() })?;
             let mut bytes = ZBytes::writer();
             bytes.append(encoded.head.into());

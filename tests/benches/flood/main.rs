@@ -1,10 +1,11 @@
 //! What a flood from one authenticated peer costs the others, and what QUIC costs everyone.
 //!
-//! Three vehicles send maps of 1.6 MB ten times a second to an ego; a fourth, with a certificate of the same fleet, sends
-//! 1 MiB as often as it can, up to 1000 times a second. Router, ego, the three and the fourth are processes of this program.
+//! Three vehicles send maps of 1.6 MB ten times a second to an ego; a fourth (`--floods`: as many as four more), with a
+//! certificate of the same fleet, sends 1 MiB as often as it can, up to 1000 times a second. Router, ego, the three and each
+//! that floods are processes of this program.
 //!
 //! ```text
-//! cargo bench -p tests --bench flood [-- --seconds 20 --shm-mib 256 --out deploy/results/security-flood.md]
+//! cargo bench -p tests --bench flood [-- --seconds 20 --shm-mib 256 --floods 1 --out deploy/results/security-flood.md]
 //! ```
 //!
 //! With `--shm-mib` large messages go through shared memory, of that size for each process: a flood then costs its sender a
@@ -24,7 +25,7 @@ use anyhow::{Context, Result, bail};
 use deploy::keys::{KeyPlan, make};
 use tests::machine;
 
-use fleet::{Measured, Setting};
+use fleet::{FLOODING, Measured, Setting};
 
 /// Others' 99th percentile under the flood, in times of that without it.
 const AT_MOST: f64 = 2.0;
@@ -46,33 +47,36 @@ fn main() -> ExitCode {
 }
 
 fn bench(arguments: &[String]) -> Result<bool> {
-    let (mut seconds, mut shm_mib, mut out) = (20.0, 0, None);
+    let (mut seconds, mut shm_mib, mut floods, mut out) = (20.0, 0, 1, None);
     let mut arguments = arguments.iter().filter(|argument| *argument != "--bench");
     while let Some(name) = arguments.next() {
         let value = arguments.next().with_context(|| format!("{name} needs a value"))?;
         match name.as_str() {
             "--seconds" => seconds = value.parse()?,
             "--shm-mib" => shm_mib = value.parse()?,
+            "--floods" => floods = value.parse::<usize>()?.clamp(1, FLOODING.len()),
             // cargo runs benches in the folder of their package.
             "--out" => out = Some(Path::new(env!("CARGO_MANIFEST_DIR")).join("..").join(value)),
-            _ => bail!("{name} is none of --seconds, --shm-mib, --out"),
+            _ => bail!("{name} is none of --seconds, --shm-mib, --floods, --out"),
         }
     }
     let folder = tempfile::tempdir()?;
-    let parties = ["agent-1", "agent-2", "agent-3", "agent-4", "ego-9", "replay"];
-    let parties = parties.map(str::parse).into_iter().collect::<Result<_, _>>()?;
+    let agents = (1..=7).map(|cav| format!("agent-{cav}"));
+    let parties = agents.chain(["ego-9".into(), "replay".into()]).map(|party| party.parse());
+    let parties = parties.collect::<Result<_, _>>()?;
     make(&KeyPlan::new(folder.path(), parties, 1))?;
     let mut rows = Vec::new();
     // They take turns, so that a machine that is busier in one minute than in the next does not decide.
     for _ in 0..2 {
         for (secured, flood) in [(false, false), (true, false), (false, true), (true, true)] {
             let keys = secured.then(|| folder.path().to_path_buf());
-            let setting = Setting { keys, flood, shm_mib, duration: Duration::from_secs_f64(seconds) };
+            let floods = if flood { floods } else { 0 };
+            let setting = Setting { keys, floods, shm_mib, duration: Duration::from_secs_f64(seconds) };
             rows.push((secured, flood, fleet::measure(&setting)?));
         }
     }
     let memory = if shm_mib == 0 { "no shared memory".into() } else { format!("{shm_mib} MiB of shared memory each") };
-    report(&rows, &format!("{seconds} s for each line, {memory}"), out.as_ref())
+    report(&rows, &format!("{seconds} s for each line, {memory}, {floods} flooding"), out.as_ref())
 }
 
 fn report(rows: &[(bool, bool, Measured)], how: &str, out: Option<&PathBuf>) -> Result<bool> {
