@@ -60,21 +60,23 @@ fn read(line: &Value) -> Option<Result> {
 pub struct Findings {
     /// Longest time between two results of one life of the ego while nothing was done to what it lives on, milliseconds.
     pub longest_gap_ms: u64,
-    /// Of all such times, how many were above two periods.
-    pub gaps: u64,
+    /// Those of them that were above two periods, milliseconds, and what was done meanwhile.
+    pub gaps: Vec<(u64, String)>,
     /// From the first message of a vehicle's new life to the first result with its data in it, milliseconds.
     pub fused_again_ms: Vec<u64>,
 }
 
 impl Findings {
-    /// Takes in the results between `from_ms` and `to_ms`.
-    pub fn add_gaps(&mut self, results: &[Result], from_ms: u64, to_ms: u64, period_ms: u64) {
+    /// Takes in the results between `from_ms` and `to_ms`, while `what` was done.
+    pub fn add_gaps(&mut self, results: &[Result], [from_ms, to_ms]: [u64; 2], period_ms: u64, what: &str) {
         let within = |result: &&Result| (from_ms..=to_ms).contains(&result.published_ms);
         let results: Vec<&Result> = results.iter().filter(within).collect();
         for pair in results.windows(2).filter(|pair| pair[0].epoch == pair[1].epoch) {
             let gap_ms = pair[1].published_ms.saturating_sub(pair[0].published_ms);
             self.longest_gap_ms = self.longest_gap_ms.max(gap_ms);
-            self.gaps += u64::from(gap_ms > 2 * period_ms);
+            if gap_ms > 2 * period_ms {
+                self.gaps.push((gap_ms, what.to_owned()));
+            }
         }
     }
 
@@ -103,11 +105,11 @@ mod tests {
         let results =
             [result(1, 0, &[]), result(1, 100, &[]), result(1, 350, &[]), result(2, 900, &[]), result(2, 1000, &[])];
         let mut findings = Findings::default();
-        findings.add_gaps(&results, 0, 2000, 100);
-        assert_eq!((findings.longest_gap_ms, findings.gaps), (250, 1));
+        findings.add_gaps(&results, [0, 2000], 100, "a fault");
+        assert_eq!((findings.longest_gap_ms, findings.gaps), (250, vec![(250, "a fault".into())]));
         let mut later = Findings::default();
-        later.add_gaps(&results, 300, 2000, 100);
-        assert_eq!((later.longest_gap_ms, later.gaps), (100, 0));
+        later.add_gaps(&results, [300, 2000], 100, "a fault");
+        assert_eq!((later.longest_gap_ms, later.gaps), (100, vec![]));
     }
 
     #[test]

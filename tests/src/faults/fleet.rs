@@ -132,7 +132,7 @@ impl FaultyFleet {
             }
             let results = self.results.update();
             if !fault.silences_ego() {
-                self.findings.add_gaps(results, settled_ms, now_ms, PERIOD_MS);
+                self.findings.add_gaps(results, [settled_ms, now_ms], PERIOD_MS, &fault.to_string());
             }
             let heard = self.heard.lock().unwrap_or_else(PoisonError::into_inner);
             let new = heard.iter().filter(|((cav, _), at)| **at >= began_ms && cav != VEHICLES[0]);
