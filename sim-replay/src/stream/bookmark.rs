@@ -3,11 +3,14 @@
 use std::fs;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::thread::{self, JoinHandle};
 
 use serde::{Deserialize, Serialize};
 
 use super::StreamReport;
 use super::schedule::Position;
+use crate::bus::mailbox::{Mailbox, Pushed, Taken};
 
 /// Largest file that is read: a place has a few numbers.
 const LARGEST: u64 = 64 << 10;
@@ -71,54 +74,76 @@ pub enum BookmarkError {
     },
 }
 
-/// The file.
-#[derive(Debug)]
+/// The place that an earlier life has left in a scenario of `ticks` ticks; `None`: there was no earlier life.
+pub(super) fn read(path: &Path, scenario: &str, ticks: usize) -> Result<Option<Place>, BookmarkError> {
+    let at = || path.to_path_buf();
+    let text = match text_of(path) {
+        Ok(text) => text,
+        Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
+        Err(source) => return Err(BookmarkError::Read { path: at(), source }),
+    };
+    let place: Place = serde_json::from_str(&text).map_err(|source| BookmarkError::Text { path: at(), source })?;
+    if place.scenario != scenario || place.position.next_tick > ticks {
+        let told = format!("is tick {} of scenario {}", place.position.next_tick, place.scenario);
+        return Err(BookmarkError::Elsewhere { path: at(), place: told, scenario: scenario.into(), ticks });
+    }
+    Ok(Some(place))
+}
+
+/// Writes places down, on a thread of its own: the clock does not wait for a disk.
 pub(super) struct Bookmark {
-    path: PathBuf,
-    /// It is said once that the file cannot be written.
-    is_broken: bool,
+    newest: Arc<Mailbox<(), Place>>,
+    writing: Option<JoinHandle<()>>,
 }
 
 impl Bookmark {
-    pub(super) fn new(path: PathBuf) -> Self {
-        Self { path, is_broken: false }
+    /// # Errors
+    /// When the system gives no thread.
+    pub(super) fn open(path: PathBuf) -> std::io::Result<Self> {
+        let newest = Arc::new(Mailbox::new(1, 1));
+        let writing = thread::Builder::new().name("bookmark".into()).spawn({
+            let newest = Arc::clone(&newest);
+            move || write_all(&path, &newest)
+        })?;
+        Ok(Self { newest, writing: Some(writing) })
     }
 
-    /// The place that an earlier life has left in a scenario of `ticks` ticks; `None`: there was no earlier life.
-    pub(super) fn read(&self, scenario: &str, ticks: usize) -> Result<Option<Place>, BookmarkError> {
-        let path = || self.path.clone();
-        let text = match text_of(&self.path) {
-            Ok(text) => text,
-            Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
-            Err(source) => return Err(BookmarkError::Read { path: path(), source }),
-        };
-        let place: Place =
-            serde_json::from_str(&text).map_err(|source| BookmarkError::Text { path: path(), source })?;
-        if place.scenario != scenario || place.position.next_tick > ticks {
-            let told = format!("is tick {} of scenario {}", place.position.next_tick, place.scenario);
-            return Err(BookmarkError::Elsewhere { path: path(), place: told, scenario: scenario.into(), ticks });
+    /// Has a place written down; one that still waits for the disk is out of date.
+    pub(super) fn note(&self, place: Place) {
+        match self.newest.push((), place) {
+            Pushed::Queued | Pushed::Displaced(_) | Pushed::NoLane(_) | Pushed::Closed(_) => {}
         }
-        Ok(Some(place))
     }
+}
 
-    /// Writes a place down, whole or not at all. Without it the replay goes on; only a next life cannot.
-    pub(super) fn write(&mut self, place: &Place) {
-        let beside = self.path.with_extension("new");
-        let text = serde_json::to_string(place).map_err(std::io::Error::from);
-        let written =
-            text.and_then(|text| fs::write(&beside, text + "\n")).and_then(|()| fs::rename(&beside, &self.path));
-        match written {
-            Ok(()) => self.is_broken = false,
-            Err(error) if !self.is_broken => {
-                tracing::warn!(
-                    "{}: {error}; a replay that falls now begins where this file stands",
-                    self.path.display()
-                );
-                self.is_broken = true;
+impl Drop for Bookmark {
+    fn drop(&mut self) {
+        self.newest.close();
+        if self.writing.take().is_some_and(|writing| writing.join().is_err()) {
+            tracing::error!("the thread that notes the place panicked");
+        }
+    }
+}
+
+fn write_all(path: &Path, places: &Mailbox<(), Place>) {
+    let mut has_complained = false;
+    while let Taken::Item((), place) = places.take(None) {
+        match write(path, &place) {
+            Ok(()) => has_complained = false,
+            // Without it the replay goes on; only a next life cannot.
+            Err(error) if !has_complained => {
+                tracing::warn!("{}: {error}; a replay that falls now begins where this file stands", path.display());
+                has_complained = true;
             }
             Err(_) => {}
         }
     }
+}
+
+/// Whole or not at all.
+fn write(path: &Path, place: &Place) -> std::io::Result<()> {
+    let beside = path.with_extension("new");
+    fs::write(&beside, serde_json::to_string(place)? + "\n").and_then(|()| fs::rename(&beside, path))
 }
 
 fn text_of(path: &Path) -> std::io::Result<String> {
@@ -146,12 +171,16 @@ mod tests {
     }
 
     #[test]
-    fn a_place_comes_back() {
+    fn the_last_place_comes_back() {
         let folder = tempfile::tempdir().unwrap();
-        let mut bookmark = Bookmark::new(folder.path().join("place.json"));
-        assert_eq!(bookmark.read("town1", 10).unwrap(), None);
-        bookmark.write(&place());
-        assert_eq!(bookmark.read("town1", 10).unwrap(), Some(place()));
+        let path = folder.path().join("place.json");
+        assert_eq!(read(&path, "town1", 10).unwrap(), None);
+        let bookmark = Bookmark::open(path.clone()).unwrap();
+        for ticks in 0..=7 {
+            bookmark.note(Place { ticks, ..place() });
+        }
+        drop(bookmark);
+        assert_eq!(read(&path, "town1", 10).unwrap(), Some(place()));
         assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1, "nothing is left beside it");
         let report = place().report();
         assert_eq!((report.ticks, report.unanswered, report.unreadable_frames), (7, 1, 2));
@@ -161,25 +190,25 @@ mod tests {
     fn a_place_of_another_scene_and_a_broken_one_are_named() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("place.json");
-        let mut bookmark = Bookmark::new(path.clone());
-        bookmark.write(&place());
+        write(&path, &place()).unwrap();
         let told = |found: Result<Option<Place>, BookmarkError>| found.unwrap_err().to_string();
         for (scenario, ticks) in [("town4", 10), ("town1", 6)] {
-            let error = told(bookmark.read(scenario, ticks));
+            let error = told(read(&path, scenario, ticks));
             assert!(error.contains("tick 7 of scenario town1") && error.contains(scenario), "{error}");
         }
         for broken in ["{", "[]", "{\"scenario\": \"town1\"}"] {
             fs::write(&path, broken).unwrap();
-            assert!(told(bookmark.read("town1", 10)).contains("not the place of a replay"));
+            assert!(told(read(&path, "town1", 10)).contains("not the place of a replay"));
         }
         fs::write(&path, " ".repeat(LARGEST as usize + 1)).unwrap();
-        assert!(told(bookmark.read("town1", 10)).contains("at most"));
+        assert!(told(read(&path, "town1", 10)).contains("at most"));
     }
 
     #[test]
     fn a_file_that_cannot_be_written_ends_nothing() {
-        let mut bookmark = Bookmark::new(PathBuf::from("/nowhere/place.json"));
-        bookmark.write(&place());
-        assert!(bookmark.is_broken);
+        let bookmark = Bookmark::open(PathBuf::from("/nowhere/place.json")).unwrap();
+        bookmark.note(place());
+        drop(bookmark);
+        assert!(read(Path::new("/nowhere/place.json"), "town1", 10).unwrap().is_none());
     }
 }

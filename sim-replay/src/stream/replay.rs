@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use protocol::{CavId, Control, Limits, Role, Stream, Topic, Truth, Verb};
 
 use super::ReplayClock;
-use super::bookmark::{Bookmark, BookmarkError, Place};
+use super::bookmark::{self, Bookmark, BookmarkError, Place};
 use super::outlet::{Outlet, truth_of};
 use super::read_ahead::{ReadAhead, TickFrames};
 use super::report::StreamReport;
@@ -121,8 +121,8 @@ pub enum StreamError {
     /// The bus failed.
     #[error(transparent)]
     Bus(#[from] BusError),
-    /// The reading thread could not be started.
-    #[error("no thread for reading ahead: {0}")]
+    /// A thread could not be started.
+    #[error("no thread for reading ahead or noting the place: {0}")]
     Thread(std::io::Error),
 }
 
@@ -161,10 +161,8 @@ impl<'a> Replay<'a> {
         check(scenario, &options)?;
         let cavs: Vec<CavId> = agents.iter().map(|&index| scenario.agents[index].clone()).collect();
         let options = StreamOptions { agents: cavs, ..options };
-        let bookmark = options.bookmark.clone().map(Bookmark::new);
-        let place =
-            bookmark.as_ref().map(|bookmark| bookmark.read(&scenario.name, scenario.ticks.len())).transpose()?;
-        let place = place.flatten();
+        let read = |path: &PathBuf| bookmark::read(path, &scenario.name, scenario.ticks.len());
+        let place = options.bookmark.as_ref().map(read).transpose()?.flatten();
         let schedule = Schedule::new(&scenario.ticks, options.seek, options.frames, options.repeats);
         let mut clock = ReplayClock::new(options.rate);
         let schedule = match &place {
@@ -191,7 +189,7 @@ impl<'a> Replay<'a> {
             bus,
             scenario: scenario.name.clone(),
             tick_count: scenario.ticks.len(),
-            bookmark,
+            bookmark: options.bookmark.clone().map(Bookmark::open).transpose().map_err(StreamError::Thread)?,
             is_resumed: place.is_some(),
             reading,
             schedule,
@@ -315,10 +313,10 @@ impl<'a> Replay<'a> {
     }
 
     /// After everything of a tick was handed over: what comes next is for the next life.
-    fn note_place(&mut self) {
-        let Some(bookmark) = &mut self.bookmark else { return };
+    fn note_place(&self) {
+        let Some(bookmark) = &self.bookmark else { return };
         let StreamReport { ticks, unanswered, unreadable_frames, .. } = self.report;
-        bookmark.write(&Place {
+        bookmark.note(Place {
             scenario: self.scenario.clone(),
             position: self.schedule.position(),
             is_halted: self.clock.is_halted(),
