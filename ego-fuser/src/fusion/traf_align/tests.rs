@@ -61,7 +61,7 @@ fn it_learns_to_look_along_a_motion() {
     let mut optimizer = tch::nn::Adam::default().build(&variables, 5e-3).unwrap();
     let facts = facts(&[(0, 0.0), (0, 0.1), (0, 0.2)]);
     let mut losses = Vec::new();
-    for step in 0..120 {
+    for step in 0..300 {
         let column = 6 + (step * 7) % 12;
         let row = 2 + (step * 5) % 14;
         let features = Tensor::zeros([3, 6, 18, 22], FLOAT);
@@ -76,8 +76,10 @@ fn it_learns_to_look_along_a_motion() {
         losses.push(loss.double_value(&[]));
     }
     let mean = |losses: &[f64]| losses.iter().sum::<f64>() / losses.len() as f64;
-    let (first, last) = (mean(&losses[..10]), mean(&losses[110..]));
-    assert!(last < 0.6 * first, "{first} to {last}");
+    let (first, last) = (mean(&losses[..10]), mean(&losses[280..]));
+    // Shown the newest map alone it stays at 0.82. The tensor library has one seed for all tests that run at a time, so
+    // weights differ from run to run: of 60 the slowest came to 0.43.
+    assert!(last < 0.7 * first, "{first} to {last}");
     for (name, variable) in variables.variables() {
         if variable.requires_grad() {
             let norm = variable.grad().abs().sum(Kind::Float).double_value(&[]);
