@@ -34,9 +34,30 @@ pub struct Place {
 }
 
 impl Place {
+    /// The place that an earlier life has left in a scenario of `ticks` ticks; `None`: there was no earlier life.
+    ///
+    /// # Errors
+    /// [`BookmarkError`] when the file is no place, or one of another scene.
+    pub fn read(path: &Path, scenario: &str, ticks: usize) -> Result<Option<Self>, BookmarkError> {
+        let at = || path.to_path_buf();
+        let text = match text_of(path) {
+            Ok(text) => text,
+            Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
+            Err(source) => return Err(BookmarkError::Read { path: at(), source }),
+        };
+        let place: Self = serde_json::from_str(&text).map_err(|source| BookmarkError::Text { path: at(), source })?;
+        if place.scenario != scenario || place.position.next_tick > ticks {
+            let told = format!("is tick {} of scenario {}", place.position.next_tick, place.scenario);
+            return Err(BookmarkError::Elsewhere { path: at(), place: told, scenario: scenario.into(), ticks });
+        }
+        Ok(Some(place))
+    }
+
     /// What earlier lives have to report.
     pub(super) fn report(&self) -> StreamReport {
-        let Self { ticks, unanswered, unreadable_frames, .. } = *self;
+        // A file may say anything; counting goes on from here.
+        let [ticks, unanswered, unreadable_frames] =
+            [self.ticks, self.unanswered, self.unreadable_frames].map(|count| count.min(u64::MAX >> 1));
         StreamReport { ticks, unanswered, unreadable_frames, ..StreamReport::default() }
     }
 }
@@ -72,22 +93,6 @@ pub enum BookmarkError {
         /// Its ticks.
         ticks: usize,
     },
-}
-
-/// The place that an earlier life has left in a scenario of `ticks` ticks; `None`: there was no earlier life.
-pub(super) fn read(path: &Path, scenario: &str, ticks: usize) -> Result<Option<Place>, BookmarkError> {
-    let at = || path.to_path_buf();
-    let text = match text_of(path) {
-        Ok(text) => text,
-        Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
-        Err(source) => return Err(BookmarkError::Read { path: at(), source }),
-    };
-    let place: Place = serde_json::from_str(&text).map_err(|source| BookmarkError::Text { path: at(), source })?;
-    if place.scenario != scenario || place.position.next_tick > ticks {
-        let told = format!("is tick {} of scenario {}", place.position.next_tick, place.scenario);
-        return Err(BookmarkError::Elsewhere { path: at(), place: told, scenario: scenario.into(), ticks });
-    }
-    Ok(Some(place))
 }
 
 /// Writes places down, on a thread of its own: the clock does not wait for a disk.
@@ -174,13 +179,13 @@ mod tests {
     fn the_last_place_comes_back() {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("place.json");
-        assert_eq!(read(&path, "town1", 10).unwrap(), None);
+        assert_eq!(Place::read(&path, "town1", 10).unwrap(), None);
         let bookmark = Bookmark::open(path.clone()).unwrap();
         for ticks in 0..=7 {
             bookmark.note(Place { ticks, ..place() });
         }
         drop(bookmark);
-        assert_eq!(read(&path, "town1", 10).unwrap(), Some(place()));
+        assert_eq!(Place::read(&path, "town1", 10).unwrap(), Some(place()));
         assert_eq!(fs::read_dir(folder.path()).unwrap().count(), 1, "nothing is left beside it");
         let report = place().report();
         assert_eq!((report.ticks, report.unanswered, report.unreadable_frames), (7, 1, 2));
@@ -193,15 +198,15 @@ mod tests {
         write(&path, &place()).unwrap();
         let told = |found: Result<Option<Place>, BookmarkError>| found.unwrap_err().to_string();
         for (scenario, ticks) in [("town4", 10), ("town1", 6)] {
-            let error = told(read(&path, scenario, ticks));
+            let error = told(Place::read(&path, scenario, ticks));
             assert!(error.contains("tick 7 of scenario town1") && error.contains(scenario), "{error}");
         }
         for broken in ["{", "[]", "{\"scenario\": \"town1\"}"] {
             fs::write(&path, broken).unwrap();
-            assert!(told(read(&path, "town1", 10)).contains("not the place of a replay"));
+            assert!(told(Place::read(&path, "town1", 10)).contains("not the place of a replay"));
         }
         fs::write(&path, " ".repeat(LARGEST as usize + 1)).unwrap();
-        assert!(told(read(&path, "town1", 10)).contains("at most"));
+        assert!(told(Place::read(&path, "town1", 10)).contains("at most"));
     }
 
     #[test]
@@ -209,6 +214,6 @@ mod tests {
         let bookmark = Bookmark::open(PathBuf::from("/nowhere/place.json")).unwrap();
         bookmark.note(place());
         drop(bookmark);
-        assert!(read(Path::new("/nowhere/place.json"), "town1", 10).unwrap().is_none());
+        assert!(Place::read(Path::new("/nowhere/place.json"), "town1", 10).unwrap().is_none());
     }
 }

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use protocol::{CavId, Control, Limits, Role, Stream, Topic, Truth, Verb};
 
 use super::ReplayClock;
-use super::bookmark::{self, Bookmark, BookmarkError, Place};
+use super::bookmark::{Bookmark, BookmarkError, Place};
 use super::outlet::{Outlet, truth_of};
 use super::read_ahead::{ReadAhead, TickFrames};
 use super::report::StreamReport;
@@ -161,7 +161,7 @@ impl<'a> Replay<'a> {
         check(scenario, &options)?;
         let cavs: Vec<CavId> = agents.iter().map(|&index| scenario.agents[index].clone()).collect();
         let options = StreamOptions { agents: cavs, ..options };
-        let read = |path: &PathBuf| bookmark::read(path, &scenario.name, scenario.ticks.len());
+        let read = |path: &PathBuf| Place::read(path, &scenario.name, scenario.ticks.len());
         let place = options.bookmark.as_ref().map(read).transpose()?.flatten();
         let schedule = Schedule::new(&scenario.ticks, options.seek, options.frames, options.repeats);
         let mut clock = ReplayClock::new(options.rate);

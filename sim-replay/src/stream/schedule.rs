@@ -63,7 +63,7 @@ impl Schedule {
 
     /// Goes on where an earlier life has been, with its capture times.
     #[must_use]
-    pub(super) fn resumed(self, position: Position) -> Self {
+    pub fn resumed(self, position: Position) -> Self {
         let Position { next_tick, left, shift_nanos, last_nanos } = position;
         Self { next_index: next_tick, left, shift_nanos, last_nanos, ..self }
     }

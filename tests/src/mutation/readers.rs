@@ -10,9 +10,10 @@ use deploy::sweep::Experiment;
 use deploy::table::TableSpec;
 use protocol::{Limits, wire};
 use safetensors::tensor::{Dtype, TensorView, serialize};
-use sim_replay::dataset::{self, LoadOptions};
+use sim_replay::dataset::{self, LoadOptions, Tick};
 use sim_replay::link::{LinkConfig, Trace};
 use sim_replay::recording::Recording;
+use sim_replay::stream::{Place, Schedule};
 use sim_replay::{pcd, town};
 
 use super::seeds;
@@ -79,6 +80,7 @@ pub fn all(root: &Path) -> Vec<Reader> {
             Trace::read_mahimahi(path).is_ok()
         }),
         on_disk("pose table", text(seeds::POSES), file("poses", "a.csv"), |path, _| PoseTable::read(path).is_ok()),
+        on_disk("replay place", text(seeds::PLACE), file("place", "a.json"), read_place),
         on_disk("error table", text(seeds::ERRORS), file("errors", "a.csv"), |path, _| ErrorTable::read(path).is_ok()),
         on_disk("weights", vec![weights()], file("weights", "a.safetensors"), |path, _| {
             Weights::load(path)
@@ -88,6 +90,14 @@ pub fn all(root: &Path) -> Vec<Reader> {
     all.extend(frames(root));
     all.extend(drives(root));
     all
+}
+
+/// Where a replay is, and the ticks that follow from there.
+fn read_place(path: &Path, _: &[u8]) -> bool {
+    let tick = |number: u64| Tick { stem: number.to_string(), capture_nanos: number * 100_000_000 };
+    let ticks: Vec<Tick> = (0..10).map(tick).collect();
+    let Ok(Some(place)) = Place::read(path, "town", ticks.len()) else { return false };
+    Schedule::new(&ticks, 0, None, true).resumed(place.position).take(20).count() <= 20
 }
 
 /// The annotations of OPV2V and V2V4Real, Python's matrices among them.

@@ -119,6 +119,10 @@ pub const TRACE: &str = "time_s,rate_mbps,delay_ms,loss\n0,27,10,0.01\n0.5,6,20.
 /// When packets could leave.
 pub const MAHIMAHI: &str = "0\n1\n1\n5\n12\n40\n";
 
+/// Where a replay is.
+pub const PLACE: &str = "{\"scenario\":\"town\",\"position\":{\"next_tick\":7,\"left\":12,\"shift_nanos\":1000000000,\
+    \"last_nanos\":1600000000},\"is_halted\":false,\"ticks\":17,\"unanswered\":0,\"unreadable_frames\":1}\n";
+
 /// Poses of a localizer.
 pub const POSES: &str = "scenario,cav,capture_nanos,x_m,y_m,z_m,qw,qx,qy,qz,confidence,no_pose,inliers\n\
     town,1000,3000000000,258.3,296.2,1.99,0.712174537,0.000278377,0.000295992,-0.702002324,0.99,,\n\
