@@ -214,7 +214,7 @@ pub(super) fn lattice(deltas: &Tensor, ego_from_cav: &[Pose], area: &Area, size:
 /// Maps `[N, C, H, W]` and what is valid of them `[N, 1, H, W]`, read at `lattice`; nothing is valid beyond their edges.
 pub(super) fn resample(maps: &Tensor, valid: &Tensor, lattice: &Tensor) -> Result<(Tensor, Tensor), TchError> {
     let valid = valid.f_grid_sampler(&lattice.f_detach()?, NEAREST, PADDING_ZEROS, false)?.f_to_kind(Kind::Float)?;
-    Ok((maps.f_grid_sampler(lattice, BILINEAR, PADDING_ZEROS, false)? * &valid, valid))
+    Ok((maps.f_grid_sampler(lattice, BILINEAR, PADDING_ZEROS, false)?.f_mul_(&valid)?, valid))
 }
 
 #[cfg(test)]

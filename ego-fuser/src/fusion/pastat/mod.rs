@@ -57,6 +57,37 @@ struct Entries {
     deltas: Option<Tensor>,
 }
 
+/// What lies somewhere on the ego's lattice, where poses put it or where FSA does.
+struct Placed {
+    /// The newest maps of all but the ego.
+    others: Maps,
+    /// `[N, D, h, w]`: what tokens of all entries have seen.
+    seen: Tensor,
+    /// `[N, h, w]`: where they have.
+    valid: Tensor,
+}
+
+impl Placed {
+    /// Everything but the ego's newest, the first entry, moved to where FSA says that it fits.
+    fn moved(self, deltas: &Tensor, ego_from_cav: &[Pose], area: &Area) -> Result<Self, TchError> {
+        let Self { others, seen, valid } = self;
+        let (entries, _, rows, columns) = seen.size4()?;
+        let after_first = |tensor: &Tensor| tensor.f_narrow(0, 1, entries - 1);
+        let with_first = |first: &Tensor, moved: Tensor| Tensor::f_cat(&[first.f_narrow(0, 0, 1)?, moved], 0);
+        let places = lattice(deltas, ego_from_cav, area, [rows, columns])?;
+        let (moved, moved_valid) = resample(&after_first(&seen)?, &after_first(&valid)?.f_unsqueeze(1)?, &places)?;
+        let (seen, valid) = (with_first(&seen, moved)?, with_first(&valid, moved_valid.f_squeeze_dim(1)?)?);
+        let count = others.count()?;
+        if count == 0 {
+            return Ok(Self { others, seen, valid });
+        }
+        let (.., height, width) = others.features.size4()?;
+        let places = lattice(&deltas.f_narrow(0, 0, count)?, &ego_from_cav[..count as usize], area, [height, width])?;
+        let (features, mask) = resample(&others.features, &others.mask, &places)?;
+        Ok(Self { others: Maps { features, mask }, seen, valid })
+    }
+}
+
 impl Pastat {
     /// Builds the module; its variables lie under `path`.
     ///
@@ -81,26 +112,30 @@ impl Pastat {
         let (padding, larger) = (self.config.padding_cells(), self.config.earlier_cells);
         let newest = shown.newest.padded(padding)?;
         let earlier = shown.earlier.as_ref().map(|earlier| earlier.padded(padding / larger)).transpose()?;
-        let (mut seen, mut valid) =
-            (self.tokeniser.shown(&newest.features, 1)?, self.tokeniser.valid(&newest.mask, 1)?);
+        let (mut seen, mut valid) = (self.tokeniser.seen(&newest.features, 1)?, self.tokeniser.valid(&newest.mask, 1)?);
         if let Some(earlier) = &earlier {
-            seen = Tensor::f_cat(&[seen, self.tokeniser.shown(&earlier.features, larger)?], 0)?;
+            seen = Tensor::f_cat(&[seen, self.tokeniser.seen(&earlier.features, larger)?], 0)?;
             valid = Tensor::f_cat(&[valid, self.tokeniser.valid(&earlier.mask, larger)?], 0)?;
         }
-        let told = &shown.told;
-        let shares = Tensor::f_from_slice(&told.shares)?.f_to_device(seen.device())?;
-        let tokens = self.tokeniser.tokens(&seen, &shares, &told.age_secs)?;
-        let others = newest.only(1, newest.count()?)?;
-        let entries = Entries { own: newest.features.f_get(0)?, others, tokens, valid, deltas: None };
-        match &self.alignment {
+        let (told, count) = (&shown.told, newest.count()?);
+        let facts = self.tokeniser.facts(&told.shares, &told.age_secs)?;
+        let (own, others) = (newest.features.f_get(0)?, newest.only(1, count)?);
+        let placed = Placed { others, seen, valid };
+        let (placed, facts, deltas) = match &self.alignment {
             Some(alignment) if told.age_secs.len() > 1 => {
-                let (_, height, width) = entries.own.size3()?;
+                let (_, height, width) = own.size3()?;
                 let area = Area::new(grid, [height, width], alignment.radius());
-                let found = self.compare(alignment, &newest, earlier.as_ref(), told, &area)?;
-                moved(told, entries, found, &area)
+                let Found { deltas, fit } = self.compare(alignment, &newest, earlier.as_ref(), told, &area)?;
+                // The ego's newest, which fits itself, is told nothing.
+                let facts = facts + fit.f_constant_pad_nd([0, 0, 1, 0])?;
+                (placed.moved(&deltas, &told.ego_from_cav[1..], &area)?, facts, Some(deltas))
             }
-            _ => Ok(entries),
-        }
+            _ => (placed, facts, None),
+        };
+        let Placed { others, seen, valid } = placed;
+        let facts = facts.f_unsqueeze(1)?.f_unsqueeze(1)?;
+        let tokens = seen.f_permute([0, 2, 3, 1])?.f_contiguous()? + facts;
+        Ok(Entries { own, others, tokens, valid, deltas })
     }
 
     /// How all entries but the ego's newest lie beside that.
@@ -153,10 +188,15 @@ impl Pastat {
         if count == 0 {
             return Ok(own.shallow_clone());
         }
-        let maps = &others.features * self.gate.forward(&tokens.f_narrow(0, 1, count)?, ego)?;
-        let out_of_reach = others.mask.f_eq(0.0)?;
-        let strongest = maps.f_masked_fill(&out_of_reach, f64::NEG_INFINITY)?.f_amax([0_i64].as_slice(), false)?;
-        own.f_maximum(&strongest)
+        let trust = self.gate.forward(&tokens.f_narrow(0, 1, count)?, ego)?;
+        // Out of reach nothing is the strongest.
+        let reach = others.mask.f_zeros_like()?.f_masked_fill(&others.mask.f_eq(0.0)?, f64::NEG_INFINITY)?;
+        let mut strongest = own.shallow_clone();
+        for index in 0..count {
+            let [map, trust, reach] = [&others.features, &trust, &reach].map(|tensor| tensor.f_get(index));
+            strongest = strongest.f_maximum(&reach?.f_addcmul(&map?, &trust?)?)?;
+        }
+        Ok(strongest)
     }
 }
 
@@ -188,34 +228,6 @@ impl Fusion for Pastat {
     fn earlier_cells(&self) -> Option<i64> {
         Some(self.config.earlier_cells)
     }
-}
-
-/// FSA: every entry but the ego's newest, its tokens and where it is a newest map the map itself, is moved to where it
-/// fits, and its tokens are told how well it does.
-fn moved(told: &Told, entries: Entries, Found { deltas, fit }: Found, area: &Area) -> Result<Entries, TchError> {
-    let Entries { own, others, tokens, valid, .. } = entries;
-    let (count, rows, columns, dim) = tokens.size4()?;
-    let poses: &[Pose] = &told.ego_from_cav[1..];
-    let after_first = |tensor: &Tensor| tensor.f_narrow(0, 1, tensor.size()[0] - 1);
-    let with_first = |first: &Tensor, moved: &Tensor| Tensor::f_cat(&[&first.f_narrow(0, 0, 1)?, moved], 0);
-
-    let places = lattice(&deltas, poses, area, [rows, columns])?;
-    let told_fit = after_first(&tokens)? + fit.f_view([-1, 1, 1, dim])?;
-    let by_channel = told_fit.f_permute([0, 3, 1, 2])?.f_contiguous()?;
-    let (moved, moved_valid) = resample(&by_channel, &after_first(&valid)?.f_unsqueeze(1)?, &places)?;
-    let tokens = with_first(&tokens, &moved.f_permute([0, 2, 3, 1])?.f_contiguous()?)?;
-    let valid = with_first(&valid, &moved_valid.f_view([count - 1, rows, columns])?)?;
-    let count = others.count()?;
-    let others = match count {
-        0 => others,
-        _ => {
-            let (_, height, width) = own.size3()?;
-            let places = lattice(&deltas.f_narrow(0, 0, count)?, &poses[..count as usize], area, [height, width])?;
-            let (features, mask) = resample(&others.features, &others.mask, &places)?;
-            Maps { features, mask }
-        }
-    };
-    Ok(Entries { own, others, tokens, valid, deltas: Some(deltas) })
 }
 
 #[cfg(test)]

@@ -29,35 +29,33 @@ impl Tokeniser {
         }
     }
 
-    /// What maps `[N, C, H, W]` show, `[N, h, w, D]`; each of their cells is one of `cells` by `cells`.
-    pub(super) fn shown(&self, maps: &Tensor, cells: i64) -> Result<Tensor, TchError> {
+    /// What tokens see of maps `[N, C, H, W]`: `[N, D, h, w]`; each cell of the maps is one of `cells` by `cells`.
+    pub(super) fn seen(&self, maps: &Tensor, cells: i64) -> Result<Tensor, TchError> {
         if cells == 1 {
-            return self.patches.forward(maps).f_permute([0, 2, 3, 1]);
+            return Ok(self.patches.forward(maps));
         }
         // As if each of the cells that were taken together showed their mean.
         let weight =
             self.patches.ws.f_avg_pool2d([cells, cells], [cells, cells], [0_i64, 0], false, true, None::<i64>)?;
         let (weight, edge) = (weight * (cells * cells) as f64, self.config.patch / cells);
-        maps.f_conv2d(&weight, self.patches.bs.as_ref(), [edge, edge], [0, 0], [1, 1], 1)?.f_permute([0, 2, 3, 1])
+        maps.f_conv2d(&weight, self.patches.bs.as_ref(), [edge, edge], [0, 0], [1, 1], 1)
     }
 
-    /// Tokens `[N, h, w, D]` of what maps show, with the maps' shares of all trust, `[N]`, and their ages.
-    pub(super) fn tokens(&self, shown: &Tensor, shares: &Tensor, age_secs: &[f64]) -> Result<Tensor, TchError> {
-        let per_map = |values: Tensor| values.f_view([-1, 1, 1, self.config.dim]);
-        let tokens = shown.shallow_clone();
-        let tokens = match &self.confidence {
-            Some(weight) => tokens + per_map(shares.f_unsqueeze(1)? * weight)?,
-            None => tokens,
-        };
-        let tokens = match self.config.te {
+    /// What tokens are told of the map that they are of, `[N, D]`: its share of all trust (CE) and its age (TE).
+    pub(super) fn facts(&self, shares: &[f32], age_secs: &[f64]) -> Result<Tensor, TchError> {
+        let (entries, device) = (shares.len() as i64, self.patches.ws.device());
+        let facts = match self.config.te {
             Some(wavelengths) => {
                 let values: Vec<f32> =
                     age_secs.iter().flat_map(|&age| encoding(age, &self.config, wavelengths)).collect();
-                tokens + per_map(Tensor::f_from_slice(&values)?.f_to_device(shown.device())?)?
+                Tensor::f_from_slice(&values)?.f_view([entries, self.config.dim])?.f_to_device(device)?
             }
-            None => tokens,
+            None => Tensor::f_zeros([entries, self.config.dim], (Kind::Float, device))?,
         };
-        tokens.f_contiguous()
+        match &self.confidence {
+            Some(weight) => Ok(facts + Tensor::f_from_slice(shares)?.f_to_device(device)?.f_unsqueeze(1)? * weight),
+            None => Ok(facts),
+        }
     }
 
     /// `[N, h, w]`: 1 for tokens of which any cell is valid in the mask `[N, 1, H, W]`, a cell of which is one of `cells` by
@@ -89,8 +87,12 @@ impl TrustGate {
 
     /// `[M, 1, H, W]` from the neighbours' tokens `[M, h, w, D]` and the ego's after the transformer `[1, h, w, D]`.
     pub(super) fn forward(&self, others: &Tensor, ego: &Tensor) -> Result<Tensor, TchError> {
-        let pairs = Tensor::f_cat(&[others, &ego.f_expand_as(others)?], 3)?;
-        let trust = self.out.forward(&self.hidden.forward(&pairs).f_relu()?).f_sigmoid()? * 2.0;
+        // A layer of both, side by side; the ego's part is the same for all others.
+        let dim = ego.size4()?.3;
+        let part = |first: i64| self.hidden.ws.f_narrow(1, first, dim);
+        let hidden =
+            others.f_linear(&part(0)?, None::<&Tensor>)? + ego.f_linear(&part(dim)?, self.hidden.bs.as_ref())?;
+        let trust = self.out.forward(&hidden.f_relu()?).f_sigmoid()? * 2.0;
         let (maps, rows, columns, _) = trust.size4()?;
         let trust = trust.f_view([maps, 1, rows, columns])?;
         trust.f_upsample_nearest2d([rows * self.patch, columns * self.patch], None, None)
