@@ -109,7 +109,7 @@ impl PastatConfig {
             mlp_ratio: 2,
             windows: vec![4, 8],
             rows: Rows::Ego,
-            refine: Some(32),
+            refine: Some(96),
             frames: 3,
             earlier_cells: 2,
             frame_secs: 0.1,

@@ -39,14 +39,14 @@ pub(super) fn correlate(ego: &Tensor, others: &Tensor, radius: i64) -> Result<Co
         .f_permute([2, 4, 0, 1, 3, 5])?
         .f_reshape([PARTS * PARTS, count, cells])?;
     let around = ego.f_detach()?.f_constant_pad_nd([radius; 4])?.f_squeeze_dim(0)?;
-    // [M, H, W, edge, edge]: what lies around each cell, without a copy until all is sorted by part.
-    let windows = around.f_unfold(1, edge, 1)?.f_unfold(2, edge, 1)?;
-    let windows = windows
-        .f_view([channels, PARTS, rows, PARTS, columns, edge, edge].as_slice())?
-        .f_permute([1, 3, 0, 2, 4, 5, 6])?
-        .f_reshape([PARTS * PARTS, cells, edge * edge])?;
-    let products = others.f_matmul(&windows)?;
-    let own = windows.f_select(2, edge * edge / 2)?.f_square()?.f_sum_dim_intlist([1_i64].as_slice(), false, None)?;
+    // [M, edge, edge, H, W]: the map at each shift, without a copy until all is sorted by part.
+    let shifted = around.f_unfold(1, height, 1)?.f_unfold(2, width, 1)?;
+    let shifted = shifted
+        .f_view([channels, edge, edge, PARTS, rows, PARTS, columns].as_slice())?
+        .f_permute([3, 5, 1, 2, 0, 4, 6])?
+        .f_reshape([PARTS * PARTS, edge * edge, cells])?;
+    let products = others.f_matmul(&shifted.f_transpose(1, 2)?)?;
+    let own = shifted.f_select(1, edge * edge / 2)?.f_square()?.f_sum_dim_intlist([1_i64].as_slice(), false, None)?;
     let theirs = others.f_square()?.f_sum_dim_intlist([2_i64].as_slice(), false, None)?;
     let length = |square: Tensor| square.f_add_scalar(EPSILON)?.f_sqrt();
     let energy = length(own.f_unsqueeze(1)? * &theirs)?;

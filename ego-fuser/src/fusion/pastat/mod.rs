@@ -16,6 +16,7 @@ mod confidence;
 mod config;
 mod correlation;
 mod entries;
+mod refiner;
 mod temporal;
 mod tokens;
 
@@ -28,7 +29,8 @@ pub use config::{FsaConfig, Part, PastatConfig, Rows, Wavelengths};
 use self::alignment::{Area, Found, SpatialAlignment, TRUST, lattice, resample};
 use self::block::Block;
 use self::entries::{Maps, Shown, Told};
-use self::tokens::{Decoder, Refiner, Tokeniser, TrustGate};
+use self::refiner::Refiner;
+use self::tokens::{Decoder, Tokeniser, TrustGate};
 use super::{AlignedViews, Fusion};
 
 /// PASTAT between encoder and head.
@@ -205,7 +207,7 @@ impl Fusion for Pastat {
         Ok(self.fuse_and_correct(views, train)?.0)
     }
 
-    fn fuse_and_correct(&self, views: &AlignedViews<'_>, _train: bool) -> Result<(Tensor, Option<Tensor>), TchError> {
+    fn fuse_and_correct(&self, views: &AlignedViews<'_>, train: bool) -> Result<(Tensor, Option<Tensor>), TchError> {
         let (_, _, height, width) = views.features.size4()?;
         let shown = Shown::of(views)?;
         let entries = self.align(&shown, views.grid)?;
@@ -214,7 +216,7 @@ impl Fusion for Pastat {
         // What was padded on is off before convolutions look around: nothing is known there.
         let fused = fused.f_narrow(1, 0, height)?.f_narrow(2, 0, width)?;
         let fused = match &self.refiner {
-            Some(refiner) => refiner.forward(&fused)?,
+            Some(refiner) => refiner.forward(&fused, train)?,
             None => fused,
         };
         let deltas = entries.deltas.map(|deltas| shown.among_all(&deltas)).transpose()?;

@@ -99,34 +99,6 @@ impl TrustGate {
     }
 }
 
-/// Sharpens the fused map, cell by cell and its neighbours, by what it shows itself: maps were blurred when they were
-/// moved, and heads of one cell cannot mend that. Changes nothing before it is trained.
-#[derive(Debug)]
-pub(super) struct Refiner {
-    convolutions: [nn::Conv2D; 2],
-}
-
-impl Refiner {
-    /// `hidden` are the channels between its two convolutions.
-    pub(super) fn new(path: &nn::Path<'_>, channels: i64, hidden: i64) -> Self {
-        let around = nn::ConvConfig { padding: 1, ..Default::default() };
-        let neutral = nn::ConvConfig { ws_init: Init::Const(0.0), bs_init: Init::Const(0.0), ..around };
-        Self {
-            convolutions: [
-                nn::conv2d(path / "conv0", channels, hidden, 3, around),
-                nn::conv2d(path / "conv1", hidden, channels, 3, neutral),
-            ],
-        }
-    }
-
-    /// `[C, H, W]` of a fused map of that shape.
-    pub(super) fn forward(&self, fused: &Tensor) -> Result<Tensor, TchError> {
-        let [first, second] = &self.convolutions;
-        let change = second.forward(&first.forward(&fused.f_unsqueeze(0)?).f_relu()?).f_squeeze_dim(0)?;
-        Ok(fused + change)
-    }
-}
-
 /// Tokens back to cells: what the transformer adds to a map; nothing before it is trained.
 #[derive(Debug)]
 pub(super) struct Decoder {
