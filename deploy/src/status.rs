@@ -7,6 +7,7 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 
 use protocol::HeardNeighbour;
 use serde::{Deserialize, Serialize};
+use sim_replay::whole_file;
 
 use crate::health::{ProcessStatus, State, Usage};
 use crate::score::Progress;
@@ -232,11 +233,7 @@ impl StatusWriter {
             dropped: progress.dropped,
             processes: processes(now),
         };
-        // Who reads it never sees half of it.
-        let unfinished = self.path.with_added_extension("unfinished");
-        let text = serde_json::to_string_pretty(&status).unwrap_or_default();
-        let written = fs::write(&unfinished, text).and_then(|()| fs::rename(&unfinished, &self.path));
-        match written {
+        match whole_file::write(&self.path, serde_json::to_string_pretty(&status).unwrap_or_default()) {
             Ok(()) => self.complained = false,
             Err(error) if !self.complained => {
                 self.complained = true;

@@ -19,3 +19,4 @@ pub mod stream;
 pub mod synth;
 pub mod town;
 pub mod web;
+pub mod whole_file;

@@ -11,6 +11,7 @@ use std::path::{Path, PathBuf};
 use safetensors::tensor::{Dtype, SafeTensorError, SafeTensors, TensorView};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
+use sim_replay::whole_file;
 use tch::nn::VarStore;
 use tch::{Kind, TchError, Tensor, no_grad};
 
@@ -85,8 +86,7 @@ pub fn save<P: Serialize>(
     ]);
     let bytes = safetensors::serialize(views.map_err(format)?, Some(header)).map_err(format)?;
     let io = |source| CheckpointError::Io { path: path.to_owned(), source };
-    let unfinished = path.with_extension("unfinished");
-    fs::write(&unfinished, bytes).and_then(|()| fs::rename(&unfinished, path)).map_err(io)
+    whole_file::write(path, bytes).map_err(io)
 }
 
 /// Brings a training back to where [`save`] left it.

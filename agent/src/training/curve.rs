@@ -4,6 +4,8 @@ use std::fs::{self, File, OpenOptions};
 use std::io::Write;
 use std::path::{Path, PathBuf};
 
+use sim_replay::whole_file;
+
 use super::error::TrainingError;
 
 /// Appends rows, the first cell of which is the step; every row is on disk when the call returns.
@@ -25,8 +27,7 @@ impl Curve {
             Some(step) if path.exists() => rows_until(&fs::read_to_string(path).map_err(io)?, step),
             _ => format!("{header}\n"),
         };
-        let unfinished = path.with_extension("unfinished");
-        fs::write(&unfinished, kept).and_then(|()| fs::rename(&unfinished, path)).map_err(io)?;
+        whole_file::write(path, kept).map_err(io)?;
         let file = OpenOptions::new().append(true).open(path).map_err(io)?;
         Ok(Self { path: path.to_owned(), file })
     }

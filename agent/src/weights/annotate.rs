@@ -7,6 +7,7 @@ use std::path::Path;
 use safetensors::tensor::SafeTensors;
 use serde_json::Value;
 use sha2::{Digest, Sha256};
+use sim_replay::whole_file;
 
 use super::error::WeightsError;
 use super::hex;
@@ -29,8 +30,7 @@ pub fn annotate(path: &Path, key: &str, text: &str) -> Result<String, WeightsErr
         key: key.to_owned(),
         source,
     })?;
-    let unfinished = path.with_extension("unfinished");
-    fs::write(&unfinished, &new).and_then(|()| fs::rename(&unfinished, path)).map_err(io)?;
+    whole_file::write(path, &new).map_err(io)?;
     Ok(hex(&Sha256::digest(&new)))
 }
 

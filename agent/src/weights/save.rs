@@ -1,12 +1,12 @@
 //! Writing parameters.
 
 use std::collections::{BTreeMap, HashMap};
-use std::fs;
 use std::path::Path;
 
 use half::f16;
 use safetensors::tensor::{Dtype, TensorView};
 use sha2::{Digest, Sha256};
+use sim_replay::whole_file;
 use tch::nn::VarStore;
 use tch::{Kind, Tensor};
 
@@ -49,8 +49,7 @@ pub fn save(
     let header: HashMap<_, _> = metadata.clone().into_iter().collect();
     let bytes = with_sorted_header(safetensors::serialize(views.map_err(format)?, Some(header)).map_err(format)?);
     let io = |source| WeightsError::Io { path: path.to_owned(), source };
-    let unfinished = path.with_extension("unfinished");
-    fs::write(&unfinished, &bytes).and_then(|()| fs::rename(&unfinished, path)).map_err(io)?;
+    whole_file::write(path, &bytes).map_err(io)?;
     Ok(hex(&Sha256::digest(&bytes)))
 }
 

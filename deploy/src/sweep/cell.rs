@@ -16,6 +16,7 @@ use protocol::{Counts, DropReason, Dtype, Stream, Topic};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use sim_replay::link::LinkConfig;
+use sim_replay::whole_file;
 
 use super::SweepError;
 use super::grid::{self, Point};
@@ -115,11 +116,8 @@ impl Cell {
     /// [`SweepError::Io`] when it cannot be written.
     pub fn write(&self, folder: &Path) -> Result<(), SweepError> {
         let path = self.key.file(folder);
-        let unfinished = path.with_extension(format!("{}.unfinished", std::process::id()));
         let text = serde_json::to_string_pretty(self).unwrap_or_default();
-        fs::write(&unfinished, text)
-            .and_then(|()| fs::rename(&unfinished, &path))
-            .map_err(|source| SweepError::Io { path, source })
+        whole_file::write(&path, text).map_err(|source| SweepError::Io { path, source })
     }
 }
 

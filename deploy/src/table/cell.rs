@@ -9,6 +9,7 @@ use ego_fuser::Method;
 use ego_fuser::trust::TrustConfig;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
+use sim_replay::whole_file;
 
 use super::TableError;
 use crate::fingerprint::hash_file;
@@ -88,11 +89,8 @@ impl Cell {
     /// [`TableError::Io`] when it cannot be written.
     pub(super) fn write(&self, folder: &Path) -> Result<(), TableError> {
         let path = self.key.file(folder);
-        let unfinished = path.with_extension("unfinished");
         let text = serde_json::to_string_pretty(self).unwrap_or_default();
-        fs::write(&unfinished, text)
-            .and_then(|()| fs::rename(&unfinished, &path))
-            .map_err(|source| TableError::Io { path, source })
+        whole_file::write(&path, text).map_err(|source| TableError::Io { path, source })
     }
 }
 

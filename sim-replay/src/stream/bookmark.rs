@@ -1,6 +1,5 @@
 //! How far a replay is, in a file: one that falls is started again and goes on from there.
 
-use std::fs;
 use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
@@ -11,9 +10,10 @@ use serde::{Deserialize, Serialize};
 use super::StreamReport;
 use super::schedule::Position;
 use crate::bus::mailbox::{Mailbox, Pushed, Taken};
+use crate::{bounded, whole_file};
 
 /// Largest file that is read: a place has a few numbers.
-const LARGEST: u64 = 64 << 10;
+const MAX_BYTES: u64 = 64 << 10;
 
 /// How far a replay is.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
@@ -40,7 +40,7 @@ impl Place {
     /// [`BookmarkError`] when the file is no place, or one of another scene.
     pub fn read(path: &Path, scenario: &str, ticks: usize) -> Result<Option<Self>, BookmarkError> {
         let at = || path.to_path_buf();
-        let text = match text_of(path) {
+        let text = match bounded::read_text(path, MAX_BYTES) {
             Ok(text) => text,
             Err(error) if error.kind() == ErrorKind::NotFound => return Ok(None),
             Err(source) => return Err(BookmarkError::Read { path: at(), source }),
@@ -145,23 +145,14 @@ fn write_all(path: &Path, places: &Mailbox<(), Place>) {
     }
 }
 
-/// Whole or not at all.
 fn write(path: &Path, place: &Place) -> std::io::Result<()> {
-    let beside = path.with_extension("new");
-    fs::write(&beside, serde_json::to_string(place)? + "\n").and_then(|()| fs::rename(&beside, path))
-}
-
-fn text_of(path: &Path) -> std::io::Result<String> {
-    let length = fs::metadata(path)?.len();
-    if length > LARGEST {
-        let told = format!("{length} bytes, and at most {LARGEST} are read");
-        return Err(std::io::Error::new(ErrorKind::InvalidData, told));
-    }
-    fs::read_to_string(path)
+    whole_file::write(path, serde_json::to_string(place)? + "\n")
 }
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
+
     use super::*;
 
     fn place() -> Place {
@@ -205,8 +196,8 @@ mod tests {
             fs::write(&path, broken).unwrap();
             assert!(told(Place::read(&path, "town1", 10)).contains("not the place of a replay"));
         }
-        fs::write(&path, " ".repeat(LARGEST as usize + 1)).unwrap();
-        assert!(told(Place::read(&path, "town1", 10)).contains("at most"));
+        fs::write(&path, " ".repeat(MAX_BYTES as usize + 1)).unwrap();
+        assert!(told(Place::read(&path, "town1", 10)).contains("larger than"));
     }
 
     #[test]
