@@ -135,6 +135,7 @@ impl<'a> Node<'a> {
     }
 
     fn listen(&mut self, stop: &Stop) {
+        let _working = self.bus.works_from(&self.inbox);
         while !stop.requested() {
             self.outlet.describe();
             let deadline = self.pairing.deadline().unwrap_or(self.outlet.next_descriptor);

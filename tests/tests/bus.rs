@@ -114,6 +114,31 @@ fn no_first_frame_is_lost_in_twenty_cold_starts() {
 }
 
 #[test]
+fn a_process_whose_work_stands_still_falls_silent() {
+    let router = TestRouter::open();
+    let (agent, watcher) = (router.join("agent-7", "7"), router.join("watcher", "watcher"));
+    let told = watcher.inbox(64, 4);
+    let _told = watcher.subscribe(topic("stats/agent-7"), &told).unwrap();
+    let says = |patience: Duration| matches!(told.take(Some(Instant::now() + patience)), Taken::Item(..));
+    assert!(says(PATIENCE), "it says how it is");
+
+    let inbox = agent.inbox(1, 1);
+    let working = agent.works_from(&inbox);
+    // It waits for work, for longer than it takes to say anything.
+    assert!(matches!(inbox.take(Some(Instant::now() + Duration::from_millis(1200))), Taken::TimedOut));
+    while says(Duration::from_millis(1)) {}
+    // It has come by since the last time, which is said once; and does not come back.
+    says(Duration::from_millis(700));
+    assert!(!says(Duration::from_millis(1500)), "it speaks though its work stands still");
+    working.beat();
+    assert!(says(PATIENCE), "it came by");
+    drop(working);
+    assert!((0..3).all(|_| says(PATIENCE)), "its work is done: it says how it is as before");
+    agent.leave(PATIENCE).unwrap();
+    watcher.leave(PATIENCE).unwrap();
+}
+
+#[test]
 fn a_missing_pair_is_named() {
     let router = TestRouter::open();
     let replay = router.join("replay", "replay");

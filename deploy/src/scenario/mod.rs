@@ -462,7 +462,8 @@ pub struct Timeouts {
     pub stop_s: f64,
     /// How often a process that keeps failing is started again.
     pub restarts: u32,
-    /// For a process that has fallen silent to say something, before it is killed and started again, seconds.
+    /// For a process that has fallen silent to say something, before it is killed and started again, seconds. One whose work
+    /// stands still falls silent too: longer than the slowest frame takes.
     pub hang_s: f64,
 }
 

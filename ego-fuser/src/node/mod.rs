@@ -171,6 +171,7 @@ impl<'a> Node<'a> {
     }
 
     fn listen(&mut self, stop: &Stop) -> Result<(), BusError> {
+        let _working = self.bus.works_from(&self.inbox);
         while !stop.requested() {
             self.look_round()?;
             match self.inbox.take(Some(self.next_moment())) {

@@ -15,6 +15,7 @@ use super::liveliness::{Presence, Sighting, Watch};
 use super::metrics::MetricsServer;
 use super::notices::{Notices, Speaker};
 use super::publisher::{Publisher, PublisherOptions, unix_nanos};
+use super::pulse::Working;
 use super::receipt::Receipt;
 use super::shutdown::{self, Overdue};
 use super::subscriber::{Inbox, Subscription};
@@ -120,6 +121,12 @@ impl Bus {
     #[must_use]
     pub fn limited_inbox(&self, places: usize, max_topics: usize, limits: InboxLimits) -> Arc<Inbox> {
         Inbox::within(limits, places, max_topics, &self.books)
+    }
+
+    /// Until what is returned is dropped, this process says how it is only while a thread works from `inbox`: waits there or
+    /// has come back since the last time. One whose work stands still falls silent so, and whoever watches over it can tell.
+    pub fn works_from(&self, inbox: &Inbox) -> Working {
+        Working::begin(&self.notices, inbox.pulse())
     }
 
     /// Delivers `topic` into `inbox`.

@@ -14,6 +14,7 @@ use zenoh::{Session, Wait};
 
 use super::mailbox::{Mailbox, Pushed, Taken};
 use super::publisher::{payload, unix_nanos};
+use super::pulse::Pulse;
 use super::{Books, BusError};
 
 /// How often a process says how its books stand and which routes it has heard, beside every time it hears a probe.
@@ -36,13 +37,20 @@ struct Shared {
     heard: Mutex<BTreeSet<Topic>>,
     // Many probes need one answer.
     answer_due: AtomicBool,
+    // Of the thread that works, while it does.
+    pulse: Mutex<Option<Arc<Pulse>>>,
     queue: Mailbox<(), Notice>,
 }
 
 impl Notices {
     pub(super) fn new() -> Self {
         let queue = Mailbox::new(PLACES, 1);
-        Self(Arc::new(Shared { heard: Mutex::default(), answer_due: AtomicBool::new(false), queue }))
+        Self(Arc::new(Shared {
+            heard: Mutex::default(),
+            answer_due: AtomicBool::new(false),
+            pulse: Mutex::default(),
+            queue,
+        }))
     }
 
     /// A message has come on `topic`: its route stands.
@@ -64,6 +72,11 @@ impl Notices {
     /// Says `control` to all who listen.
     pub(super) fn say(&self, control: Control, capture_nanos: u64) {
         self.push(Notice::Say { control, capture_nanos });
+    }
+
+    /// How the books stand is said only while this thread works; `None`: always.
+    pub(super) fn watch(&self, pulse: Option<Arc<Pulse>>) {
+        *self.0.pulse.lock().unwrap_or_else(PoisonError::into_inner) = pulse;
     }
 
     /// Ends the thread after it has said what is queued, and how the books stand at the end.
@@ -100,7 +113,7 @@ pub(super) struct Speaker {
 
 impl Speaker {
     fn run(self, shared: &Shared) {
-        let mut sequence = 0;
+        let (mut sequence, mut beats) = (0, 0);
         let mut next = Instant::now() + PERIOD;
         loop {
             match shared.queue.take(Some(next)) {
@@ -111,7 +124,10 @@ impl Speaker {
                 Taken::TimedOut => {
                     next = Instant::now() + PERIOD;
                     self.ready(shared, &mut sequence);
-                    self.stats(&mut sequence);
+                    let pulse = shared.pulse.lock().unwrap_or_else(PoisonError::into_inner).clone();
+                    if pulse.is_none_or(|pulse| pulse.is_alive(&mut beats)) {
+                        self.stats(&mut sequence);
+                    }
                 }
                 Taken::Closed => return self.stats(&mut sequence),
             }

@@ -14,6 +14,7 @@ use super::inbox_limits::{InboxLimits, Meters};
 use super::mailbox::{Mailbox, Pushed, Taken};
 use super::notices::Notices;
 use super::publisher::unix_nanos;
+use super::pulse::Pulse;
 use super::{Books, BusError};
 
 /// Where a message waits: data and notices of one topic apart, so that a notice never takes the place of data.
@@ -89,6 +90,7 @@ pub struct Inbox {
     meters: Meters,
     max_waiting: usize,
     waiting_bytes: AtomicUsize,
+    pulse: Arc<Pulse>,
 }
 
 impl Inbox {
@@ -105,6 +107,7 @@ impl Inbox {
             meters: Meters::new(limits),
             max_waiting: limits.waiting_bytes,
             waiting_bytes: AtomicUsize::new(0),
+            pulse: Arc::default(),
         })
     }
 
@@ -116,7 +119,7 @@ impl Inbox {
 
     /// The oldest event, waiting until `deadline` for one.
     pub fn take(&self, deadline: Option<Instant>) -> Taken<Topic, Event> {
-        match self.mailbox.take(deadline) {
+        match self.pulse.wait(|| self.mailbox.take(deadline)) {
             Taken::Item(lane, event) => {
                 self.waiting_bytes.fetch_sub(event.bytes(), Ordering::Relaxed);
                 Taken::Item(lane.topic, event)
@@ -124,6 +127,11 @@ impl Inbox {
             Taken::TimedOut => Taken::TimedOut,
             Taken::Closed => Taken::Closed,
         }
+    }
+
+    /// Of the thread that takes.
+    pub(super) fn pulse(&self) -> &Arc<Pulse> {
+        &self.pulse
     }
 
     /// Takes no more; what is inside can still be taken.

@@ -80,6 +80,13 @@ impl Default for StreamOptions {
     }
 }
 
+impl StreamOptions {
+    /// Whether those who listen set the pace: nothing is published that they have no room for.
+    fn is_paced(&self) -> bool {
+        self.rate == 0.0 || !self.lockstep.is_empty()
+    }
+}
+
 /// Why a scene cannot be played.
 #[derive(Debug, thiserror::Error)]
 pub enum StreamError {
@@ -184,7 +191,6 @@ impl<'a> Replay<'a> {
         let answers = options.lockstep.iter().map(|ego| Topic::Stream { cav: ego.clone(), stream: Stream::Detections });
         let subscriptions = verbs.into_iter().chain(answers).map(|topic| bus.subscribe(topic, &inbox));
         let air = options.link.as_ref().map(|(link, seed)| SensorAir::new(link, *seed)).transpose()?;
-        let is_paced = options.rate == 0.0 || !options.lockstep.is_empty();
         Ok(Self {
             bus,
             scenario: scenario.name.clone(),
@@ -194,7 +200,7 @@ impl<'a> Replay<'a> {
             reading,
             schedule,
             clock,
-            outlet: Outlet::open(bus, &options.agents, options.load.radar, is_paced)?,
+            outlet: Outlet::open(bus, &options.agents, options.load.radar, options.is_paced())?,
             _subscriptions: subscriptions.collect::<Result<_, _>>()?,
             air,
             inbox,
@@ -231,13 +237,20 @@ impl<'a> Replay<'a> {
     pub fn play(mut self) -> StreamReport {
         let began = Instant::now();
         let mut last = began;
+        // Without a pace of its own it may wait for its slowest agent for any time.
+        let working = (!self.options.is_paced()).then(|| self.bus.works_from(&self.inbox));
         while let Some((planned, due)) = self.wait_for_next() {
+            // One that is late takes nothing from its inbox.
+            if let Some(working) = &working {
+                working.beat();
+            }
             self.publish(planned, due);
             last = Instant::now();
             self.wait_for_answers(planned.capture_nanos);
             self.note_place();
         }
         self.await_the_last();
+        drop(working);
         let Self { bus, outlet, air, mut report, .. } = self;
         report.air = air.map(|air| air.report().clone());
         report.seconds = last.duration_since(began).as_secs_f64();
