@@ -21,14 +21,14 @@ use tests::machine;
 
 fn main() -> Result<()> {
     let arguments: Vec<String> = std::env::args().skip(1).filter(|argument| argument != "--bench").collect();
-    let mut seed = 1;
+    let pairs = arguments.chunks(2).map(pair).collect::<Result<Vec<_>>>()?;
+    // Wherever it stands among them.
+    let seed = pairs.iter().rfind(|(name, _)| *name == "--seed").map_or(1, |(_, seed)| *seed);
     let mut misses = Vec::new();
     println!("{}\n", machine::describe());
-    for pair in arguments.chunks(2) {
-        let [name, value] = pair else { bail!("{} needs a value", pair[0]) };
-        let value: u64 = value.parse().with_context(|| format!("{name} {value}"))?;
-        match name.as_str() {
-            "--seed" => seed = value,
+    for (name, value) in pairs {
+        match name {
+            "--seed" => {}
             "--faults" => misses.extend(under_faults(seed, value as usize)),
             "--starts" => misses.extend(starts(value as usize, false)),
             "--secured-starts" => misses.extend(starts(value as usize, true)),
@@ -40,6 +40,12 @@ fn main() -> Result<()> {
         bail!("missed: {}", misses.join("; "));
     }
     Ok(())
+}
+
+/// An option and its value.
+fn pair(arguments: &[String]) -> Result<(&str, u64)> {
+    let [name, value] = arguments else { bail!("{} needs a value", arguments[0]) };
+    Ok((name, value.parse().with_context(|| format!("{name} {value}"))?))
 }
 
 /// The names of the targets that do not hold.

@@ -49,12 +49,17 @@ fn convolve(convolution: &nn::Conv2D, maps: &Tensor) -> Result<Tensor, TchError>
 
 /// The precision in which convolutions are fastest without being wrong.
 fn fastest(device: Device) -> Kind {
-    #[cfg(target_arch = "x86_64")]
-    if device == Device::Cpu && std::arch::is_x86_feature_detected!("avx512bf16") {
-        return Kind::BFloat16;
-    }
-    let _ = device;
-    Kind::Float
+    if device == Device::Cpu && multiplies_bfloat16() { Kind::BFloat16 } else { Kind::Float }
+}
+
+#[cfg(target_arch = "x86_64")]
+fn multiplies_bfloat16() -> bool {
+    std::arch::is_x86_feature_detected!("avx512bf16")
+}
+
+#[cfg(not(target_arch = "x86_64"))]
+fn multiplies_bfloat16() -> bool {
+    false
 }
 
 #[cfg(test)]
