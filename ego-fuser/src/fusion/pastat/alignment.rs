@@ -7,6 +7,7 @@ use tch::{Kind, TchError, Tensor};
 use super::config::FsaConfig;
 use super::correlation::{PARTS, correlate, peaks, shifts};
 use super::entries::Maps;
+use super::search::Search;
 use crate::warp::{BILINEAR, NEAREST, PADDING_ZEROS};
 
 /// Keeps the weight of a map that fits nowhere from being divided by.
@@ -24,6 +25,8 @@ pub(super) struct Area {
     middle_m: [f64; 2],
     half_m: [f64; 2],
     cell_m: f64,
+    /// Cells of the ego's lattice along each edge of a cell.
+    cells: i64,
     /// Cells are compared with those of the ego up to so many cells away.
     radius: i64,
 }
@@ -32,12 +35,29 @@ impl Area {
     /// The area of `height` x `width` cells that begin where `grid` begins; maps are compared up to `radius` cells away.
     pub(super) fn new(grid: &BevGrid, [height, width]: [i64; 2], radius: i64) -> Self {
         let half_m = [width as f64 * grid.cell_m / 2.0, height as f64 * grid.cell_m / 2.0];
-        Self { middle_m: [grid.x_min_m + half_m[0], grid.y_min_m + half_m[1]], half_m, cell_m: grid.cell_m, radius }
+        Self {
+            middle_m: [grid.x_min_m + half_m[0], grid.y_min_m + half_m[1]],
+            half_m,
+            cell_m: grid.cell_m,
+            cells: 1,
+            radius,
+        }
     }
 
     /// The same with cells of `cells` by `cells`, compared up to about as many metres away.
     pub(super) fn with_cells_of(self, cells: i64) -> Self {
-        Self { cell_m: self.cell_m * cells as f64, radius: (self.radius + cells - 1) / cells, ..self }
+        let (cell_m, radius) = (self.cell_m * cells as f64, (self.radius + cells - 1) / cells);
+        Self { cell_m, cells: self.cells * cells, radius, ..self }
+    }
+
+    /// Edge of a cell, metres.
+    pub(super) fn cell_m(&self) -> f64 {
+        self.cell_m
+    }
+
+    /// Cells of the ego's lattice along each edge of a cell.
+    pub(super) fn cells(&self) -> i64 {
+        self.cells
     }
 
     /// `[PARTS^2, 2]`: the middles of the parts that maps are compared by, metres from the middle of the area.
@@ -65,6 +85,7 @@ pub(super) struct SpatialAlignment {
     delta: nn::Linear,
     /// What the map's tokens are told of how well it fits.
     fit: nn::Linear,
+    search: Option<Search>,
 }
 
 /// What the comparison of `K` maps with the ego's has found.
@@ -101,6 +122,7 @@ impl SpatialAlignment {
             hidden: nn::linear(path / "hidden", inputs, hidden, nn::LinearConfig::default()),
             delta: nn::linear(path / "delta", hidden, 6, still),
             fit: nn::linear(path / "fit", hidden, dim, still),
+            search: config.search.map(|search| Search::new(&(path / "search"), search)),
             config: config.clone(),
         }
     }
@@ -124,7 +146,12 @@ impl SpatialAlignment {
         ego_from_cav: &[Pose],
         area: &Area,
     ) -> Result<Found, TchError> {
-        let found = correlate(&self.shown(ego)?, &self.shown(others)?, area.radius)?;
+        let (own, mut shown) = (self.shown(ego)?, self.shown(others)?);
+        let far = self.search.as_ref().map(|search| search.offsets([&own, &shown], trust, area)).transpose()?;
+        if let Some(far) = &far {
+            shown = shifted(&shown, others, far, ego_from_cav, area)?;
+        }
+        let found = correlate(&own, &shown, area.radius)?;
         let device = others.features.device();
         let shifts = (shifts(area.radius)? * area.cell_m).f_to_device(device)?;
         let sharpness = self.sharpness.f_exp()?;
@@ -133,7 +160,12 @@ impl SpatialAlignment {
         let [fit, fit_whole] = [&found.parts, &found.whole].map(|found| found.f_amax([-1_i64].as_slice(), false));
         let (fit, fit_whole) = (fit?, fit_whole?);
         let weight = fit.f_relu()?.f_square()? * &found.energy;
-        let motion = rigid_motion(&parts, &weight, ego_from_cav, area)?;
+        let senders = senders(ego_from_cav, area)?.f_to_device(device)?;
+        let senders = match &far {
+            Some(far) => senders + far.f_detach()?,
+            None => senders,
+        };
+        let motion = rigid_motion(&parts, &weight, &senders, area)?;
         let by_entry = |parts: Tensor| parts.f_transpose(0, 1)?.f_reshape([ego_from_cav.len() as i64, -1]);
         let motion_in = motion.shallow_clone();
         let inputs =
@@ -144,7 +176,12 @@ impl SpatialAlignment {
         let bounds = Tensor::f_from_slice(&[max_shift_m as f32, max_shift_m as f32, max_turn_rad as f32])?;
         let bounds = bounds.f_to_device(device)?;
         let raw = learnt.f_narrow(1, 0, 3)? + motion / &bounds * learnt.f_narrow(1, 3, 3)?;
-        Ok(Found { deltas: raw.f_tanh()? * bounds, fit: self.fit.forward(&hidden) })
+        let near = raw.f_tanh()? * bounds;
+        let deltas = match far {
+            Some(far) => near + far.f_constant_pad_nd([0, 1])?,
+            None => near,
+        };
+        Ok(Found { deltas, fit: self.fit.forward(&hidden) })
     }
 
     /// What is compared, `[N, M, H, W]`: zero in the mean of what a map shows, so that empty road fits nothing.
@@ -157,12 +194,30 @@ impl SpatialAlignment {
     }
 }
 
+/// What is compared of maps, moved by `offsets` `[K, 2]`, metres.
+fn shifted(
+    shown: &Tensor,
+    maps: &Maps,
+    offsets: &Tensor,
+    ego_from_cav: &[Pose],
+    area: &Area,
+) -> Result<Tensor, TchError> {
+    let offsets = offsets.f_detach()?;
+    if offsets.f_count_nonzero(None::<i64>)?.f_int64_value(&[])? == 0 {
+        return Ok(shown.shallow_clone());
+    }
+    let (.., height, width) = shown.size4()?;
+    let places = lattice(&offsets.f_constant_pad_nd([0, 1])?, ego_from_cav, area, [height, width])?;
+    Ok(resample(shown, &maps.mask, &places)?.0)
+}
+
 /// The motion that fits the shifts of the parts best, `[N, 3]`: a shift, metres, after a small turn about the sender, radians.
 ///
 /// # Shapes
 /// - `parts`: `[PARTS^2, N, 2]` shifts, metres
 /// - `weight`: `[PARTS^2, N]` how sure each of them is
-fn rigid_motion(parts: &Tensor, weight: &Tensor, ego_from_cav: &[Pose], area: &Area) -> Result<Tensor, TchError> {
+/// - `senders`: `[N, 2]`, see [`senders`]
+fn rigid_motion(parts: &Tensor, weight: &Tensor, senders: &Tensor, area: &Area) -> Result<Tensor, TchError> {
     let over_parts = |tensor: &Tensor| tensor.f_sum_dim_intlist([0_i64].as_slice(), false, None);
     let share = weight / over_parts(weight)?.f_add_scalar(EPSILON)?;
     let share = share.f_unsqueeze(2)?;
@@ -175,15 +230,17 @@ fn rigid_motion(parts: &Tensor, weight: &Tensor, ego_from_cav: &[Pose], area: &A
     let inertia = over_parts(&(arm.f_square()?.f_sum_dim_intlist([2_i64].as_slice(), true, None)? * &share))?;
     // A single part says nothing of a turn: a few metres keep that from being divided by.
     let turn = over_parts(&(turning * &share))? / inertia.f_add_scalar(ARM_M * ARM_M)?;
-    let senders: Vec<f32> = ego_from_cav
-        .iter()
-        .flat_map(|pose| [0, 1].map(|axis| (pose.translation_m[axis] - area.middle_m[axis]) as f32))
-        .collect();
-    let senders = Tensor::f_from_slice(&senders)?.f_view([-1, 2])?.f_to_device(parts.device())?;
     let to_sender = senders - middle;
     // The middle of what was seen moves by `mean`; a turn moves the sender beside it.
     let across = Tensor::f_cat(&[-(to_sender.f_narrow(1, 1, 1)?), to_sender.f_narrow(1, 0, 1)?], 1)?;
     Tensor::f_cat(&[mean + across * &turn, turn], 1)
+}
+
+/// Where senders are, metres from the middle of the area, `[N, 2]`.
+fn senders(ego_from_cav: &[Pose], area: &Area) -> Result<Tensor, TchError> {
+    let from_middle = |pose: &Pose| [0, 1].map(|axis| (pose.translation_m[axis] - area.middle_m[axis]) as f32);
+    let senders: Vec<f32> = ego_from_cav.iter().flat_map(from_middle).collect();
+    Tensor::f_from_slice(&senders)?.f_view([-1, 2])
 }
 
 /// Where the cells of the ego's lattice lie on maps that are moved by `deltas`, for `grid_sampler`: `[N, H, W, 2]`.
@@ -232,6 +289,11 @@ mod tests {
         Area::new(&GRID, [16, 32], 4)
     }
 
+    /// Without the search, in which maps without a meaning fit anywhere.
+    fn near() -> FsaConfig {
+        FsaConfig { search: None, ..FsaConfig::default() }
+    }
+
     fn random(maps: i64) -> Maps {
         Maps { features: Tensor::randn([maps, 4, 16, 32], FLOAT), mask: Tensor::ones([maps, 1, 16, 32], FLOAT) }
     }
@@ -245,7 +307,7 @@ mod tests {
     #[test]
     fn untrained_it_moves_nothing_and_gradients_reach_it() {
         let variables = VarStore::new(Device::Cpu);
-        let fsa = SpatialAlignment::new(&variables.root(), [4, 6], &FsaConfig::default());
+        let fsa = SpatialAlignment::new(&variables.root(), [4, 6], &near());
         let poses = [Pose::from_xyz_yaw([3.0, 1.0, 0.0], 0.3), Pose::IDENTITY];
         let found = fsa.compare(&random(1), &random(2), &Tensor::ones([2, TRUST], FLOAT), &poses, &area()).unwrap();
         assert_eq!(found.fit, Tensor::zeros([2, 6], FLOAT));
@@ -285,13 +347,32 @@ mod tests {
     #[test]
     fn the_shift_is_bounded_whatever_is_learnt() {
         let variables = VarStore::new(Device::Cpu);
-        let config = FsaConfig::default();
+        let config = near();
         let fsa = SpatialAlignment::new(&variables.root(), [4, 6], &config);
         let _ = tch::no_grad(|| variables.variables()["delta.bias"].shallow_clone().fill_(1e6));
         let trust = Tensor::ones([1, TRUST], FLOAT);
         let deltas = fsa.compare(&random(1), &random(1), &trust, &[Pose::IDENTITY], &area()).unwrap().deltas;
         let found = Vec::<f32>::try_from(deltas.view(-1)).unwrap();
         assert!((found[0] - 3.0).abs() < 1e-6 && (f64::from(found[2]) - config.max_turn_rad).abs() < 1e-6);
+    }
+
+    #[test]
+    fn a_map_that_is_far_off_comes_back_and_then_fits_as_well_as_any() {
+        tch::manual_seed(5);
+        let grid = BevGrid { x_min_m: -24.0, y_min_m: -16.0, cell_m: 0.5, width: 96, height: 64 };
+        let (area, trust) = (Area::new(&grid, [64, 96], 4), Tensor::ones([2, TRUST], FLOAT));
+        let fsa = SpatialAlignment::new(&VarStore::new(Device::Cpu).root(), [4, 6], &FsaConfig::default());
+        let features = Tensor::rand([1, 4, 64, 96], FLOAT).gt(0.99).to_kind(Kind::Float);
+        let far = features.roll([-16, 12], [2, 3]);
+        let with_mask = |features: Tensor| {
+            let (maps, _, height, width) = features.size4().unwrap();
+            Maps { features, mask: Tensor::ones([maps, 1, height, width], FLOAT) }
+        };
+        let others = with_mask(Tensor::cat(&[&features, &far], 0));
+        let poses = [Pose::IDENTITY, Pose::from_xyz_yaw([3.0, 1.0, 0.0], 0.3)];
+        let deltas = fsa.compare(&with_mask(features), &others, &trust, &poses, &area).unwrap().deltas;
+        let found = Vec::<f32>::try_from(deltas.view(-1)).unwrap();
+        assert_eq!(found, [0.0, 0.0, 0.0, -6.0, 8.0, 0.0]);
     }
 
     #[test]
@@ -311,7 +392,9 @@ mod tests {
             .collect();
         let parts = Tensor::from_slice(&parts).view([-1, 1, 2]);
         let wide = Area { cell_m: 0.5, ..area() };
-        let motion = rigid_motion(&parts, &Tensor::ones([PARTS * PARTS, 1], FLOAT), &[sender], &wide).unwrap();
+        let motion =
+            rigid_motion(&parts, &Tensor::ones([PARTS * PARTS, 1], FLOAT), &senders(&[sender], &wide).unwrap(), &wide)
+                .unwrap();
         let [dx, dy, theta] = [0, 1, 2].map(|index| motion.double_value(&[0, index]));
         // The turn comes out smaller by the arm that is added, and the shift by what that turn moves the sender.
         assert!(theta > 0.4 * turn && theta <= turn, "{theta}");

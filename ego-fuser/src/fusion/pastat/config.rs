@@ -50,11 +50,31 @@ pub struct FsaConfig {
     pub max_shift_m: f64,
     /// Largest turn, radians.
     pub max_turn_rad: f64,
+    /// The search for maps that are further away than all that; absent: such maps stay where they are.
+    #[serde(default)]
+    pub search: Option<SearchConfig>,
+}
+
+/// The search for a map that lies far from where its pose puts it.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SearchConfig {
+    /// So many cells along each edge are taken together.
+    pub cells: i64,
+    /// Maps are looked for up to so many of these larger cells away, along x and along y.
+    pub radius: i64,
 }
 
 impl Default for FsaConfig {
     fn default() -> Self {
-        Self { matching: 4, radius: 4, hidden: 64, max_shift_m: 3.0, max_turn_rad: 5.0_f64.to_radians() }
+        Self {
+            matching: 4,
+            radius: 4,
+            hidden: 64,
+            max_shift_m: 3.0,
+            max_turn_rad: 5.0_f64.to_radians(),
+            search: Some(SearchConfig { cells: 4, radius: 9 }),
+        }
     }
 }
 
@@ -153,7 +173,9 @@ impl PastatConfig {
     /// compares.
     #[must_use]
     pub fn padding_cells(&self) -> i64 {
-        let parts = if self.fsa.is_some() { PARTS * self.earlier_cells } else { 1 };
+        let larger =
+            |fsa: &FsaConfig| fsa.search.map_or(self.earlier_cells, |search| lcm(search.cells, self.earlier_cells));
+        let parts = self.fsa.as_ref().map_or(1, |fsa| PARTS * larger(fsa));
         lcm(self.patch * self.windows.iter().copied().fold(1, lcm), parts)
     }
 
@@ -191,11 +213,21 @@ impl PastatConfig {
         if !(1e-3..=10.0).contains(&self.frame_secs) {
             return error("pastat frame_secs", self.frame_secs.to_string(), "0.001 to 10 s");
         }
+        if let Some(cells) = self.fsa.as_ref().and_then(|fsa| fsa.search).map(|search| search.cells)
+            && cells % self.earlier_cells != 0
+        {
+            return error("pastat fsa search cells", cells.to_string(), "a multiple of earlier_cells");
+        }
         self.fsa.as_ref().map_or(Ok(()), FsaConfig::validate)
     }
 }
 
 impl FsaConfig {
+    /// How far a map may lie from where its pose puts it, metres; cells of its lattice are of `cell_m`.
+    pub(super) fn reach_m(&self, cell_m: f64) -> f64 {
+        self.search.map_or(self.max_shift_m, |SearchConfig { cells, radius }| (cells * radius) as f64 * cell_m)
+    }
+
     fn validate(&self) -> Result<(), ConfigError> {
         let error = |field, value: String, must| Err(ConfigError::Value { field, value, must });
         if !(1..=256).contains(&self.matching) || !(1..=4096).contains(&self.hidden) {
@@ -211,6 +243,11 @@ impl FsaConfig {
         if !(0.0..=50.0).contains(&self.max_shift_m) || !(0.0..=1.6).contains(&self.max_turn_rad) {
             let value = format!("{} m, {} rad", self.max_shift_m, self.max_turn_rad);
             return error("pastat fsa bounds", value, "up to 50 m and 1.6 rad");
+        }
+        if let Some(SearchConfig { cells, radius }) = self.search
+            && !((1..=16).contains(&cells) && (1..=32).contains(&radius))
+        {
+            return error("pastat fsa search", format!("{cells}, {radius}"), "1 to 16 cells, 1 to 32 of them away");
         }
         Ok(())
     }
@@ -236,7 +273,7 @@ mod tests {
             assert_eq!(serde_json::from_str::<PastatConfig>(&text).unwrap(), config);
         }
         assert_eq!(PastatConfig::lean(64).padding_cells(), 16);
-        assert_eq!(PastatConfig { windows: vec![4, 6], ..PastatConfig::lean(64) }.padding_cells(), 24);
+        assert_eq!(PastatConfig { windows: vec![4, 6], ..PastatConfig::lean(64) }.padding_cells(), 48);
     }
 
     #[test]
@@ -245,6 +282,13 @@ mod tests {
             (PastatConfig { dim: 36, ..PastatConfig::lean(64) }, "dim is 36"),
             (PastatConfig { windows: vec![4, 8, 16], ..PastatConfig::lean(64) }, "windows is [4, 8, 16]"),
             (PastatConfig { earlier_cells: 3, ..PastatConfig::lean(64) }, "earlier_cells is 3"),
+            (
+                PastatConfig {
+                    fsa: Some(FsaConfig { search: Some(SearchConfig { cells: 3, radius: 9 }), ..FsaConfig::default() }),
+                    ..PastatConfig::lean(64)
+                },
+                "search cells is 3",
+            ),
             (PastatConfig { frames: 0, ..PastatConfig::lean(64) }, "frames is 0"),
             (PastatConfig { frame_secs: f64::NAN, ..PastatConfig::lean(64) }, "frame_secs is NaN"),
         ] {

@@ -17,6 +17,7 @@ mod config;
 mod correlation;
 mod entries;
 mod refiner;
+mod search;
 mod temporal;
 mod tokens;
 
@@ -24,7 +25,7 @@ use agent::model_config::ConfigError;
 use protocol::{BevGrid, Pose};
 use tch::{TchError, Tensor, nn};
 
-pub use config::{FsaConfig, Part, PastatConfig, Rows, Wavelengths};
+pub use config::{FsaConfig, Part, PastatConfig, Rows, SearchConfig, Wavelengths};
 
 use self::alignment::{Area, Found, SpatialAlignment, TRUST, lattice, resample};
 use self::block::Block;
@@ -221,6 +222,10 @@ impl Fusion for Pastat {
         };
         let deltas = entries.deltas.map(|deltas| shown.among_all(&deltas)).transpose()?;
         Ok((fused.f_to_kind(views.features.kind())?, deltas))
+    }
+
+    fn reach_m(&self, cell_m: f64) -> f64 {
+        self.config.fsa.as_ref().map_or(0.0, |fsa| fsa.reach_m(cell_m))
     }
 
     fn frames(&self) -> usize {

@@ -67,8 +67,10 @@ impl Scene {
     }
 }
 
+/// Without the search, in which maps without a meaning fit anywhere.
 fn small() -> PastatConfig {
-    PastatConfig { dim: 16, windows: vec![2, 4], ..PastatConfig::lean(4) }
+    let fsa = FsaConfig { search: None, ..FsaConfig::default() };
+    PastatConfig { dim: 16, windows: vec![2, 4], fsa: Some(fsa), ..PastatConfig::lean(4) }
 }
 
 /// A module in which no weight is neutral any more, as after a training.
@@ -154,7 +156,7 @@ fn each_switch_decides_whether_its_input_matters() {
 #[test]
 fn every_parameter_gets_a_gradient() {
     for rows in [Rows::Ego, Rows::All] {
-        let (store, pastat) = trained(&PastatConfig { rows, ..small() });
+        let (store, pastat) = trained(&PastatConfig { rows, fsa: Some(FsaConfig::default()), ..small() });
         let scene = Scene::new(&[0, 1, 2, 1], &[0.0, 0.1, 0.0, 0.2]);
         (scene.fused(&pastat) * Tensor::randn([4, 12, 20], FLOAT)).sum(Kind::Float).backward();
         for (name, variable) in store.variables() {
