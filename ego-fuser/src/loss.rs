@@ -10,8 +10,8 @@ use crate::targets::{BOX_CODE, Labels};
 
 /// What a turn by a radian weighs against a shift by a metre: about the distance at which neighbours see what the ego sees.
 const METRES_PER_RADIAN: f64 = 20.0;
-/// Turns beyond this are not undone by looking at maps, radians.
-const RECOVERABLE_RAD: f64 = 0.25;
+/// What is left of a pose's error beyond this is not undone by looking at maps from near, metres.
+const RECOVERABLE_M: f64 = 5.0;
 
 /// Weights and shapes of the two terms.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -143,15 +143,11 @@ pub fn detection_loss(
 /// How far corrections are from what would undo the errors put on poses: smooth L1 per view, mean over views and samples.
 ///
 /// A turn by a radian counts as a shift by 20 m. No true pose takes part: an error that was put on top is
-/// known whatever lies below. Beyond `reach_m` and a quarter of a radian nothing is asked.
+/// known whatever lies below. Where more than 5 m are left nothing is asked: such a map was not found from afar.
 ///
 /// # Errors
 /// [`TchError`] when a sample has other views than offsets.
-pub fn alignment_loss(
-    corrections: &[Option<Tensor>],
-    offsets: &[Vec<Offset>],
-    reach_m: f64,
-) -> Result<Tensor, TchError> {
+pub fn alignment_loss(corrections: &[Option<Tensor>], offsets: &[Vec<Offset>]) -> Result<Tensor, TchError> {
     let unit = Tensor::f_from_slice(&[1.0, 1.0, METRES_PER_RADIAN as f32])?;
     let mut losses = Vec::new();
     for (moved_by, offsets) in corrections.iter().zip(offsets) {
@@ -159,11 +155,9 @@ pub fn alignment_loss(
         let wanted: Vec<f32> =
             offsets.iter().skip(1).flat_map(|Offset(offset)| offset.map(|value| value as f32)).collect();
         let wanted = Tensor::f_from_slice(&wanted)?.f_view([-1, 3])?.f_to_device(moved_by.device())?;
-        let is_asked =
-            |Offset([dx, dy, turn_rad]): &Offset| dx.hypot(*dy) <= reach_m && turn_rad.abs() <= RECOVERABLE_RAD;
-        let asked: Vec<f32> = offsets.iter().skip(1).map(|offset| f32::from(u8::from(is_asked(offset)))).collect();
-        let asked = Tensor::f_from_slice(&asked)?.f_view([-1, 1])?.f_to_device(moved_by.device())?;
-        let off = (moved_by.f_to_kind(Kind::Float)? - wanted) * unit.f_to_device(moved_by.device())? * asked;
+        let off = (moved_by.f_to_kind(Kind::Float)? - wanted) * unit.f_to_device(moved_by.device())?;
+        let left_m = off.f_abs()?.f_amax([1_i64].as_slice(), true)?;
+        let off = off * left_m.f_le(RECOVERABLE_M)?;
         losses.push(off.f_smooth_l1_loss(&off.f_zeros_like()?, tch::Reduction::Mean, 1.0)?);
     }
     match losses.as_slice() {
@@ -243,14 +237,14 @@ mod tests {
         let offsets = vec![vec![Offset::default(), Offset([1.0, -0.5, 0.02]), Offset([0.0, 2.0, 0.0])]];
         let undone = Tensor::from_slice(&[1.0f32, -0.5, 0.02, 0.0, 2.0, 0.0]).view([2, 3]);
         let loss = |corrections: &[Option<Tensor>], offsets: &[Vec<Offset>]| {
-            alignment_loss(corrections, offsets, 5.0).unwrap().double_value(&[])
+            alignment_loss(corrections, offsets).unwrap().double_value(&[])
         };
         assert!(loss(&[Some(undone.shallow_clone())], &offsets) < 1e-12);
         // Nothing moved: |1|, |-0.5|, 20 m * |0.02|, |2| by smooth L1, over six numbers.
         let still = Tensor::zeros([2, 3], (Kind::Float, Device::Cpu)).set_requires_grad(true);
         let expected = (0.5 + 0.125 + 0.08 + 1.5) / 6.0;
         assert!((loss(&[Some(still.shallow_clone())], &offsets) - expected).abs() < 1e-6);
-        alignment_loss(&[Some(still.shallow_clone()), None], &[offsets[0].clone(), vec![]], 5.0).unwrap().backward();
+        alignment_loss(&[Some(still.shallow_clone()), None], &[offsets[0].clone(), vec![]]).unwrap().backward();
         assert!(still.grad().double_value(&[0, 0]) < 0.0, "towards the offset");
         let lost = vec![vec![Offset::default(), Offset([9.0, 0.0, 0.0]), Offset([0.0, 0.0, 1.0])]];
         assert_eq!(loss(&[Some(still.detach())], &lost), 0.0, "of a lost vehicle nothing is asked");

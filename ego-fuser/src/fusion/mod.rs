@@ -103,11 +103,6 @@ pub trait Fusion: Debug + Send {
         Ok((self.fuse(views, train)?, None))
     }
 
-    /// How large an error of a pose its own alignment can undo, metres; cells of the lattice are of `cell_m`.
-    fn reach_m(&self, _cell_m: f64) -> f64 {
-        0.0
-    }
-
     /// Time steps that it wants of every agent, the newest included.
     fn frames(&self) -> usize {
         1

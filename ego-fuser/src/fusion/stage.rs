@@ -136,12 +136,6 @@ impl FusionStage {
         self.fusion.frames()
     }
 
-    /// How large an error of a pose the fusion's own alignment can undo, metres.
-    #[must_use]
-    pub fn reach_m(&self) -> f64 {
-        self.fusion.reach_m(self.grid.cell_m)
-    }
-
     /// Moves maps onto the ego lattice: `own_frame` is `[N, C, H, W]`, each map in the axes of its sender, `sent`
     /// `[N, 1, H, W]` is 1 where a cell was sent (absent: everywhere), `facts` are `N`: the ego's newest first, then the
     /// newest of all others, then what is older.

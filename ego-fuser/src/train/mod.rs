@@ -132,10 +132,7 @@ impl<'a> Training<'a> {
         let loss = detection_loss(&output.head.scores, &output.head.offsets, &labels, &self.config.loss)?;
         let share_done = self.share_done();
         let total = match self.config.loss.alignment_weight {
-            weight if weight > 0.0 => {
-                let reach_m = self.model.fusion().reach_m();
-                loss.total() + alignment_loss(&output.corrections, &batch.offsets, reach_m)? * weight
-            }
+            weight if weight > 0.0 => loss.total() + alignment_loss(&output.corrections, &batch.offsets)? * weight,
             _ => loss.total(),
         };
         Ok(match self.trainer.step(&total, share_done)? {

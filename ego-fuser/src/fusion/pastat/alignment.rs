@@ -7,7 +7,7 @@ use tch::{Kind, TchError, Tensor};
 use super::config::FsaConfig;
 use super::correlation::{PARTS, correlate, peaks, shifts};
 use super::entries::Maps;
-use super::search::Search;
+use super::search::offsets;
 use crate::warp::{BILINEAR, NEAREST, PADDING_ZEROS};
 
 /// Keeps the weight of a map that fits nowhere from being divided by.
@@ -85,7 +85,6 @@ pub(super) struct SpatialAlignment {
     delta: nn::Linear,
     /// What the map's tokens are told of how well it fits.
     fit: nn::Linear,
-    search: Option<Search>,
 }
 
 /// What the comparison of `K` maps with the ego's has found.
@@ -122,7 +121,6 @@ impl SpatialAlignment {
             hidden: nn::linear(path / "hidden", inputs, hidden, nn::LinearConfig::default()),
             delta: nn::linear(path / "delta", hidden, 6, still),
             fit: nn::linear(path / "fit", hidden, dim, still),
-            search: config.search.map(|search| Search::new(&(path / "search"), search)),
             config: config.clone(),
         }
     }
@@ -147,7 +145,7 @@ impl SpatialAlignment {
         area: &Area,
     ) -> Result<Found, TchError> {
         let (own, mut shown) = (self.shown(ego)?, self.shown(others)?);
-        let far = self.search.as_ref().map(|search| search.offsets([&own, &shown], trust, area)).transpose()?;
+        let far = self.config.search.map(|search| offsets([&own, &shown], area, search)).transpose()?;
         if let Some(far) = &far {
             shown = shifted(&shown, others, far, ego_from_cav, area)?;
         }
@@ -162,7 +160,7 @@ impl SpatialAlignment {
         let weight = fit.f_relu()?.f_square()? * &found.energy;
         let senders = senders(ego_from_cav, area)?.f_to_device(device)?;
         let senders = match &far {
-            Some(far) => senders + far.f_detach()?,
+            Some(far) => senders + far,
             None => senders,
         };
         let motion = rigid_motion(&parts, &weight, &senders, area)?;
@@ -202,7 +200,6 @@ fn shifted(
     ego_from_cav: &[Pose],
     area: &Area,
 ) -> Result<Tensor, TchError> {
-    let offsets = offsets.f_detach()?;
     if offsets.f_count_nonzero(None::<i64>)?.f_int64_value(&[])? == 0 {
         return Ok(shown.shallow_clone());
     }

@@ -56,13 +56,15 @@ pub struct FsaConfig {
 }
 
 /// The search for a map that lies far from where its pose puts it.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct SearchConfig {
     /// So many cells along each edge are taken together.
     pub cells: i64,
     /// Maps are looked for up to so many of these larger cells away, along x and along y.
     pub radius: i64,
+    /// A map is moved when its correlation with the ego's is higher elsewhere by more than this.
+    pub margin: f64,
 }
 
 impl Default for FsaConfig {
@@ -73,7 +75,7 @@ impl Default for FsaConfig {
             hidden: 64,
             max_shift_m: 3.0,
             max_turn_rad: 5.0_f64.to_radians(),
-            search: Some(SearchConfig { cells: 4, radius: 9 }),
+            search: Some(SearchConfig { cells: 4, radius: 9, margin: 0.1 }),
         }
     }
 }
@@ -223,11 +225,6 @@ impl PastatConfig {
 }
 
 impl FsaConfig {
-    /// How far a map may lie from where its pose puts it, metres; cells of its lattice are of `cell_m`.
-    pub(super) fn reach_m(&self, cell_m: f64) -> f64 {
-        self.search.map_or(self.max_shift_m, |SearchConfig { cells, radius }| (cells * radius) as f64 * cell_m)
-    }
-
     fn validate(&self) -> Result<(), ConfigError> {
         let error = |field, value: String, must| Err(ConfigError::Value { field, value, must });
         if !(1..=256).contains(&self.matching) || !(1..=4096).contains(&self.hidden) {
@@ -244,10 +241,11 @@ impl FsaConfig {
             let value = format!("{} m, {} rad", self.max_shift_m, self.max_turn_rad);
             return error("pastat fsa bounds", value, "up to 50 m and 1.6 rad");
         }
-        if let Some(SearchConfig { cells, radius }) = self.search
-            && !((1..=16).contains(&cells) && (1..=32).contains(&radius))
+        if let Some(SearchConfig { cells, radius, margin }) = self.search
+            && !((1..=16).contains(&cells) && (1..=32).contains(&radius) && (0.0..=2.0).contains(&margin))
         {
-            return error("pastat fsa search", format!("{cells}, {radius}"), "1 to 16 cells, 1 to 32 of them away");
+            let value = format!("{cells}, {radius}, {margin}");
+            return error("pastat fsa search", value, "1 to 16 cells, 1 to 32 of them away, a margin of 0 to 2");
         }
         Ok(())
     }
@@ -284,7 +282,10 @@ mod tests {
             (PastatConfig { earlier_cells: 3, ..PastatConfig::lean(64) }, "earlier_cells is 3"),
             (
                 PastatConfig {
-                    fsa: Some(FsaConfig { search: Some(SearchConfig { cells: 3, radius: 9 }), ..FsaConfig::default() }),
+                    fsa: Some(FsaConfig {
+                        search: Some(SearchConfig { cells: 3, radius: 9, margin: 0.1 }),
+                        ..FsaConfig::default()
+                    }),
                     ..PastatConfig::lean(64)
                 },
                 "search cells is 3",

@@ -224,10 +224,6 @@ impl Fusion for Pastat {
         Ok((fused.f_to_kind(views.features.kind())?, deltas))
     }
 
-    fn reach_m(&self, cell_m: f64) -> f64 {
-        self.config.fsa.as_ref().map_or(0.0, |fsa| fsa.reach_m(cell_m))
-    }
-
     fn frames(&self) -> usize {
         self.config.frames
     }
