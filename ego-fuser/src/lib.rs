@@ -16,6 +16,8 @@ pub mod feature_store;
 pub mod fusion;
 mod history;
 pub mod loss;
+#[cfg(test)]
+mod made_up;
 pub mod method;
 pub mod model;
 pub mod multi_scale;

@@ -277,6 +277,7 @@ mod tests {
     use tch::nn::VarStore;
 
     use super::*;
+    use crate::made_up::{redraw, uniform};
     use crate::warp::warp_to_ego;
 
     const FLOAT: (Kind, Device) = (Kind::Float, Device::Cpu);
@@ -355,11 +356,12 @@ mod tests {
 
     #[test]
     fn a_map_that_is_far_off_comes_back_and_then_fits_as_well_as_any() {
-        tch::manual_seed(5);
         let grid = BevGrid { x_min_m: -24.0, y_min_m: -16.0, cell_m: 0.5, width: 96, height: 64 };
         let (area, trust) = (Area::new(&grid, [64, 96], 4), Tensor::ones([2, TRUST], FLOAT));
-        let fsa = SpatialAlignment::new(&VarStore::new(Device::Cpu).root(), [4, 6], &FsaConfig::default());
-        let features = Tensor::rand([1, 4, 64, 96], FLOAT).gt(0.99).to_kind(Kind::Float);
+        let variables = VarStore::new(Device::Cpu);
+        let fsa = SpatialAlignment::new(&variables.root(), [4, 6], &FsaConfig::default());
+        redraw(&variables, &["matching"], 0.3);
+        let features = uniform(5, &[1, 4, 64, 96]).gt(0.99).to_kind(Kind::Float);
         let far = features.roll([-16, 12], [2, 3]);
         let with_mask = |features: Tensor| {
             let (maps, _, height, width) = features.size4().unwrap();
