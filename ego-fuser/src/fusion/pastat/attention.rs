@@ -3,6 +3,8 @@
 use tch::nn::{self, Init, Module};
 use tch::{Kind, TchError, Tensor};
 
+use super::gather::{Others, numbers};
+
 /// What a masked score is set to: low enough for no weight, and finite, so that rows with nothing valid stay numbers.
 const MASKED: f64 = -1e9;
 
@@ -52,6 +54,31 @@ impl AgentAttention {
             all_rows(&by_head(&query)?, &by_head(&key)?, &by_head(&value)?, &hidden)?
         };
         Ok(self.out.forward(&mixed.f_reshape([rows, height, width, dim])?))
+    }
+
+    /// What the ego learns of all, from tokens that are not normalised yet: the same as `forward` of one row.
+    ///
+    /// A head's score of a token is the product of its query, led back through the weights of keys and norm, with the
+    /// token; what the norm adds to all tokens alike changes no weight. So neither keys nor values are made of tokens.
+    ///
+    /// # Shapes
+    /// - `ego`, returns: `[1, h, w, D]`
+    pub(super) fn gather(&self, norm: &nn::LayerNorm, ego: &Tensor, others: &Others) -> Result<Tensor, TchError> {
+        let (_, height, width, dim) = ego.size4()?;
+        let (cells, each) = (height * width, dim / self.heads);
+        let by_channel = |tokens: &Tensor| tokens.f_view([cells, dim])?.f_transpose(0, 1);
+        let by_head = |linear: &nn::Linear| linear.ws.f_view([self.heads, each, dim]);
+        let query = self.query.forward(&norm.forward(ego)) / (each as f64).sqrt();
+        let query = by_channel(&query)?.f_reshape([self.heads, each, cells])?;
+        let (one, none) = (Tensor::from(1f32), Tensor::from(0f32));
+        let (gain, shift) = (norm.ws.as_ref().unwrap_or(&one), norm.bs.as_ref().unwrap_or(&none));
+        let asked = (by_head(&self.key)? * gain).f_transpose(1, 2)?.f_matmul(&query)?;
+        let gathered = others.gather(&numbers(&asked)?, &numbers(&by_channel(ego)?)?);
+        let gathered = Tensor::f_from_slice(&gathered)?.f_view([self.heads, dim, cells])?;
+        let values = by_head(&self.value)?;
+        let mixed =
+            (&values * gain).f_matmul(&gathered)? + values.f_matmul(&shift.f_expand([dim], false)?.f_unsqueeze(1)?)?;
+        Ok(self.out.forward(&mixed.f_view([dim, cells])?.f_transpose(0, 1)?.f_reshape([1, height, width, dim])?))
     }
 
     /// Only the ego asks: sums over few entries, cheaper than products of small matrices.
@@ -170,6 +197,7 @@ mod tests {
     use tch::nn::VarStore;
 
     use super::*;
+    use crate::made_up::{redraw, uniform};
 
     const FLOAT: (Kind, Device) = (Kind::Float, Device::Cpu);
 
@@ -183,6 +211,23 @@ mod tests {
         let all = attention.forward(&tokens, &valid, 4).unwrap();
         let one = attention.forward(&tokens, &valid, 1).unwrap();
         assert!(one.allclose(&all.narrow(0, 0, 1), 1e-4, 1e-5, false));
+    }
+
+    #[test]
+    fn what_the_ego_gathers_is_what_one_row_learns() {
+        let variables = VarStore::new(Device::Cpu);
+        let attention = AgentAttention::new(&variables.root(), 12, 2);
+        let norm = nn::layer_norm(variables.root() / "norm", vec![12], nn::LayerNormConfig::default());
+        redraw(&variables, &["weight", "bias"], 0.8);
+        // More cells than a strip, and a rest.
+        let tokens = uniform(1, &[4, 9, 10, 12]) * 3.0;
+        let valid = uniform(2, &[4, 9, 10]).gt(0.4).to_kind(Kind::Float);
+        // There nothing counts.
+        let _ = valid.select(1, 0).select(1, 0).fill_(0.0);
+        let forward = attention.forward(&norm.forward(&tokens), &valid, 1).unwrap();
+        let others = Others::of(&tokens.permute([0, 3, 1, 2]), &valid).unwrap();
+        let gathered = attention.gather(&norm, &tokens.narrow(0, 0, 1), &others).unwrap();
+        assert!(gathered.allclose(&forward, 1e-4, 1e-5, false), "{}", (gathered - forward).abs().max());
     }
 
     #[test]

@@ -5,6 +5,7 @@ use tch::{TchError, Tensor};
 
 use super::attention::{AgentAttention, WindowAttention};
 use super::config::PastatConfig;
+use super::gather::Others;
 
 /// One block: over agents and time at each cell, across cells within windows, then cell by cell.
 #[derive(Debug)]
@@ -35,11 +36,21 @@ impl Block {
     /// - `valid`: `[N, h, w]`
     /// - returns: `[rows, h, w, D]`
     pub(super) fn forward(&self, tokens: &Tensor, valid: &Tensor, rows: i64) -> Result<Tensor, TchError> {
-        let [norm_agents, norm_windows, norm_mlp] = &self.norms;
-        let own = valid.f_narrow(0, 0, rows)?;
         let kept = tokens.f_narrow(0, 0, rows)?;
-        let kept = self.agents.forward(&norm_agents.forward(tokens), valid, rows)? + kept;
-        let kept = self.windows.forward(&norm_windows.forward(&kept), &own)? + kept;
+        let kept = self.agents.forward(&self.norms[0].forward(tokens), valid, rows)? + kept;
+        self.across(&kept, &valid.f_narrow(0, 0, rows)?)
+    }
+
+    /// The ego's newest `[1, h, w, D]` after this block, in numbers: the same as the first row of [`forward`](Self::forward).
+    pub(super) fn gather(&self, ego: &Tensor, others: &Others, valid: &Tensor) -> Result<Tensor, TchError> {
+        let kept = self.agents.gather(&self.norms[0], ego, others)? + ego;
+        self.across(&kept, valid)
+    }
+
+    /// What is left when each entry has learnt of the others: across cells, and cell by cell.
+    fn across(&self, kept: &Tensor, valid: &Tensor) -> Result<Tensor, TchError> {
+        let [_, norm_windows, norm_mlp] = &self.norms;
+        let kept = self.windows.forward(&norm_windows.forward(kept), valid)? + kept;
         let inner = self.mlp[0].forward(&norm_mlp.forward(&kept)).f_gelu("none")?;
         Ok(self.mlp[1].forward(&inner) + kept)
     }

@@ -16,6 +16,7 @@ mod confidence;
 mod config;
 mod correlation;
 mod entries;
+mod gather;
 mod refiner;
 mod search;
 mod temporal;
@@ -23,13 +24,14 @@ mod tokens;
 
 use agent::model_config::ConfigError;
 use protocol::{BevGrid, Pose};
-use tch::{TchError, Tensor, nn};
+use tch::{Device, TchError, Tensor, nn};
 
 pub use config::{FsaConfig, Part, PastatConfig, Rows, SearchConfig, Wavelengths};
 
 use self::alignment::{Area, Found, SpatialAlignment, TRUST, lattice, resample};
 use self::block::Block;
 use self::entries::{Maps, Shown, Told};
+use self::gather::Others;
 use self::refiner::Refiner;
 use self::tokens::{Decoder, Tokeniser, TrustGate};
 use super::{AlignedViews, Fusion};
@@ -52,7 +54,7 @@ struct Entries {
     own: Tensor,
     /// The newest maps of all others.
     others: Maps,
-    /// `[N, h, w, D]`: tokens of all entries.
+    /// `[N, D, h, w]`: tokens of all entries.
     tokens: Tensor,
     /// `[N, h, w]`.
     valid: Tensor,
@@ -136,8 +138,7 @@ impl Pastat {
             _ => (placed, facts, None),
         };
         let Placed { others, seen, valid } = placed;
-        let facts = facts.f_unsqueeze(1)?.f_unsqueeze(1)?;
-        let tokens = seen.f_permute([0, 2, 3, 1])?.f_contiguous()? + facts;
+        let tokens = seen + facts.f_unsqueeze(2)?.f_unsqueeze(3)?;
         Ok(Entries { own, others, tokens, valid, deltas })
     }
 
@@ -169,13 +170,18 @@ impl Pastat {
     }
 
     /// The ego's tokens `[1, h, w, D]` after all blocks.
-    fn transform(&self, entries: &Entries) -> Result<Tensor, TchError> {
-        let count = entries.tokens.size()[0];
-        let mut tokens = entries.tokens.shallow_clone();
+    fn transform(&self, Entries { tokens, valid, .. }: &Entries) -> Result<Tensor, TchError> {
+        let count = tokens.size()[0];
+        if self.config.rows == Rows::Ego && tokens.device() == Device::Cpu && !tokens.requires_grad() {
+            let (others, valid) = (Others::of(tokens, valid)?, valid.f_narrow(0, 0, 1)?);
+            let ego = by_cell(&tokens.f_narrow(0, 0, 1)?)?;
+            return self.blocks.iter().try_fold(ego, |ego, block| block.gather(&ego, &others, &valid));
+        }
+        let mut tokens = by_cell(tokens)?;
         for (index, block) in self.blocks.iter().enumerate() {
             let is_last = index + 1 == self.blocks.len();
             let rows = if is_last || self.config.rows == Rows::Ego { 1 } else { count };
-            let kept = block.forward(&tokens, &entries.valid, rows)?;
+            let kept = block.forward(&tokens, valid, rows)?;
             tokens = if is_last || rows == count {
                 kept
             } else {
@@ -191,7 +197,7 @@ impl Pastat {
         if count == 0 {
             return Ok(own.shallow_clone());
         }
-        let trust = self.gate.forward(&tokens.f_narrow(0, 1, count)?, ego)?;
+        let trust = self.gate.forward(&by_cell(&tokens.f_narrow(0, 1, count)?)?, ego)?;
         // Out of reach nothing is the strongest.
         let reach = others.mask.f_zeros_like()?.f_masked_fill(&others.mask.f_eq(0.0)?, f64::NEG_INFINITY)?;
         let mut strongest = own.shallow_clone();
@@ -201,6 +207,11 @@ impl Pastat {
         }
         Ok(strongest)
     }
+}
+
+/// Tokens `[N, D, h, w]` with their channels last.
+fn by_cell(tokens: &Tensor) -> Result<Tensor, TchError> {
+    tokens.f_permute([0, 2, 3, 1])?.f_contiguous()
 }
 
 impl Fusion for Pastat {
