@@ -262,10 +262,22 @@ fn newest(facts: &[ViewFacts]) -> usize {
 
 /// Maps `[N, C, H, W]` with cells of `cells` by `cells`, each their mean; those at the edges of fewer.
 pub(super) fn larger_cells(maps: &Tensor, cells: i64) -> Result<Tensor, TchError> {
+    let (.., height, width) = maps.size4()?;
     if cells == 1 {
         return Ok(maps.shallow_clone());
     }
-    maps.f_avg_pool2d([cells, cells], [cells, cells], [0_i64, 0], true, false, None::<i64>)
+    if height % cells != 0 || width % cells != 0 {
+        return maps.f_avg_pool2d([cells, cells], [cells, cells], [0_i64, 0], true, false, None::<i64>);
+    }
+    // The tensor library's pooling takes three times as long.
+    let rows = sum_of_every(maps, 2, cells)?;
+    Ok(sum_of_every(&rows, 3, cells)? / (cells * cells) as f64)
+}
+
+/// The sums of each `count` neighbours along `dim`.
+fn sum_of_every(maps: &Tensor, dim: i64, count: i64) -> Result<Tensor, TchError> {
+    let every = |first: i64| maps.f_slice(dim, first, None, count);
+    (1..count).try_fold(every(0)?, |sum, first| sum.f_add(&every(first)?))
 }
 
 /// The lattice of such maps.
@@ -315,5 +327,16 @@ mod tests {
         let here = fused(&plain, &maps);
         let there = fused(&mirrored, &maps.flip([2])).flip([1]);
         assert!(here.allclose(&there, 1e-3, 1e-3, false));
+    }
+
+    #[test]
+    fn larger_cells_are_means_at_the_edges_too() {
+        let maps = Tensor::arange(24, (Kind::Float, Device::Cpu)).view([1, 1, 4, 6]);
+        let pooled = |maps: &Tensor| maps.avg_pool2d([2, 2], [2, 2], [0, 0], true, false, None);
+        assert_eq!(larger_cells(&maps, 1).unwrap(), maps);
+        assert_eq!(larger_cells(&maps, 2).unwrap(), pooled(&maps));
+        let odd = maps.narrow(3, 0, 5);
+        assert_eq!(larger_cells(&odd, 2).unwrap(), pooled(&odd));
+        assert_eq!(larger_cells(&odd, 2).unwrap().double_value(&[0, 0, 0, 2]), 7.0);
     }
 }

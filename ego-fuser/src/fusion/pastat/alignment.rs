@@ -149,7 +149,7 @@ impl SpatialAlignment {
         if let Some(far) = &far {
             shown = shifted(&shown, others, far, ego_from_cav, area)?;
         }
-        let found = correlate(&own, &shown, area.radius)?;
+        let found = correlate([&own, &shown], area.radius, PARTS)?;
         let device = others.features.device();
         let shifts = (shifts(area.radius)? * area.cell_m).f_to_device(device)?;
         let sharpness = self.sharpness.f_exp()?;
@@ -205,7 +205,8 @@ fn shifted(
     }
     let (.., height, width) = shown.size4()?;
     let places = lattice(&offsets.f_constant_pad_nd([0, 1])?, ego_from_cav, area, [height, width])?;
-    Ok(resample(shown, &maps.mask, &places)?.0)
+    let (moved, valid) = resample(shown, &maps.mask, &places)?;
+    moved.f_mul(&valid)
 }
 
 /// The motion that fits the shifts of the parts best, `[N, 3]`: a shift, metres, after a small turn about the sender, radians.
@@ -265,10 +266,11 @@ pub(super) fn lattice(deltas: &Tensor, ego_from_cav: &[Pose], area: &Area, size:
     Tensor::f_affine_grid_generator(&affine, [maps, 1, size[0], size[1]], false)
 }
 
-/// Maps `[N, C, H, W]` and what is valid of them `[N, 1, H, W]`, read at `lattice`; nothing is valid beyond their edges.
+/// Maps `[N, C, H, W]` and what is valid of them `[N, 1, H, W]`, read at `lattice`. Nothing is valid beyond their edges; maps
+/// are not zero where nothing is valid.
 pub(super) fn resample(maps: &Tensor, valid: &Tensor, lattice: &Tensor) -> Result<(Tensor, Tensor), TchError> {
     let valid = valid.f_grid_sampler(&lattice.f_detach()?, NEAREST, PADDING_ZEROS, false)?.f_to_kind(Kind::Float)?;
-    Ok((maps.f_grid_sampler(lattice, BILINEAR, PADDING_ZEROS, false)?.f_mul_(&valid)?, valid))
+    Ok((maps.f_grid_sampler(lattice, BILINEAR, PADDING_ZEROS, false)?, valid))
 }
 
 #[cfg(test)]

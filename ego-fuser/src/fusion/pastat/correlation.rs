@@ -9,9 +9,9 @@ const EPSILON: f64 = 1e-6;
 
 /// How alike maps are, by shift.
 pub(super) struct Correlation {
-    /// `[PARTS^2, N, K]`: -1..1, of each part.
+    /// `[parts^2, N, K]`: -1..1, of each part.
     pub parts: Tensor,
-    /// `[PARTS^2, N]`: how much there is to see in both maps.
+    /// `[parts^2, N]`: how much there is to see in both maps.
     pub energy: Tensor,
     /// `[N, K]`: of the whole lattice.
     pub whole: Tensor,
@@ -25,26 +25,26 @@ pub(super) fn shifts(radius: i64) -> Result<Tensor, TchError> {
     Tensor::f_from_slice(&all)?.f_view([-1, 2])
 }
 
-/// Compares the maps of neighbours with the ego's, moved by up to `radius` cells.
+/// Compares the maps of neighbours with the ego's, moved by up to `radius` cells, in `parts` parts along each edge.
 ///
 /// # Shapes
-/// - `ego`: `[1, M, H, W]`, `H` and `W` multiples of [`PARTS`]; no gradient flows into it: `others` learn the same
+/// - `ego`: `[1, M, H, W]`, `H` and `W` multiples of `parts`; no gradient flows into it: `others` learn the same
 /// - `others`: `[N, M, H, W]`
-pub(super) fn correlate(ego: &Tensor, others: &Tensor, radius: i64) -> Result<Correlation, TchError> {
+pub(super) fn correlate([ego, others]: [&Tensor; 2], radius: i64, parts: i64) -> Result<Correlation, TchError> {
     let (count, channels, height, width) = others.size4()?;
-    let (rows, columns, edge) = (height / PARTS, width / PARTS, 2 * radius + 1);
+    let (rows, columns, edge) = (height / parts, width / parts, 2 * radius + 1);
     let cells = channels * rows * columns;
     let others = others
-        .f_reshape([count, channels, PARTS, rows, PARTS, columns])?
+        .f_reshape([count, channels, parts, rows, parts, columns])?
         .f_permute([2, 4, 0, 1, 3, 5])?
-        .f_reshape([PARTS * PARTS, count, cells])?;
+        .f_reshape([parts * parts, count, cells])?;
     let around = ego.f_detach()?.f_constant_pad_nd([radius; 4])?.f_squeeze_dim(0)?;
     // [M, edge, edge, H, W]: the map at each shift, without a copy until all is sorted by part.
     let shifted = around.f_unfold(1, height, 1)?.f_unfold(2, width, 1)?;
     let shifted = shifted
-        .f_view([channels, edge, edge, PARTS, rows, PARTS, columns].as_slice())?
+        .f_view([channels, edge, edge, parts, rows, parts, columns].as_slice())?
         .f_permute([3, 5, 1, 2, 0, 4, 6])?
-        .f_reshape([PARTS * PARTS, edge * edge, cells])?;
+        .f_reshape([parts * parts, edge * edge, cells])?;
     let products = others.f_matmul(&shifted.f_transpose(1, 2)?)?;
     let own = shifted.f_select(1, edge * edge / 2)?.f_square()?.f_sum_dim_intlist([1_i64].as_slice(), false, None)?;
     let theirs = others.f_square()?.f_sum_dim_intlist([2_i64].as_slice(), false, None)?;
@@ -75,7 +75,7 @@ mod tests {
         let ego = Tensor::randn([1, 3, 16, 24], (Kind::Float, Device::Cpu));
         // Two cells further along x, one back along y.
         let other = ego.roll([-1, 2], [2, 3]);
-        let found = correlate(&ego, &other, 3).unwrap();
+        let found = correlate([&ego, &other], 3, PARTS).unwrap();
         let shifts = shifts(3).unwrap();
         let whole = peaks(&found.whole, &Tensor::from(60f32), &shifts).unwrap();
         let parts = peaks(&found.parts, &Tensor::from(60f32), &shifts).unwrap();
@@ -92,7 +92,7 @@ mod tests {
     #[test]
     fn where_nothing_is_to_be_seen_nothing_fits() {
         let options = (Kind::Float, Device::Cpu);
-        let found = correlate(&Tensor::zeros([1, 2, 8, 8], options), &Tensor::zeros([2, 2, 8, 8], options), 2).unwrap();
+        let found = correlate([1, 2].map(|maps| Tensor::zeros([maps, 2, 8, 8], options)).each_ref(), 2, PARTS).unwrap();
         assert_eq!(found.parts.abs().max().double_value(&[]), 0.0);
         assert_eq!(found.whole.size(), [2, 25]);
     }

@@ -22,7 +22,7 @@ pub(super) fn offsets(
     let none: [i64; 2] = [0, 0];
     let large =
         |maps: &Tensor| maps.f_detach()?.f_avg_pool2d([cells, cells], [cells, cells], none, false, true, None::<i64>);
-    let fit = correlate(&large(ego)?, &large(others)?, radius)?.whole;
+    let fit = correlate([&large(ego)?, &large(others)?], radius, 1)?.whole;
     let shifts = (shifts(radius)? * (area.cell_m() * cells as f64)).f_to_device(fit.device())?;
     let _ = fit.f_select(1, shifts.size()[0] / 2)?.f_add_scalar_(margin)?;
     shifts.f_index_select(0, &fit.f_argmax(-1, false)?)
