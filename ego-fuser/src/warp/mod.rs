@@ -5,9 +5,12 @@
 
 pub mod coalign;
 pub mod opencood;
+mod sampling;
 
 use protocol::{BevGrid, Pose};
-use tch::{Kind, TchError, Tensor};
+use tch::{Device, Kind, TchError, Tensor};
+
+use self::sampling::Cells;
 
 /// `grid_sampler` reads zeros outside of the map.
 pub(crate) const PADDING_ZEROS: i64 = 0;
@@ -102,13 +105,29 @@ pub fn warp_to_ego(
         }
         let theta = Tensor::from_slice(affine).f_view([1, 2, 3])?.f_to_device(features.device())?;
         let lattice = Tensor::f_affine_grid_generator(&theta, [1, 1, height, width], false)?;
-        let inside = sent.f_grid_sampler(&lattice, NEAREST, PADDING_ZEROS, false)?;
-        let mask = inside.f_to_kind(features.kind())?;
-        let lattice = lattice.f_to_kind(features.kind())?;
-        moved.push(map.f_grid_sampler(&lattice, BILINEAR, PADDING_ZEROS, false)? * &mask);
+        let (map, mask) = read(&map, &sent, &lattice)?;
+        moved.push(map);
         masks.push(mask);
     }
     Ok(Warped { features: Tensor::f_cat(&moved, 0)?, mask: Tensor::f_cat(&masks, 0)? })
+}
+
+/// A map `[1, C, H, W]` and which of its cells were sent `[1, 1, H, W]`, read at `lattice` `[1, h, w, 2]`.
+fn read(map: &Tensor, sent: &Tensor, lattice: &Tensor) -> Result<(Tensor, Tensor), TchError> {
+    let are_numbers = map.device() == Device::Cpu && map.kind() == Kind::Float && map.numel() > 0;
+    if !are_numbers || map.requires_grad() {
+        return read_by_tensors(map, sent, lattice);
+    }
+    let first = |tensor: &Tensor| tensor.f_squeeze_dim(0);
+    let (map, mask) = Cells::of(&first(map)?)?.read(&first(&first(sent)?)?, &first(lattice)?)?;
+    Ok((map.f_unsqueeze(0)?, mask.f_unsqueeze(0)?))
+}
+
+/// [`read`] on any device, in any precision, with gradients.
+fn read_by_tensors(map: &Tensor, sent: &Tensor, lattice: &Tensor) -> Result<(Tensor, Tensor), TchError> {
+    let mask = sent.f_grid_sampler(lattice, NEAREST, PADDING_ZEROS, false)?.f_to_kind(map.kind())?;
+    let lattice = lattice.f_to_kind(map.kind())?;
+    Ok((map.f_grid_sampler(&lattice, BILINEAR, PADDING_ZEROS, false)? * &mask, mask))
 }
 
 fn shape_error(found: Vec<i64>, grid: &BevGrid) -> WarpError {
@@ -137,9 +156,10 @@ pub(crate) fn cav_from_ego_normalized(ego_from_cav: &Pose, grid: &BevGrid) -> [f
 mod tests {
     use std::f64::consts::{FRAC_PI_2, PI};
 
-    use tch::Device;
+    use proptest::prelude::*;
 
     use super::*;
+    use crate::made_up::uniform;
 
     const GRID: BevGrid = BevGrid { x_min_m: -8.0, y_min_m: -4.0, cell_m: 0.5, width: 32, height: 16 };
 
@@ -184,6 +204,27 @@ mod tests {
         let turned = Pose::from_xyz_yaw([0.0, 0.0, 0.0], FRAC_PI_2);
         let warped = warp_to_ego(&one_hot(9, 20), None, &[turned], &GRID).unwrap();
         assert!((at(&warped.features, 12, 14) - 1.0).abs() < 1e-4);
+    }
+
+    proptest! {
+        #[test]
+        fn numbers_and_tensors_read_the_same(
+            x_m in -12.0..12.0f64, y_m in -6.0..6.0f64, yaw in -4.0..4.0f64, seed in 0..1000u64, channels in 1..6i64,
+        ) {
+            let map = uniform(seed, &[1, channels, 16, 32]);
+            let sent = uniform(seed + 1, &[1, 1, 16, 32]).gt(0.3).to_kind(Kind::Float);
+            let affine = cav_from_ego_normalized(&Pose::from_xyz_yaw([x_m, y_m, 0.0], yaw), &GRID);
+            let theta = Tensor::from_slice(&affine).view([1, 2, 3]);
+            let lattice = Tensor::affine_grid_generator(&theta, [1, 1, 16, 32], false);
+            let (numbers, reached) = read(&map, &sent, &lattice).unwrap();
+            let (tensors, mask) = read_by_tensors(&map, &sent, &lattice).unwrap();
+            prop_assert_eq!(numbers.size(), tensors.size());
+            // A place between two cells may be nearest to either.
+            let differ = (&reached - mask).abs();
+            prop_assert!(differ.sum(Kind::Float).double_value(&[]) <= 2.0);
+            let apart = (numbers - tensors).abs() * differ.eq(0.0);
+            prop_assert!(apart.max().double_value(&[]) < 1e-4);
+        }
     }
 
     #[test]
