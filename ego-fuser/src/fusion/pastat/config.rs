@@ -127,7 +127,7 @@ impl PastatConfig {
             patch: 2,
             dim: 32,
             heads: 4,
-            depth: 2,
+            depth: 1,
             mlp_ratio: 2,
             windows: vec![4, 8],
             rows: Rows::Ego,
