@@ -23,6 +23,7 @@ pub mod model;
 pub mod multi_scale;
 mod neighbourhood;
 pub mod node;
+mod numbers;
 pub mod pairing;
 mod peer_models;
 pub mod residual;

@@ -5,6 +5,8 @@
 
 use tch::{TchError, Tensor};
 
+use crate::numbers::numbers;
+
 /// Cells that are transposed together; what they show fits into a core's nearest cache.
 const BLOCK: usize = 16;
 
@@ -27,7 +29,7 @@ struct Place {
 }
 
 impl Cells {
-    /// Of a map `[C, H, W]`.
+    /// Of a map `[C, H, W]` that is not empty.
     pub(super) fn of(map: &Tensor) -> Result<Self, TchError> {
         let (channels, height, width) = map.size3()?;
         let [channels, height, width] = [channels, height, width].map(|size| size as usize);
@@ -101,8 +103,4 @@ impl Cells {
         let is_on_map = row >= 0.0 && row < self.height as f32 && column >= 0.0 && column < self.width as f32;
         is_on_map.then(|| row as usize * self.width + column as usize)
     }
-}
-
-fn numbers(tensor: &Tensor) -> Result<Vec<f32>, TchError> {
-    Vec::try_from(tensor.f_reshape(-1)?)
 }

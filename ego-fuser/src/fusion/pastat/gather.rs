@@ -3,6 +3,8 @@
 
 use tch::{TchError, Tensor};
 
+use crate::numbers::numbers;
+
 /// Cells that are worked on together: their numbers fit into a core's nearest cache.
 const STRIP: usize = 64;
 /// As in `LayerNormConfig`.
@@ -136,9 +138,4 @@ impl Strip<'_> {
             }
         }
     }
-}
-
-/// What `tensor` holds.
-pub(super) fn numbers(tensor: &Tensor) -> Result<Vec<f32>, TchError> {
-    Vec::try_from(tensor.f_reshape(-1)?)
 }
