@@ -4,69 +4,30 @@
 //! same views give the same bits.
 
 mod box_correction;
+mod error;
+mod stages;
+mod view;
 
 use std::path::Path;
-use std::time::Instant;
 
 use agent::decode::Decoded;
-use agent::detector::{Detector, DetectorError};
+use agent::detector::Detector;
 use agent::postprocess::{AgentBoxes, PostprocessConfig, postprocess};
-use agent::weights::{Weights, WeightsError};
+use agent::weights::Weights;
 use nalgebra::Isometry3;
-use protocol::{BevGrid, CavId, DecodedFeatures, Detection, DropReason, PointCloud, Pose, PoseEstimate, StageTiming};
+use protocol::{DecodedFeatures, Detection, DropReason, Pose, StageTiming};
 use tch::{Kind, TchError, Tensor, no_grad};
 
 use crate::fusion::{FusionStage, SentMaps, StageError, ViewFacts};
 use crate::history::{History, KeptMap};
-use crate::method::{Exchange, Method, UnknownMethod};
+use crate::method::{Exchange, Method};
 use crate::model::{METHOD_KEY, SCORE_THRESHOLD};
 use crate::samples::merge_points;
 use crate::trust::{Belief, Trust, TrustConfig};
-use crate::warp::WarpError;
 
-/// What one vehicle sees, as it arrived.
-#[derive(Debug, Clone, PartialEq)]
-pub struct View {
-    /// Who.
-    pub cav: CavId,
-    /// Where it believes to be.
-    pub pose: PoseEstimate,
-    /// Capture time of the sweep, nanoseconds.
-    pub capture_nanos: u64,
-    /// What it sees, in its own LiDAR frame.
-    pub content: Content,
-}
-
-impl View {
-    /// How much older it is than another, nanoseconds.
-    #[must_use]
-    pub fn age_nanos(&self, newer: &Self) -> i64 {
-        newer.capture_nanos as i64 - self.capture_nanos as i64
-    }
-}
-
-/// What crosses the air, by method.
-#[derive(Debug, Clone, PartialEq)]
-pub enum Content {
-    /// A feature map: `none`, and all methods of intermediate fusion.
-    Features(DecodedFeatures),
-    /// Detections: `late`.
-    Boxes(Vec<Detection>),
-    /// Points, without those on the sender's own body: `early`.
-    Points(PointCloud),
-}
-
-impl Content {
-    /// What has to be exchanged for it.
-    #[must_use]
-    pub fn exchange(&self) -> Exchange {
-        match self {
-            Self::Features(_) => Exchange::Features,
-            Self::Boxes(_) => Exchange::Boxes,
-            Self::Points(_) => Exchange::Points,
-        }
-    }
-}
+pub use error::EgoError;
+use stages::Stages;
+pub use view::{Content, View};
 
 /// Why a neighbour is not in a result.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -90,51 +51,6 @@ pub struct EgoOutput {
     pub beliefs: Vec<(usize, Belief)>,
     /// Where the time went.
     pub stages: Vec<StageTiming>,
-}
-
-/// Why the ego has no result at all. What is wrong with a neighbour never leads here.
-#[derive(Debug, thiserror::Error)]
-pub enum EgoError {
-    /// The weights are not readable.
-    #[error(transparent)]
-    Weights(#[from] WeightsError),
-    /// The detector refused.
-    #[error(transparent)]
-    Detector(#[from] DetectorError),
-    /// The weights name a method that is not known.
-    #[error(transparent)]
-    Method(#[from] UnknownMethod),
-    /// The fusion does not fit the weights.
-    #[error(transparent)]
-    Fusion(#[from] StageError),
-    /// Own maps cannot be aligned.
-    #[error(transparent)]
-    Warp(#[from] WarpError),
-    /// The ego's own view is not what the method takes.
-    #[error("method {method} needs the ego's own {needed:?}, not {found:?}")]
-    OwnContent {
-        /// The method.
-        method: Method,
-        /// What it needs.
-        needed: Exchange,
-        /// What came.
-        found: Exchange,
-    },
-    /// The ego's own map is of another network.
-    #[error("the ego's own map is {channels} x {found}, the network's is {expected_channels} x {expected}")]
-    OwnMap {
-        /// Channels found.
-        channels: u32,
-        /// Lattice found.
-        found: BevGrid,
-        /// Channels of the network.
-        expected_channels: i64,
-        /// Lattice of the network.
-        expected: BevGrid,
-    },
-    /// The tensor library refused.
-    #[error("fusion: {0}")]
-    Torch(#[from] TchError),
 }
 
 /// Fuses views and detects.
@@ -248,11 +164,8 @@ impl Ego {
         }
         let mut stages = Stages::start();
         let mut beliefs = Vec::new();
-        if let Some(trust) = &mut self.trust
-            && !fused.is_empty()
-        {
-            let told: Vec<(&View, Pose)> = aligned[1..].iter().map(|view| (view.view, view.ego_from_cav)).collect();
-            let found = no_grad(|| trust.judge(own, &told, &mut self.detector))?;
+        if self.trust.is_some() && !fused.is_empty() {
+            let found = self.judge(&aligned)?;
             let is_out: Vec<bool> = found.iter().map(Belief::is_out).collect();
             let doubted = fused.iter().zip(&is_out).filter(|(_, is_out)| **is_out);
             skipped.extend(doubted.map(|(&index, _)| (index, Skipped::Unusable(DropReason::Distrusted))));
@@ -268,6 +181,13 @@ impl Ego {
             Exchange::Features | Exchange::Nothing => self.merge_features(&aligned, &mut stages),
         })?;
         Ok(EgoOutput { detections, fused, skipped, beliefs, stages: stages.timings })
+    }
+
+    /// How far each of the neighbours, which follow the ego itself, is believed.
+    fn judge(&mut self, aligned: &[Aligned<'_>]) -> Result<Vec<Belief>, EgoError> {
+        let Some(trust) = &mut self.trust else { return Ok(Vec::new()) };
+        let told: Vec<(&View, Pose)> = aligned[1..].iter().map(|view| (view.view, view.ego_from_cav)).collect();
+        Ok(no_grad(|| trust.judge(aligned[0].view, &told, &mut self.detector))?)
     }
 
     /// Where a neighbour stands relative to the ego, or why it has no part.
@@ -459,24 +379,6 @@ fn sent_cells(map: &DecodedFeatures, is_ego: bool, [height, width]: [i64; 2]) ->
     match &map.sent {
         Some(sent) if !is_ego => Tensor::f_from_slice(sent)?.f_to_kind(Kind::Float)?.f_view([1, 1, height, width]),
         _ => Tensor::f_ones([1, 1, height, width], (Kind::Float, tch::Device::Cpu)),
-    }
-}
-
-/// Times of the stages, lap by lap.
-struct Stages {
-    last: Instant,
-    timings: Vec<StageTiming>,
-}
-
-impl Stages {
-    fn start() -> Self {
-        Self { last: Instant::now(), timings: Vec::new() }
-    }
-
-    fn lap(&mut self, stage: &str) {
-        let now = Instant::now();
-        self.timings.push(StageTiming::new(stage, now - self.last));
-        self.last = now;
     }
 }
 

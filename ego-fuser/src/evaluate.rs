@@ -4,35 +4,36 @@
 //! Nothing is lost, and nothing is late unless asked for, so a live run paced like that gives the same boxes. With
 //! [`Evaluator::over_link`] messages cross the emulated air in virtual time ([`stepped`]).
 
+mod error;
+mod sent;
 pub mod stepped;
 
 use std::collections::VecDeque;
 use std::ops::ControlFlow;
 use std::path::PathBuf;
 
-use agent::agent::{Agent, AgentInput, Perception};
-use agent::attack::{Attack, AttackConfig, Overheard};
-use agent::detector::{Detector, DetectorError};
+use agent::agent::Agent;
+use agent::attack::{Attack, AttackConfig};
+use agent::detector::Detector;
 use agent::model_config::DetectorConfig;
-use agent::pose_source::{NoiseMode, PoseSourceConfig, PoseSourceError};
+use agent::pose_source::{NoiseMode, PoseSourceConfig};
 use agent::rate::RateConfig;
-use agent::weights::{Weights, WeightsError};
-use protocol::message::{Bev, Boxes, Detections, FusedNeighbour, Payload, Points, SkippedNeighbour};
-use protocol::{
-    Box3d, CavId, CodecConfig, HEADER_LEN, Header, Ledger, Limits, PoseEstimate, RateChoice, Stamp, WireError, wire,
-};
-use sim_replay::dataset::{LoadOptions, ReadError, Scenario};
+use agent::weights::Weights;
+use protocol::message::{Detections, FusedNeighbour, SkippedNeighbour};
+use protocol::{Box3d, CavId, CodecConfig, Ledger, PoseEstimate, Stamp};
+use sim_replay::dataset::{LoadOptions, Scenario};
 use sim_replay::frame::Frame;
 use sim_replay::ground_truth::{self, GroundTruthRule};
-use sim_replay::link::LinkError;
 use tch::Tensor;
 
-use crate::ego::{Content, Ego, EgoError, EgoOutput, Skipped, View, own_content};
-use crate::feature_store::{FeatureStoreError, MapSource};
+use crate::ego::{Ego, EgoOutput, Skipped, View, own_content};
+use crate::feature_store::MapSource;
 use crate::method::{Exchange, Method};
 use crate::trust::{TrustConfig, heard};
 
-use stepped::{RemoteCrew, RemoteError, SteppedConfig, VehicleConfig};
+pub use error::EvaluateError;
+use sent::{Sent, stamp, view};
+use stepped::{RemoteCrew, SteppedConfig, VehicleConfig};
 
 /// What to evaluate.
 #[derive(Debug, Clone)]
@@ -55,50 +56,6 @@ pub struct EvaluateConfig {
     pub attack: Option<AttackConfig>,
     /// Whether the ego leaves out neighbours that it does not trust.
     pub trust: Option<TrustConfig>,
-}
-
-/// Why an evaluation ended early.
-#[derive(Debug, thiserror::Error)]
-pub enum EvaluateError {
-    /// The weights are not readable.
-    #[error(transparent)]
-    Weights(#[from] WeightsError),
-    /// The detector refused.
-    #[error(transparent)]
-    Detector(#[from] DetectorError),
-    /// The ego refused.
-    #[error(transparent)]
-    Ego(#[from] EgoError),
-    /// A pose source cannot be set up.
-    #[error(transparent)]
-    PoseSource(#[from] PoseSourceError),
-    /// A frame cannot be read.
-    #[error(transparent)]
-    Read(#[from] ReadError),
-    /// A message cannot be encoded or decoded.
-    #[error(transparent)]
-    Wire(#[from] WireError),
-    /// Kept maps cannot be read.
-    #[error(transparent)]
-    Maps(#[from] Box<FeatureStoreError>),
-    /// The emulated air cannot be made.
-    #[error(transparent)]
-    Link(#[from] LinkError),
-    /// Vehicles in processes of their own do not answer.
-    #[error(transparent)]
-    Remote(#[from] Box<RemoteError>),
-    /// A computer of the fleet does not keep up with the scene.
-    #[error(
-        "{what} takes {takes_ms} ms, but the scene has a frame every {period_ms} ms: choose a smaller time in `compute`"
-    )]
-    TooSlow {
-        /// What takes too long.
-        what: &'static str,
-        /// How long, milliseconds.
-        takes_ms: f64,
-        /// From frame to frame, milliseconds.
-        period_ms: f64,
-    },
 }
 
 /// One frame of the ego with everything it can be judged by.
@@ -373,113 +330,4 @@ fn source_of_ego(all: &PoseSourceConfig) -> PoseSourceConfig {
         PoseSourceConfig::Noisy(noisy) if noisy.mode == NoiseMode::Fixed => PoseSourceConfig::Recorded,
         other => other.clone(),
     }
-}
-
-/// What a vehicle sends for one frame.
-#[derive(Debug)]
-struct Sent {
-    cav: CavId,
-    capture_nanos: u64,
-    pose: PoseEstimate,
-    content: Option<Content>,
-    payload_bytes: u64,
-    wire_bytes: u64,
-    /// Of these, the pose's own message.
-    pose_bytes: u64,
-    /// Why a map is written as it is, where it had to keep within a limit.
-    rate: Option<RateChoice>,
-}
-
-impl Sent {
-    /// As the ego sees it; nothing where nothing was sent.
-    fn view(&self) -> Option<View> {
-        let Self { cav, capture_nanos, pose, content, .. } = self;
-        Some(View { cav: cav.clone(), pose: *pose, capture_nanos: *capture_nanos, content: content.clone()? })
-    }
-
-    /// As a vehicle that repeats it hears it.
-    fn overheard(&self) -> Overheard {
-        let mut heard = Overheard::default();
-        match self.content.clone() {
-            Some(Content::Features(map)) => heard.features = Some(map.features),
-            Some(Content::Boxes(found)) => heard.detections = Some(found),
-            Some(Content::Points(points)) => heard.points = Some(points),
-            None => {}
-        }
-        heard
-    }
-
-    /// The same, with payload and wire bytes.
-    fn heard(&self) -> Option<(View, (u64, u64))> {
-        Some((self.view()?, (self.payload_bytes, self.wire_bytes)))
-    }
-}
-
-fn view(
-    agent: &mut Agent,
-    frame: &Frame,
-    map: Option<&Tensor>,
-    exchange: Option<Exchange>,
-    codec: &CodecConfig,
-) -> Result<Sent, EvaluateError> {
-    let input = AgentInput {
-        capture_nanos: frame.capture_nanos,
-        cloud: &frame.points,
-        measured_pose: frame.world_from_lidar.as_ref(),
-    };
-    let pose = agent.estimate_pose(&input);
-    let stamp = stamp(agent.cav(), frame.capture_nanos);
-    let (_, pose_bytes) = through_the_wire(&stamp, pose)?;
-    let sent = |content, payload_bytes, wire_bytes| Sent {
-        cav: frame.cav.clone(),
-        capture_nanos: frame.capture_nanos,
-        pose,
-        content,
-        payload_bytes,
-        wire_bytes,
-        pose_bytes,
-        rate: None,
-    };
-    let (content, bytes) = match exchange {
-        None => return Ok(sent(None, 0, 0)),
-        Some(Exchange::Points) => {
-            let points = agent.share_points(&frame.points);
-            let (message, bytes) = through_the_wire(&stamp, Points { pose, points })?;
-            (Content::Points(message.points), bytes)
-        }
-        Some(Exchange::Boxes) => {
-            let detections = perceive(agent, frame, map)?.detections;
-            let (message, bytes) = through_the_wire(&stamp, Boxes { pose, detections })?;
-            (Content::Boxes(message.detections), bytes)
-        }
-        Some(Exchange::Features | Exchange::Nothing) => {
-            let Perception { features, confidence, .. } = perceive(agent, frame, map)?;
-            let features = agent.write_map(features, &confidence, codec, frame.capture_nanos)?;
-            let (message, bytes) = through_the_wire(&stamp, Bev { pose, features })?;
-            let rate = message.features.rate;
-            let content = Content::Features(message.features.decode(&Limits::default())?);
-            let sent = sent(Some(content), bytes - HEADER_LEN as u64, bytes + pose_bytes);
-            return Ok(Sent { rate, ..sent });
-        }
-    };
-    Ok(sent(Some(content), bytes - HEADER_LEN as u64, bytes + pose_bytes))
-}
-
-fn perceive(agent: &mut Agent, frame: &Frame, map: Option<&Tensor>) -> Result<Perception, DetectorError> {
-    match map {
-        Some(map) => agent.perceive_map(map),
-        None => agent.perceive(&frame.points),
-    }
-}
-
-/// Encodes and decodes a message; its size on the wire.
-fn through_the_wire<M: Payload>(stamp: &Stamp, message: M) -> Result<(M, u64), WireError> {
-    let encoded = wire::encode(stamp, message)?;
-    let bytes = encoded.pieces().iter().map(|piece| piece.len() as u64).sum();
-    let (_, message): (Header, M) = wire::decode(encoded.pieces(), &Limits::default())?;
-    Ok((message, bytes))
-}
-
-fn stamp(cav: &CavId, capture_nanos: u64) -> Stamp {
-    Stamp { cav: cav.clone(), epoch: 0, sequence: 0, capture_nanos, publish_nanos: capture_nanos }
 }

@@ -2,7 +2,7 @@ use agent::agent::{Agent, AgentInput};
 use agent::model_config::DetectorConfig;
 use agent::point_pillars::PointPillars;
 use agent::pose_source::RecordedPose;
-use protocol::{CodecConfig, ConfidenceGate, Limits, NoPoseReason, encode_features};
+use protocol::{CavId, CodecConfig, ConfidenceGate, Limits, NoPoseReason, PointCloud, PoseEstimate, encode_features};
 use tch::Device;
 use tch::nn::VarStore;
 

@@ -26,7 +26,8 @@ use sim_replay::random::derive_seed;
 pub use compute::ComputeTimes;
 pub use remote::{RemoteCrew, RemoteError};
 
-use super::{EvaluateError, EvaluatedFrame, Evaluator, Sent, stamp, view};
+use super::sent::{Sent, stamp, view};
+use super::{EvaluateError, EvaluatedFrame, Evaluator};
 use crate::ego::{Skipped, View, own_content};
 use crate::method::{Exchange, Method};
 use crate::pairing::{Paired, Pairing, PairingConfig};

@@ -7,7 +7,7 @@ use agent::statistics::{quantile, sorted};
 use serde::{Deserialize, Serialize};
 use sim_replay::dataset::{LoadOptions, Scenario};
 
-use super::super::{EvaluateError, Evaluator, Sent, view};
+use super::super::{EvaluateError, Evaluator, view};
 use crate::ego::own_content;
 
 /// Ticks that times are measured over.
@@ -101,14 +101,6 @@ impl Evaluator {
         self.ego.forget();
         let median = |sample: &[f64]| quantile(&sorted(sample), 0.5).unwrap_or(0.0).ceil();
         Ok(ComputeTimes { pose_ms: median(&pose), map_ms: median(&map), fuse_ms: median(&fuse) })
-    }
-}
-
-impl Sent {
-    /// As the ego sees it; nothing where nothing was sent.
-    pub(super) fn into_view(self) -> Option<crate::ego::View> {
-        let Self { cav, capture_nanos, pose, content, .. } = self;
-        Some(crate::ego::View { cav, pose, capture_nanos, content: content? })
     }
 }
 
