@@ -1,30 +1,30 @@
 //! Which processes a scenario needs, and with which arguments.
 
 mod arguments;
+mod error;
+mod routes;
 
-use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
 
-use agent::localizer::{EndToEndLocalizer, Localizer, LocalizerError};
+use agent::localizer::{EndToEndLocalizer, Localizer};
 use agent::model_config::DetectorConfig;
-use agent::weights::{Weights, WeightsError};
+use agent::weights::Weights;
 use ego_fuser::Exchange;
-use protocol::{CavId, Party, ProcessId, Role, Stream, Topic};
-use sim_replay::bus::{Route, process_id};
-use sim_replay::dataset::{self, ReadError};
+use protocol::{CavId, Party, Role, Stream};
+use sim_replay::dataset;
 use sim_replay::ground_truth::GroundTruthRule;
-use sim_replay::link::{Air, LinkError};
+use sim_replay::link::Air;
 use tch::Device;
 
 pub use self::arguments::Meeting;
 use self::arguments::{Arguments, dtype, noise_mode, rate_options, smoothing};
+pub use self::error::FleetError;
 use crate::keys::KeyError;
 use crate::run_folder::{BOOKMARK, RECORDING, RunFolder, SWEEP_LOG};
 use crate::scenario::{Clock, Launch, PoseSource, Publish, Scenario};
-use crate::score::scorer_cav;
 use crate::security::RunKeys;
 use crate::supervise::{Life, ProcessSpec};
-use crate::weights_choice::{WeightsChoiceError, weights_of};
+use crate::weights_choice::weights_of;
 
 /// Vehicles farther than this from the ego do not take part, metres (the rule of the OPV2V family).
 const COMM_RANGE_M: f64 = 70.0;
@@ -33,71 +33,6 @@ const COMM_RANGE_M: f64 = 70.0;
 pub const REPLAY: &str = "replay";
 /// Name of the process that writes everything down.
 pub const RECORDER: &str = "recorder";
-
-/// Why a scenario makes no fleet.
-#[derive(Debug, thiserror::Error)]
-pub enum FleetError {
-    /// The scene cannot be read.
-    #[error("scene: {0}")]
-    Scene(#[from] ReadError),
-    /// The data set has no scenario at all.
-    #[error("scene {}: there is no scenario in it", .0.display())]
-    Empty(PathBuf),
-    /// The data set has no scenario of that name.
-    #[error("scene {}: there is no scenario {asked:?}; it has {found:?}", dir.display())]
-    NoScenario {
-        /// The data set.
-        dir: PathBuf,
-        /// The name asked for.
-        asked: String,
-        /// The names there are.
-        found: Vec<String>,
-    },
-    /// The scenario has no moment that all its vehicles have.
-    #[error("scene {}: scenario {name} has no frame that all of {agents:?} have", dir.display())]
-    NoFrames {
-        /// The data set.
-        dir: PathBuf,
-        /// The scenario.
-        name: String,
-        /// Its vehicles.
-        agents: Vec<String>,
-    },
-    /// The first tick to play is behind the last.
-    #[error("scene.seek is {seek}, but scenario {name} has {ticks} ticks")]
-    Seek {
-        /// The tick asked for.
-        seek: usize,
-        /// The scenario.
-        name: String,
-        /// Its ticks.
-        ticks: usize,
-    },
-    /// A vehicle is named that the scene does not have.
-    #[error("{field} names vehicle {cav}, but scenario {name} has {found:?}")]
-    NoVehicle {
-        /// Where it is named.
-        field: &'static str,
-        /// The vehicle.
-        cav: CavId,
-        /// The scenario.
-        name: String,
-        /// The vehicles there are.
-        found: Vec<String>,
-    },
-    /// The weights cannot be used.
-    #[error("weights: {0}")]
-    Weights(#[from] WeightsError),
-    /// There are no weights for the method.
-    #[error(transparent)]
-    NoWeights(#[from] WeightsChoiceError),
-    /// The emulated air cannot be made.
-    #[error(transparent)]
-    Link(#[from] LinkError),
-    /// The networks that find poses cannot be used, or not together.
-    #[error("localizer: {0}")]
-    Localizer(#[from] LocalizerError),
-}
 
 /// A scenario with everything filled in that it leaves open.
 #[derive(Debug, Clone)]
@@ -392,54 +327,6 @@ impl Fleet {
         Some(meeting.process(RECORDER.into(), "sim-replay", args, Life::Optional))
     }
 
-    /// What has to stand before the clock starts, beside the routes from the replay to the agents that it knows itself.
-    fn routes(&self) -> Vec<Route> {
-        let ego = process_id(Role::Ego, &self.ego);
-        let scorer = process_id(Role::Scorer, &scorer_cav());
-        let route = |cav: &CavId, stream, receiver: &ProcessId| Route {
-            topic: Topic::Stream { cav: cav.clone(), stream },
-            receiver: receiver.clone(),
-        };
-        let mut routes = vec![
-            Route { topic: Topic::Truth, receiver: scorer.clone() },
-            route(&self.ego, Stream::Detections, &scorer),
-        ];
-        for cav in &self.agents {
-            routes.push(route(cav, Stream::Pose, &scorer));
-        }
-        routes.push(route(&self.ego, self.publish(&self.ego).stream(), &ego));
-        // Alone, the ego listens to nobody but its own agent.
-        if self.scenario.method.exchange() == Exchange::Nothing {
-            return routes;
-        }
-        for cav in self.neighbours() {
-            let stream = self.publish(cav).stream();
-            if self.is_over_link() {
-                let topic = Topic::Received { ego: self.ego.clone(), cav: cav.clone(), stream };
-                routes.push(route(cav, stream, &process_id(Role::Link, &self.ego)));
-                routes.push(Route { topic, receiver: ego.clone() });
-            } else {
-                routes.push(route(cav, stream, &ego));
-            }
-        }
-        routes
-    }
-
-    /// The routes, and where the run is recorded those of the same topics and of the sensors to the recorder: what is
-    /// published before it listens is lost to it.
-    fn recorded(&self, mut routes: Vec<Route>) -> Vec<Route> {
-        if self.scenario.record.is_some() {
-            let receiver = process_id(Role::Recorder, &recorder_cav());
-            let sensors = self
-                .agents
-                .iter()
-                .flat_map(|cav| [Stream::Lidar, Stream::Gnss].map(|stream| Topic::Stream { cav: cav.clone(), stream }));
-            let topics: BTreeSet<Topic> = routes.iter().map(|route| route.topic.clone()).chain(sensors).collect();
-            routes.extend(topics.into_iter().map(|topic| Route { topic, receiver: receiver.clone() }));
-        }
-        routes
-    }
-
     pub(crate) fn publish(&self, cav: &CavId) -> Publish {
         self.scenario.settings_of(cav).publish.unwrap_or(Publish::for_method(self.scenario.method))
     }
@@ -448,9 +335,4 @@ impl Fleet {
         args.option("--weights", &self.scenario.models.weights);
         args.option("--threads", &self.scenario.models.threads.to_string());
     }
-}
-
-/// The recorder's name in place of a vehicle's.
-fn recorder_cav() -> CavId {
-    CavId::new(RECORDER).expect("eight lower-case letters")
 }
