@@ -100,12 +100,6 @@ impl Agent {
         Self { cav, pose_source, detector, postprocess, rate: RateControl::default(), attack: None }
     }
 
-    /// The same with another clean-up of its own detections.
-    #[must_use]
-    pub fn with_postprocess(self, postprocess: PostprocessConfig) -> Self {
-        Self { postprocess, ..self }
-    }
-
     /// The same with maps that keep within `rate`, where [`Self::write_map`] writes them.
     #[must_use]
     pub fn within(self, rate: RateConfig) -> Self {
@@ -198,13 +192,17 @@ impl Agent {
         Ok(Perception { times: PerceptionTimes { encode: encoded.times, ..perception.times }, ..perception })
     }
 
-    /// The same from a map `[1, C, H, W]` that the encoder made before.
+    /// The same from a map `[1, C, H, W]` that the encoder made before, as it came out of it.
     ///
     /// # Errors
     /// [`DetectorError::Shape`] when it is not one of this detector's maps.
     pub fn perceive_map(&mut self, map: &Tensor) -> Result<Perception, DetectorError> {
-        let (features, message) = timed(|| self.detector.to_message(map))?;
-        let (heads, head) = timed(|| self.detector.heads(map))?;
+        let ((map, features), message) = timed(|| {
+            let map = self.detector.through_compressor(map)?;
+            let features = self.detector.to_message(&map)?;
+            Ok((map, features))
+        })?;
+        let (heads, head) = timed(|| self.detector.heads(&map))?;
         let (detections, boxes) = timed(|| {
             let boxes = self.detector.boxes(&heads, self.postprocess.score_threshold)?;
             let own = AgentBoxes { boxes: &boxes, output_from_agent: nalgebra::Isometry3::identity() };
@@ -245,9 +243,14 @@ mod tests {
     use crate::pose_source::RecordedPose;
 
     fn agent() -> Agent {
+        agent_with(None)
+    }
+
+    fn agent_with(compress_ratio: Option<i64>) -> Agent {
         tch::set_num_threads(1);
         tch::manual_seed(11);
-        let config = DetectorConfig { lidar_range_m: [-12.8, -6.4, -3.0, 12.8, 6.4, 1.0], ..DetectorConfig::lean() };
+        let lidar_range_m = [-12.8, -6.4, -3.0, 12.8, 6.4, 1.0];
+        let config = DetectorConfig { lidar_range_m, compress_ratio, ..DetectorConfig::lean() };
         let network = VarStore::new(Device::Cpu);
         let pillars = PointPillars::new(&network.root(), &config).unwrap();
         // A head that believes in vehicles everywhere gives the clean-up something to do.
@@ -274,6 +277,18 @@ mod tests {
         assert_eq!(times.stages().len(), 6);
         let second = agent.process(&input).unwrap();
         assert_eq!((second.perception.features, second.perception.detections), (features.clone(), detections.clone()));
+    }
+
+    #[test]
+    fn what_others_and_the_own_head_see_went_through_the_compressor_once() {
+        let mut agent = agent_with(Some(4));
+        let cloud = PointCloud { xyzi: (0..500).map(|k| [(k % 83) as f32 * 0.1 + 3.0, 0.5, -1.5, 0.2]).collect() };
+        let encoded = agent.detector.encode(&cloud).unwrap().features;
+        let left = agent.detector.through_compressor(&encoded).unwrap();
+        let (shared, heads) = (agent.detector.to_message(&left).unwrap(), agent.detector.heads(&left).unwrap());
+        let seen = agent.perceive(&cloud).unwrap();
+        assert_eq!((&seen.features, &seen.confidence), (&shared, &heads.confidence));
+        assert_ne!(seen.features, agent.detector.to_message(&encoded).unwrap());
     }
 
     #[test]

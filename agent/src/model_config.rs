@@ -3,6 +3,8 @@
 use protocol::BevGrid;
 use serde::{Deserialize, Serialize};
 
+use crate::head::BOX_CODE;
+
 /// Why a [`DetectorConfig`] cannot be built.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
 pub enum ConfigError {
@@ -256,7 +258,58 @@ impl DetectorConfig {
         if self.anchors.size_lwh_m.iter().any(|size| !(size.is_finite() && *size > 0.0)) {
             return Err(value_error("anchors.size_lwh_m", self.anchors.size_lwh_m, "positive"));
         }
+        self.check_sizes()
+    }
+
+    /// Checked before anything of such a size is allocated: the file that the numbers come from may be anybody's.
+    fn check_sizes(&self) -> Result<(), ConfigError> {
+        let [x, y, _] = self.pillar_grid().map(|count| count as i64);
+        let canvas = x * y * self.pillar_channels;
+        if canvas > MAX_VALUES {
+            return Err(value_error("pillar grid times pillar_channels", canvas, "268435456 values at most"));
+        }
+        let step = self.layer_strides[0] / self.upsample_strides[0];
+        let layers = [self.backbone_channels(), self.feature_channels(), self.head_channels()];
+        let widest = self.num_filters.iter().chain(&layers).copied().max().unwrap_or(0);
+        let map = (x / step) * (y / step) * widest;
+        if map > MAX_VALUES {
+            let field = "cells of a map times the most of num_filters, num_upsample_filters, shrink and anchors";
+            return Err(value_error(field, map, "268435456 values at most"));
+        }
+        let parameters = self.parameters();
+        if parameters > MAX_PARAMETERS {
+            let field = "layer_nums, num_filters, upsample_strides and shrink: number of parameters";
+            return Err(value_error(field, parameters, "256000000 at most"));
+        }
         Ok(())
+    }
+
+    /// Channels of the head's output.
+    fn head_channels(&self) -> i64 {
+        (1 + BOX_CODE) * self.anchors.yaws_deg.len() as i64
+    }
+
+    /// Parameters of the convolutions, nearly all there are.
+    fn parameters(&self) -> i64 {
+        let mut input = self.pillar_channels;
+        let mut count = 0;
+        for (level, &filters) in self.num_filters.iter().enumerate() {
+            let layers = self.layer_nums[level] as i64;
+            let more = if self.blocks == BlockKind::Residual { 2 * layers - 1 } else { layers };
+            count += 9 * filters * (input + more * filters);
+            count += self.upsample_strides[level].pow(2) * filters * self.num_upsample_filters[level];
+            input = filters;
+        }
+        let channels = self.feature_channels();
+        count += match self.shrink {
+            Some(ShrinkConfig::DoubleConv { .. }) => 9 * channels * (self.backbone_channels() + channels),
+            Some(ShrinkConfig::Pointwise { .. }) => channels * self.backbone_channels(),
+            None => 0,
+        };
+        if let Some(ratio) = self.compress_ratio {
+            count += 9 * channels * (2 * (channels / ratio).max(1) + channels);
+        }
+        count + channels * self.head_channels()
     }
 
     fn check_area(&self) -> Result<(), ConfigError> {
@@ -336,6 +389,10 @@ pub const OWN_BODY_M: [f64; 4] = [-1.95, -1.1, 2.95, 1.1];
 
 /// More cells than any map in the field has; keeps a wrong number from taking all memory.
 const MAX_CELLS: usize = 1 << 24;
+/// Values of a map, for the same reason: 1 GiB.
+const MAX_VALUES: i64 = 1 << 28;
+/// Parameters of a network, for the same reason: nearly 1 GiB.
+const MAX_PARAMETERS: i64 = 256_000_000;
 
 fn value_error(field: &'static str, value: impl std::fmt::Debug, must: &'static str) -> ConfigError {
     ConfigError::Value { field, value: format!("{value:?}"), must }
@@ -365,6 +422,29 @@ mod tests {
         assert_eq!(serde_json::from_value::<DetectorConfig>(json.clone()).unwrap(), full);
         json["max_pilars"] = 7.into();
         assert!(serde_json::from_value::<DetectorConfig>(json).unwrap_err().to_string().contains("max_pilars"));
+    }
+
+    #[test]
+    fn what_does_not_fit_into_memory_is_refused_before_it_is_asked_for() {
+        let refused = |config: DetectorConfig, field: &str, value: &str| {
+            let message = config.validate().unwrap_err().to_string();
+            assert!(message.contains(field) && message.contains(value), "{message}");
+        };
+        let wide = [-819.2, -819.2, -3.0, 819.2, 819.2, 1.0];
+        let lean = || DetectorConfig { lidar_range_m: wide, pillar_channels: 8, ..DetectorConfig::lean() };
+        refused(DetectorConfig { pillar_channels: 4096, ..lean() }, "pillar_channels", "68719476736");
+        refused(DetectorConfig { num_filters: vec![4096; 3], ..lean() }, "num_filters", "17179869184");
+        refused(
+            DetectorConfig { layer_nums: vec![64; 3], num_filters: vec![1024; 3], ..DetectorConfig::lean() },
+            "layer_nums",
+            "256000000",
+        );
+        let ratio = DetectorConfig {
+            shrink: Some(ShrinkConfig::Pointwise { channels: 4096 }),
+            compress_ratio: Some(1),
+            ..DetectorConfig::lean()
+        };
+        refused(ratio, "number of parameters", "256000000");
     }
 
     #[test]

@@ -1,6 +1,7 @@
 //! Which measured pose belongs to which sweep: the one of the same capture time.
 
 use std::collections::BTreeMap;
+use std::ops::Bound;
 use std::time::{Duration, Instant};
 
 use protocol::Pose;
@@ -34,15 +35,23 @@ impl<S> SweepPairing<S> {
         Self { patience, waiting: None, poses: BTreeMap::new() }
     }
 
-    /// A pose has come. Returns how many older ones had to go.
+    /// A pose has come. Returns how many others had to go: the oldest where there are too many, and those of later sweeps.
+    /// Poses come in order, so a later one is left over from before the scene began anew.
     #[must_use]
     pub fn add_pose(&mut self, capture_nanos: u64, pose: Pose) -> usize {
-        self.poses.insert(capture_nanos, pose);
+        let left_over = self.take_later(capture_nanos).len();
+        let replaced = usize::from(self.poses.insert(capture_nanos, pose).is_some());
         let too_many = self.poses.len().saturating_sub(MAX_POSES);
         for _ in 0..too_many {
             self.poses.pop_first();
         }
-        too_many
+        left_over + replaced + too_many
+    }
+
+    /// Takes out the poses of later sweeps.
+    fn take_later(&mut self, capture_nanos: u64) -> BTreeMap<u64, Pose> {
+        // Nothing is later than the end of time.
+        capture_nanos.checked_add(1).map_or_else(BTreeMap::new, |next| self.poses.split_off(&next))
     }
 
     /// A sweep has come. Returns the one it takes the place of.
@@ -56,11 +65,11 @@ impl<S> SweepPairing<S> {
         let &(capture_nanos, _, since) = self.waiting.as_ref()?;
         let pose = self.poses.get(&capture_nanos).copied();
         // Poses come in order: a later one tells that this sweep's own is lost.
-        let is_lost = self.poses.range(capture_nanos + 1..).next().is_some();
+        let is_lost = self.poses.range((Bound::Excluded(capture_nanos), Bound::Unbounded)).next().is_some();
         if pose.is_none() && !is_lost && now < since + self.patience {
             return None;
         }
-        let later = self.poses.split_off(&(capture_nanos + 1));
+        let later = self.take_later(capture_nanos);
         let unused = self.poses.len() - usize::from(pose.is_some());
         self.poses = later;
         let (_, sweep, _) = self.waiting.take()?;
@@ -111,6 +120,29 @@ mod tests {
         assert_eq!(paired(&mut pairing, now), None);
         assert_eq!(pairing.deadline(), Some(now + PATIENCE));
         assert_eq!(paired(&mut pairing, now + PATIENCE), Some((30, 'c', None, 1)), "the pose of 20 found no sweep");
+    }
+
+    #[test]
+    fn a_scene_that_begins_anew_is_not_mistaken_for_one_whose_poses_are_lost() {
+        let (mut pairing, now) = (SweepPairing::new(PATIENCE), Instant::now());
+        assert_eq!(pairing.add_pose(90, at(9.0)) + pairing.add_pose(100, at(10.0)), 0);
+        assert_eq!(pairing.add_pose(10, at(1.0)), 2, "those of the old scene have to go, and are told");
+        assert_eq!(pairing.add_sweep(20, 'b', now), None);
+        assert_eq!(paired(&mut pairing, now), None, "its own may still come");
+        assert_eq!(pairing.add_pose(20, at(2.0)), 0);
+        assert_eq!(paired(&mut pairing, now), Some((20, 'b', Some(2.0), 1)));
+        assert_eq!(pairing.add_pose(30, at(3.0)), 0);
+        assert_eq!(pairing.add_pose(30, at(4.0)), 1, "nor is one of the same time lost silently");
+    }
+
+    #[test]
+    fn the_last_moment_there_is_has_nothing_after_it() {
+        let (mut pairing, now) = (SweepPairing::new(PATIENCE), Instant::now());
+        assert_eq!(pairing.add_pose(10, at(1.0)) + pairing.add_pose(u64::MAX, at(2.0)), 0);
+        assert_eq!(pairing.add_sweep(u64::MAX, 'z', now), None);
+        assert_eq!(paired(&mut pairing, now), Some((u64::MAX, 'z', Some(2.0), 1)));
+        assert_eq!(pairing.add_sweep(u64::MAX, 'z', now), None);
+        assert_eq!(paired(&mut pairing, now), None);
     }
 
     #[test]

@@ -69,7 +69,8 @@ impl CrewProcesses {
                 }
             }
         });
-        let vehicles: Vec<_> = fleet.agents.iter().map(|cav| (cav.clone(), fleet.publish(cav).stream())).collect();
+        let stream = fleet.publish().stream();
+        let vehicles: Vec<_> = fleet.agents.iter().map(|cav| (cav.clone(), stream)).collect();
         let timeouts = &fleet.scenario.timeouts;
         let remote = RemoteCrew::meet(&bus, &vehicles, Duration::from_secs_f64(timeouts.ready_s), &stop)
             .map_err(|error| EvaluateError::from(Box::new(error)))?;

@@ -192,7 +192,7 @@ impl Fleet {
         let mut args = self.arguments("run", meeting);
         args.option("--cav", cav.as_str());
         self.model(&mut args);
-        args.option("--publish", self.publish(cav).name());
+        args.option("--publish", self.publish().name());
         args.option("--pose-source", settings.pose.name());
         if let PoseSource::Noisy(noise) = settings.pose {
             args.option("--noise-mode", noise_mode(noise.mode));
@@ -258,11 +258,7 @@ impl Fleet {
     /// The emulated air, where the scenario has one and the method sends anything through it.
     fn link(&self, meeting: &Meeting<'_>) -> Option<ProcessSpec> {
         let link = self.scenario.link.as_ref().filter(|_| self.is_over_link())?;
-        let mut streams: Vec<Stream> = self.neighbours().map(|cav| self.publish(cav).stream()).collect();
-        streams.extend([Stream::Pose, Stream::Descriptor]);
-        streams.sort_unstable();
-        streams.dedup();
-        let streams: Vec<String> = streams.iter().map(ToString::to_string).collect();
+        let streams = [Stream::Pose, self.publish().stream(), Stream::Descriptor].map(|stream| stream.to_string());
         let mut args = self.arguments("link", meeting);
         args.option("--ego", self.ego.as_str());
         args.option("--link", &link.air);
@@ -327,8 +323,9 @@ impl Fleet {
         Some(meeting.process(RECORDER.into(), "sim-replay", args, Life::Optional))
     }
 
-    pub(crate) fn publish(&self, cav: &CavId) -> Publish {
-        self.scenario.settings_of(cav).publish.unwrap_or(Publish::for_method(self.scenario.method))
+    /// What every vehicle puts on the air beside its pose.
+    pub(crate) fn publish(&self) -> Publish {
+        Publish::for_method(self.scenario.method)
     }
 
     fn model(&self, args: &mut Arguments) {

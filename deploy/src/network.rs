@@ -44,7 +44,8 @@ impl MeetingPlace {
                 keys.map_or(Ok(options.clone()), |keys| keys.for_router(options, run))
             }
         }?;
-        Ok(Self { session: open(&options)?, endpoint: options.endpoint().clone(), is_guarded: options.guard.is_some() })
+        let session = open(&options)?;
+        Ok(Self { session, endpoint: from_here(options.endpoint())?, is_guarded: options.guard.is_some() })
     }
 
     /// Closes the session.
@@ -58,6 +59,13 @@ impl MeetingPlace {
             }
         })
     }
+}
+
+/// The endpoint as processes of this host reach it: who listens everywhere is met on the loopback, whose name certificates
+/// carry.
+fn from_here(endpoint: &Endpoint) -> Result<Endpoint, BusError> {
+    let text = endpoint.as_str().replacen("/0.0.0.0:", "/127.0.0.1:", 1);
+    Endpoint::new(&text.replacen("/[::]:", "/[::1]:", 1))
 }
 
 /// The endpoint with port 0 replaced by a port that is free right now.
@@ -84,6 +92,17 @@ mod tests {
             assert!(!endpoint.as_str().ends_with(":0"), "{}", endpoint.as_str());
         }
         assert_eq!(with_port("tcp/127.0.0.1:7447", false).unwrap().as_str(), "tcp/127.0.0.1:7447");
+    }
+
+    #[test]
+    fn who_listens_everywhere_is_met_on_the_loopback() {
+        for (listen, met) in [
+            ("quic/0.0.0.0:7447", "quic/127.0.0.1:7447"),
+            ("tcp/[::]:7447", "tcp/[::1]:7447"),
+            ("tcp/10.0.0.1:7447", "tcp/10.0.0.1:7447"),
+        ] {
+            assert_eq!(from_here(&Endpoint::new(listen).unwrap()).unwrap().as_str(), met);
+        }
     }
 
     #[test]

@@ -29,6 +29,7 @@ What to know before trusting the numbers:
   boxes are mirrored around the network. Real-world data sets (DAIR-V2X, V2V4Real) have y to the left: `--y-axis left`.
 * Models with `proj_first: true` were trained on clouds brought to the ego's frame before they were encoded. An agent on
   the road cannot do that; its maps are turned instead, which such a network has not learnt to read.
+* Converted weights move neighbours' maps with v2vloc's own warp, not that of the code base (multi-scale: CoAlign's).
 * The direction head of CoAlign's models is left out: boxes may face backwards, which no overlap notices.
 * Where2comm's threshold and window are settings of the sender, not weights: they are printed for `agent run`.
 """

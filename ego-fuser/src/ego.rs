@@ -62,7 +62,6 @@ pub struct Ego {
     history: History,
     trust: Option<Trust>,
     limits: PostprocessConfig,
-    comm_range_m: f64,
 }
 
 impl Ego {
@@ -98,19 +97,7 @@ impl Ego {
         let limits = PostprocessConfig::for_detector(detector.config());
         let limits = PostprocessConfig { score_threshold: SCORE_THRESHOLD, ..limits };
         let history = History::new(fusion.frames());
-        Self { method, detector, fusion, history, trust: None, limits, comm_range_m: Self::COMM_RANGE_M }
-    }
-
-    /// The same with other limits of the clean-up.
-    #[must_use]
-    pub fn with_limits(self, limits: PostprocessConfig) -> Self {
-        Self { limits, ..self }
-    }
-
-    /// The same with another communication range, metres.
-    #[must_use]
-    pub fn with_comm_range(self, comm_range_m: f64) -> Self {
-        Self { comm_range_m, ..self }
+        Self { method, detector, fusion, history, trust: None, limits }
     }
 
     /// The same leaving out neighbours whose words do not fit what the ego sees itself.
@@ -199,7 +186,7 @@ impl Ego {
         let world_from_ego = own.pose.world_from_cav().ok_or(no_pose)?;
         let world_from_cav = view.pose.world_from_cav().ok_or(no_pose)?;
         let [dx, dy] = [0, 1].map(|axis| world_from_cav.translation_m[axis] - world_from_ego.translation_m[axis]);
-        if dx.hypot(dy) > self.comm_range_m {
+        if dx.hypot(dy) > Self::COMM_RANGE_M {
             return Err(Skipped::Unusable(DropReason::OutOfRange));
         }
         let fits = match &view.content {
@@ -310,7 +297,8 @@ impl Ego {
         let poses: Vec<Pose> = aligned.iter().map(|view| view.ego_from_cav).collect();
         let merged = merge_points(clouds, &poses);
         stages.lap("align");
-        let features = self.detector.encode_merged(&merged)?.features;
+        let encoded = self.detector.encode_merged(&merged)?.features;
+        let features = self.detector.through_compressor(&encoded)?;
         stages.lap("encode");
         self.boxes_of(&features, stages)
     }

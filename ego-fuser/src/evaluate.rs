@@ -233,9 +233,7 @@ impl Evaluator {
         for (index, (agent, frame)) in agents.iter_mut().zip(&frames).enumerate() {
             // Without an exchange, neighbours have nothing to encode; where they are is still asked.
             let is_needed = index == 0 || self.ego.method() != Method::None;
-            // What the ego leaves out for others it has itself.
-            let gate = self.config.codec.gate.filter(|_| index > 0);
-            let codec = CodecConfig { gate, ..self.config.codec };
+            let codec = if index == 0 { of_the_ego(self.config.codec) } else { self.config.codec };
             agent.overhear(|| sent.last().map(Sent::overheard).unwrap_or_default());
             sent.push(view(agent, frame, maps.get(index), is_needed.then_some(exchange), &codec)?);
         }
@@ -321,6 +319,11 @@ pub fn rule_for(config: &DetectorConfig) -> GroundTruthRule {
         comm_range_m: Ego::COMM_RANGE_M,
         min_corners: 8,
     }
+}
+
+/// What the ego leaves out for others it has itself.
+fn of_the_ego(codec: CodecConfig) -> CodecConfig {
+    CodecConfig { gate: None, budget_bytes: None, ..codec }
 }
 
 /// Where the ego's own poses come from: one fixed offset spares it, as in the reference code. With the same offset on all

@@ -1,8 +1,8 @@
 //! The maps of a frozen encoder, computed once and kept on disk.
 //!
 //! Methods that share an encoder differ in what they make of its maps; what takes the time, the encoder, need not run
-//! again for each of them, nor for each pass over the data. The file belongs to one encoder, one listing of data and one
-//! wire version: all are in its name. It holds one packed message per sweep, as on the wire, each after its length: what
+//! again for each of them, nor for each pass over the data. The file belongs to one encoder, one set of data (its contents)
+//! and one wire version: all are in its name. It holds one packed message per sweep, as on the wire, each after its length: what
 //! is cut off or changed is found out.
 
 use std::fs::{self, File, OpenOptions};
@@ -63,7 +63,7 @@ pub enum FeatureStoreError {
 /// Where maps are kept, how exactly and how many.
 #[derive(Debug, Clone, PartialEq, Eq)]
 pub struct KeptMaps {
-    /// The folder; a file per encoder, listing of data and kind of number.
+    /// The folder; a file per encoder, contents of the data and kind of number.
     pub folder: PathBuf,
     /// How exactly.
     pub dtype: Dtype,
@@ -106,7 +106,7 @@ impl FeatureStore {
         scenarios: &[Scenario],
         on_sweep: &mut dyn FnMut(usize, usize),
     ) -> Result<Self, FeatureStoreError> {
-        let [encoder, data] = [weights.sha256_of(is_encoder), dataset::listing_sha256(scenarios)];
+        let [encoder, data] = [weights.sha256_of(is_encoder), dataset::content_sha256(scenarios)];
         let dtype = format!("{:?}", kept.dtype).to_lowercase();
         let name = format!("{}-{}-{dtype}-wire{WIRE_VERSION}.maps", &encoder[..HASH_DIGITS], &data[..HASH_DIGITS]);
         let path = kept.folder.join(name);

@@ -1,6 +1,6 @@
 //! Who is around: agents found by their liveliness tokens, and the subscriptions to them.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
 
 use protocol::{CavId, Role, Stream, Topic};
@@ -8,6 +8,8 @@ use sim_replay::bus::{Bus, BusError, Inbox, RollCall, Subscription};
 
 /// Neighbours that an ego listens to at most: a flood of tokens must not become a flood of subscriptions.
 const MAX_NEIGHBOURS: usize = 64;
+/// Vehicles that are remembered at most while there is no place for them.
+const MAX_QUEUED: usize = 256;
 /// Frames in a row without a word after which a neighbour is not waited for any more, until it speaks again.
 const SILENT_AFTER: u32 = 3;
 
@@ -19,7 +21,12 @@ pub(crate) struct Neighbourhood {
     allowed: Option<BTreeSet<CavId>>,
     roll_call: RollCall,
     members: BTreeMap<CavId, Member>,
+    queue: Queue,
 }
+
+/// Vehicles for which there was no place when they came, first come first: their tokens are not told of again.
+#[derive(Default)]
+struct Queue(VecDeque<CavId>);
 
 struct Member {
     silent_frames: u32,
@@ -55,31 +62,40 @@ impl Neighbourhood {
         allowed: Option<BTreeSet<CavId>>,
     ) -> Result<Self, BusError> {
         let roll_call = RollCall::begin(bus, Role::Agent, 2 * MAX_NEIGHBOURS)?;
-        Ok(Self { ego: ego.clone(), streams, over_link, allowed, roll_call, members: BTreeMap::new() })
+        let (members, queue) = (BTreeMap::new(), Queue::default());
+        Ok(Self { ego: ego.clone(), streams, over_link, allowed, roll_call, members, queue })
     }
 
     /// Follows up on who came and went; those who went are returned.
     pub(crate) fn update(&mut self, bus: &Bus, inbox: &Arc<Inbox>) -> Result<Vec<CavId>, BusError> {
         let mut gone = Vec::new();
         while let Some((cav, is_there)) = self.roll_call.next() {
-            if !is_there {
+            if is_there && self.is_wanted(&cav) {
+                self.queue.add(cav);
+            } else if !is_there {
+                self.queue.remove(&cav);
                 if self.members.remove(&cav).is_some() {
                     tracing::info!(%cav, "a neighbour has left");
                     gone.push(cav);
                 }
-            } else if self.is_wanted(&cav) {
-                tracing::info!(%cav, "a neighbour has come");
-                let topics = self.streams.iter().map(|&stream| heard_on(&self.ego, &cav, stream, self.over_link));
-                let subscriptions = topics.map(|topic| bus.subscribe(topic, inbox)).collect::<Result<_, _>>()?;
-                self.members.insert(cav, Member { silent_frames: 0, _subscriptions: subscriptions });
+            }
+            while let Some(cav) = self.queue.next(self.members.len()) {
+                self.listen_to(cav, bus, inbox)?;
             }
         }
         Ok(gone)
     }
 
+    fn listen_to(&mut self, cav: CavId, bus: &Bus, inbox: &Arc<Inbox>) -> Result<(), BusError> {
+        tracing::info!(%cav, "a neighbour has come");
+        let topics = self.streams.iter().map(|&stream| heard_on(&self.ego, &cav, stream, self.over_link));
+        let subscriptions = topics.map(|topic| bus.subscribe(topic, inbox)).collect::<Result<_, _>>()?;
+        self.members.insert(cav, Member { silent_frames: 0, _subscriptions: subscriptions });
+        Ok(())
+    }
+
     fn is_wanted(&self, cav: &CavId) -> bool {
         *cav != self.ego
-            && self.members.len() < MAX_NEIGHBOURS
             && !self.members.contains_key(cav)
             && self.allowed.as_ref().is_none_or(|allowed| allowed.contains(cav))
     }
@@ -106,5 +122,53 @@ impl Neighbourhood {
         if let Some(member) = self.members.get_mut(cav) {
             member.silent_frames = member.silent_frames.saturating_add(1);
         }
+    }
+}
+
+impl Queue {
+    /// Somebody has come. Of too many the last are passed over.
+    fn add(&mut self, cav: CavId) {
+        if self.0.len() >= MAX_QUEUED {
+            tracing::warn!(%cav, "more vehicles wait to be listened to than can be remembered");
+        } else if !self.0.contains(&cav) {
+            self.0.push_back(cav);
+        }
+    }
+
+    /// Somebody has gone.
+    fn remove(&mut self, cav: &CavId) {
+        self.0.retain(|waiting| waiting != cav);
+    }
+
+    /// Who has waited longest, where there is a place beside so many members.
+    fn next(&mut self, members: usize) -> Option<CavId> {
+        if members < MAX_NEIGHBOURS { self.0.pop_front() } else { None }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn cav(number: usize) -> CavId {
+        CavId::new(&format!("v{number}")).unwrap()
+    }
+
+    #[test]
+    fn who_came_while_there_was_no_place_gets_the_next_that_is_free() {
+        let mut queue = Queue::default();
+        [0, 1, 2, 1].into_iter().for_each(|number| queue.add(cav(number)));
+        assert_eq!(queue.next(MAX_NEIGHBOURS), None);
+        assert_eq!(queue.next(MAX_NEIGHBOURS - 1), Some(cav(0)));
+        queue.remove(&cav(1));
+        assert_eq!(queue.next(MAX_NEIGHBOURS - 1), Some(cav(2)));
+        assert_eq!(queue.next(0), None);
+    }
+
+    #[test]
+    fn a_flood_of_tokens_is_not_remembered() {
+        let mut queue = Queue::default();
+        (0..1000).for_each(|number| queue.add(cav(number)));
+        assert_eq!(queue.0.len(), MAX_QUEUED);
     }
 }

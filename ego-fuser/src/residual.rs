@@ -8,7 +8,7 @@ use std::f64::consts::TAU;
 use agent::detector::{Detector, DetectorError};
 use agent::statistics::{quantile, sorted};
 use agent::weights::{Weights, WeightsError};
-use protocol::Pose;
+use protocol::{PointCloud, Pose};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
@@ -129,7 +129,7 @@ impl ResidualMeter {
     fn pairs(&mut self, scenario: &Scenario, tick: usize) -> Result<Vec<Pair>, ResidualError> {
         let ego = scenario.load(0, tick, &LoadOptions::default())?;
         let Some(world_from_ego) = ego.world_from_lidar else { return Ok(Vec::new()) };
-        let own = self.detector.encode(&ego.points)?.features;
+        let own = self.map(&ego.points)?;
         let mut pairs = Vec::new();
         for agent in 1..scenario.agents.len() {
             let frame = scenario.load(agent, tick, &LoadOptions::default())?;
@@ -137,11 +137,17 @@ impl ResidualMeter {
             let ego_from_cav = world_from_ego.from_world(&world_from_cav);
             let [x, y, _] = ego_from_cav.translation_m;
             if x.hypot(y) <= Ego::COMM_RANGE_M {
-                let maps = Tensor::f_cat(&[&own, &self.detector.encode(&frame.points)?.features], 0)?;
+                let maps = Tensor::f_cat(&[&own, &self.map(&frame.points)?], 0)?;
                 pairs.push(Pair { maps, ego_from_cav });
             }
         }
         Ok(pairs)
+    }
+
+    /// The map `[1, C, H, W]` of a sweep as others get it.
+    fn map(&mut self, points: &PointCloud) -> Result<Tensor, DetectorError> {
+        let encoded = self.detector.encode(points)?.features;
+        self.detector.through_compressor(&encoded)
     }
 
     /// Errors of a pair with an offset, before and after: metres and degrees.

@@ -212,12 +212,6 @@ impl Selector {
         Self(format!("{KEY_ROOT}/{run}/alive/{role}/*"))
     }
 
-    /// The liveliness tokens of every process.
-    #[must_use]
-    pub fn everyone_alive(run: &RunId) -> Self {
-        Self(format!("{KEY_ROOT}/{run}/alive/*/*"))
-    }
-
     /// The key expression.
     #[must_use]
     pub fn as_str(&self) -> &str {

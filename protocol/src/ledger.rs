@@ -9,8 +9,11 @@
 //!   naming a receiver: such lines hold for every receiver of the topic.
 //! - A receiver opens an account when it subscribes ([`Ledger::open`]), so that it is known even if nothing ever comes;
 //!   it counts as received what it accepted and used, and everything else as dropped.
-//! - The link counts under the *sender's* topic what it drops on the way to one receiver, what it still holds (in
-//!   flight), and a duplicate that it makes as sent once more. It never counts as a receiver.
+//! - In virtual time the link counts under the *sender's* topic what it drops on the way to one receiver, what it still
+//!   holds (in flight), and a duplicate that it makes as sent once more, and is no receiver itself.
+//! - A live link is a process between two topics. It receives what agents publish: what it passes on is received, what
+//!   the air loses is dropped, what it still holds is in flight. And it publishes under `rx/...` what it passes on, a
+//!   duplicate once more.
 
 use std::collections::BTreeMap;
 use std::fmt;

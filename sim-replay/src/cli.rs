@@ -10,7 +10,11 @@ use crate::command;
 
 /// Scenes: look into recorded ones, generate new ones, stream either as live traffic, record what comes of it.
 #[derive(Debug, Parser)]
-#[command(version, after_help = "Exit codes: 0 done, 1 failed, 2 bad usage or input, 3 finished but data was lost.")]
+#[command(
+    version,
+    after_help = "Exit codes: 0 done, 1 failed, 2 bad usage or input, 3 finished but data was lost (stream: frames that \
+                  cannot be read, ticks that are not answered)."
+)]
 pub(crate) struct Cli {
     #[command(subcommand)]
     command: Command,

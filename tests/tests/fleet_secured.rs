@@ -111,7 +111,7 @@ fn strangers_and_liars_change_nothing() {
     let rest = format!(
         "security: {{keys: {}}}\nnetwork: {{listen: {}}}\nvehicles: {{\"4288\": {{launch: elsewhere}}}}",
         keys.display(),
-        endpoint.as_str().replace("quic/", "tcp/")
+        endpoint.as_str()
     );
     let scenario = scenario(&stormy, &rest);
     let mut up = Up::start(&stormy, &scenario);

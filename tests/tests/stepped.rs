@@ -40,12 +40,20 @@ fn config(link: LinkConfig) -> SteppedConfig {
 
 /// The frames of a scene in `folder`, and the books.
 fn evaluate(folder: &Path, stepped: Option<SteppedConfig>) -> (Vec<EvaluatedFrame>, protocol::Ledger) {
+    evaluate_with(folder, stepped, CodecConfig { dtype: Dtype::F16, ..CodecConfig::default() })
+}
+
+fn evaluate_with(
+    folder: &Path,
+    stepped: Option<SteppedConfig>,
+    codec: CodecConfig,
+) -> (Vec<EvaluatedFrame>, protocol::Ledger) {
     tch::set_num_threads(1);
     let config = EvaluateConfig {
         weights: folder.join("weights.safetensors"),
         method: Some(Method::Max),
         pose_source: PoseSourceConfig::Recorded,
-        codec: CodecConfig { dtype: Dtype::F16, ..CodecConfig::default() },
+        codec,
         rate: RateConfig::default(),
         rule: None,
         delay_nanos: 0,
@@ -93,6 +101,21 @@ fn over_an_ideal_link_boxes_are_those_of_an_evaluation_without_one() {
     assert!(nothing.is_empty() && ledger.balance().is_exact(), "{:?}", ledger.balance());
     // Two neighbours with a pose and a map each per tick.
     assert_eq!((ledger.total().sent, ledger.total().received), (4 * TICKS as u64, 4 * TICKS as u64));
+}
+
+/// What the ego leaves out for others it has itself, over a link and without one.
+#[test]
+fn a_budget_cuts_the_neighbours_maps_and_not_the_egos_own() {
+    let folder = scene();
+    let codec = CodecConfig { dtype: Dtype::F16, budget_bytes: Some(4000), ..CodecConfig::default() };
+    let (offline, _) = evaluate_with(folder.path(), None, codec);
+    let (stepped, _) = evaluate_with(folder.path(), Some(config(LinkConfig::default())), codec);
+    assert_eq!(offline.len(), TICKS);
+    for (offline, stepped) in offline.iter().zip(&stepped) {
+        assert!(offline.result.fused.iter().all(|neighbour| neighbour.payload_bytes <= 4000));
+        assert!(!offline.result.detections.is_empty());
+        assert_eq!(offline.result.detections, stepped.result.detections);
+    }
 }
 
 #[test]

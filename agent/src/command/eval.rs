@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
 use agent::chart;
-use agent::localizer::confidence::{CONFIDENCE_KEY, Confidence, ConfidenceModel, FitReport};
+use agent::localizer::confidence::{CONFIDENCE_KEY, Confidence, ConfidenceModel, FitReport, check_good_loss};
 use agent::localizer::evaluation::{
     EvaluatedSweep, EvaluationError, EvaluationOptions, LocalizationSummary, evaluate, evaluate_source,
     reliability_charts, write_csv, write_error_table,
@@ -15,6 +15,7 @@ use agent::pose_source::{IcpMapPose, PoseSource, read_map};
 use agent::registration::icp::IcpConfig;
 use agent::registration::ransac::RansacConfig;
 use agent::registration::sc2pcr::Sc2PcrConfig;
+use agent::training::cuda_device;
 use agent::weights::annotate;
 use anyhow::Context;
 use clap::ValueEnum;
@@ -127,6 +128,7 @@ enum Subject {
 /// Localises, fits, writes and prints.
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     tch::set_num_threads(i32::from(args.threads));
+    check_good_loss(args.good_loss).map_err(|error| BadInput(anyhow::anyhow!("--good-loss: {error}")))?;
     let groups = by_head(&args.head, &args.scene)?;
     if args.fit_confidence && groups.len() > 1 {
         let count = groups.len();
@@ -153,7 +155,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
 impl Args {
     fn subject(&self, head: &Path) -> Result<Subject, BadInput> {
         if self.icp_map.is_empty() {
-            return Ok(Subject::Localizer(self.localizer(head).map_err(|error| BadInput(error.into()))?));
+            let device = match self.device {
+                ComputeOn::Cpu => Device::Cpu,
+                ComputeOn::Cuda => cuda_device().map_err(|error| BadInput(error.into()))?,
+            };
+            return Ok(Subject::Localizer(self.localizer(head, device).map_err(|error| BadInput(error.into()))?));
         }
         if !self.map_spacing.is_finite() || self.map_spacing < 0.0 {
             return Err(BadInput(anyhow::anyhow!("--map-spacing is {}, must be 0 or more", self.map_spacing)));
@@ -163,11 +169,7 @@ impl Args {
         Ok(Subject::Source(Box::new(IcpMapPose::new(Arc::new(map), config))))
     }
 
-    fn localizer(&self, head: &Path) -> Result<Box<dyn Localize>, LocalizerError> {
-        let device = match self.device {
-            ComputeOn::Cpu => Device::Cpu,
-            ComputeOn::Cuda => Device::Cuda(0),
-        };
+    fn localizer(&self, head: &Path, device: Device) -> Result<Box<dyn Localize>, LocalizerError> {
         let solver = match self.solver {
             Search::Ransac => Solver::Ransac(RansacConfig { seed: self.seed, ..RansacConfig::default() }),
             Search::Sc2pcr => Solver::Sc2Pcr(Sc2PcrConfig::default()),

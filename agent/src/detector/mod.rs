@@ -180,10 +180,17 @@ impl Detector {
         Ok(Encoded { features, points: self.cropped.len(), pillars: pillars.len(), times })
     }
 
-    /// The squeezed channels of a map, where the configuration has a compressor.
-    #[must_use]
-    pub fn compressor(&self) -> Option<&Compressor> {
-        self.compressor.as_ref()
+    /// What is left of an encoded map `[1, C, H, W]` behind the compressor, as head and fusion have learnt it; the map itself
+    /// where the configuration has none.
+    ///
+    /// Maps are encoded and kept without: whoever shares, fuses or reads one calls this once.
+    ///
+    /// # Errors
+    /// [`DetectorError::Shape`] when there is a compressor and the map is not one of this detector's.
+    pub fn through_compressor(&self, features: &Tensor) -> Result<Tensor, DetectorError> {
+        let Some(compressor) = &self.compressor else { return Ok(features.shallow_clone()) };
+        let map = self.one_map(features)?;
+        Ok(tch::no_grad(|| compressor.decode(&compressor.encode(&map, false), false)))
     }
 
     /// Scores, offsets and confidence of a map `[1, C, H, W]` or `[C, H, W]`, own or fused.
@@ -191,17 +198,20 @@ impl Detector {
     /// # Errors
     /// [`DetectorError::Shape`] when the map is not one of this detector's.
     pub fn heads(&self, features: &Tensor) -> Result<Heads, DetectorError> {
+        let map = self.one_map(features)?;
+        tch::no_grad(|| Heads::new(&self.head.forward(&map)?))
+    }
+
+    /// A map `[1, C, H, W]` or `[C, H, W]` of this detector as `[1, C, H, W]`.
+    fn one_map(&self, features: &Tensor) -> Result<Tensor, DetectorError> {
         let expected = self.map_shape();
         let found = features.size();
         if found != expected && found.split_first() != Some((&1, expected.as_slice())) {
             return Err(DetectorError::Shape { what: "feature map", found, expected });
         }
         let [channels, height, width] = expected;
-        tch::no_grad(|| {
-            // One memory layout, or the same values would give other last bits.
-            let output = self.head.forward(&features.f_contiguous()?.f_view([1, channels, height, width])?)?;
-            Heads::new(&output)
-        })
+        // One memory layout, or the same values would give other last bits.
+        Ok(features.f_contiguous()?.f_view([1, channels, height, width])?)
     }
 
     /// Boxes above a score, in the frame of the vehicle whose map it is, not yet suppressed.
@@ -265,10 +275,14 @@ mod tests {
 
     /// A network with running statistics that are not those of a new one, so that folding has something to do.
     fn network() -> (VarStore, PointPillars) {
+        network_of(&config())
+    }
+
+    fn network_of(config: &DetectorConfig) -> (VarStore, PointPillars) {
         tch::set_num_threads(1);
         tch::manual_seed(5);
         let network = VarStore::new(Device::Cpu);
-        let pillars = PointPillars::new(&network.root(), &config()).unwrap();
+        let pillars = PointPillars::new(&network.root(), config).unwrap();
         for (name, mut variable) in network.variables() {
             if name.contains("running_var") {
                 let _ = tch::no_grad(|| variable.uniform_(0.3, 1.5));
@@ -304,6 +318,24 @@ mod tests {
         let heads = detector.heads(&encoded.features).unwrap();
         let close = Tensor::from_slice(&heads.scores).allclose(&scores.reshape([-1]), 1e-4, 1e-4, false);
         assert!(close && heads.confidence.iter().all(|value| (0.0..=1.0).contains(value)));
+    }
+
+    #[test]
+    fn what_is_left_behind_the_compressor_is_what_the_training_saw() {
+        let (_store, pillars) = network_of(&DetectorConfig { compress_ratio: Some(4), ..config() });
+        let mut cropped = Vec::new();
+        Crop::for_detector(&config()).keep(&cloud().xyzi, &mut cropped);
+        let sweep = Voxeliser::for_detector(&config()).voxelise(&cropped);
+        let batch = PillarBatch::new(&[&sweep], pillars.lattice());
+        let expected = tch::no_grad(|| pillars.through_compressor(&pillars.features(&batch, false), false));
+        let mut detector = Detector::from_network(pillars);
+        let encoded = detector.encode(&cloud()).unwrap().features;
+        let left = detector.through_compressor(&encoded).unwrap();
+        assert!(left.allclose(&expected, 1e-4, 1e-4, false) && !left.allclose(&encoded, 1e-2, 1e-2, false));
+        let other = Tensor::zeros([1, 64, 8, 8], (Kind::Float, Device::Cpu));
+        assert!(matches!(detector.through_compressor(&other), Err(DetectorError::Shape { .. })));
+        let plain = Detector::from_network(network().1);
+        assert!(plain.through_compressor(&encoded).unwrap().equal(&encoded), "there is nothing to lose");
     }
 
     #[test]

@@ -2,6 +2,11 @@
 
 use serde::{Deserialize, Serialize};
 
+use super::head_config::MAX_PARAMETERS;
+use crate::sparse::KERNEL_VOLUME;
+
+/// Residual groups, and windows around a cell, at most.
+const MAX_ENTRIES: usize = 16;
 /// Cells of the last level from the sensor to the edge: planes of features have four times its square.
 const MAX_PLANE_CELLS: f64 = 512.0;
 
@@ -158,14 +163,41 @@ impl SceneEncoderConfig {
         if !(2..=6).contains(&self.levels()) {
             return Err(format!("widths has {} entries, must have 2 to 6", self.levels()));
         }
+        for (name, entries) in [("residual_widths", self.residual_widths.len()), ("context_m", self.context_m.len())] {
+            if entries > MAX_ENTRIES {
+                return Err(format!("{name} has {entries} entries, must have {MAX_ENTRIES} at most"));
+            }
+        }
         let channels = self.widths.iter().chain(&self.residual_widths);
         match channels.copied().find(|channels| !(1..=4096).contains(channels)) {
             Some(channels) => Err(format!("a layer has {channels} channels, must have 1 to 4096")),
             None if self.range_m / self.voxel_m > 10_000.0 || self.range_m / self.coarse_cell_m() > MAX_PLANE_CELLS => {
                 Err(format!("range_m is {} with voxel_m {}: too many voxels", self.range_m, self.voxel_m))
             }
+            // Checked before anything of this size is allocated: the file that the numbers come from may be anybody's.
+            None if self.parameters() > MAX_PARAMETERS => Err(format!(
+                "widths are {:?} and residual_widths {:?}: {} parameters, must be {MAX_PARAMETERS} at most",
+                self.widths,
+                self.residual_widths,
+                self.parameters()
+            )),
             None => Ok(()),
         }
+    }
+
+    /// Parameters of the 3x3x3 convolutions, nearly all there are.
+    fn parameters(&self) -> i64 {
+        let group = |from: i64, to: i64| (from + to) * to;
+        let before_last = self.widths[self.levels() - 2];
+        let mut products = self.input.channels() * self.widths[0];
+        products += self.widths.windows(2).map(|pair| pair[0] * pair[1]).sum::<i64>();
+        products += if self.fine_cells { group(before_last, before_last) } else { 0 };
+        let mut channels = self.widths[self.levels() - 1];
+        for &width in &self.residual_widths {
+            products += group(channels, width);
+            channels = width;
+        }
+        products * KERNEL_VOLUME as i64
     }
 }
 
@@ -191,5 +223,9 @@ mod tests {
         assert!(refused(SceneEncoderConfig { voxel_m: 1e-6, ..SceneEncoderConfig::lean() }, "too many"));
         assert!(refused(SceneEncoderConfig { widths: vec![4], ..SceneEncoderConfig::lean() }, "widths"));
         assert!(refused(SceneEncoderConfig { height_m: [2.0, 1.0], ..SceneEncoderConfig::lean() }, "height_m"));
+        assert!(refused(SceneEncoderConfig { context_m: vec![9.0; 17], ..SceneEncoderConfig::lean() }, "context_m"));
+        for residual_widths in [vec![1; 17], vec![4096; 9]] {
+            assert!(refused(SceneEncoderConfig { residual_widths, ..SceneEncoderConfig::lean() }, "residual_widths"));
+        }
     }
 }

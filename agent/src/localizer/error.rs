@@ -14,6 +14,14 @@ pub enum LocalizerError {
     /// The configuration is not one of a network.
     #[error("localizer: {0}")]
     Config(String),
+    /// The confidence in a head's file is none that can be computed with.
+    #[error("{head}: confidence: {reason}")]
+    Confidence {
+        /// File of the head.
+        head: String,
+        /// What is wrong with it.
+        reason: String,
+    },
     /// The head was trained on the features of another encoder.
     #[error("{head}: trained on encoder {expected}, but {encoder} is {found} (SHA-256)")]
     OtherEncoder {

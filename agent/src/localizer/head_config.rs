@@ -4,6 +4,8 @@ use serde::{Deserialize, Serialize};
 
 /// Values of a lattice.
 const MAX_LATTICE: i64 = 64_000_000;
+/// Parameters of a network, head or encoder: keeps a wrong number from taking all memory.
+pub(super) const MAX_PARAMETERS: i64 = 256_000_000;
 
 /// The head of one town.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -139,8 +141,20 @@ impl SceneHeadConfig {
             None if self.origin_m.iter().any(|axis| !axis.is_finite()) => {
                 Err(format!("origin_m is {:?}, must be finite", self.origin_m))
             }
+            None if self.parameters() > MAX_PARAMETERS => Err(format!(
+                "width is {} with {} blocks: {} parameters, must be {MAX_PARAMETERS} at most",
+                self.width,
+                self.blocks,
+                self.parameters()
+            )),
             None => Ok(()),
         }
+    }
+
+    /// Parameters of the layers that regress; those of the classifier are few in any case.
+    fn parameters(&self) -> i64 {
+        let blocks = self.blocks as i64 * 3 * self.width;
+        (self.cell_channels + self.classes + blocks + self.centres + 4) * self.width
     }
 }
 
@@ -161,6 +175,26 @@ mod tests {
         };
         let message = huge.validate().unwrap_err();
         assert!(message.contains("33335 x 33335") && message.contains("4096 keys"), "{message}");
+    }
+
+    #[test]
+    fn a_head_too_large_for_memory_is_refused_with_its_size() {
+        let head = SceneHeadConfig {
+            town: "test".into(),
+            encoder_sha256: String::new(),
+            cell_channels: 448,
+            sweep_channels: 256,
+            classes: 150,
+            centres: 1400,
+            width: 448,
+            blocks: 3,
+            origin_m: [0.0; 3],
+            max_cells: 1024,
+            refiner: None,
+        };
+        assert_eq!(head.validate(), Ok(()));
+        let message = SceneHeadConfig { width: 16_384, blocks: 16_384, ..head }.validate().unwrap_err();
+        assert!(message.contains("width is 16384") && message.contains("256000000"), "{message}");
     }
 
     #[test]

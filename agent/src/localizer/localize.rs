@@ -7,7 +7,7 @@ use protocol::{PointCloud, PoseEstimate, StageTiming};
 use tch::nn::VarStore;
 use tch::{Device, Kind, TchError, Tensor, no_grad};
 
-use super::confidence::{CONFIDENCE_KEY, Confidence};
+use super::confidence::{CONFIDENCE_KEY, Confidence, ConfidenceModel};
 use super::error::LocalizerError;
 use super::head_config::SceneHeadConfig;
 use super::pose_evidence::PoseEvidence;
@@ -101,13 +101,11 @@ impl Localizer {
     /// Reads encoder and head.
     ///
     /// # Errors
-    /// [`LocalizerError`] when a file is missing, cut off, of something else, or when the head was trained on the
-    /// features of another encoder.
+    /// [`LocalizerError`] when a file is missing, cut off, of something else, when its confidence is none, or when the head
+    /// was trained on the features of another encoder.
     pub fn load(encoder: &Path, head: &Path, device: Device) -> Result<Self, LocalizerError> {
         let (mut localizer, weights) = Self::open(encoder, head, device)?;
-        if weights.metadata(CONFIDENCE_KEY).is_some() {
-            localizer.solver.confidence = Confidence::Calibrated(weights.metadata_json(CONFIDENCE_KEY)?);
-        }
+        localizer.solver.confidence = stored_confidence(&weights)?;
         Ok(localizer)
     }
 
@@ -303,6 +301,17 @@ impl SceneCoordinates {
     }
 }
 
+/// The confidence in a head's file; the plain one where there is none.
+fn stored_confidence(weights: &Weights) -> Result<Confidence, LocalizerError> {
+    if weights.metadata(CONFIDENCE_KEY).is_none() {
+        return Ok(Confidence::Plain);
+    }
+    let model: ConfidenceModel = weights.metadata_json(CONFIDENCE_KEY)?;
+    let head = weights.path().display().to_string();
+    model.check().map_err(|reason| LocalizerError::Confidence { head, reason })?;
+    Ok(Confidence::Calibrated(model))
+}
+
 /// Confidence of a cell (Eq. 6): 0.5 at an expected error of 1 m.
 #[must_use]
 pub fn sigma(epsilon_m: f32) -> f32 {
@@ -326,7 +335,25 @@ fn every_nth(rows: &[usize], count: usize) -> Vec<usize> {
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeMap;
+
     use super::*;
+    use crate::weights::{self, Precision};
+
+    #[test]
+    fn a_confidence_that_would_fail_on_a_sweep_is_refused_with_its_file() {
+        let folder = tempfile::tempdir().unwrap();
+        let stored = |model: &ConfidenceModel| {
+            let path = folder.path().join("head.safetensors");
+            let metadata: BTreeMap<_, _> = [(CONFIDENCE_KEY.to_owned(), serde_json::to_string(model).unwrap())].into();
+            weights::save(&path, &VarStore::new(Device::Cpu), &metadata, Precision::Single).unwrap();
+            stored_confidence(&Weights::load(&path).unwrap())
+        };
+        let model = ConfidenceModel::example();
+        assert_eq!(stored(&model).unwrap(), Confidence::Calibrated(model.clone()));
+        let message = stored(&ConfidenceModel { bias: -1e308, ..model }).unwrap_err().to_string();
+        assert!(message.contains("head.safetensors") && message.contains("bias"), "{message}");
+    }
 
     #[test]
     fn ground_is_never_more_than_its_share() {

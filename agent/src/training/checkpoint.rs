@@ -1,7 +1,7 @@
 //! The state of a training on disk: parameters, moments and counters in one file that appears only when it is whole.
 //!
-//! Order and augmentation of samples follow from seed and step in every training here, so no state of a random number
-//! generator has to be kept.
+//! Order and augmentation of samples follow from seed and step, so no state of a random number generator has to be kept.
+//! The one exception are the heads of towns: one that is resumed begins a new pass over its cells, with all of its sweeps.
 
 use std::collections::{BTreeMap, HashMap};
 use std::fs;

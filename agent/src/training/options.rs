@@ -111,7 +111,10 @@ impl TrainingOptions {
         match (self.steps, self.epochs, self.minutes) {
             (Some(steps), _, _) if steps > 0 => Ok(Length::Steps(steps)),
             (_, Some(epochs), _) if epochs > 0.0 => Ok(Length::Epochs(epochs)),
-            (_, _, Some(minutes)) if minutes > 0.0 => Ok(Length::Time(Duration::from_secs_f64(60.0 * minutes))),
+            (_, _, Some(minutes)) => match Duration::try_from_secs_f64(60.0 * minutes) {
+                Ok(time) if !time.is_zero() => Ok(Length::Time(time)),
+                _ => Err(OptionsError::Length),
+            },
             _ => Err(OptionsError::Length),
         }
     }
@@ -119,10 +122,17 @@ impl TrainingOptions {
     fn device(&self) -> Result<Device, OptionsError> {
         match self.device {
             DeviceName::Cpu => Ok(Device::Cpu),
-            DeviceName::Cuda if Cuda::is_available() => Ok(Device::Cuda(0)),
-            DeviceName::Cuda => Err(OptionsError::NoCuda),
+            DeviceName::Cuda => cuda_device(),
         }
     }
+}
+
+/// The first CUDA device; without this question the tensor library panics where there is none.
+///
+/// # Errors
+/// [`OptionsError::NoCuda`] when there is none, or the tensor library is one without CUDA.
+pub fn cuda_device() -> Result<Device, OptionsError> {
+    if Cuda::is_available() { Ok(Device::Cuda(0)) } else { Err(OptionsError::NoCuda) }
 }
 
 #[cfg(test)]
@@ -147,9 +157,9 @@ mod tests {
         let run = run_config("train --minutes 1.5 --precision bf16 --out runs/x", 4).unwrap();
         assert_eq!(run.length, Length::Time(Duration::from_secs(90)));
         assert_eq!((run.precision, run.batch, run.seed, run.resume), (ComputePrecision::Bf16, 4, 0, false));
-        for line in ["train --out x", "train --out x --steps 0", "train --out x --epochs -1"] {
-            let asked = line.replace("--epochs -1", "--epochs=-1");
-            assert_eq!(run_config(&asked, 4).unwrap_err(), OptionsError::Length, "{line}");
+        for length in ["", "--steps 0", "--epochs=-1", "--minutes=-1", "--minutes 1e30", "--minutes nan"] {
+            let line = format!("train --out x {length}");
+            assert_eq!(run_config(&line, 4).unwrap_err(), OptionsError::Length, "{line}");
         }
         assert_eq!(run_config("train --out x --steps 3", 0).unwrap_err(), OptionsError::Batch);
         assert!(Line::try_parse_from(["train", "--out", "x", "--steps", "3", "--minutes", "3"]).is_err());

@@ -23,7 +23,7 @@ pub(crate) struct Arguments {
     /// Data set, split or scenario in place of the scenario's.
     #[arg(long, value_name = "DIR")]
     scene: Option<PathBuf>,
-    /// Fusion method in place of the scenario's: none, late, early, max, attention.
+    /// Fusion method in place of the scenario's, one of `ego-fuser methods`.
     #[arg(long)]
     method: Option<Method>,
     /// Ticks to play in place of the scenario's.

@@ -25,13 +25,13 @@ impl Fleet {
         for cav in &self.agents {
             routes.push(route(cav, Stream::Pose, &scorer));
         }
-        routes.push(route(&self.ego, self.publish(&self.ego).stream(), &ego));
+        let stream = self.publish().stream();
+        routes.push(route(&self.ego, stream, &ego));
         // Alone, the ego listens to nobody but its own agent.
         if self.scenario.method.exchange() == Exchange::Nothing {
             return routes;
         }
         for cav in self.neighbours() {
-            let stream = self.publish(cav).stream();
             if self.is_over_link() {
                 let topic = Topic::Received { ego: self.ego.clone(), cav: cav.clone(), stream };
                 routes.push(route(cav, stream, &process_id(Role::Link, &self.ego)));

@@ -4,55 +4,10 @@ use std::path::{Path, PathBuf};
 
 use sim_replay::link::PRESETS;
 
-use super::{Clock, Launch, Scenario};
+use super::{Scenario, ScenarioError};
 
 /// Largest scenario file, bytes.
 const MAX_BYTES: u64 = 1 << 20;
-
-/// Why a scenario cannot be used.
-#[derive(Debug, thiserror::Error)]
-pub enum ScenarioError {
-    /// The file cannot be read.
-    #[error("cannot read scenario {}: {source}", path.display())]
-    Read {
-        /// The scenario file.
-        path: PathBuf,
-        /// Why.
-        source: std::io::Error,
-    },
-    /// The file is not YAML, or a field is unknown, missing or of the wrong kind.
-    #[error("{}{}: {reason}", path.display(), line.map_or(String::new(), |line| format!(":{line}")))]
-    Syntax {
-        /// The scenario file.
-        path: PathBuf,
-        /// Line of the offence, from 1.
-        line: Option<u64>,
-        /// What is wrong there.
-        reason: String,
-    },
-    /// A field has a value that makes no sense.
-    #[error("{}: {field} is {found}: {rule}", path.display())]
-    Value {
-        /// The scenario file.
-        path: PathBuf,
-        /// The field, with its parents.
-        field: &'static str,
-        /// What it says.
-        found: String,
-        /// What it may say.
-        rule: &'static str,
-    },
-    /// A path names nothing.
-    #[error("{}: {field}: {} does not exist", path.display(), missing.display())]
-    Missing {
-        /// The scenario file.
-        path: PathBuf,
-        /// The field, with its parents.
-        field: &'static str,
-        /// The file or folder that is not there.
-        missing: PathBuf,
-    },
-}
 
 impl Scenario {
     /// Reads and checks a scenario. Relative paths in it are taken from its folder and come back absolute.
@@ -107,140 +62,6 @@ impl Scenario {
             reason: first_line(&error.without_snippet().to_string()),
         })
     }
-
-    /// Checks the values of the fields and that what they name exists.
-    ///
-    /// # Errors
-    /// [`ScenarioError`] for the first field that makes no sense; `path` is named in it.
-    pub fn check(&self, path: &Path) -> Result<(), ScenarioError> {
-        let value = |field, found: String, rule| ScenarioError::Value { path: path.into(), field, found, rule };
-        let positive = |field, number: f64| {
-            let fits = number.is_finite() && number > 0.0;
-            if fits { Ok(()) } else { Err(value(field, number.to_string(), "must be a number above 0")) }
-        };
-        positive("scene.rate", self.scene.rate)?;
-        positive("ego.peer_messages_per_s", self.ego.peer_messages_per_s)?;
-        positive("ego.peer_mib_per_s", self.ego.peer_mib_per_s)?;
-        positive("network.stall_limit_s", self.network.stall_limit_s)?;
-        positive("timeouts.ready_s", self.timeouts.ready_s)?;
-        positive("timeouts.drain_s", self.timeouts.drain_s)?;
-        positive("timeouts.stop_s", self.timeouts.stop_s)?;
-        positive("timeouts.hang_s", self.timeouts.hang_s)?;
-        if self.scene.frames == Some(0) {
-            return Err(value("scene.frames", "0".into(), "must be at least 1"));
-        }
-        if !(1..=256).contains(&self.models.threads) {
-            return Err(value("models.threads", self.models.threads.to_string(), "must be 1 to 256"));
-        }
-        if self.ego.deadline_ms > 60_000 {
-            return Err(value("ego.deadline_ms", self.ego.deadline_ms.to_string(), "must be at most 60000"));
-        }
-        self.check_clock(path)?;
-        self.check_security(path)?;
-        if let Some(ego) = &self.ego.id
-            && !self.scene.agents.is_empty()
-            && !self.scene.agents.contains(ego)
-        {
-            return Err(value("ego.id", ego.to_string(), "must be one of scene.agents"));
-        }
-        if let Some(level) = self.record.as_ref().and_then(|record| record.zstd_level)
-            && !(1..=22).contains(&level)
-        {
-            return Err(value("record.zstd_level", level.to_string(), "must be 1 to 22"));
-        }
-        for endpoint in std::iter::once(&self.network.listen).chain(&self.network.connect) {
-            if !endpoint.starts_with("tcp/")
-                || endpoint.rsplit_once(':').is_none_or(|(_, port)| port.parse::<u16>().is_err())
-            {
-                return Err(value("network", endpoint.clone(), "must read tcp/ADDRESS:PORT"));
-            }
-        }
-        let localizer = self.models.localizer.iter();
-        if self.uses_localizer() && localizer.len() == 0 {
-            return Err(value(
-                "models.localizer",
-                "left out".into(),
-                "must name encoder and head: a vehicle's pose is pgc",
-            ));
-        }
-        if self.uses_end_to_end() && self.models.end_to_end.is_none() {
-            return Err(value(
-                "models.end_to_end",
-                "left out".into(),
-                "must name weights: a vehicle's pose is end_to_end",
-            ));
-        }
-        let networks = localizer.flat_map(|models| {
-            [("models.localizer.encoder", &models.encoder), ("models.localizer.head", &models.head)]
-        });
-        let networks = networks.chain(self.models.end_to_end.iter().map(|weights| ("models.end_to_end", weights)));
-        let places = [("scene.dir", &self.scene.dir), ("models.weights", &self.models.weights)];
-        for (field, place) in places.into_iter().chain(networks) {
-            if !place.exists() {
-                return Err(ScenarioError::Missing { path: path.into(), field, missing: place.clone() });
-            }
-        }
-        Ok(())
-    }
-
-    fn check_security(&self, path: &Path) -> Result<(), ScenarioError> {
-        let Some(security) = &self.security else { return Ok(()) };
-        if let Some(missing) = security.keys.as_ref().filter(|folder| !folder.is_dir()) {
-            return Err(ScenarioError::Missing { path: path.into(), field: "security.keys", missing: missing.clone() });
-        }
-        let elsewhere = self.network.connect.is_some()
-            || [&self.agents.launch]
-                .into_iter()
-                .chain(self.vehicles.values().filter_map(|own| own.launch.as_ref()))
-                .any(|launch| *launch == Launch::Elsewhere);
-        if security.keys.is_none() && elsewhere {
-            let rule =
-                "must name the folder of `v2vloc keys`: processes on other hosts need keys of the same authority";
-            let field = "security.keys";
-            return Err(ScenarioError::Value { path: path.into(), field, found: "left out".into(), rule });
-        }
-        if self.clock == Clock::Stepped && self.network.connect.is_some() {
-            let rule = "runs in virtual time are their own router when there is security";
-            let found = self.network.connect.clone().unwrap_or_default();
-            return Err(ScenarioError::Value { path: path.into(), field: "network.connect", found, rule });
-        }
-        Ok(())
-    }
-
-    /// Checks that nothing contradicts the clock: virtual time knows no pace, no waiting and no other hosts.
-    fn check_clock(&self, path: &Path) -> Result<(), ScenarioError> {
-        let value = |field, found: String, rule| Err(ScenarioError::Value { path: path.into(), field, found, rule });
-        if self.clock == Clock::Wall {
-            return match self.stepped {
-                Some(_) => value("stepped", "given".into(), "must be left out unless clock is stepped"),
-                None => Ok(()),
-            };
-        }
-        if self.scene.rate != 1.0 {
-            return value("scene.rate", self.scene.rate.to_string(), "must be 1 with clock stepped, which has no pace");
-        }
-        for (field, is_set) in [("scene.loop", self.scene.repeat), ("scene.lockstep", self.scene.lockstep)] {
-            if is_set {
-                return value(field, "true".into(), "must be false with clock stepped");
-            }
-        }
-        let launches = self.vehicles.values().filter_map(|own| own.launch).chain([self.agents.launch]);
-        if launches.into_iter().any(|launch| launch == Launch::Elsewhere) {
-            return value("launch", "elsewhere".into(), "must be here with clock stepped, which runs in one process");
-        }
-        for (field, ms) in self.stepped.and_then(|stepped| stepped.compute).into_iter().flat_map(|compute| {
-            [
-                ("stepped.compute.pose_ms", compute.pose_ms),
-                ("stepped.compute.map_ms", compute.map_ms),
-                ("stepped.compute.fuse_ms", compute.fuse_ms),
-            ]
-        }) {
-            if !(0.0..=60_000.0).contains(&ms) {
-                return value(field, ms.to_string(), "must be 0 to 60000");
-            }
-        }
-        Ok(())
-    }
 }
 
 /// The path with `.` and `a/..` taken out, so that messages and the resolved copy read well.
@@ -268,7 +89,7 @@ mod tests {
     use ego_fuser::Method;
     use protocol::{CavId, Dtype};
 
-    use super::super::{NoiseMode, PoseSource, Publish};
+    use super::super::{NoiseMode, PoseSource};
     use super::*;
 
     const SMALL: &str = "scene: {dir: ../scene}\nmodels: {weights: w.safetensors}\n";
@@ -377,7 +198,15 @@ mod tests {
             ("scene: {dir: ., rate: 0}", "scene.rate is 0"),
             ("scene: {dir: ., frames: 0}", "scene.frames is 0"),
             ("scene: {dir: nowhere}", "nowhere does not exist"),
-            ("scene: {dir: .}\nnetwork: {listen: localhost}", "network is localhost"),
+            ("scene: {dir: .}\nnetwork: {listen: localhost}", "network.listen is localhost"),
+            ("scene: {dir: .}\nnetwork: {connect: quic/10.0.0.1:7447}", "network.connect is quic/10.0.0.1:7447"),
+            ("scene: {dir: .}\nnetwork: {metrics: \"127.0.0.1:0\"}", "network.metrics is 127.0.0.1:0"),
+            ("scene: {dir: .}\ntimeouts: {ready_s: 1e30}", "timeouts.ready_s is 1000000"),
+            ("scene: {dir: .}\nclock: stepped\nrecord: {}", "record is given"),
+            (
+                "scene: {dir: .}\nclock: stepped\nnetwork: {metrics: \"127.0.0.1:9464\"}",
+                "network.metrics is 127.0.0.1:9464",
+            ),
             ("scene: {dir: ., agents: [a]}\nego: {id: b}", "ego.id is b"),
             ("scene: {dir: ., rate: 2}\nclock: stepped", "scene.rate is 2"),
             ("scene: {dir: ., lockstep: true}\nclock: stepped", "scene.lockstep is true"),
@@ -411,7 +240,6 @@ mod tests {
     #[test]
     fn what_is_written_reads_back_the_same() {
         let mut scenario = parse(SMALL).unwrap();
-        scenario.agents.publish = Some(Publish::Boxes);
         scenario.agents.pose = PoseSource::Noisy(super::super::PoseNoise::default());
         assert_eq!(parse(&scenario.to_yaml()).unwrap(), scenario);
     }

@@ -3,6 +3,8 @@
 //! Every part is a typed struct with a default per field, so that a scenario needs to name nothing but its scene and
 //! its weights. `deploy/scenarios/demo.yaml` shows every field with its default.
 
+mod check;
+mod error;
 mod load;
 mod vehicle;
 
@@ -16,7 +18,7 @@ use protocol::{CavId, RunId, Stream};
 use serde::{Deserialize, Serialize};
 use sim_replay::bus::InboxLimits;
 
-pub use load::ScenarioError;
+pub use error::ScenarioError;
 pub use vehicle::{AgentOverrides, AgentSettings, Launch, NoiseMode, PoseNoise, PoseSource, Publish};
 
 use crate::fingerprint::Provenance;
@@ -82,7 +84,7 @@ pub struct Scene {
     /// Which vehicles take part; all when empty.
     #[serde(default)]
     pub agents: Vec<CavId>,
-    /// Which point files to read, where the data set has several (weather), for example `_fog_0.060`.
+    /// Which point files to read, where the data set has several (weather), for example `fog_0.060`.
     #[serde(default)]
     pub variant: Option<String>,
     /// Speed in times the recorded speed.
@@ -218,7 +220,6 @@ impl Scenario {
             pose: own.pose.unwrap_or(base.pose),
             codec: own.codec.unwrap_or(base.codec),
             rate: own.rate.unwrap_or(base.rate),
-            publish: own.publish.or(base.publish),
             launch: own.launch.unwrap_or(base.launch),
             lie: own.lie.or(base.lie),
         }

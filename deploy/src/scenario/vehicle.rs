@@ -7,8 +7,7 @@ use protocol::{CodecConfig, Stream};
 use serde::{Deserialize, Serialize};
 
 /// What a vehicle puts on the air beside its pose.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub enum Publish {
     /// Feature maps.
     Bev,
@@ -121,8 +120,6 @@ pub struct AgentSettings {
     pub codec: CodecConfig,
     /// How they are fitted to what the air takes: a size, a byte rate, the vehicle's own queue.
     pub rate: RateConfig,
-    /// What goes on the air; what the method needs when absent.
-    pub publish: Option<Publish>,
     /// Who starts the process.
     pub launch: Launch,
     /// What the vehicle lies about, to see what that does to the ego; absent: nothing.
@@ -151,8 +148,6 @@ pub struct AgentOverrides {
     pub codec: Option<CodecConfig>,
     /// See [`AgentSettings::rate`]; replaces it as a whole.
     pub rate: Option<RateConfig>,
-    /// See [`AgentSettings::publish`].
-    pub publish: Option<Publish>,
     /// See [`AgentSettings::launch`].
     pub launch: Option<Launch>,
     /// See [`AgentSettings::lie`].

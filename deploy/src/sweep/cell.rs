@@ -1,9 +1,9 @@
 //! One run of a sweep: computed, and kept on disk under everything that decides it.
 
 use std::collections::BTreeMap;
-use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::Instant;
+use std::{env, fs};
 
 use agent::model_config::DetectorConfig;
 use agent::pose_source::PoseSourceConfig;
@@ -47,8 +47,8 @@ pub struct CellKey {
     pub weights_sha256: String,
     /// SHA-256 over the part of the data that is looked at ([`sim_replay::dataset::content_sha256`]).
     pub data_sha256: String,
-    /// Version of the program.
-    pub version: String,
+    /// SHA-256 of the program: what another one computed is not taken for its own.
+    pub program_sha256: String,
 }
 
 /// A run that is done.
@@ -149,6 +149,7 @@ impl Hashes {
         let poses_sha256 = poses.files().into_iter().map(|file| self.of(file)).collect::<Result<_, _>>()?;
         let trace_sha256 = link.trace_file().map(|file| self.of(&folder.join(file))).transpose()?;
         let weights_sha256 = self.of(&weights_of(&experiment.weights, point.method)?)?;
+        let program = env::current_exe().map_err(|source| SweepError::Io { path: "this program".into(), source })?;
         Ok(CellKey {
             point: point.clone(),
             link,
@@ -159,7 +160,7 @@ impl Hashes {
             poses_sha256,
             weights_sha256,
             data_sha256: self.data_sha256.clone(),
-            version: env!("CARGO_PKG_VERSION").to_owned(),
+            program_sha256: self.of(&program)?,
         })
     }
 }

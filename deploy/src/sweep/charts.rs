@@ -28,13 +28,20 @@ struct Dimension {
     text: fn(&Point) -> Option<String>,
 }
 
-const DIMENSIONS: [Dimension; 6] = [
+const DIMENSIONS: [Dimension; 7] = [
     Dimension {
         name: "latency",
         label: "latency, ms",
         is_logarithmic: false,
         value: |cell| cell.key.point.latency_ms,
         text: |point| point.latency_ms.map(|ms| format!("{ms} ms")),
+    },
+    Dimension {
+        name: "jitter",
+        label: "standard deviation of the latency, ms",
+        is_logarithmic: false,
+        value: |cell| cell.key.point.jitter_ms,
+        text: |point| point.jitter_ms.map(|ms| format!("jitter {ms} ms")),
     },
     Dimension {
         name: "bandwidth",
@@ -103,7 +110,7 @@ pub(super) fn figures(experiment: &Experiment, cells: &[Cell]) -> Vec<Figure> {
 }
 
 fn file_name(place: usize) -> &'static str {
-    ["ap_latency", "ap_bandwidth", "ap_loss", "ap_pose_noise", "ap_agents", "ap_bytes"][place]
+    ["ap_latency", "ap_jitter", "ap_bandwidth", "ap_loss", "ap_pose_noise", "ap_agents", "ap_bytes"][place]
 }
 
 fn chart(

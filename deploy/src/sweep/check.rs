@@ -100,6 +100,9 @@ fn contradictions(experiment: &Experiment, link: &LinkConfig) -> Result<(), Stri
     if grid.jitter_ms.is_some() && grid.latency_ms.is_none() {
         return Err("grid.jitter_ms is the deviation of grid.latency_ms, which is left out".into());
     }
+    if grid.bandwidth_mbps.is_none() && grid.codec.iter().flatten().any(|codec| codec.fit.is_some()) {
+        return Err("grid.codec.fit is a share of grid.bandwidth_mbps, which is left out".into());
+    }
     if let Some(ms) = grid.latency_ms.iter().flatten().find(|ms| **ms > ego.max_age_ms as f64 + ego.deadline_ms as f64)
     {
         return Err(format!(
@@ -184,6 +187,7 @@ mod tests {
             ("grid: {method: [max], codec: [{dtype: f16, keep: 0}]}", "keep is 0"),
             ("grid: {method: [max], codec: [{dtype: f32, fit: 2}]}", "grid.codec: fit is 2"),
             ("grid: {method: [max], jitter_ms: [5]}", "grid.latency_ms, which is left out"),
+            ("grid: {method: [max], codec: [{dtype: f32, fit: 0.2}]}", "grid.bandwidth_mbps, which is left out"),
             ("link: dsrc\ngrid: {method: [max], bandwidth_mbps: [6]}", "capacity of link dsrc"),
             ("link: nowhere\ngrid: {method: [max]}", "nowhere"),
             ("ego: {max_age_ms: 300}\ngrid: {method: [max], latency_ms: [500]}", "ego.max_age_ms is 300"),

@@ -58,14 +58,14 @@ pub(super) fn page(experiment: &Experiment, spec: &str, cells: &[Cell], figures:
     page
 }
 
-/// Version, data and weights, each once.
+/// Program, data and weights, each once.
 fn provenance(cells: &[Cell]) -> Vec<String> {
     let mut lines: Vec<String> = cells
         .iter()
         .flat_map(|cell| {
             let key = &cell.key;
             [
-                format!("version {}", key.version),
+                format!("program SHA-256 {}", key.program_sha256),
                 format!("data SHA-256 {}", key.data_sha256),
                 format!("weights of {} SHA-256 {}", key.point.method, key.weights_sha256),
             ]

@@ -187,7 +187,8 @@ fn gigabytes() -> f64 {
 const MAX_BYTES: u64 = 1 << 20;
 
 impl Experiment {
-    /// Reads and checks an experiment. Relative paths in it are taken from its folder.
+    /// Reads and checks an experiment. Relative paths in it are taken from its folder, but for files of `poses`, which
+    /// go by the working directory as on the command line.
     ///
     /// # Errors
     /// [`SweepError`] names the file and the field.

@@ -36,7 +36,11 @@ pub(super) const NOTES: &[(&str, &str)] = &[
     ),
     ("log2_payload, log2_wire", "binary logarithm of these"),
     ("log2_frame", "binary logarithm of the wire bytes that an ego used per frame, of all neighbours together"),
-    ("log2_fp32", "binary logarithm of the sent values at 4 bytes each, as Where2comm counts"),
+    (
+        "log2_fp32",
+        "binary logarithm of the sent values at 4 bytes each, as Where2comm counts; empty where bytes do not tell how many \
+         there are: packed, or fitted to the link",
+    ),
     ("nominal_fp32_log2", "binary logarithm of a whole map at 4 bytes a value, whatever was sent"),
     ("e2e_ms", "from the capture of the ego's sweep to the publication of its detections, virtual time"),
     ("age_ms", "capture time of the ego's sweep less that of the fused neighbour's"),
@@ -64,6 +68,7 @@ fn line(experiment: &Experiment, cell: &Cell) -> Vec<String> {
     let Cell { key, metrics, used, messages, wall_seconds: _ } = cell;
     let point = &key.point;
     let sends_maps = point.method.exchange() == Exchange::Features;
+    let is_plain = sends_maps && point.codec.fit.is_none() && point.codec.zstd.is_none();
     let bandwidth = match point.bandwidth_mbps {
         None if experiment.grid.bandwidth_mbps.is_some() => "inf".into(),
         mbps => plain(mbps),
@@ -85,7 +90,7 @@ fn line(experiment: &Experiment, cell: &Cell) -> Vec<String> {
     fields.push(log2(comm.wire_bytes_mean));
     fields.push(log2(comm.wire_bytes_mean.map(|bytes| bytes * *used as f64 / metrics.frames.max(1) as f64)));
     fields.push(log2(
-        comm.payload_bytes_mean.filter(|_| sends_maps).map(|bytes| bytes * 4.0 / point.codec.dtype.size() as f64),
+        comm.payload_bytes_mean.filter(|_| is_plain).map(|bytes| bytes * 4.0 / point.codec.dtype.size() as f64),
     ));
     fields.push(fixed(Some(comm.nominal_fp32_log2), 4));
     let latency = &metrics.latency_ms.capture_to_detection;

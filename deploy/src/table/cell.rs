@@ -22,7 +22,7 @@ pub struct CellKey {
     pub method: Method,
     /// SHA-256 of its weights.
     pub weights_sha256: String,
-    /// SHA-256 of the listing of the data.
+    /// SHA-256 over the contents of the data ([`sim_replay::dataset::content_sha256`]).
     pub data_sha256: String,
     /// Where poses come from.
     pub poses: PoseSourceConfig,

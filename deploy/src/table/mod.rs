@@ -92,7 +92,7 @@ pub trait TableObserver {
 pub fn run(spec: &TableSpec, out: &Path, observer: &mut dyn TableObserver) -> Result<Vec<FilledTable>, TableError> {
     let cells = out.join("cells");
     fs::create_dir_all(&cells).map_err(|source| TableError::Io { path: cells.clone(), source })?;
-    let data_sha256 = dataset::listing_sha256(&dataset::open(&spec.dataset)?.scenarios);
+    let data_sha256 = dataset::content_sha256(&dataset::open(&spec.dataset)?.scenarios);
     let run = Run { spec, cells, data_sha256, commit: commit() };
     let mut filled = Vec::with_capacity(spec.tables.len());
     for table in &spec.tables {

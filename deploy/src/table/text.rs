@@ -53,7 +53,7 @@ fn provenance(table: &FilledTable) -> String {
         values.join(", ")
     };
     let mut text = format!(
-        "\nFrames: {}. Commit: {}. Data: listing SHA-256 {}. Weights:\n\n",
+        "\nFrames: {}. Commit: {}. Data: contents SHA-256 {}. Weights:\n\n",
         all(&|cell| cell.metrics.frames.to_string()),
         all(&|cell| cell.commit.clone()),
         all(&|cell| format!("`{}`", cell.key.data_sha256)),

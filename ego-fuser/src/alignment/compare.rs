@@ -52,7 +52,7 @@ impl AlignmentError {
     }
 }
 
-/// Compares approaches on a scenario, every `every`-th moment of the first `frames`.
+/// Compares approaches on the moments of a scenario that `ticks` names; tells of every pair as it is done.
 ///
 /// # Errors
 /// [`AlignError`] at the first frame that cannot be read or has no true pose.

@@ -1,7 +1,7 @@
 //! `ego-fuser eval`: AP of a method on recorded scenes.
 
 use std::ops::ControlFlow;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use agent::pose_source::PoseSourceConfig;
 use agent::rate::RateConfig;
@@ -47,8 +47,7 @@ impl Arguments {
     pub(crate) fn run(self) -> Result<()> {
         tch::set_num_threads(i32::from(self.threads.max(1)));
         let scenarios = scenarios(&self.data)?;
-        let kind = Weights::load(&self.weights)?.metadata(KIND_KEY).map(ToOwned::to_owned);
-        if kind.as_deref() == Some(MULTI_SCALE_KIND) {
+        if kind_of(&self.weights)?.as_deref() == Some(MULTI_SCALE_KIND) {
             return self.run_multi_scale(&scenarios);
         }
         let methods =
@@ -81,7 +80,7 @@ impl Arguments {
         if !self.method.is_empty() {
             return Err(BadInput("a multi-scale network has one method: leave --method out".to_owned()).into());
         }
-        let mut detector = OfflineDetector::load(&self.weights)?;
+        let mut detector = OfflineDetector::load(&self.weights).map_err(|error| BadInput(error.to_string()))?;
         let rule = detector.rule();
         let frames = self.frames.unwrap_or(usize::MAX);
         let mut tally = Tally::default();
@@ -107,8 +106,14 @@ impl Arguments {
     }
 }
 
+/// What the network of a weights file is for, where the file says it.
+fn kind_of(weights: &Path) -> Result<Option<String>, BadInput> {
+    let weights = Weights::load(weights).map_err(|error| BadInput(error.to_string()))?;
+    Ok(weights.metadata(KIND_KEY).map(ToOwned::to_owned))
+}
+
 fn evaluate(config: EvaluateConfig, scenarios: &[Scenario], frames: usize, json: bool) -> Result<serde_json::Value> {
-    let mut evaluator = Evaluator::new(config)?;
+    let mut evaluator = Evaluator::new(config).map_err(|error| BadInput(error.to_string()))?;
     let ticks: usize = scenarios.iter().map(|scenario| scenario.ticks.len().min(frames)).sum();
     let method = evaluator.ego().method();
     let bar = progress(method.name(), ticks);
@@ -173,5 +178,20 @@ impl Tally {
             "ap_frame_order": by_iou(Ordering::Frame),
             "payload_bytes_mean": bytes,
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::process::ExitCode;
+
+    use super::super::exit_code;
+    use super::*;
+
+    #[test]
+    fn weights_that_are_not_there_are_bad_input() {
+        let error = anyhow::Error::from(kind_of(Path::new("no/such.safetensors")).unwrap_err());
+        assert!(error.to_string().contains("no/such.safetensors"), "{error}");
+        assert_eq!(exit_code(&error), ExitCode::from(2));
     }
 }

@@ -46,7 +46,7 @@ impl Arguments {
         let turns = self.turns.iter().map(|&turn_deg| Offset { shift_m: 0.0, turn_deg });
         let offsets: Vec<Offset> = shifts.chain(turns).collect();
         let weights = Weights::load(&self.weights).map_err(|error| BadInput(error.to_string()))?;
-        let mut meter = ResidualMeter::load(&weights)?;
+        let mut meter = ResidualMeter::load(&weights).map_err(|error| BadInput(error.to_string()))?;
         let found = meter.measure(&scenarios(&self.data)?, self.every, &offsets, self.seed)?;
         if self.json {
             println!("{}", serde_json::to_string_pretty(&found)?);

@@ -13,8 +13,9 @@ use ego_fuser::feature_store::KeptMaps;
 use ego_fuser::fusion::FusionConfig;
 use ego_fuser::fusion::pastat::Part;
 use ego_fuser::loss::{LossConfig, Unassigned};
+use ego_fuser::model::ModelError;
 use ego_fuser::samples::{Augmentation, Moments, SampleConfig, SampleKind, SamplePoses};
-use ego_fuser::train::{self, Accuracy, Observer, StepReport, TrainConfig};
+use ego_fuser::train::{self, Accuracy, Observer, StepReport, TrainConfig, TrainError};
 use protocol::Dtype;
 
 use super::BadInput;
@@ -122,7 +123,7 @@ impl Arguments {
     pub(crate) fn run(&self) -> Result<()> {
         let config = self.config()?;
         let mut bar = Progress::default();
-        let summary = train::run(&config, &mut bar)?;
+        let summary = train::run(&config, &mut bar).map_err(blamed)?;
         bar.0.finish();
         self.options.print(&summary.trained, &serde_json::json!({"accuracy": summary.accuracy}));
         Ok(())
@@ -197,12 +198,26 @@ impl Arguments {
             return Ok(None);
         }
         let detector = match &self.init {
-            Some(init) => Weights::load(init)?.config()?,
+            Some(init) => {
+                let config = Weights::load(init).and_then(|weights| weights.config());
+                config.map_err(|error| BadInput(error.to_string()))?
+            }
             None => self.config.clone(),
         };
         let usual = FusionConfig::for_detector(self.method, &detector);
         let fusion = usual.ablated(&self.without, self.frames).map_err(|error| BadInput(error.to_string()))?;
         Ok(Some(fusion))
+    }
+}
+
+/// Whose fault it is that a training has ended early: that of what it was told, where no model could be begun with.
+fn blamed(error: TrainError) -> anyhow::Error {
+    match error {
+        TrainError::Model(ModelError::Weights(_) | ModelError::Config(_) | ModelError::Method(_))
+        | TrainError::NotTrained(_)
+        | TrainError::NothingToFreeze
+        | TrainError::NothingToKeep(_) => BadInput(error.to_string()).into(),
+        error => error.into(),
     }
 }
 
@@ -263,5 +278,22 @@ impl Observer for Progress {
             "step {step}: AP@0.3/0.5/0.7 global {ap_30:.3} {ap_50:.3} {ap_70:.3} on {} frames",
             accuracy.frames
         ));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use agent::training::TrainingError;
+
+    use super::*;
+
+    #[test]
+    fn weights_that_are_not_there_are_bad_input_and_a_training_that_diverges_is_not() {
+        let missing = Weights::load(Path::new("no/such.safetensors")).unwrap_err();
+        let blame = blamed(TrainError::Model(missing.into()));
+        assert!(blame.is::<BadInput>() && blame.to_string().contains("no/such.safetensors"), "{blame}");
+        assert!(!blamed(TrainError::Training(TrainingError::Diverged(9))).is::<BadInput>());
     }
 }

@@ -15,8 +15,13 @@ const HERE: Pose = Pose { translation_m: [100.0, 50.0, 2.0], rotation_wxyz: [1.0
 
 /// The same network every time, with a head that believes in vehicles, so that there is something to clean up.
 fn detector() -> Detector {
+    detector_with(None)
+}
+
+fn detector_with(compress_ratio: Option<i64>) -> Detector {
     tch::set_num_threads(1);
-    let config = DetectorConfig { lidar_range_m: [-12.8, -6.4, -3.0, 12.8, 6.4, 1.0], ..DetectorConfig::lean() };
+    let lidar_range_m = [-12.8, -6.4, -3.0, 12.8, 6.4, 1.0];
+    let config = DetectorConfig { lidar_range_m, compress_ratio, ..DetectorConfig::lean() };
     let network = VarStore::new(Device::Cpu);
     let pillars = PointPillars::new(&network.root(), &config).unwrap();
     for (name, mut variable) in network.variables() {
@@ -45,8 +50,12 @@ fn cloud(phase: f32) -> PointCloud {
 }
 
 fn view(name: &str, world_from_cav: Pose, method: Method, phase: f32) -> View {
+    view_by(detector(), name, world_from_cav, method, phase)
+}
+
+fn view_by(detector: Detector, name: &str, world_from_cav: Pose, method: Method, phase: f32) -> View {
     let cav = CavId::new(name).unwrap();
-    let mut agent = Agent::new(cav.clone(), Box::new(RecordedPose), detector());
+    let mut agent = Agent::new(cav.clone(), Box::new(RecordedPose), detector);
     let cloud = cloud(phase);
     let input = AgentInput { capture_nanos: 0, cloud: &cloud, measured_pose: Some(&world_from_cav) };
     let output = agent.process(&input).unwrap();
@@ -75,6 +84,17 @@ fn a_neighbour_changes_what_is_seen_and_the_same_views_give_the_same_bits() {
         let again = Ego::new(detector(), method).unwrap().detect(&own, std::slice::from_ref(&other)).unwrap();
         assert_eq!(again.detections, together.detections, "{method}");
     }
+}
+
+#[test]
+fn alone_the_points_show_what_the_map_shows_with_a_compressor_too() {
+    let alone = |compress_ratio, method| {
+        let own = view_by(detector_with(compress_ratio), "a", HERE, method, 0.0);
+        Ego::new(detector_with(compress_ratio), method).unwrap().detect(&own, &[]).unwrap().detections
+    };
+    let by_map = alone(Some(4), Method::None);
+    assert!(!by_map.is_empty() && by_map != alone(None, Method::None));
+    assert_eq!(alone(Some(4), Method::Early), by_map);
 }
 
 #[test]

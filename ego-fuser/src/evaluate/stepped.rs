@@ -27,7 +27,7 @@ pub use compute::ComputeTimes;
 pub use remote::{RemoteCrew, RemoteError};
 
 use super::sent::{Sent, stamp, view};
-use super::{EvaluateError, EvaluatedFrame, Evaluator};
+use super::{EvaluateError, EvaluatedFrame, Evaluator, of_the_ego};
 use crate::ego::{Skipped, View, own_content};
 use crate::method::{Exchange, Method};
 use crate::pairing::{Paired, Pairing, PairingConfig};
@@ -162,12 +162,7 @@ impl<'a> Run<'a> {
             let own = config.vehicles.get(cav);
             let codec = own.map_or(evaluator.config.codec, |own| own.codec);
             let gate = codec.gate.or(evaluator.ego.method().gate());
-            // What the ego leaves out for others it has itself.
-            let codec = if crew.is_empty() {
-                CodecConfig { gate: None, budget_bytes: None, ..codec }
-            } else {
-                CodecConfig { gate, ..codec }
-            };
+            let codec = if crew.is_empty() { of_the_ego(codec) } else { CodecConfig { gate, ..codec } };
             let agent = evaluator.agent(scenario, cav, crew.is_empty(), own)?;
             crew.push(Member { place, cav: cav.clone(), pipeline: Pipeline::Here(Box::new(agent), codec) });
         }

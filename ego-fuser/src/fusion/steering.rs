@@ -5,10 +5,9 @@
 //! broadcasts one map to everyone cannot do that. Resampling moves cells and leaves what stands in them unturned, so the
 //! channels are turned here: by a learnt matrix that depends on the relative heading.
 
-use agent::weights::{Weights, WeightsError};
 use protocol::Pose;
-use tch::nn::{self, Init, VarStore};
-use tch::{Device, Kind, TchError, Tensor};
+use tch::nn::{self, Init};
+use tch::{Kind, TchError, Tensor};
 
 /// Name of the parameter in weights files. Those that were trained without it, alone or elsewhere, do not have it.
 pub(crate) const WEIGHT: &str = "steering.weight";
@@ -29,20 +28,6 @@ impl Steering {
     pub fn new(path: &nn::Path<'_>, channels: i64) -> Self {
         let weight = (path / "steering").var("weight", &[BASIS, channels, channels], Init::Const(0.0));
         Self { weight }
-    }
-
-    /// The steering of a weights file; `None` for weights that were trained without.
-    ///
-    /// # Errors
-    /// [`WeightsError::Shape`] when it was made for another number of channels.
-    pub fn from_weights(weights: &Weights, channels: i64) -> Result<Option<Self>, WeightsError> {
-        if !weights.contains(WEIGHT) {
-            return Ok(None);
-        }
-        let variables = VarStore::new(Device::Cpu);
-        let steering = Self::new(&variables.root(), channels);
-        weights.copy_into(&variables)?;
-        Ok(Some(steering))
     }
 
     /// Turns maps `[N, C, H, W]` into the axes of the ego; those at the identity, the ego's own, stay as they are.
@@ -78,6 +63,9 @@ impl Steering {
 #[cfg(test)]
 mod tests {
     use std::f64::consts::{FRAC_PI_2, PI};
+
+    use tch::Device;
+    use tch::nn::VarStore;
 
     use super::*;
 

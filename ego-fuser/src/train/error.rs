@@ -24,6 +24,9 @@ pub enum TrainError {
     /// An encoder that does not learn must have learnt before.
     #[error("a frozen encoder needs weights to begin with")]
     NothingToFreeze,
+    /// Points are put together before they are encoded, so there are no maps to keep.
+    #[error("method {0} puts points together before the encoder and cannot be trained behind a frozen one")]
+    NothingToKeep(Method),
     /// The picture of the curve cannot be written.
     #[error(transparent)]
     Picture(#[from] agent::canvas::CanvasError),

@@ -37,10 +37,11 @@ pub fn run(config: &TrainConfig, observer: &mut dyn Observer) -> Result<Summary,
     Training::prepare(config, observer)?.run(observer)
 }
 
-/// The views that a method learns from.
-fn sample_kind(method: Method) -> Result<SampleKind, TrainError> {
+/// The views that a method learns from; `is_frozen` says that its encoder does not learn.
+fn sample_kind(method: Method, is_frozen: bool) -> Result<SampleKind, TrainError> {
     match method.exchange() {
         Exchange::Nothing => Ok(SampleKind::Single),
+        Exchange::Points if is_frozen => Err(TrainError::NothingToKeep(method)),
         Exchange::Points => Ok(SampleKind::Merged),
         Exchange::Features => Ok(SampleKind::Cooperative),
         Exchange::Boxes => Err(TrainError::NotTrained(method)),
@@ -73,7 +74,7 @@ struct Training<'a> {
 
 impl<'a> Training<'a> {
     fn prepare(config: &'a TrainConfig, observer: &mut dyn Observer) -> Result<Self, TrainError> {
-        let kind = sample_kind(config.method)?;
+        let kind = sample_kind(config.method, config.frozen_encoder.is_some())?;
         let run = &config.run;
         run.start()?;
         let mut model = first_model(config)?;
@@ -221,5 +222,17 @@ impl Window {
 
     fn mean_losses(&self) -> [f64; 2] {
         self.losses.map(|sum| sum / self.finite as f64)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn merged_points_are_not_learnt_from_behind_a_frozen_encoder() {
+        assert!(matches!(sample_kind(Method::Early, true), Err(TrainError::NothingToKeep(Method::Early))));
+        assert_eq!(sample_kind(Method::Early, false).unwrap(), SampleKind::Merged);
+        assert_eq!(sample_kind(Method::Max, true).unwrap(), SampleKind::Cooperative);
     }
 }

@@ -9,7 +9,7 @@
 mod evidence;
 mod seen;
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 
 use agent::detector::{Detector, DetectorError};
 use nalgebra::Isometry2;
@@ -25,6 +25,8 @@ use seen::{Seen, likeness};
 const NEWEST: f64 = 0.5;
 /// Vehicles that are remembered at most.
 const MAX_PEERS: usize = 64;
+/// Who has not been heard for so long is forgotten, nanoseconds: long enough that a liar gains nothing by staying away.
+const FORGOTTEN_NANOS: u64 = 60_000_000_000;
 /// Messages further apart than this are not compared with each other, seconds.
 const SUCCESSIVE_S: f64 = 0.25;
 /// No vehicle drives faster, metres a second.
@@ -65,6 +67,8 @@ struct Standing {
     is_out: bool,
     /// What spoke against it last.
     doubt: Doubt,
+    /// Capture time of the ego's own view when it was heard last, nanoseconds.
+    heard_nanos: u64,
     /// Capture time, place and looks of the message that was judged last.
     last: Option<(u64, Pose, Vec<f32>)>,
 }
@@ -104,7 +108,8 @@ pub fn heard(beliefs: &[(usize, Belief)], views: &[View]) -> Vec<HeardNeighbour>
 impl Trust {
     /// Trusts everybody.
     pub(crate) fn new(config: TrustConfig, detector: &mut Detector) -> Result<Self, DetectorError> {
-        let empty = detector.encode(&PointCloud::default())?.features;
+        let encoded = detector.encode(&PointCloud::default())?.features;
+        let empty = detector.through_compressor(&encoded)?;
         let empty = Vec::try_from(&empty.f_contiguous()?.f_view([-1])?)?;
         Ok(Self { config, empty, peers: BTreeMap::new() })
     }
@@ -121,6 +126,7 @@ impl Trust {
         neighbours: &[(&View, Pose)],
         detector: &mut Detector,
     ) -> Result<Vec<Belief>, DetectorError> {
+        self.forget_absent(own.capture_nanos, neighbours.iter().map(|(view, _)| &view.cav));
         let mine = Seen::in_message(&own.content, detector, &self.empty)?;
         let mut all = Vec::with_capacity(neighbours.len());
         for (view, _) in neighbours {
@@ -139,7 +145,7 @@ impl Trust {
         for ((view, _), evidence) in neighbours.iter().zip(evidence) {
             let judgement = evidence.as_ref().and_then(Evidence::judgement);
             tracing::debug!(cav = %view.cav, ?judgement, ?evidence, "neighbour judged");
-            beliefs.push(self.add_up(&view.cav, judgement, mine.is_boxes()));
+            beliefs.push(self.add_up(own.capture_nanos, &view.cav, judgement, mine.is_boxes()));
         }
         for ((view, _), seen) in neighbours.iter().zip(all) {
             if let (Some(standing), Some(pose)) = (self.peers.get_mut(&view.cav), view.pose.world_from_cav()) {
@@ -170,15 +176,30 @@ impl Trust {
         evidence
     }
 
+    /// Makes room for others where vehicles have not been heard for long, by the ego's own time: what others say of theirs
+    /// keeps nobody here.
+    fn forget_absent<'a>(&mut self, now_nanos: u64, present: impl Iterator<Item = &'a CavId>) {
+        let present: BTreeSet<&CavId> = present.collect();
+        self.peers.retain(|cav, standing| {
+            present.contains(cav) || now_nanos.abs_diff(standing.heard_nanos) <= FORGOTTEN_NANOS
+        });
+    }
+
     /// Takes in what a frame says; whoever `must_earn` it is left out until something speaks for it.
-    fn add_up(&mut self, cav: &CavId, judgement: Option<(f64, Doubt)>, must_earn: bool) -> Belief {
+    fn add_up(&mut self, now_nanos: u64, cav: &CavId, judgement: Option<(f64, Doubt)>, must_earn: bool) -> Belief {
         let TrustConfig { leave_out_below, take_back_above } = self.config;
         if self.peers.len() >= MAX_PEERS && !self.peers.contains_key(cav) {
             // Of more vehicles than an ego can listen to, nothing is known.
             return Belief { trust: 0.5, doubt: must_earn.then_some(Doubt::Unproven) };
         }
-        let stranger = Standing { log_odds: 0.0, is_out: must_earn, doubt: Doubt::Unproven, last: None };
-        let standing = self.peers.entry(cav.clone()).or_insert(stranger);
+        let standing = self.peers.entry(cav.clone()).or_insert(Standing {
+            log_odds: 0.0,
+            is_out: must_earn,
+            doubt: Doubt::Unproven,
+            heard_nanos: now_nanos,
+            last: None,
+        });
+        standing.heard_nanos = now_nanos;
         if let Some((log_odds, doubt)) = judgement {
             standing.log_odds += NEWEST * (log_odds - standing.log_odds);
             if log_odds < 0.0 {
@@ -235,7 +256,7 @@ mod tests {
     fn who_is_left_out_comes_back_after_a_while_and_not_at_once() {
         let mut trust = trust();
         let cav = CavId::new("a").unwrap();
-        let mut hear = |log_odds: Option<f64>| trust.add_up(&cav, log_odds.map(|odds| (odds, Doubt::Copied)), false);
+        let mut hear = |log_odds: Option<f64>| trust.add_up(0, &cav, log_odds.map(|odds| (odds, Doubt::Copied)), false);
         assert!(!hear(None).is_out(), "nobody is doubted without a reason");
         assert_eq!(hear(Some(-3.0)).doubt, Some(Doubt::Copied), "strong evidence counts at once");
         assert!(hear(None).is_out(), "the same message says nothing new");
@@ -250,18 +271,37 @@ mod tests {
     fn boxes_are_believed_when_something_speaks_for_them() {
         let mut trust = trust();
         let cav = CavId::new("a").unwrap();
-        assert_eq!(trust.add_up(&cav, None, true).doubt, Some(Doubt::Unproven));
-        assert!(!trust.add_up(&cav, Some((2.0, Doubt::Elsewhere)), true).is_out());
-        assert!(!trust.add_up(&cav, None, true).is_out());
+        assert_eq!(trust.add_up(0, &cav, None, true).doubt, Some(Doubt::Unproven));
+        assert!(!trust.add_up(0, &cav, Some((2.0, Doubt::Elsewhere)), true).is_out());
+        assert!(!trust.add_up(0, &cav, None, true).is_out());
     }
 
     #[test]
     fn what_is_remembered_is_bounded() {
         let mut trust = trust();
         for number in 0..1000 {
-            trust.add_up(&CavId::new(&format!("v{number}")).unwrap(), Some((-9.0, Doubt::Jumped)), false);
+            trust.add_up(0, &CavId::new(&format!("v{number}")).unwrap(), Some((-9.0, Doubt::Jumped)), false);
         }
         assert_eq!(trust.peers.len(), MAX_PEERS);
+    }
+
+    #[test]
+    fn who_stays_away_for_long_makes_room_and_a_liar_is_known_after_a_short_absence() {
+        let mut trust = trust();
+        let names: Vec<CavId> = (0..=MAX_PEERS).map(|number| CavId::new(&format!("v{number}")).unwrap()).collect();
+        let lie = Some((-9.0, Doubt::Jumped));
+        for cav in &names[..MAX_PEERS] {
+            assert!(trust.add_up(0, cav, lie, false).is_out());
+        }
+        let newcomer = &names[MAX_PEERS];
+        trust.forget_absent(FORGOTTEN_NANOS, [newcomer].into_iter());
+        assert!(!trust.add_up(FORGOTTEN_NANOS, newcomer, lie, false).is_out(), "there is no place yet");
+        assert!(trust.add_up(FORGOTTEN_NANOS, &names[0], None, false).is_out(), "it has not washed itself");
+        let later = FORGOTTEN_NANOS + 1;
+        trust.forget_absent(later, [newcomer, &names[1]].into_iter());
+        let known: Vec<&CavId> = trust.peers.keys().collect();
+        assert_eq!(known, [&names[0], &names[1]]);
+        assert!(trust.add_up(later, newcomer, lie, false).is_out(), "a newcomer is judged");
     }
 
     #[test]

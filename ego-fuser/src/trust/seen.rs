@@ -46,8 +46,8 @@ impl Seen {
                 Ok(Self::of_boxes(all))
             }
             Content::Points(points) => {
-                let map = detector.encode(points)?.features;
-                let features = detector.to_message(&map)?;
+                let encoded = detector.encode(points)?.features;
+                let features = detector.to_message(&detector.through_compressor(&encoded)?)?;
                 let seen = Self::in_map(&DecodedFeatures { features, sent: None }, detector, empty)?;
                 Ok(Self { is_blind: seen.vehicles.is_empty(), ..seen })
             }

@@ -1,7 +1,8 @@
 //! BEV features of a neighbour on the lattice of the ego.
 //!
 //! Only x, y and yaw of a pose enter: maps have no height. The public reference codes each have a convention of their
-//! own; they are in [`opencood`] and [`coalign`], for weights that were trained with them.
+//! own. [`opencood`] has those of OpenCOOD, for the tests that compare with it and for nothing else; [`coalign`] has that of
+//! CoAlign, for networks that fuse at every level. All other weights run on the warp of this module, whoever trained them.
 
 pub mod coalign;
 pub mod opencood;

@@ -182,11 +182,16 @@ fn check_nanos(what: &'static str, nanos: u64) -> Result<(), WireError> {
 
 /// A box from outside: finite, of positive and plausible size.
 fn check_box(box3d: &crate::Box3d) -> Result<(), WireError> {
+    check_box_from(box3d, 1e-3)
+}
+
+/// [`check_box`] with another smallest size, metres.
+fn check_box_from(box3d: &crate::Box3d, min_size_m: f64) -> Result<(), WireError> {
     for coordinate in box3d.center_m {
         check_within("box center_m", coordinate, -1e7, 1e7)?;
     }
     for size in box3d.size_m {
-        check_within("box size_m", size, 1e-3, 1e3)?;
+        check_within("box size_m", size, min_size_m, 1e3)?;
     }
     check_within("box heading_rad", box3d.heading_rad, -1e3, 1e3)
 }

@@ -2,7 +2,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{check_box, check_count, check_name, check_pose, check_within, metadata_only};
+use super::{check_box_from, check_count, check_name, check_pose, check_within, metadata_only};
 use crate::{Box3d, CavId, Limits, Pose, WireError};
 
 /// The truth of one tick: replay to scorer, on a key of its own, so that no pipeline can lean on it by accident.
@@ -36,7 +36,7 @@ pub struct TrueObject {
     pub class: String,
     /// Pose of the box's centre.
     pub world_from_object: Pose,
-    /// Full length, width and height, metres.
+    /// Full length, width and height, metres, from 0.
     pub size_m: [f64; 3],
     /// Speed, metres per second, where the data set has it.
     pub speed_mps: Option<f64>,
@@ -59,13 +59,42 @@ impl TrueObject {
     fn check_values(&self) -> Result<(), WireError> {
         check_name("class", &self.class)?;
         check_pose("world_from_object", &self.world_from_object)?;
-        check_box(&Box3d {
+        let box3d = Box3d {
             center_m: self.world_from_object.translation_m,
             size_m: self.size_m,
             heading_rad: self.world_from_object.yaw_rad(),
-        })?;
+        };
+        // Data sets have objects without length, width or height: one of them must not cost the truth of its moment.
+        check_box_from(&box3d, 0.0)?;
         self.speed_mps.map_or(Ok(()), |speed| check_within("speed_mps", speed, -1e3, 1e3))
     }
 }
 
 metadata_only!(Truth, Truth);
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::{Stamp, wire};
+
+    fn encoded(size_m: [f64; 3]) -> Result<Vec<u8>, WireError> {
+        let cav = CavId::new("4279").unwrap();
+        let object =
+            TrueObject { id: 1, class: "car".into(), world_from_object: Pose::IDENTITY, size_m, speed_mps: None };
+        let agent = AgentTruth { cav: cav.clone(), world_from_lidar: Pose::IDENTITY, objects: vec![object] };
+        let stamp = Stamp { cav, epoch: 1, sequence: 0, capture_nanos: 5, publish_nanos: 7 };
+        wire::encode(&stamp, Truth { frame_index: 0, agents: vec![agent] }).map(|encoded| encoded.to_vec())
+    }
+
+    #[test]
+    fn an_object_may_have_no_height_but_no_size_beyond_all_bounds() {
+        for size_m in [[4.0, 1.8, 0.0], [0.0; 3], [1e3; 3]] {
+            let bytes = encoded(size_m).unwrap();
+            let (_, truth) = wire::decode::<Truth>([bytes.as_slice()], &Limits::DEFAULT).unwrap();
+            assert_eq!(truth.agents[0].objects[0].size_m, size_m);
+        }
+        for size in [-1e-9, 1001.0, f64::NAN, f64::INFINITY] {
+            assert!(matches!(encoded([4.0, size, 1.5]), Err(WireError::Value { what: "box size_m", .. })), "{size}");
+        }
+    }
+}

@@ -143,6 +143,11 @@ impl Books {
         self.refused(topic, DropReason::RateLimit, &why);
     }
 
+    /// The same of a notice: logged alone, as no sender counts what it says about itself.
+    pub(super) fn limited_notice(&self, topic: &Topic, why: &'static str) {
+        self.complain(topic, DropReason::RateLimit, &why);
+    }
+
     /// A sound message says what is not its sender's to say; counted and logged like an unsound one.
     pub(super) fn misused(&self, topic: &Topic, why: &'static str) {
         self.refused(topic, DropReason::Identity, &why);
@@ -150,6 +155,10 @@ impl Books {
 
     fn refused(&self, topic: &Topic, reason: DropReason, why: &dyn fmt::Display) {
         self.dropped(topic, reason);
+        self.complain(topic, reason, why);
+    }
+
+    fn complain(&self, topic: &Topic, reason: DropReason, why: &dyn fmt::Display) {
         let times = {
             let mut state = self.lock();
             let has_room = state.refused.len() < MAX_ACCOUNTS || state.refused.contains_key(topic);

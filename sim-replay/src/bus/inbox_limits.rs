@@ -60,10 +60,12 @@ impl Meters {
         let mut meters = self.meters.lock().unwrap_or_else(PoisonError::into_inner);
         let own = Some(topic.clone());
         let key = if meters.len() < MAX_METERS || meters.contains_key(&own) { own } else { None };
-        let full = || Meter { messages: messages_per_s * BURST_S, bytes: bytes_per_s * BURST_S, at: now };
+        // A rate far below one message a second still lets one through now and then.
+        let burst = (messages_per_s * BURST_S).max(1.0);
+        let full = || Meter { messages: burst, bytes: bytes_per_s * BURST_S, at: now };
         let meter = meters.entry(key).or_insert_with(full);
         let passed = now.saturating_duration_since(meter.at).as_secs_f64();
-        meter.messages = (meter.messages + passed * messages_per_s).min(messages_per_s * BURST_S);
+        meter.messages = (meter.messages + passed * messages_per_s).min(burst);
         meter.bytes = (meter.bytes + passed * bytes_per_s).min(bytes_per_s * BURST_S);
         meter.at = now;
         // One message may have more bytes than are left, or no large one could ever come; those after it wait.
@@ -106,6 +108,12 @@ mod tests {
         assert_eq!(admitted(&meters, "1/bev", 10, Duration::from_nanos(1), 3_000_000), 1);
         let paid = Instant::now() + Duration::from_secs(2);
         assert!(meters.admit(&"1/bev".parse().unwrap(), 1, paid), "after 2 s there is room again");
+    }
+
+    #[test]
+    fn a_low_rate_lets_a_message_through_now_and_then() {
+        let admitted = admitted(&meters(0.25, 1e9), "1/bev", 9, Duration::from_secs(1), 1);
+        assert_eq!(admitted, 3, "at the beginning and every 4 s");
     }
 
     #[test]

@@ -268,6 +268,9 @@ impl Sender {
                     if is_large && self.is_one_at_a_time {
                         self.receipt.wait(LONGEST_MESSAGE);
                     }
+                } else {
+                    // The session is closed: nothing carries it.
+                    self.books.withheld(&self.topic, DropReason::Away);
                 }
             }
             Err(error) => {
@@ -333,4 +336,27 @@ pub(super) fn payload(encoded: Encoded) -> ZBytes {
 pub fn unix_nanos() -> u64 {
     let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
     u64::try_from(since.as_nanos()).unwrap_or(u64::MAX)
+}
+
+#[cfg(test)]
+mod tests {
+    use protocol::{Account, Counts, Gnss, GnssSource, Pose};
+
+    use super::*;
+    use crate::bus::{BusOptions, Endpoint, open};
+
+    #[test]
+    fn what_zenoh_refuses_is_no_longer_in_flight() {
+        let session = open(&BusOptions::router(Endpoint::loopback(0))).unwrap();
+        let (key, books): (Key, _) = ("v2v/test/7/gnss".parse().unwrap(), Books::new("replay".parse().unwrap()));
+        let cav = CavId::new("7").unwrap();
+        let publisher = Publisher::new(&session, (&key, &cav), 1, &books, PublisherOptions::POSE).unwrap();
+        session.close().wait().unwrap();
+        let source = GnssSource::Recorded;
+        let gnss = Gnss { world_from_lidar: Pose::IDENTITY, position_std_m: 0.0, heading_std_rad: 0.0, source };
+        publisher.offer(5, gnss);
+        publisher.finish();
+        let lost = Counts { sent: 1, dropped: [(DropReason::Away, 1)].into(), ..Counts::default() };
+        assert_eq!(books.ledger().get(&Account::published(key.topic)), Some(&lost));
+    }
 }

@@ -150,10 +150,12 @@ impl Inbox {
     }
 
     fn deliver(&self, topic: &Topic, event: Event, places: Option<usize>) {
-        let lane = Lane { topic: topic.clone(), is_notice: matches!(event, Event::End { .. }) };
+        let is_notice = matches!(event, Event::End { .. });
+        let lane = Lane { topic: topic.clone(), is_notice };
         // A bound on what all topics hold together; a message that finds it reached is lost, and so is room for it.
         let bytes = event.bytes();
-        if self.waiting_bytes.fetch_add(bytes, Ordering::Relaxed).saturating_add(bytes) > self.max_waiting {
+        let waiting = self.waiting_bytes.fetch_add(bytes, Ordering::Relaxed).saturating_add(bytes);
+        if waiting > self.max_waiting && !is_notice {
             self.waiting_bytes.fetch_sub(bytes, Ordering::Relaxed);
             return self.books.limited(topic, "too much waits here already");
         }
@@ -207,7 +209,7 @@ impl Subscription {
     ) -> Result<Self, BusError> {
         let subscriber = session.declare_subscriber(key).callback(move |sample| {
             if let Some(topic) = topic(&sample) {
-                door.admit(topic, &sample);
+                door.admit(topic, sample.payload());
             }
         });
         subscriber.wait().map(Self).map_err(|cause| BusError::zenoh(format!("subscribing to {key}"), &cause))
@@ -236,18 +238,17 @@ impl Door {
         Self { inbox: Arc::clone(inbox), places, notices: notices.clone() }
     }
 
-    fn admit(&self, topic: Topic, sample: &Sample) {
+    fn admit(&self, topic: Topic, payload: &ZBytes) {
         // Before anything of it is looked at: a flood must cost next to nothing.
-        if !self.inbox.meters.admit(&topic, sample.payload().len(), Instant::now()) {
-            self.inbox.books.arrived(&topic);
-            return self.inbox.books.limited(&topic, "more than its sender may send in that time");
+        if !self.inbox.meters.admit(&topic, payload.len(), Instant::now()) {
+            return self.turn_away(&topic, payload);
         }
-        let header = match wire::decode_header(sample.payload().slices()).and_then(|header| check(&topic, header)) {
+        let header = match header_of(&topic, payload) {
             Ok(header) => header,
             Err(error) => return self.refuse(&topic, &error),
         };
-        if header.kind == Kind::Control && has_notices(&topic) {
-            return self.note(topic, &header, sample);
+        if is_notice(&topic, &header) {
+            return self.note(topic, &header, payload);
         }
         let at = Instant::now();
         if has_notices(&topic) {
@@ -257,9 +258,18 @@ impl Door {
                 return self.inbox.books.dropped(&topic, reason);
             }
         }
-        let payload = sample.payload().clone();
-        let arrival = Arrival { topic: topic.clone(), header, at, payload };
+        let arrival = Arrival { topic: topic.clone(), header, at, payload: payload.clone() };
         self.inbox.deliver(&topic, Event::Message(arrival), self.places);
+    }
+
+    /// More than the sender may send. The header alone says whether that is in the sender's books.
+    fn turn_away(&self, topic: &Topic, payload: &ZBytes) {
+        const WHY: &str = "more than its sender may send in that time";
+        if header_of(topic, payload).is_ok_and(|header| is_notice(topic, &header)) {
+            return self.inbox.books.limited_notice(topic, WHY);
+        }
+        self.inbox.books.arrived(topic);
+        self.inbox.books.limited(topic, WHY);
     }
 
     fn refuse(&self, topic: &Topic, error: &WireError) {
@@ -267,8 +277,8 @@ impl Door {
         self.inbox.books.rejected(topic, error);
     }
 
-    fn note(&self, topic: Topic, header: &Header, sample: &Sample) {
-        match wire::decode(sample.payload().slices(), &Limits::DEFAULT) {
+    fn note(&self, topic: Topic, header: &Header, payload: &ZBytes) {
+        match wire::decode(payload.slices(), &Limits::DEFAULT) {
             Ok((_, Control::Probe)) => self.notices.probed(&topic),
             Ok((_, Control::End { ticks: sent, .. })) => {
                 let end = Event::End { topic: topic.clone(), epoch: header.stamp.epoch, sent };
@@ -300,6 +310,16 @@ impl Door {
     }
 }
 
+/// The header of a message on `topic`, if it is one that may come there.
+fn header_of(topic: &Topic, payload: &ZBytes) -> Result<Header, WireError> {
+    wire::decode_header(payload.slices()).and_then(|header| check(topic, header))
+}
+
+/// Whether a message is about its publisher, and so in nobody's books.
+fn is_notice(topic: &Topic, header: &Header) -> bool {
+    header.kind == Kind::Control && has_notices(topic)
+}
+
 /// Who may speak on `topic`, and of what.
 fn check(topic: &Topic, header: Header) -> Result<Header, WireError> {
     let expected = match topic {
@@ -317,5 +337,41 @@ fn check(topic: &Topic, header: Header) -> Result<Header, WireError> {
             Err(WireError::Kind { expected, found: header.kind })
         }
         _ => Ok(header),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use protocol::{Account, CavId, Counts, Gnss, GnssSource, Pose, Stamp};
+
+    use super::super::publisher::payload;
+    use super::*;
+
+    fn bytes<M: Payload>(sequence: u64, message: M) -> ZBytes {
+        let cav = CavId::new("7").unwrap();
+        let stamp = Stamp { cav, epoch: 1, sequence, capture_nanos: sequence, publish_nanos: 5 };
+        payload(wire::encode(&stamp, message).unwrap())
+    }
+
+    fn gnss() -> Gnss {
+        let source = GnssSource::Recorded;
+        Gnss { world_from_lidar: Pose::IDENTITY, position_std_m: 0.0, heading_std_rad: 0.0, source }
+    }
+
+    #[test]
+    fn of_what_is_beyond_the_limit_only_data_are_booked() {
+        let books = Books::new("ego-9".parse().unwrap());
+        let limits = InboxLimits { messages_per_s: 1e-3, ..InboxLimits::PEERS };
+        let (inbox, topic) = (Inbox::within(limits, 4, 4, &books), "7/gnss".parse::<Topic>().unwrap());
+        let door = Door::new(&inbox, None, &Notices::new());
+        let counts = || books.ledger().get(&Account::towards(topic.clone(), books.process())).cloned();
+        books.subscribed(&topic);
+        for _ in 0..3 {
+            door.admit(topic.clone(), &bytes(0, Control::Probe));
+            door.admit(topic.clone(), &bytes(0, Control::End { ticks: 0, sent: Vec::new() }));
+        }
+        assert_eq!(counts(), Some(Counts::default()));
+        door.admit(topic.clone(), &bytes(0, gnss()));
+        assert_eq!(counts(), Some(Counts { dropped: [(DropReason::RateLimit, 1)].into(), ..Counts::default() }));
     }
 }

@@ -1,10 +1,11 @@
 //! `sim-replay stream`: a scene as live traffic.
 
+use std::collections::BTreeMap;
 use std::path::PathBuf;
 use std::time::Duration;
 
 use anyhow::Context;
-use protocol::{CavId, Role};
+use protocol::{CavId, DropReason, Role};
 use sim_replay::bus::{BusArgs, Route, STOP_LIMIT, log_to_stderr};
 use sim_replay::dataset::{self, LoadOptions, Scenario};
 use sim_replay::link::{CapacityConfig, DelayLaw, LinkConfig, LossLaw};
@@ -16,6 +17,9 @@ use crate::cli::Outcome;
 ///
 /// The clock starts when all expected routes have carried a probe. While it runs, control messages (`pause`, `resume`,
 /// `step`, `seek`, `start` with another rate) steer it.
+///
+/// Where the clock keeps its own pace, a newer sweep takes the place of one that still waits for the network: the last line
+/// says how many. Exit code 3 is for frames that cannot be read and ticks that are not answered.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
     /// Dataset, split or scenario; the layout is found out.
@@ -200,8 +204,7 @@ fn print(report: &StreamReport, as_json: bool) -> anyhow::Result<()> {
         lateness.p50_ms, lateness.p95_ms, lateness.max_ms, lateness.late_ticks
     );
     if let Some(AirReport { offered, arrived, dropped }) = &report.air {
-        let lost: Vec<String> = dropped.iter().map(|(reason, count)| format!(", {count} {reason}")).collect();
-        println!("{offered} sensor frames crossed a link: {arrived} arrived{}", lost.concat());
+        println!("{offered} sensor frames crossed a link: {arrived} arrived{}", by_reason(dropped));
     }
     if report.unreadable_frames > 0 {
         println!("{} frames could not be read", report.unreadable_frames);
@@ -209,5 +212,13 @@ fn print(report: &StreamReport, as_json: bool) -> anyhow::Result<()> {
     if report.unanswered > 0 {
         println!("{} ticks were not answered", report.unanswered);
     }
+    if !report.unsent.is_empty() {
+        let unsent: u64 = report.unsent.values().sum();
+        println!("{unsent} of the messages were not sent{}", by_reason(&report.unsent));
+    }
     Ok(())
+}
+
+fn by_reason(dropped: &BTreeMap<DropReason, u64>) -> String {
+    dropped.iter().map(|(reason, count)| format!(", {count} {reason}")).collect()
 }

@@ -53,6 +53,18 @@ pub(super) fn stems<'a>(files: &'a [String], suffix: &str) -> Vec<&'a str> {
     files.iter().filter_map(|name| name.strip_suffix(suffix)).collect()
 }
 
+/// The names by which a folder can be found from outside: as it is given, from the root on, and where it really lies. In
+/// `.` or `00` there is little of what lies above it; behind a symbolic link other things may be.
+pub(super) fn names_of(dir: &Path) -> impl Iterator<Item = PathBuf> {
+    let others = [std::path::absolute(dir), dir.canonicalize()].into_iter().flatten();
+    std::iter::once(dir.to_owned()).chain(others).filter(|name| name.file_name().is_some())
+}
+
+/// The folders that lie above one, by its [`names_of`].
+pub(super) fn above(dir: &Path) -> impl Iterator<Item = PathBuf> {
+    names_of(dir).filter_map(|name| name.parent().map(Path::to_owned))
+}
+
 /// The name of a path below `root`, or the folder's own name where they are the same.
 pub(super) fn name_below(root: &Path, dir: &Path) -> String {
     let below = dir.strip_prefix(root).ok().filter(|below| !below.as_os_str().is_empty());

@@ -80,11 +80,11 @@ fn no_line(path: &Path, scan: usize, lines: usize) -> ReadError {
 /// Where the sequence's poses are: beside the scans, or in the release's common folder.
 fn poses_path(dir: &Path) -> Option<PathBuf> {
     let beside = ["poses.txt", "poses_cam0.txt"].map(|name| dir.join(name)).into_iter().find(|path| path.is_file());
-    let common = || {
+    let common = |dir: PathBuf| {
         let name = dir.file_name()?.to_str()?;
         Some(dir.parent()?.parent()?.join("poses").join(format!("{name}.txt"))).filter(|path| path.is_file())
     };
-    beside.or_else(common)
+    beside.or_else(|| files::names_of(dir).find_map(common))
 }
 
 fn poses(dir: &Path) -> Result<Option<Vec<Pose>>, ReadError> {
@@ -152,6 +152,19 @@ mod tests {
         let moved = frame.world_from_lidar.unwrap().translation_m;
         assert!((moved[0] - 2.0).abs() < 1e-9 && (moved[1] + 1.0).abs() < 1e-9 && moved[2].abs() < 1e-9, "{moved:?}");
         assert_eq!((frame.points.xyzi, frame.capture_nanos), (vec![[1.0, 2.0, 3.0, 0.5]], 100_000_000));
+    }
+
+    #[test]
+    fn poses_above_are_found_by_whatever_name_the_folder_has() {
+        let dir = tempfile::tempdir().unwrap();
+        build(dir.path(), "sequences/07", "poses/07.txt", &"1 0 0 0 0 1 0 0 0 0 1 0\n".repeat(2));
+        let sequence = dir.path().join("sequences/07");
+        for name in [sequence.clone(), sequence.join("velodyne/..")] {
+            let dataset = dataset::open(&name).unwrap();
+            assert_eq!(dataset.scenarios[0].name, "07");
+            let frame = dataset.scenarios[0].load(0, 0, &LoadOptions::default()).unwrap();
+            assert!(frame.world_from_lidar.is_some(), "{}", name.display());
+        }
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! Which data it is, in one line.
 
-use std::fs::{self, File};
+use std::fs::File;
 use std::io::{self, Read, Seek, SeekFrom};
 use std::path::Path;
 
@@ -9,9 +9,12 @@ use rayon::prelude::*;
 use sha2::{Digest, Sha256};
 
 use super::{Scenario, Tick};
+use crate::bounded;
 
 /// Bytes at the beginning and at the end of a point cloud that count: its header, and points that differ from sweep to sweep.
 const EDGE_BYTES: usize = 1024;
+/// Largest file of annotations that counts, bytes: as much as the reader of any layout takes.
+const MAX_ANNOTATION_BYTES: u64 = 32 << 20;
 
 /// SHA-256 over names, agents and capture times, in hexadecimal digits: the same for the same listing wherever it lies.
 /// No file is opened; see [`content_sha256`] for what is in them.
@@ -48,7 +51,7 @@ fn list(scenario: &Scenario, hash: &mut Sha256) {
     scenario.ticks.iter().for_each(|tick| hash.update(format!("\n{} {}", tick.stem, tick.capture_nanos)));
 }
 
-/// A file that cannot be read counts as such: who needs its contents will hear of it.
+/// A file that cannot be read, or is larger than any reader takes, counts as such: who needs its contents will hear of it.
 fn frame_digest(scenario: &Scenario, agent: &CavId, tick: &Tick) -> [u8; 32] {
     let mut hash = Sha256::new();
     let points = scenario.source.points_path(agent, tick, None);
@@ -56,7 +59,7 @@ fn frame_digest(scenario: &Scenario, agent: &CavId, tick: &Tick) -> [u8; 32] {
         hash.update("\nno points");
     }
     match scenario.source.annotation_path(agent, tick) {
-        Some(path) => match fs::read(path) {
+        Some(path) => match bounded::read(&path, MAX_ANNOTATION_BYTES) {
             Ok(text) => hash.update(text),
             Err(_) => hash.update("\nno annotations"),
         },
@@ -89,6 +92,7 @@ fn digits(hash: Sha256) -> String {
 
 #[cfg(test)]
 mod tests {
+    use std::fs;
     use std::path::PathBuf;
 
     use super::*;
@@ -155,5 +159,16 @@ mod tests {
         let whole = content_sha256(&dataset.scenarios);
         fs::remove_file(folder.path().join("scene/4279/000068.pcd")).unwrap();
         assert_ne!(content_sha256(&dataset.scenarios), whole);
+    }
+
+    #[test]
+    fn annotations_that_no_reader_takes_count_as_missing() {
+        let folder = tempfile::tempdir().unwrap();
+        let dataset = scene(folder.path(), b"points");
+        let path = folder.path().join("scene/4279/000068.yaml");
+        File::create(&path).unwrap().set_len(MAX_ANNOTATION_BYTES + 1).unwrap();
+        let huge = content_sha256(&dataset.scenarios);
+        fs::remove_file(path).unwrap();
+        assert_eq!(content_sha256(&dataset.scenarios), huge);
     }
 }

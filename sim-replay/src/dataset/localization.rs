@@ -146,11 +146,10 @@ fn poses_as_stored(
 
 /// What LightLoc takes from all positions of a scene, metres in the axes of the poses' file; nothing without its file.
 fn middle_m(dir: &Path, scene: &str) -> Result<Translation3<f64>, ReadError> {
-    let above = dir.parent().map_or_else(|| dir.join(".."), Path::to_path_buf);
-    let path = above.join(format!("{scene}_pose_stats.txt"));
-    if !path.is_file() {
+    let name = format!("{scene}_pose_stats.txt");
+    let Some(path) = files::above(dir).map(|above| above.join(&name)).find(|path| path.is_file()) else {
         return Ok(Translation3::identity());
-    }
+    };
     // Three numbers, one a line.
     let text: Vec<String> = lines(&path)?.into_iter().map(|(_, line)| line).collect();
     let [x, y, z] = numbers::<3>(&path, 1, None, &text.join(" "))?;
@@ -311,8 +310,12 @@ mod tests {
         assert!((pose.yaw_rad() + turn).abs() < 1e-9, "east is to the right of north");
         // LightLoc counts from the middle of the training sequences.
         write(dir.path(), "NCLT_pose_stats.txt", b"100.0\n-50.0000000\n-4.0\n");
-        let [x, y, z] = load().world_from_lidar.unwrap().translation_m;
+        let moved = load().world_from_lidar.unwrap();
+        let [x, y, z] = moved.translation_m;
         assert!((x + 99.0).abs() < 1e-9 && (y + 50.5).abs() < 1e-9 && (z + 1.0).abs() < 1e-9, "{x} {y} {z}");
+        // What lies above the folder does not depend on how that is called.
+        let same = open(&dir.path().join("2012-01-15/velodyne_sync/.."));
+        assert_eq!(same.scenarios[0].load(0, 0, &LoadOptions::default()).unwrap().world_from_lidar, Some(moved));
         write(dir.path(), "NCLT_pose_stats.txt", b"100.0\n-50.0000000\n");
         let message = dataset::open(dir.path()).unwrap_err().to_string();
         assert!(message.contains("NCLT_pose_stats.txt") && message.contains("2 numbers, expected 3"), "{message}");

@@ -27,9 +27,9 @@ pub(super) struct GroundTruth {
 /// `ground_truth` there.
 pub(super) fn find(dir: &Path, name: &str) -> Option<PathBuf> {
     let file = format!("groundtruth_{name}.csv");
-    let above = dir.parent().map_or_else(|| dir.join(".."), Path::to_path_buf);
-    let places = [dir.join(&file), dir.join("ground_truth").join(&file), above.join(&file)];
-    places.into_iter().chain([above.join("ground_truth").join(&file)]).find(|path| path.is_file())
+    let folders = std::iter::once(dir.to_owned()).chain(files::above(dir));
+    let mut places = folders.flat_map(|folder| [folder.join(&file), folder.join("ground_truth").join(&file)]);
+    places.find(|path| path.is_file())
 }
 
 impl GroundTruth {

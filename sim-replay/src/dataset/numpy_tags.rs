@@ -60,7 +60,7 @@ pub(super) fn array(field: &Field<'_>) -> Result<NumpyArray, ReadError> {
     Ok(NumpyArray { shape, values })
 }
 
-/// Reads `scalar(dtype, data)`.
+/// Reads `scalar(dtype, data)`, a finite number.
 pub(super) fn scalar(field: &Field<'_>) -> Result<f64, ReadError> {
     expect_call(field, "scalar")?;
     let args = match field.node().value {
@@ -69,7 +69,11 @@ pub(super) fn scalar(field: &Field<'_>) -> Result<f64, ReadError> {
     };
     let [dtype, data] = items::<2>(&args)?;
     let values = numbers(&data, read_dtype(&dtype)?, 1)?;
-    values.first().copied().ok_or_else(|| data.error("no number"))
+    match values.first() {
+        Some(value) if value.is_finite() => Ok(*value),
+        Some(value) => Err(data.error(format!("{value}, expected a finite number"))),
+        None => Err(data.error("no number")),
+    }
 }
 
 fn tag<'a>(field: &Field<'a>) -> Option<&'a str> {
@@ -242,6 +246,12 @@ pub(super) mod tests {
         let root = Field::root(path, &node);
         assert_eq!(array(&root.required("true_ego_pos").unwrap()).unwrap(), expected);
         assert_eq!(scalar(&root.required("lon").unwrap()).unwrap(), 1.5);
+        for not_finite in [f64::NAN, f64::INFINITY] {
+            let text = text.replace("AAAAAAAA+D8=", &STANDARD.encode(not_finite.to_le_bytes()));
+            let node = yaml::parse(path, text.as_bytes()).unwrap();
+            let error = scalar(&Field::root(path, &node).required("lon").unwrap()).unwrap_err().to_string();
+            assert!(error.contains("lon") && error.contains("expected a finite number"), "{error}");
+        }
     }
 
     #[test]

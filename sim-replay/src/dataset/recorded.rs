@@ -4,7 +4,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-use protocol::{CavId, Gnss, Handedness, Lidar, Limits, Payload, Radar, Stream, Topic, Truth, wire};
+use protocol::{CavId, Gnss, Handedness, Lidar, Limits, Payload, Radar, Stamp, Stream, Topic, Truth, wire};
 
 use super::{Dataset, FrameSource, Layout, MissingFrame, ReadError, Scenario, Tick};
 use crate::frame::{Frame, Object, ObjectClass};
@@ -56,22 +56,33 @@ struct Recorded {
 }
 
 impl Recorded {
-    /// A truth that cannot be read is a problem of its moment, and not of the scene.
+    /// A truth that cannot be read is a problem of its moment, and not of the scene. Of two replays of one moment the
+    /// first is taken, sweeps and truth alike.
     fn new(recording: Recording, problems: &mut Vec<ReadError>) -> Result<Self, ReadError> {
         let mut sensors = BTreeMap::new();
-        let mut truth = BTreeMap::new();
+        let (mut truth, mut first_epochs, mut told_twice) = (BTreeMap::new(), BTreeMap::new(), 0);
         for entry in recording.entries() {
-            let capture_nanos = entry.header.stamp.capture_nanos;
+            let Stamp { capture_nanos, epoch, .. } = entry.header.stamp;
             match &entry.key.topic {
                 Topic::Stream { cav, stream: stream @ (Stream::Lidar | Stream::Gnss | Stream::Radar) } => {
                     sensors.entry((capture_nanos, cav.clone(), *stream)).or_insert_with(|| entry.clone());
                 }
-                Topic::Truth => match message::<Truth>(&recording, entry) {
-                    Ok(told) => drop(truth.insert(capture_nanos, told)),
-                    Err(problem) => problems.push(problem),
+                Topic::Truth => match first_epochs.get(&capture_nanos) {
+                    Some(first) => told_twice += u64::from(*first != epoch),
+                    None => {
+                        first_epochs.insert(capture_nanos, epoch);
+                        match message::<Truth>(&recording, entry) {
+                            Ok(told) => drop(truth.insert(capture_nanos, told)),
+                            Err(problem) => problems.push(problem),
+                        }
+                    }
                 },
                 _ => {}
             }
+        }
+        if told_twice > 0 {
+            let reason = format!("more than one replay tells the truth of {told_twice} moments: the first is taken");
+            problems.push(ReadError::malformed(recording.path(), reason));
         }
         let mut recorded = Self { recording, agents: Vec::new(), sensors, truth };
         recorded.agents = recorded.in_order();

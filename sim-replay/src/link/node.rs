@@ -21,6 +21,8 @@ use crate::bus::{
 const PLACES: usize = 64;
 /// Vehicles that a link carries at most.
 const MAX_VEHICLES: usize = 64;
+/// Vehicles that are remembered for having been turned away, so that the log names each once.
+const MAX_TURNED_AWAY: usize = 1024;
 /// How often the node looks for newcomers though nothing happens.
 const LOOK_ROUND: Duration = Duration::from_millis(20);
 
@@ -86,6 +88,8 @@ struct Vehicle {
     /// Streams that have ended.
     ended: BTreeSet<Stream>,
     position_m: Option<[f64; 3]>,
+    /// Whether it has vanished: a newcomer may have its place.
+    is_gone: bool,
     _subscriptions: Vec<Subscription>,
 }
 
@@ -96,6 +100,8 @@ struct Node<'a> {
     inbox: Arc<Inbox>,
     roll_call: RollCall,
     vehicles: BTreeMap<CavId, Vehicle>,
+    /// For whom there was no place.
+    turned_away: BTreeSet<CavId>,
     /// Messages that are under way.
     kept: BTreeMap<u64, Arrival>,
     /// Their bytes.
@@ -123,6 +129,7 @@ impl<'a> Node<'a> {
             inbox,
             roll_call,
             vehicles: BTreeMap::new(),
+            turned_away: BTreeSet::new(),
             kept: BTreeMap::new(),
             kept_bytes: 0,
             next_id: 0,
@@ -168,19 +175,45 @@ impl<'a> Node<'a> {
     /// Follows up on who came and went.
     fn look_round(&mut self) -> Result<(), BusError> {
         while let Some((cav, is_there)) = self.roll_call.next() {
-            if is_there && let Some(vehicle) = self.vehicles.get_mut(&cav) {
-                // It was away and sends again.
-                vehicle.ended.clear();
-            } else if is_there && self.vehicles.len() < MAX_VEHICLES {
-                let vehicle = self.attach(&cav)?;
-                tracing::info!(%cav, "its messages cross the link");
-                self.vehicles.insert(cav, vehicle);
-            } else if !is_there && let Some(vehicle) = self.vehicles.get_mut(&cav) {
-                // What it sent before may still be under way.
-                vehicle.ended.extend(self.options.streams.iter().copied());
+            match self.vehicles.get_mut(&cav) {
+                Some(vehicle) if is_there => {
+                    // It was away and sends again.
+                    vehicle.ended.clear();
+                    vehicle.is_gone = false;
+                }
+                Some(vehicle) => {
+                    // What it sent before may still be under way.
+                    vehicle.ended.extend(self.options.streams.iter().copied());
+                    vehicle.is_gone = true;
+                }
+                None if is_there => self.welcome(cav)?,
+                None => {}
             }
         }
         Ok(())
+    }
+
+    /// Gives a newcomer a place; where all are taken, that of one who has gone.
+    fn welcome(&mut self, cav: CavId) -> Result<(), BusError> {
+        if self.vehicles.len() >= MAX_VEHICLES {
+            let has_kept = |cav: &CavId| self.kept.values().any(|arrival| arrival.header.stamp.cav == *cav);
+            let Some(gone) = place_to_free(&self.vehicles, &self.options.ego, has_kept).cloned() else {
+                self.turn_away(cav);
+                return Ok(());
+            };
+            self.vehicles.remove(&gone);
+        }
+        let vehicle = self.attach(&cav)?;
+        tracing::info!(%cav, "its messages cross the link");
+        self.vehicles.insert(cav, vehicle);
+        Ok(())
+    }
+
+    fn turn_away(&mut self, cav: CavId) {
+        if self.turned_away.len() < MAX_TURNED_AWAY && !self.turned_away.contains(&cav) {
+            tracing::warn!(%cav, "its messages do not cross the link, which carries at most {MAX_VEHICLES} vehicles");
+            self.turned_away.insert(cav);
+        }
     }
 
     fn attach(&self, cav: &CavId) -> Result<Vehicle, BusError> {
@@ -196,7 +229,8 @@ impl<'a> Node<'a> {
             // The air has decided what is lost; after it nothing is.
             publishers.insert(stream, self.bus.publisher(topic, how.lossless(PLACES))?);
         }
-        Ok(Vehicle { publishers, ended: BTreeSet::new(), position_m: None, _subscriptions: subscriptions })
+        let (ended, position_m, is_gone) = (BTreeSet::new(), None, false);
+        Ok(Vehicle { publishers, ended, position_m, is_gone, _subscriptions: subscriptions })
     }
 
     /// Takes note of where a vehicle is: loss may depend on distance.
@@ -211,15 +245,17 @@ impl<'a> Node<'a> {
     fn admit(&mut self, from: CavId, stream: Stream, arrival: Arrival) {
         let began = *self.began.get_or_insert(arrival.at);
         let distance_m = self.distance_m(&from);
-        if let Some(vehicle) = self.vehicles.get_mut(&from) {
-            // The end that was heard was that of an earlier life, which can come after the news of the next one.
-            vehicle.ended.remove(&stream);
-        }
         self.report.offered += 1;
+        match self.vehicles.get_mut(&from) {
+            // The end that was heard was that of an earlier life, which can come after the news of the next one.
+            Some(vehicle) => {
+                vehicle.ended.remove(&stream);
+            }
+            // It has gone, and its place is another's.
+            None => return self.lose(&arrival, DropReason::Away),
+        }
         if self.kept_bytes.saturating_add(arrival.wire_bytes()) > self.options.max_kept_bytes {
-            *self.report.dropped.entry(DropReason::LinkQueue).or_default() += 1;
-            self.bus.books().dropped(&arrival.topic, DropReason::LinkQueue);
-            return;
+            return self.lose(&arrival, DropReason::LinkQueue);
         }
         self.kept_bytes += arrival.wire_bytes();
         self.air.offer(Parcel {
@@ -251,9 +287,8 @@ impl<'a> Node<'a> {
         for Outcome { parcel, fate, .. } in self.air.advance(nanos_since(began, Instant::now())) {
             match fate {
                 Fate::Dropped(reason) => {
-                    *self.report.dropped.entry(reason).or_default() += 1;
                     if let Some(lost) = self.release(parcel.id) {
-                        self.bus.books().dropped(&lost.topic, reason);
+                        self.lose(&lost, reason);
                     }
                 }
                 Fate::Arrived { is_copy, is_repeated } => self.pass_on(&parcel, is_copy, is_repeated),
@@ -283,6 +318,12 @@ impl<'a> Node<'a> {
         }
     }
 
+    /// Counts a message that is not passed on.
+    fn lose(&mut self, arrival: &Arrival, reason: DropReason) {
+        *self.report.dropped.entry(reason).or_default() += 1;
+        self.bus.books().dropped(&arrival.topic, reason);
+    }
+
     /// Keeps a message no longer.
     fn release(&mut self, id: u64) -> Option<Arrival> {
         let released = self.kept.remove(&id)?;
@@ -297,6 +338,39 @@ impl<'a> Node<'a> {
     }
 }
 
+/// Someone who has vanished and of whom nothing is under way any more; never the ego, whose place in the world counts.
+fn place_to_free<'v>(
+    vehicles: &'v BTreeMap<CavId, Vehicle>,
+    ego: &CavId,
+    has_kept: impl Fn(&CavId) -> bool,
+) -> Option<&'v CavId> {
+    let is_free = |(cav, vehicle): &(&CavId, &Vehicle)| vehicle.is_gone && *cav != ego && !has_kept(cav);
+    vehicles.iter().find(is_free).map(|(cav, _)| cav)
+}
+
 fn nanos_since(began: Instant, at: Instant) -> u64 {
     u64::try_from(at.saturating_duration_since(began).as_nanos()).unwrap_or(u64::MAX)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_place_of_one_who_has_gone_for_good_is_free() {
+        let cav = |id: usize| CavId::new(&id.to_string()).unwrap();
+        let vehicle = |is_gone| Vehicle {
+            publishers: BTreeMap::new(),
+            ended: BTreeSet::new(),
+            position_m: None,
+            is_gone,
+            _subscriptions: Vec::new(),
+        };
+        let mut vehicles: BTreeMap<CavId, Vehicle> = (0..4).map(|id| (cav(id), vehicle(id < 3))).collect();
+        let [ego, on_its_way] = [cav(0), cav(1)];
+        let free = |vehicles: &BTreeMap<_, _>| place_to_free(vehicles, &ego, |cav| *cav == on_its_way).cloned();
+        assert_eq!(free(&vehicles), Some(cav(2)));
+        vehicles.remove(&cav(2));
+        assert_eq!(free(&vehicles), None);
+    }
 }

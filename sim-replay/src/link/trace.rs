@@ -1,8 +1,9 @@
 //! Links that somebody has measured.
 
-use std::fs;
 use std::io;
 use std::path::{Path, PathBuf};
+
+use crate::bounded;
 
 /// First line of a CSV trace.
 const HEADER: &str = "time_s,rate_mbps,delay_ms,loss";
@@ -136,12 +137,7 @@ impl Trace {
 }
 
 fn read(path: &Path) -> Result<String, TraceError> {
-    let io = |source| TraceError::Io { path: path.to_owned(), source };
-    let bytes = fs::metadata(path).map_err(io)?.len();
-    if bytes > MAX_FILE_BYTES {
-        return Err(io(io::Error::new(io::ErrorKind::FileTooLarge, format!("{bytes} bytes are too many for a trace"))));
-    }
-    fs::read_to_string(path).map_err(io)
+    bounded::read_text(path, MAX_FILE_BYTES).map_err(|source| TraceError::Io { path: path.to_owned(), source })
 }
 
 fn wrong(path: &Path, index: usize, found: &str, must: &'static str) -> TraceError {
@@ -155,7 +151,7 @@ mod tests {
     fn file(text: &str) -> (tempfile::TempDir, PathBuf) {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("trace.txt");
-        fs::write(&path, text).unwrap();
+        std::fs::write(&path, text).unwrap();
         (folder, path)
     }
 

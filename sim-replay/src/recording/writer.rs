@@ -7,7 +7,7 @@ use std::path::{Path, PathBuf};
 use mcap::records::MessageHeader;
 use mcap::write::NoSeek;
 use mcap::{Compression, McapError, McapResult, WriteOptions};
-use protocol::{Key, Limits, wire};
+use protocol::{Key, Limits, Topic, wire};
 
 use super::ros::{self, RosMessage};
 use super::ros_schema::RosType;
@@ -104,9 +104,8 @@ impl<S: Store> RecordingWriter<S> {
 
     fn add(&mut self, key: &Key, arrived_nanos: u64, payload: &[u8]) -> McapResult<()> {
         let header = wire::decode_header([payload]).ok();
-        let encoding = if header.is_some() { OWN_ENCODING } else { "json" };
         let head = MessageHeader {
-            channel_id: self.channel(&key.to_string(), encoding, None)?,
+            channel_id: self.channel(&key.to_string(), encoding_of(&key.topic), None)?,
             sequence: header.as_ref().map_or(0, |header| header.stamp.sequence as u32),
             log_time: arrived_nanos,
             publish_time: header.as_ref().map_or(arrived_nanos, |header| header.stamp.publish_nanos),
@@ -180,6 +179,15 @@ impl<S: Store> RecordingWriter<S> {
             self.ended = Some(error.to_string());
             error
         })
+    }
+}
+
+/// How the messages of a topic are encoded. The topic alone decides: a first message that is none must not spoil those
+/// after it.
+fn encoding_of(topic: &Topic) -> &'static str {
+    match topic {
+        Topic::Stream { stream, .. } | Topic::Received { stream, .. } if stream.kind().is_none() => "json",
+        _ => OWN_ENCODING,
     }
 }
 

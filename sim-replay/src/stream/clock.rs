@@ -2,6 +2,9 @@
 
 use std::time::{Duration, Instant};
 
+/// Slower than this, as good as halted, no scene is played: the time to the next tick has to be one that a clock can hold.
+const SLOWEST: f64 = 1e-6;
+
 /// The scene's clock on the wall: running at a rate, or halted, perhaps with some ticks still to go.
 #[derive(Debug, Clone)]
 pub struct ReplayClock {
@@ -63,7 +66,7 @@ impl ReplayClock {
             (State::Halted { steps: 0 }, _) => None,
             (State::Running, Some((at, anchored))) if self.rate > 0.0 => {
                 let scene = Duration::from_nanos(capture_nanos.saturating_sub(anchored));
-                Some(at + scene.div_f64(self.rate))
+                Some(at + scene.div_f64(self.rate.max(SLOWEST)))
             }
             _ => Some(now),
         }
@@ -112,6 +115,16 @@ mod tests {
         assert_eq!(clock.due(2 * TENTH, now), None);
         clock.resume(None);
         assert_eq!(clock.due(2 * TENTH, now), Some(now), "the pause does not count as lateness");
+    }
+
+    #[test]
+    fn a_rate_next_to_nought_waits_long() {
+        for rate in [1e-5, 1e-20, 1e-300, f64::MIN_POSITIVE] {
+            let (mut clock, now) = (ReplayClock::new(rate), Instant::now());
+            clock.published(0, now);
+            assert!(clock.due(TENTH, now).unwrap() > now + Duration::from_secs(3600));
+            assert!(clock.due(u64::MAX, now).is_some());
+        }
     }
 
     #[test]

@@ -74,7 +74,7 @@ impl Outlet {
         count(&mut self.sent, self.truth.topic());
     }
 
-    /// Sends what is queued and ends every topic; says how much was published on each.
+    /// Sends what is queued and ends every topic; says how much was offered on each.
     pub(super) fn finish(self) -> Vec<TopicCount> {
         for Sensors { lidar, gnss, radar, preview } in self.sensors {
             [Some(lidar), Some(gnss), radar, Some(preview)].into_iter().flatten().for_each(Publisher::finish);

@@ -256,6 +256,7 @@ impl<'a> Replay<'a> {
         report.seconds = last.duration_since(began).as_secs_f64();
         report.lateness.sum_up();
         report.sent = outlet.finish();
+        report.count_unsent(&bus.books().ledger());
         bus.say(Control::End { ticks: report.ticks, sent: report.sent.clone() }, 0);
         report
     }
@@ -393,9 +394,9 @@ impl<'a> Replay<'a> {
             return;
         }
         let mut missing: BTreeSet<CavId> = self.options.lockstep.iter().cloned().collect();
-        let deadline = Instant::now() + self.options.answer_patience;
+        let deadline = end_of(self.options.answer_patience);
         while !missing.is_empty() {
-            match self.inbox.take(Some(deadline)) {
+            match self.inbox.take(deadline) {
                 Taken::Item(Topic::Stream { cav, .. }, Event::Message(arrival)) => {
                     self.bus.books().received(&arrival.topic);
                     if arrival.header.stamp.capture_nanos >= capture_nanos {
@@ -419,6 +420,11 @@ impl<'a> Replay<'a> {
         // The fleet sets the pace: the next tick is not late because this one took long.
         self.clock.rebase();
     }
+}
+
+/// When a patience that begins now is over; `None`: never, where no clock reaches that far.
+fn end_of(patience: Duration) -> Option<Instant> {
+    Instant::now().checked_add(patience)
 }
 
 fn check(scenario: &Scenario, options: &StreamOptions) -> Result<(), StreamError> {
@@ -447,4 +453,15 @@ fn agent_indices(scenario: &Scenario, asked: &[CavId]) -> Result<Vec<usize>, Str
         })
     };
     asked.iter().map(find).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_patience_may_have_no_end() {
+        assert_eq!(end_of(Duration::MAX), None);
+        assert!(end_of(Duration::from_secs(60)).unwrap() > Instant::now());
+    }
 }

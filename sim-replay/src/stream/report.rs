@@ -1,8 +1,9 @@
 //! How a replay went.
 
+use std::collections::BTreeMap;
 use std::time::Duration;
 
-use protocol::TopicCount;
+use protocol::{DropReason, Ledger, TopicCount};
 use serde::Serialize;
 
 use super::sensor_air::AirReport;
@@ -19,8 +20,11 @@ pub struct StreamReport {
     pub ticks: u64,
     /// Seconds from the first tick to the last.
     pub seconds: f64,
-    /// Messages published, by topic.
+    /// Messages offered for sending, by topic.
     pub sent: Vec<TopicCount>,
+    /// Of these, never sent, by reason: at a pace of its own a newer sweep takes the place of one that still waits for the
+    /// network.
+    pub unsent: BTreeMap<DropReason, u64>,
     /// How late ticks were; empty where the fleet set the pace.
     pub lateness: Lateness,
     /// Ticks that an ego did not answer in time, under `--lockstep`.
@@ -67,7 +71,19 @@ impl StreamReport {
         }
     }
 
-    /// Whether everything of the scene went out.
+    /// Takes from the books what this process has dropped itself, and says so in the log.
+    pub(super) fn count_unsent(&mut self, ledger: &Ledger) {
+        let own = ledger.iter().filter(|(account, _)| account.to.is_none());
+        for (reason, count) in own.flat_map(|(_, counts)| &counts.dropped) {
+            *self.unsent.entry(*reason).or_default() += count;
+        }
+        if !self.unsent.is_empty() {
+            tracing::warn!(unsent = ?self.unsent, "not everything was sent");
+        }
+    }
+
+    /// Whether every frame could be read and every tick was answered that had to be. What newer messages took the place of
+    /// ([`Self::unsent`]) is no failure.
     #[must_use]
     pub fn is_complete(&self) -> bool {
         self.unreadable_frames == 0 && self.unanswered == 0
@@ -100,7 +116,26 @@ impl Lateness {
 
 #[cfg(test)]
 mod tests {
+    use protocol::Account;
+
     use super::*;
+
+    #[test]
+    fn what_was_dropped_before_it_was_sent_is_told() {
+        let published = |topic: &str| Account::published(topic.parse().unwrap());
+        let mut ledger = Ledger::default();
+        for topic in ["1/lidar", "2/lidar", "1/gnss"] {
+            ledger.sent(&published(topic));
+        }
+        ledger.dropped(&published("1/lidar"), DropReason::Superseded);
+        ledger.dropped(&published("2/lidar"), DropReason::Superseded);
+        let heard = Account::towards("1/detections".parse().unwrap(), &"replay".parse().unwrap());
+        ledger.dropped(&heard, DropReason::Superseded);
+        let mut report = StreamReport::default();
+        report.count_unsent(&ledger);
+        assert_eq!(report.unsent, [(DropReason::Superseded, 2)].into());
+        assert!(report.is_complete());
+    }
 
     #[test]
     fn lateness_is_summed_up() {

@@ -38,6 +38,8 @@ pub(super) struct SensorAir {
     air: Air,
     held: BTreeMap<u64, Held>,
     next_id: u64,
+    /// By vehicle, as its own messages are numbered: whether one is lost must not depend on who else is there.
+    next_sequences: BTreeMap<CavId, u64>,
     began: Instant,
     report: AirReport,
 }
@@ -50,6 +52,7 @@ impl SensorAir {
             air: Air::new(link.clone(), Path::new("."), seed)?,
             held: BTreeMap::new(),
             next_id: 0,
+            next_sequences: BTreeMap::new(),
             began: Instant::now(),
             report: AirReport::default(),
         })
@@ -62,10 +65,13 @@ impl SensorAir {
         let bytes = HEADER_LEN as u64 + POINT_BYTES * points as u64;
         let (id, offered_nanos) = (self.next_id, self.nanos(now));
         self.next_id += 1;
+        let next_sequence = self.next_sequences.entry(cav.clone()).or_default();
+        let sequence = *next_sequence;
+        *next_sequence += 1;
         self.report.offered += 1;
         self.held.insert(id, held);
         let (from, to, stream) = (cav.clone(), cav.clone(), Stream::Lidar);
-        self.air.offer(Parcel { id, from, to, stream, sequence: id, bytes, offered_nanos, distance_m: 0.0 });
+        self.air.offer(Parcel { id, from, to, stream, sequence, bytes, offered_nanos, distance_m: 0.0 });
     }
 
     /// When the next frame can arrive; none while none is under way.
@@ -110,6 +116,22 @@ mod tests {
         let points = PointCloud { xyzi: vec![[0.0; 4]; 1000] };
         let frame = Frame { points, ..Frame::empty(cav.clone(), tick, Handedness::Right) };
         Held { agent: 0, capture_nanos: tick, frame }
+    }
+
+    #[test]
+    fn what_a_vehicle_loses_does_not_depend_on_the_others() {
+        let [cav, other] = ["7", "8"].map(|cav| CavId::new(cav).unwrap());
+        let lossy = LinkConfig { loss: LossLaw::Bernoulli(0.5), ..LinkConfig::default() };
+        let arrived = |cavs: &[&CavId]| {
+            let mut air = SensorAir::new(&lossy, 1).unwrap();
+            let began = air.began;
+            for tick in 0..100 {
+                cavs.iter().for_each(|cav| air.offer(cav, held(cav, tick), began));
+            }
+            let arrived = air.arrived(began).into_iter().filter(|held| held.frame.cav == cav);
+            arrived.map(|held| held.capture_nanos).collect::<Vec<_>>()
+        };
+        assert_eq!(arrived(&[&other, &cav]), arrived(&[&cav]));
     }
 
     #[test]

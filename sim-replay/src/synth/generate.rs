@@ -69,7 +69,7 @@ pub fn generate(options: &SynthOptions, progress: &(dyn Fn(u64) + Sync)) -> Resu
 }
 
 /// The towns of the scenarios, which take them in turn.
-fn sources(options: &SynthOptions) -> Vec<TownSource> {
+pub(super) fn sources(options: &SynthOptions) -> Vec<TownSource> {
     match (&options.town, options.subset) {
         (Some(town), _) => vec![town.clone()],
         (None, Subset::Town1loc) => vec![TownSource::Town1],

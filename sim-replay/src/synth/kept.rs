@@ -1,14 +1,19 @@
 //! Generated scenes that are kept and used again: whole or not at all, and only where they are what is asked for.
 
-use std::fs;
 use std::path::Path;
+use std::{fs, io};
 
 use serde::Deserialize;
 
 use super::error::SynthError;
-use super::generate::{Summary, generate};
+use super::generate::{Summary, generate, sources};
 use super::options::SynthOptions;
 use super::protocol_file::FILE_NAME;
+use crate::bounded;
+use crate::town::TownSource;
+
+/// A longer file does not come from here, bytes.
+const MAX_FILE_BYTES: u64 = 1 << 20;
 
 /// What [`FILE_NAME`] says of how a scenario was made.
 #[derive(Debug, Deserialize)]
@@ -20,6 +25,7 @@ struct MadeWith {
 struct Generator {
     subset: String,
     seed: u64,
+    town: String,
     town_seed: u64,
     agents: usize,
     frames: usize,
@@ -42,7 +48,8 @@ pub fn are_kept(options: &SynthOptions) -> Result<bool, SynthError> {
         let folder = folder.to_owned();
         Err(SynthError::Kept { folder, setting, found, wanted })
     };
-    for Generator { subset, seed, town_seed, agents, frames, period_seconds, weather } in &scenarios {
+    let towns: Vec<String> = sources(options).iter().map(TownSource::name).collect();
+    for Generator { subset, seed, town, town_seed, agents, frames, period_seconds, weather } in &scenarios {
         let settings = [
             ("subset", subset.clone(), options.subset.name().to_owned()),
             ("seed", seed.to_string(), options.seed.to_string()),
@@ -53,6 +60,9 @@ pub fn are_kept(options: &SynthOptions) -> Result<bool, SynthError> {
         ];
         if let Some((setting, found, wanted)) = settings.into_iter().find(|(_, found, wanted)| found != wanted) {
             return differs(setting, found, wanted);
+        }
+        if !towns.contains(town) {
+            return differs("town", town.clone(), towns.join(" or "));
         }
         if !options.agents.contains(agents) {
             let wanted = format!("{} to {}", options.agents.start(), options.agents.end());
@@ -66,14 +76,19 @@ pub fn are_kept(options: &SynthOptions) -> Result<bool, SynthError> {
 }
 
 /// [`generate`], but the folder has its name only when all is in it: a run that is cut off leaves no half of a data set to
-/// the next one.
+/// the next one, which begins anew.
 ///
 /// # Errors
 /// As [`generate`].
 pub fn generate_whole(options: &SynthOptions, progress: &(dyn Fn(u64) + Sync)) -> Result<Summary, SynthError> {
     let unfinished = options.out.with_added_extension("unfinished");
-    let summary = generate(&SynthOptions { out: unfinished.clone(), force: true, ..options.clone() }, progress)?;
-    fs::rename(&unfinished, &options.out).map_err(|source| SynthError::Write { path: options.out.clone(), source })?;
+    let write = |path: &Path, source| SynthError::Write { path: path.to_owned(), source };
+    match fs::remove_dir_all(&unfinished) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(write(&unfinished, error)),
+        Ok(()) | Err(_) => {}
+    }
+    let summary = generate(&SynthOptions { out: unfinished.clone(), ..options.clone() }, progress)?;
+    fs::rename(&unfinished, &options.out).map_err(|source| write(&options.out, source))?;
     Ok(summary)
 }
 
@@ -88,7 +103,7 @@ fn read(folder: &Path) -> Result<Vec<Generator>, SynthError> {
             continue;
         }
         let file = scenario.join(FILE_NAME);
-        let text = fs::read_to_string(&file).map_err(|error| at(&file, error.to_string()))?;
+        let text = bounded::read_text(&file, MAX_FILE_BYTES).map_err(|error| at(&file, error.to_string()))?;
         let made: MadeWith = serde_saphyr::from_str(&text).map_err(|error| {
             at(&file, error.without_snippet().to_string().lines().next().unwrap_or_default().into())
         })?;
@@ -109,6 +124,8 @@ mod tests {
         let options =
             SynthOptions { scenes: 2, frames: 2, agents: 2..=2, ..SynthOptions::new(Subset::V2vdet, 7, out.clone()) };
         assert!(!are_kept(&options).unwrap());
+        // Of a run with another seed that was cut off.
+        fs::create_dir_all(folder.path().join("scenes.unfinished/v2vdet_town1_s8_0000")).unwrap();
         generate_whole(&options, &|_| {}).unwrap();
         assert!(are_kept(&options).unwrap());
         assert!(are_kept(&SynthOptions { agents: 1..=3, threads: 2, ..options.clone() }).unwrap());
@@ -118,6 +135,7 @@ mod tests {
             (SynthOptions { agents: 3..=4, ..options.clone() }, "agents 2, not 3 to 4"),
             (SynthOptions { scenes: 3, ..options.clone() }, "scenarios 2, not 3"),
             (SynthOptions { weather: Weather::Fog, ..options.clone() }, "weather sunny, not fog"),
+            (SynthOptions { town: Some(TownSource::Town1), ..options.clone() }, "town town4, not town1"),
         ] {
             let problem = are_kept(&asked).unwrap_err().to_string();
             assert!(problem.contains(words) && problem.contains(&*out.to_string_lossy()), "{problem}");
@@ -125,5 +143,8 @@ mod tests {
         fs::create_dir(out.join("other")).unwrap();
         let problem = are_kept(&options).unwrap_err().to_string();
         assert!(problem.contains("other/data_protocol.yaml"), "{problem}");
+        fs::write(out.join("other/data_protocol.yaml"), vec![b' '; MAX_FILE_BYTES as usize + 1]).unwrap();
+        let problem = are_kept(&options).unwrap_err().to_string();
+        assert!(problem.contains("larger than"), "{problem}");
     }
 }

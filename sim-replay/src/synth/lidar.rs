@@ -2,8 +2,6 @@
 
 use std::f32::consts::{PI, TAU};
 
-use nalgebra::Vector3;
-
 use super::cast::{Body, Caster, GROUND, MISS, RayPattern, Surface, Sweep};
 use super::weather::{Echo, Weather};
 use crate::random::SplitMix64;
@@ -157,12 +155,6 @@ fn measure(
 #[must_use]
 pub fn lidar_motion(vehicle: &Sweep) -> Sweep {
     vehicle.mounted(LIDAR_MOUNT_M)
-}
-
-/// Height of the LiDAR above its ground, metres.
-#[must_use]
-pub fn lidar_height_m() -> f64 {
-    Vector3::from(LIDAR_MOUNT_M).z
 }
 
 #[cfg(test)]

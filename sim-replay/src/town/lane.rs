@@ -133,12 +133,6 @@ impl LaneGraph {
     pub fn lane(&self, id: LaneId) -> &Lane {
         &self.lanes[id.0 as usize]
     }
-
-    /// Length of all lanes together, metres.
-    #[must_use]
-    pub fn total_length_m(&self) -> f64 {
-        self.lanes.iter().map(|lane| lane.length_m).sum()
-    }
 }
 
 /// Takes an angle into (-pi, pi].

@@ -1,4 +1,4 @@
-//! Which lane is near, and what lies ahead on it.
+//! Which lane is near.
 
 use super::lane::{Lane, LaneGraph, LaneId, wrap_angle};
 
@@ -113,33 +113,6 @@ impl LaneIndex {
     }
 }
 
-impl LaneGraph {
-    /// Distance from `s_m` on `lane` to the next junction along first successors, and the lane before it, when the
-    /// junction is at most `horizon_m` ahead. Zero inside a junction.
-    #[must_use]
-    pub fn junction_ahead(&self, lane: LaneId, s_m: f64, horizon_m: f64) -> Option<(f64, LaneId)> {
-        let mut current = self.lane(lane);
-        let mut distance_m = 0.0;
-        if current.in_junction {
-            return Some((0.0, lane));
-        }
-        let mut left_m = current.length_m - s_m;
-        loop {
-            distance_m += left_m;
-            if distance_m > horizon_m {
-                return None;
-            }
-            let next = self.lane(*current.successors.first()?);
-            if next.in_junction {
-                return Some((distance_m, current.id));
-            }
-            // A ring of lanes without a junction ends at the horizon: every lane has a length.
-            left_m = next.length_m.max(1e-3);
-            current = next;
-        }
-    }
-}
-
 /// The place on `lane` nearest to `x`, `y`, looked for on the two steps around a point of its centre line.
 fn project_near(lane: &Lane, place: usize, x: f64, y: f64) -> LanePosition {
     let steps = lane.centerline.len() - 1;
@@ -182,18 +155,5 @@ mod tests {
         assert!((found.s_m - 69.7).abs() < 1e-9 && (found.offset_m - 3.2).abs() < 1e-9);
         assert!(index.nearest(&graph, [30.3, 40.0], 5.0, None, None).is_none());
         assert!(index.nearest(&graph, [30.3, -1.2], 5.0, None, Some(6.0)).is_none());
-    }
-
-    #[test]
-    fn junction_ahead_counts_to_the_end_of_the_lane_before_it() {
-        let mut graph = two_way();
-        let mut inner = Lane::new(LaneId(2), vec![[100.0, -2.0, 0.0], [110.0, -2.0, 0.0]], 3.5, 10.0);
-        inner.in_junction = true;
-        graph.lanes.push(inner);
-        graph.lanes[0].successors.push(LaneId(2));
-        assert_eq!(graph.junction_ahead(LaneId(0), 60.0, 50.0), Some((40.0, LaneId(0))));
-        assert_eq!(graph.junction_ahead(LaneId(0), 10.0, 50.0), None);
-        assert_eq!(graph.junction_ahead(LaneId(2), 1.0, 50.0), Some((0.0, LaneId(2))));
-        assert_eq!(graph.junction_ahead(LaneId(1), 1.0, 500.0), None);
     }
 }

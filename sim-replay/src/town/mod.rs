@@ -36,6 +36,8 @@ use road::RoadNetwork;
 pub use solid::{Shape, Solid, SolidKind};
 use surface::Surface;
 
+use crate::bounded;
+
 /// Longest side of a town, metres.
 const MAX_EXTENT_M: f64 = 50_000.0;
 
@@ -63,6 +65,19 @@ pub enum TownSource {
     Town4,
     /// A map file in OpenDRIVE format.
     OpenDrive(PathBuf),
+}
+
+impl TownSource {
+    /// The name of the town made from it: its kind, or the stem of the map's file in small letters.
+    #[must_use]
+    pub fn name(&self) -> String {
+        let stem = |path: &Path| path.file_stem().map(|stem| stem.to_string_lossy().to_lowercase());
+        match self {
+            Self::Town1 => "town1".into(),
+            Self::Town4 => "town4".into(),
+            Self::OpenDrive(path) => stem(path).unwrap_or_else(|| "map".into()),
+        }
+    }
 }
 
 /// A place for one parked vehicle.
@@ -122,12 +137,12 @@ pub enum TownError {
 /// # Errors
 /// [`TownError`] when a map cannot be read or is no usable road network; procedural towns always build.
 pub fn build(source: &TownSource, town_seed: u64) -> Result<Town, TownError> {
+    let name = source.name();
     match source {
-        TownSource::Town1 => Ok(furnish("town1".into(), &layout::town1(town_seed), town_seed)),
-        TownSource::Town4 => Ok(furnish("town4".into(), &layout::town4(town_seed), town_seed)),
+        TownSource::Town1 => Ok(furnish(name, &layout::town1(town_seed), town_seed)),
+        TownSource::Town4 => Ok(furnish(name, &layout::town4(town_seed), town_seed)),
         TownSource::OpenDrive(path) => {
             let network = read_map(path)?;
-            let name = path.file_stem().map_or_else(|| "map".into(), |stem| stem.to_string_lossy().to_lowercase());
             let layout = Layout { network, islands: Vec::new() };
             check_extent(path, &layout.network)?;
             Ok(furnish(name, &layout, town_seed))
@@ -154,7 +169,8 @@ fn check_extent(path: &Path, network: &RoadNetwork) -> Result<(), TownError> {
 }
 
 fn read_map(path: &Path) -> Result<RoadNetwork, TownError> {
-    let text = std::fs::read_to_string(path).map_err(|source| TownError::Read { path: path.into(), source })?;
+    let text = bounded::read_text(path, opendrive::MAX_BYTES as u64);
+    let text = text.map_err(|source| TownError::Read { path: path.into(), source })?;
     opendrive::read(&text).map_err(|source| TownError::OpenDrive { path: path.into(), source })
 }
 
@@ -199,6 +215,8 @@ mod tests {
                  </laneSection></lanes></road></OpenDRIVE>"
             )
         };
+        std::fs::File::create(&path).unwrap().set_len(opendrive::MAX_BYTES as u64 + 1).unwrap();
+        assert!(error().ends_with("larger than 67108864 bytes, the most that is read"), "{}", error());
         std::fs::write(&path, road("", 10)).unwrap();
         assert!(error().ends_with("none of its 1 roads has a driving lane"), "{}", error());
         let lane = "<lane id=\"-1\" type=\"driving\"><width sOffset=\"0\" a=\"3\" b=\"0\" c=\"0\" d=\"0\"/></lane>";

@@ -5,6 +5,11 @@
 
 use super::curve::{Curve, Pose2, cubic, cubic_slope};
 
+/// Farthest that lanes may lie beside the reference line, metres.
+pub(super) const MAX_OFFSET_M: f64 = 1000.0;
+/// Widest lane, metres.
+pub(super) const MAX_WIDTH_M: f64 = 100.0;
+
 /// Roads and junctions of a map.
 #[derive(Debug, Clone, Default)]
 pub struct RoadNetwork {
@@ -276,16 +281,23 @@ impl Road {
         self.sections.partition_point(|section| section.s_m <= s_m).saturating_sub(1)
     }
 
+    /// Shift of the lanes' origin across the road at `s_m`, metres. Cubics of a map can lead anywhere: it is held within
+    /// what a road can be.
+    #[must_use]
+    pub fn lane_offset_m(&self, s_m: f64) -> f64 {
+        self.lane_offset.at(s_m).clamp(-MAX_OFFSET_M, MAX_OFFSET_M)
+    }
+
     /// Lower and upper `t` of lane `id` of section `section` at `s_m`, metres.
     #[must_use]
     pub fn lane_span_m(&self, section: usize, id: i32, s_m: f64) -> [f64; 2] {
         let section = &self.sections[section];
         let side = if id > 0 { &section.left } else { &section.right };
-        let width = |lane: &RoadLane| lane.width.at(s_m - section.s_m).max(0.0);
+        let width = |lane: &RoadLane| lane.width.at(s_m - section.s_m).clamp(0.0, MAX_WIDTH_M);
         let place = id.unsigned_abs() as usize;
         let inner: f64 = side.iter().take(place - 1).map(width).sum();
         let outer = inner + side.get(place - 1).map_or(0.0, width);
-        let origin = self.lane_offset.at(s_m);
+        let origin = self.lane_offset_m(s_m);
         if id > 0 { [origin + inner, origin + outer] } else { [origin - outer, origin - inner] }
     }
 

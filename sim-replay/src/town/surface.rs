@@ -8,6 +8,8 @@ use super::road::{LaneKind, Road, RoadNetwork};
 pub(crate) const STEP_M: f64 = 2.0;
 /// Edge of a cell of the index, metres.
 const CELL_M: f64 = 6.0;
+/// Most cells of the index that all patches together may touch: some 100 MB.
+const MAX_TOUCHED: f64 = 2e7;
 
 /// A cut across a road.
 #[derive(Debug, Clone, Copy)]
@@ -89,7 +91,7 @@ impl Surface {
         }
         let corners: Vec<[f64; 2]> = patches.iter().flat_map(|patch| patch.quad).collect();
         let bounds_m = if corners.is_empty() { [[0.0; 2]; 2] } else { bounds(&corners) };
-        let mut index = CellIndex::new(bounds_m, CELL_M);
+        let mut index = CellIndex::new(bounds_m, cell_m(&patches));
         for (number, patch) in patches.iter().enumerate() {
             index.insert(number as u32, bounds(&patch.quad));
         }
@@ -121,6 +123,20 @@ impl Surface {
     }
 }
 
+/// Edge of a cell of the index, metres: larger where a map has surfaces so wide, and askew, that they would fill the memory.
+fn cell_m(patches: &[Patch]) -> f64 {
+    let touched = |cell_m: f64| -> f64 {
+        let boxes = patches.iter().map(|patch| bounds(&patch.quad));
+        boxes.map(|[low, high]| [0, 1].map(|axis| (high[axis] - low[axis]) / cell_m + 1.0)).map(|[x, y]| x * y).sum()
+    };
+    let mut cell_m = CELL_M;
+    // Every patch touches one cell at least, and there are far fewer patches than that.
+    while touched(cell_m) > MAX_TOUCHED && cell_m < 1e9 {
+        cell_m *= 2.0;
+    }
+    cell_m
+}
+
 fn cross_sections(road: &Road) -> Vec<CrossSection> {
     let mut cuts = Vec::new();
     for section in 0..road.sections.len() {
@@ -136,7 +152,7 @@ fn cross_sections(road: &Road) -> Vec<CrossSection> {
 
 /// The cut at `s_m`, with widths taken at `inside_m`, which lies in the section for certain.
 fn cut(road: &Road, section: usize, s_m: f64, inside_m: f64) -> CrossSection {
-    let origin = road.lane_offset.at(inside_m);
+    let origin = road.lane_offset_m(inside_m);
     let range = |wanted: fn(LaneKind) -> bool| {
         let mut range: Option<[f64; 2]> = None;
         for id in road.sections[section].lane_ids() {
@@ -159,6 +175,16 @@ fn cut(road: &Road, section: usize, s_m: f64, inside_m: f64) -> CrossSection {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn wide_surfaces_askew_get_larger_cells() {
+        let surface = Surface::new(&super::super::layout::town1(1).network);
+        assert_eq!(cell_m(&surface.patches), CELL_M);
+        let (right, left) = ([0.0, 0.0], [9_000.0, 9_000.0]);
+        let wide = Patch { quad: [right, right, left, left], z_m: [0.0; 2], road: 0, carriageway: true };
+        let cells = (9_000.0 / cell_m(&[wide; 100]) + 1.0).powi(2) * 100.0;
+        assert!((MAX_TOUCHED / 5.0..=MAX_TOUCHED).contains(&cells), "{cells}");
+    }
 
     #[test]
     fn patches_follow_a_street_and_leave_headroom() {

@@ -53,7 +53,7 @@ pub(crate) struct Args {
     /// Largest turn of such copies, degrees.
     #[arg(long, default_value_t = 10.0)]
     turn: f64,
-    /// Leave out sweeps that are learnt evenly (RSD).
+    /// Leave out sweeps that are learnt evenly (RSD); trainings of fewer than some 14 passes have no time to judge that.
     #[arg(long)]
     rsd: bool,
     /// Cells of a step.

@@ -49,14 +49,26 @@ pub enum FitError {
     /// There are too few poses.
     #[error("a confidence is fitted on at least {MIN_SWEEPS} sweeps with a pose, there are {0}")]
     TooFew(usize),
+    /// No share that leaves a pose.
+    #[error("the share of good poses that may be withheld is {0}, must be 0 to less than 1")]
+    GoodLoss(f64),
+}
+
+/// Checks the share of good poses that a fit may withhold.
+///
+/// # Errors
+/// [`FitError::GoodLoss`] unless it is at least 0 and below 1.
+pub fn check_good_loss(good_loss: f64) -> Result<(), FitError> {
+    if (0.0..1.0).contains(&good_loss) { Ok(()) } else { Err(FitError::GoodLoss(good_loss)) }
 }
 
 impl ConfidenceModel {
     /// Fits weights, map and threshold; at most the share `good_loss` of good poses is withheld.
     ///
     /// # Errors
-    /// [`FitError`] when there are too few sweeps.
+    /// [`FitError`] when there are too few sweeps, or `good_loss` is not at least 0 and below 1.
     pub fn fit(sweeps: &[Labelled], good_loss: f64) -> Result<(Self, FitReport), FitError> {
+        check_good_loss(good_loss)?;
         let sweeps: Vec<_> = sweeps.iter().filter(|sweep| sweep.error_m.is_finite()).collect();
         if sweeps.len() < MIN_SWEEPS {
             return Err(FitError::TooFew(sweeps.len()));
@@ -171,6 +183,14 @@ mod tests {
     fn a_few_sweeps_are_too_few() {
         let few = sweeps(0..20);
         assert_eq!(ConfidenceModel::fit(&few, 0.01), Err(FitError::TooFew(few.len())));
+    }
+
+    #[test]
+    fn no_share_that_leaves_no_pose_is_taken() {
+        for good_loss in [1.0, -0.1, 1.5] {
+            assert_eq!(ConfidenceModel::fit(&[], good_loss), Err(FitError::GoodLoss(good_loss)));
+        }
+        assert!(check_good_loss(f64::NAN).is_err() && check_good_loss(0.0).is_ok() && check_good_loss(0.99).is_ok());
     }
 
     #[test]

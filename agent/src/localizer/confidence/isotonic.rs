@@ -2,6 +2,9 @@
 
 use serde::{Deserialize, Serialize};
 
+/// How far knots that are equal may be out of order for rounding, relative.
+const ROUNDING: f64 = 1e-9;
+
 /// A falling function: straight between its knots, flattening out towards 0 and 1 beyond them.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(transparent)]
@@ -46,9 +49,30 @@ impl MonotoneMap {
         Self { knots: pools.iter().map(|pool| (pool.x / pool.count, pool.mean())).collect() }
     }
 
-    /// The value at `x`; 0.5 for a map without knots.
+    /// Checks that knots rise in x and fall in value, as those that were fitted do but for rounding.
+    ///
+    /// # Errors
+    /// Says which knots are wrong.
+    pub(super) fn check(&self) -> Result<(), String> {
+        if let Some((x, y)) = self.knots.iter().find(|(x, y)| !x.is_finite() || !(0.0..=1.0).contains(y)) {
+            return Err(format!("sigma has a knot [{x}, {y}], its value must be 0 to 1"));
+        }
+        let is_in_order = |pair: &&[(f64, f64)]| {
+            let ((x0, y0), (x1, y1)) = (pair[0], pair[1]);
+            x1 >= x0 - ROUNDING * (1.0 + x0.abs()) && y1 <= y0 + ROUNDING
+        };
+        match self.knots.windows(2).find(|pair| !is_in_order(pair)) {
+            Some(pair) => Err(format!("sigma has the knots {pair:?} one after the other, x must rise and values fall")),
+            None => Ok(()),
+        }
+    }
+
+    /// The value at `x`; 0.5 for a map without knots, 0 where `x` is no number.
     #[must_use]
     pub fn at(&self, x: f64) -> f64 {
+        if x.is_nan() {
+            return 0.0;
+        }
         let (Some(&first), Some(&last)) = (self.knots.first(), self.knots.last()) else { return 0.5 };
         if x <= first.0 {
             return 1.0 - (1.0 - first.1) * (x - first.0).exp();
@@ -98,6 +122,7 @@ mod tests {
             a in -9.0..9.0_f64, b in -9.0..9.0_f64,
         ) {
             let map = MonotoneMap::fit(samples, 8, 3);
+            prop_assert_eq!(map.check(), Ok(()));
             prop_assert!(map.at(a.min(b)) >= map.at(a.max(b)) - 1e-12);
             prop_assert!((0.0..=1.0).contains(&map.at(a)));
         }
@@ -116,5 +141,11 @@ mod tests {
         let map = MonotoneMap::falling(vec![(0.0, 0.8), (1.0, 0.1)]);
         assert!(map.at(-1.0) > 0.8 && map.at(-9.0) < 1.0 && map.at(2.0) < 0.1 && map.at(9.0) > 0.0);
         assert_eq!(MonotoneMap::fit(Vec::new(), 4, 1).at(3.0), 0.5);
+    }
+
+    #[test]
+    fn what_is_no_number_has_no_confidence() {
+        let map = MonotoneMap::falling(vec![(0.0, 0.8), (1.0, 0.1)]);
+        assert_eq!((map.at(f64::NAN), map.at(f64::INFINITY), map.at(f64::NEG_INFINITY)), (0.0, 0.0, 1.0));
     }
 }

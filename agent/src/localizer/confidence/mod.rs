@@ -9,7 +9,7 @@ mod isotonic;
 
 use serde::{Deserialize, Serialize};
 
-pub use fit::{BAD_M, FitError, FitReport, Labelled, observed};
+pub use fit::{BAD_M, FitError, FitReport, Labelled, check_good_loss, observed};
 pub use isotonic::MonotoneMap;
 
 use super::pose_evidence::{PoseEvidence, SecondEvidence};
@@ -19,6 +19,9 @@ const FEATURES: usize = 14;
 
 /// Metadata key of a head's file that the [`ConfidenceModel`] of its town lies under, as JSON.
 pub const CONFIDENCE_KEY: &str = "confidence";
+
+/// Beyond this no fit gets with its weights and bias, by far; sums of so many and such features are numbers.
+const MAX_WEIGHT: f64 = 1e9;
 
 /// How sigma is computed.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -66,6 +69,23 @@ pub struct ConfidenceModel {
 }
 
 impl ConfidenceModel {
+    /// Checks numbers that come from a file: that they are such as a fit has.
+    ///
+    /// # Errors
+    /// Says which field is wrong and what stood there.
+    pub fn check(&self) -> Result<(), String> {
+        if self.bias.is_nan() || self.bias.abs() > MAX_WEIGHT {
+            return Err(format!("bias is {:?}, must be -1e9 to 1e9", self.bias));
+        }
+        if let Some(weight) = self.weights.iter().find(|weight| !(0.0..=MAX_WEIGHT).contains(*weight)) {
+            return Err(format!("a weight is {weight:?}, must be 0 to 1e9"));
+        }
+        if !(0.0..=1.0).contains(&self.withhold_below) {
+            return Err(format!("withhold_below is {}, must be 0 to 1", self.withhold_below));
+        }
+        self.sigma.check()
+    }
+
     /// Sigma of a pose, 0..=1.
     #[must_use]
     pub fn sigma(&self, evidence: &PoseEvidence) -> f64 {
@@ -131,6 +151,23 @@ mod tests {
         let text = serde_json::to_string(&model).unwrap();
         assert_eq!(serde_json::from_str::<ConfidenceModel>(&text).unwrap(), model);
         assert!(serde_json::from_str::<ConfidenceModel>(&text.replace("bias", "bais")).is_err());
+    }
+
+    #[test]
+    fn numbers_that_no_fit_has_are_refused_by_name() {
+        let example = ConfidenceModel::example;
+        assert_eq!(example().check(), Ok(()));
+        let refused = |model: ConfidenceModel, field: &str| model.check().unwrap_err().contains(field);
+        let mut weights = [0.3; FEATURES];
+        weights[3] = 1e308;
+        assert!(refused(ConfidenceModel { weights, ..example() }, "a weight is 1e308"));
+        weights[3] = -0.1;
+        assert!(refused(ConfidenceModel { weights, ..example() }, "-0.1"));
+        assert!(refused(ConfidenceModel { bias: f64::NAN, ..example() }, "bias is NaN"));
+        assert!(refused(ConfidenceModel { withhold_below: 1.5, ..example() }, "withhold_below is 1.5"));
+        for knots in [vec![(1.0, 0.5), (0.0, 0.4)], vec![(0.0, 0.4), (1.0, 0.5)], vec![(0.0, 2.0)]] {
+            assert!(refused(ConfidenceModel { sigma: MonotoneMap::falling(knots), ..example() }, "sigma has"));
+        }
     }
 
     #[test]

@@ -19,7 +19,13 @@ impl Default for RedundancyConfig {
     }
 }
 
+/// Passes that must have shown a sweep in a window before anything is known of its evenness.
+const ENOUGH_PASSES: usize = 2;
+
 /// Which sweeps are used, with which weight.
+///
+/// It is not part of a checkpoint: a training that is resumed uses all sweeps again, and leaves none out before the end
+/// of a window that it has seen enough of itself.
 #[derive(Debug)]
 pub struct Redundancy {
     config: RedundancyConfig,
@@ -60,18 +66,29 @@ impl Redundancy {
         }
     }
 
+    /// Whether sweeps that were left out are to come back now, without waiting for the end of a pass.
+    #[must_use]
+    pub fn is_time_for_all(&self, share_done: f64) -> bool {
+        share_done >= self.config.all_from && self.weights.iter().any(|&weight| weight != 1.0)
+    }
+
     /// Decides at the end of a pass. Says whether the set of used sweeps has changed.
     pub fn advance(&mut self, share_done: f64) -> bool {
         let is_over = |redundancy: &Self| {
             redundancy.config.windows.get(redundancy.windows_done).is_some_and(|[_, to]| share_done >= *to)
         };
         if share_done >= self.config.all_from {
-            let changes = self.weights.iter().any(|&weight| weight != 1.0);
+            let changes = self.is_time_for_all(share_done);
             self.weights.fill(1.0);
             self.windows_done = self.config.windows.len();
             return changes;
         }
         if is_over(self) {
+            if self.recorded.iter().all(|losses| losses.len() < ENOUGH_PASSES) {
+                tracing::warn!(
+                    "a window of RSD held fewer than {ENOUGH_PASSES} passes over the data: no sweep is left out after it"
+                );
+            }
             self.drop_most_even();
             self.windows_done += 1;
             self.recorded.iter_mut().for_each(Vec::clear);
@@ -80,7 +97,8 @@ impl Redundancy {
         false
     }
 
-    /// In each cluster the sweeps with the lowest variance of their losses go; the others stand for them.
+    /// In each cluster the sweeps with the lowest variance of their losses go; the others stand for them. Where nothing is
+    /// known of a sweep's variance it stays, however many that leaves.
     fn drop_most_even(&mut self) {
         let classes = self.class_of_sweep.iter().max().map_or(0, |class| class + 1);
         for class in 0..classes {
@@ -88,7 +106,8 @@ impl Redundancy {
             let mut members: Vec<(f32, usize)> =
                 (0..self.weights.len()).filter(used).map(|sweep| (variance(&self.recorded[sweep]), sweep)).collect();
             members.sort_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
-            let dropped = (members.len() as f64 * self.config.drop) as usize;
+            let known = members.iter().take_while(|(variance, _)| *variance < f32::MAX).count();
+            let dropped = ((members.len() as f64 * self.config.drop) as usize).min(known);
             let kept = (members.len() - dropped) as f32 / members.len().max(1) as f32;
             for (place, &(_, sweep)) in members.iter().enumerate() {
                 self.weights[sweep] = if place < dropped { 0.0 } else { self.weights[sweep] / kept };
@@ -98,7 +117,7 @@ impl Redundancy {
 }
 
 fn variance(values: &[f32]) -> f32 {
-    if values.len() < 2 {
+    if values.len() < ENOUGH_PASSES {
         // Nothing is known of its evenness, so it stays.
         return f32::MAX;
     }
@@ -137,5 +156,15 @@ mod tests {
         redundancy.advance(0.25);
         assert_eq!(redundancy.weights()[0], 0.0);
         assert!(redundancy.weights()[1..].iter().all(|&weight| weight > 0.0));
+    }
+
+    #[test]
+    fn one_pass_tells_nothing_of_evenness() {
+        let mut redundancy = Redundancy::new(RedundancyConfig::default(), vec![0; 8]);
+        redundancy.record(&std::array::from_fn::<_, 8, _>(|sweep| (sweep, sweep as f32)));
+        redundancy.advance(0.25);
+        assert_eq!(redundancy.weights(), [1.0; 8]);
+        redundancy.advance(0.5);
+        assert_eq!(redundancy.weights(), [1.0; 8], "nor does a window that a resumed training has not seen");
     }
 }

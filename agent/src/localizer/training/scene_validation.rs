@@ -43,7 +43,7 @@ pub(super) fn validate(
     // Coordinates are relative to the origin of the head's town.
     let origin = head.config().origin_m;
     let moved: [f32; 3] = std::array::from_fn(|axis| (cache.origin_m[axis] - origin[axis]) as f32);
-    let targets = &cache.targets_m + Tensor::f_from_slice(&moved)?;
+    let targets = &cache.targets_m + Tensor::f_from_slice(&moved)?.f_to_device(cache.targets_m.device())?;
     let error = (&regression.coordinates_m - targets).f_abs()?.f_sum_dim_intlist(1_i64, false, Kind::Float)?;
     let mut cell_errors: Vec<f64> = Vec::try_from(&error.f_to_kind(Kind::Double)?)?;
     let world: Vec<f32> = Vec::try_from(&regression.coordinates_m.f_reshape([-1])?)?;

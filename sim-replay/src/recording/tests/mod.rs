@@ -273,6 +273,44 @@ fn json_stands_beside_our_own_messages() {
 }
 
 #[test]
+fn a_first_message_that_is_none_spoils_none_after_it() {
+    let disk = Disk::new(usize::MAX);
+    let mut writer = RecordingWriter::over(disk.clone(), Path::new("t"), RecordingOptions::default()).unwrap();
+    let messages = tick_messages(0, 1);
+    messages.iter().for_each(|(key, _)| writer.write(key, 5, b"garbage").unwrap());
+    messages.iter().for_each(|(key, payload)| writer.write(key, 6, payload).unwrap());
+    writer.finish().unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let recording = Recording::open(&write(folder.path(), &disk.bytes())).unwrap();
+    let keys: Vec<&Key> = recording.entries().iter().map(|entry| &entry.key).collect();
+    assert_eq!(keys, messages.iter().map(|(key, _)| key).collect::<Vec<_>>());
+}
+
+#[test]
+fn the_first_of_two_replays_of_one_moment_is_taken_with_its_own_truth() {
+    let disk = Disk::new(usize::MAX);
+    let mut writer = RecordingWriter::over(disk.clone(), Path::new("t"), RecordingOptions::default()).unwrap();
+    for (key, payload) in tick_messages(0, 1) {
+        writer.write(&key, 5, &payload).unwrap();
+        if key.topic == protocol::Topic::Truth {
+            let second = Stamp { epoch: 2, ..stamp("replay", 0) };
+            let nothing = Truth { frame_index: 0, agents: Vec::new() };
+            // The same once more is no news.
+            for stamp in [stamp("replay", 0), second] {
+                writer.write(&key, 6, &wire::encode(&stamp, nothing.clone()).unwrap().to_vec()).unwrap();
+            }
+        }
+    }
+    writer.finish().unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let mut dataset = dataset::open(&write(folder.path(), &disk.bytes())).unwrap();
+    assert_eq!(dataset.problems.len(), 1, "{:?}", dataset.problems);
+    assert!(dataset.problems[0].to_string().contains("1 moments"), "{}", dataset.problems[0]);
+    let frame = dataset.scenarios.remove(0).load(0, 0, &LoadOptions::default()).unwrap();
+    assert_eq!(frame.objects.len(), 1);
+}
+
+#[test]
 fn a_full_disk_leaves_what_is_whole() {
     let folder = tempfile::tempdir().unwrap();
     let one = recorded(1, 2_000, RecordingOptions::default()).len();

@@ -113,7 +113,12 @@ impl<'a, 'input> Element<'a, 'input> {
     pub(super) fn lane_id(&self, attribute: &'static str) -> Result<i32, OpenDriveError> {
         let text = self.text(attribute)?;
         let value: i32 = text.trim().parse().map_err(|_| self.error_value(attribute, text, "a lane id"))?;
-        if value.abs() <= MAX_LANES { Ok(value) } else { Err(self.error_range(attribute, text, -MAX_LANES, MAX_LANES)) }
+        // The lowest number of all has no positive one.
+        if value.unsigned_abs() <= MAX_LANES.unsigned_abs() {
+            Ok(value)
+        } else {
+            Err(self.error_range(attribute, text, -MAX_LANES, MAX_LANES))
+        }
     }
 
     /// Coefficients a, b, c, d with a prefix or suffix, such as `aU`.

@@ -1,12 +1,9 @@
 //! `<lanes>`: sections and their lanes.
 
-use super::super::road::{Ignored, LaneKind, LaneSection, Profile, RoadLane};
+use super::super::road::{Ignored, LaneKind, LaneSection, MAX_WIDTH_M, Profile, RoadLane};
 use super::OpenDriveError;
 use super::element::{Element, MAX_LANES, children};
 use super::roads::{read_profile, read_speed};
-
-/// Widest lane, metres.
-const MAX_WIDTH_M: f64 = 100.0;
 
 pub(super) fn read_sections(
     lanes: Element,

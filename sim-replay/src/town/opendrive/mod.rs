@@ -20,7 +20,7 @@ use element::{Element, children};
 use super::road::{Ignored, Road, RoadNetwork};
 
 /// Larger files are refused, bytes.
-const MAX_BYTES: usize = 64 << 20;
+pub(super) const MAX_BYTES: usize = 64 << 20;
 /// Files with more XML nodes than this are refused.
 const MAX_NODES: u32 = 3_000_000;
 /// Roads of a map together may be at most this long, metres.

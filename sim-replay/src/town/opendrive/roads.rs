@@ -1,7 +1,9 @@
 //! `<road>`: links, reference line, elevation, and what stands beside the road.
 
 use super::super::curve::{Curve, CurveShape, Pose2};
-use super::super::road::{Contact, Ignored, Profile, Road, RoadLink, RoadObject, RoadSignal, RoadStructure};
+use super::super::road::{
+    Contact, Ignored, MAX_OFFSET_M, Profile, Road, RoadLink, RoadObject, RoadSignal, RoadStructure,
+};
 use super::element::{Element, MAX_COORDINATE_M, children};
 use super::{Ids, OpenDriveError, lanes};
 
@@ -35,12 +37,12 @@ pub(super) fn read(element: Element, ids: &Ids, ignored: &mut Ignored) -> Result
             Some(profile) => read_profile(profile, "elevation", "s", MAX_HEIGHT_M)?,
             None => Profile::default(),
         },
-        lane_offset: read_profile(lanes, "laneOffset", "s", 1000.0)?,
+        lane_offset: read_profile(lanes, "laneOffset", "s", MAX_OFFSET_M)?,
         sections: lanes::read_sections(lanes, length_m, ignored)?,
         speed_limits: read_speed_limits(element)?,
         objects: read_objects(element)?,
         signals: read_signals(element)?,
-        structures: read_structures(element)?,
+        structures: read_structures(element, length_m)?,
     })
 }
 
@@ -249,7 +251,7 @@ fn read_signals(road: Element) -> Result<Vec<RoadSignal>, OpenDriveError> {
     children(signals, "signal").map(read_signal).collect()
 }
 
-fn read_structures(road: Element) -> Result<Vec<RoadStructure>, OpenDriveError> {
+fn read_structures(road: Element, road_length_m: f64) -> Result<Vec<RoadStructure>, OpenDriveError> {
     let Some(objects) = road.child("objects") else { return Ok(Vec::new()) };
     let mut structures = Vec::new();
     for (name, tunnel) in [("bridge", false), ("tunnel", true)] {
@@ -258,5 +260,20 @@ fn read_structures(road: Element) -> Result<Vec<RoadStructure>, OpenDriveError> 
             structures.push(RoadStructure { tunnel, s_m, length_m: element.number("length", 0.0, MAX_LENGTH_M)? });
         }
     }
+    part_tunnels(&mut structures, road_length_m);
     Ok(structures)
+}
+
+/// Cuts tunnels so that none reaches into the next or beyond its road, and leaves out those of which nothing is left:
+/// together they are at most as long as the road, however many a map has for its lanes.
+fn part_tunnels(structures: &mut Vec<RoadStructure>, road_length_m: f64) {
+    structures.sort_by(|a, b| a.tunnel.cmp(&b.tunnel).then(a.s_m.total_cmp(&b.s_m)));
+    let mut covered_m = 0.0;
+    for tunnel in structures.iter_mut().filter(|structure| structure.tunnel) {
+        let end_m = (tunnel.s_m + tunnel.length_m).min(road_length_m);
+        tunnel.s_m = tunnel.s_m.max(covered_m);
+        tunnel.length_m = (end_m - tunnel.s_m).max(0.0);
+        covered_m = covered_m.max(end_m);
+    }
+    structures.retain(|structure| !structure.tunnel || structure.length_m > 0.0);
 }

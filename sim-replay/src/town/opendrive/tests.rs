@@ -94,10 +94,46 @@ fn errors_name_line_element_attribute_and_values() {
         error_of(r#"road id="b""#, r#"road id="a""#),
         "line 22: <road> has id=\"a\"; expected used by one element only"
     );
+    assert_eq!(
+        error_of(r#"<lane id="-2""#, r#"<lane id="-2147483648""#),
+        "line 16: <lane> has id=\"-2147483648\"; expected a value from -64 to 64"
+    );
     assert!(error_of("<line/>", "<helix/>").contains("holds <helix>"));
     assert!(error_of(r#"curvature="0.05""#, r#"curvature="9.5""#).contains("expected a value from -0.63"));
     assert!(error_of("</OpenDRIVE>", "").contains("not well-formed XML"));
     assert!(error_of("<OpenDRIVE>", "<!DOCTYPE a [<!ENTITY b \"c\">]><OpenDRIVE>").contains("not well-formed XML"));
+}
+
+#[test]
+fn cubics_that_lead_anywhere_are_held_within_what_a_road_can_be() {
+    let wild = [
+        (r#"laneOffset s="0" a="0" b="0""#, r#"laneOffset s="0" a="0" b="10000000""#),
+        (r#"laneOffset s="0" a="0" b="0" c="0" d="0""#, r#"laneOffset s="0" a="0" b="0" c="0" d="-9999999""#),
+        // A peak between the places where widths are checked.
+        (r#"sOffset="0" a="2" b="0" c="0" d="0""#, r#"sOffset="49" a="0" b="10000000" c="-10000000" d="0""#),
+    ];
+    for (from, to) in wild {
+        assert!(SMALL.contains(from));
+        let network = read(&SMALL.replacen(from, to, 1)).unwrap();
+        for place in 0..=500 {
+            let spans = [-2, -1, 1].map(|lane| network.roads[0].lane_span_m(0, lane, f64::from(place) / 10.0));
+            assert!(
+                spans.iter().all(|[low, high]| *low >= -1200.0 && *high <= 1200.0 && low <= high),
+                "{to}: {spans:?}"
+            );
+        }
+    }
+}
+
+#[test]
+fn tunnels_together_are_no_longer_than_their_road() {
+    let tunnels = [(30, 100), (0, 20), (10, 25), (12, 3), (30, 100), (49, 0)];
+    let tunnels = tunnels.map(|(s, length)| format!(r#"<tunnel s="{s}" length="{length}"/>"#)).concat();
+    let network = read(&SMALL.replacen("</objects>", &format!("{tunnels}</objects>"), 1)).unwrap();
+    let structures = &network.roads[0].structures;
+    let spans: Vec<_> = structures.iter().filter(|it| it.tunnel).map(|it| (it.s_m, it.length_m)).collect();
+    assert_eq!(spans, [(0.0, 20.0), (20.0, 15.0), (35.0, 15.0)]);
+    assert_eq!(structures.len(), 4, "the bridge stays");
 }
 
 #[test]

@@ -7,7 +7,7 @@ use tch::{Kind, TchError, Tensor};
 
 use crate::localizer::training::{FeatureCache, Redundancy};
 
-/// An endless sequence of batches of cells, in a new order with every pass.
+/// An endless sequence of batches of cells, in a new order with every pass. A training that is resumed begins a new pass.
 pub(super) struct CellOrder {
     redundancy: Option<Redundancy>,
     sweep_of_cell: Tensor,
@@ -60,13 +60,14 @@ impl CellOrder {
 
     /// Rows `[batch]` of the next step.
     pub(super) fn next_batch(&mut self, share_done: f64) -> Result<Tensor, TchError> {
-        if self.place + self.batch > self.order.len() {
+        let wants_all = self.redundancy.as_ref().is_some_and(|redundancy| redundancy.is_time_for_all(share_done));
+        if wants_all || self.place + self.batch > self.order.len() {
             self.next_pass(share_done)?;
         }
         let end = self.place + self.batch;
         let rows = Tensor::f_from_slice(&self.order[self.place..end])?.f_to_device(self.sweep_of_cell.device())?;
         self.place = end;
-        // A whole number at the end of a pass, whatever part of a batch is left over then.
+        // One more at the end of a pass, whatever part of a batch is left over then.
         let (shown, batches) = (end / self.batch, self.order.len() / self.batch);
         self.passes = self.passes_before + shown as f64 / batches as f64;
         Ok(rows)
@@ -149,5 +150,23 @@ mod tests {
         // Windows end after passes 5 and 10; from 84 % on, after pass 17, all are used again.
         assert_eq!([5, 6, 10, 11, 17, 18].map(|pass| cells_of_pass[pass]), [100, 80, 80, 60, 60, 100]);
         assert_eq!(steps, 8 * 3 + 12 * 2, "three batches of a full pass, two of a thinned one");
+    }
+
+    #[test]
+    fn all_come_back_in_the_middle_of_a_long_pass() {
+        // Of four passes the first two are watched; the last is three eighths over when all are wanted again.
+        let config = RedundancyConfig { windows: [[0.0, 0.5], [0.9, 0.95]], ..RedundancyConfig::default() };
+        let mut order = CellOrder::new(&cache(), Some(Redundancy::new(config, vec![0; 10])), 10, 1, 0).unwrap();
+        let mut cells = Vec::new();
+        while order.passes() < 4.0 {
+            let share_done = order.passes() / 4.0;
+            let rows = order.next_batch(share_done).unwrap();
+            let sweeps = order.sweep_of_cell.index_select(0, &rows);
+            order.watch(share_done, &sweeps, &sweeps.to_kind(Kind::Float)).unwrap();
+            cells.push(order.order.len());
+        }
+        assert_eq!((cells[19], cells[20], cells[30]), (100, 80, 80));
+        assert_eq!(cells[31..], [100; 7]);
+        assert!(order.passes() < 4.1, "{}", order.passes());
     }
 }
