@@ -27,7 +27,9 @@ impl TestRouter {
         // Another process may take the port between the two calls.
         let opened = (0..20).find_map(|_| {
             let endpoint = Endpoint::loopback(free_port());
-            bus::open(&BusOptions::router(endpoint.clone())).ok().map(|session| (endpoint, session))
+            // A machine that stands still for a while must not look like a receiver that is stuck.
+            let options = BusOptions { stall_limit: PATIENCE, ..BusOptions::router(endpoint.clone()) };
+            bus::open(&options).ok().map(|session| (endpoint, session))
         });
         let (endpoint, session) = opened.expect("a free port on loopback");
         Self { endpoint, _session: session }
