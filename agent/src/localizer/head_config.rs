@@ -4,6 +4,8 @@ use serde::{Deserialize, Serialize};
 
 /// Values of a lattice.
 const MAX_LATTICE: i64 = 64_000_000;
+/// Cells around a cell that a refiner looks at, along each direction, at most.
+const MAX_REACH: i64 = 16;
 /// Parameters of a network, head or encoder: keeps a wrong number from taking all memory.
 pub(super) const MAX_PARAMETERS: i64 = 256_000_000;
 
@@ -93,14 +95,13 @@ impl RefinerConfig {
     /// # Errors
     /// Says which field is wrong and what stood there.
     pub fn validate(&self) -> Result<(), String> {
-        let sizes = [
-            ("local_channels", self.local_channels),
-            ("keys", self.keys),
-            ("width", self.width),
-            ("reach", self.reach),
-        ];
+        let sizes = [("local_channels", self.local_channels), ("keys", self.keys), ("width", self.width)];
         if let Some((name, size)) = sizes.into_iter().find(|(_, size)| !(1..=4096).contains(size)) {
             return Err(format!("refiner: {name} is {size}, must be 1 to 4096"));
+        }
+        // What is looked at around every cell grows with its square.
+        if !(1..=MAX_REACH).contains(&self.reach) {
+            return Err(format!("refiner: reach is {}, must be 1 to {MAX_REACH}", self.reach));
         }
         let mut edges = (0..2).map(|axis| self.high_m[axis] - self.low_m[axis]);
         if edges.any(|edge| !(edge > 0.0 && edge < 1e5)) {
@@ -175,6 +176,8 @@ mod tests {
         };
         let message = huge.validate().unwrap_err();
         assert!(message.contains("33335 x 33335") && message.contains("4096 keys"), "{message}");
+        let far = RefinerConfig { reach: 4096, high_m: [50.0; 2], keys: 4, ..huge };
+        assert_eq!(far.validate(), Err("refiner: reach is 4096, must be 1 to 16".to_owned()));
     }
 
     #[test]

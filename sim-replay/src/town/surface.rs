@@ -91,7 +91,7 @@ impl Surface {
         }
         let corners: Vec<[f64; 2]> = patches.iter().flat_map(|patch| patch.quad).collect();
         let bounds_m = if corners.is_empty() { [[0.0; 2]; 2] } else { bounds(&corners) };
-        let mut index = CellIndex::new(bounds_m, cell_m(&patches));
+        let mut index = CellIndex::new(bounds_m, cell_m(&patches, CELL_M));
         for (number, patch) in patches.iter().enumerate() {
             index.insert(number as u32, bounds(&patch.quad));
         }
@@ -123,13 +123,14 @@ impl Surface {
     }
 }
 
-/// Edge of a cell of the index, metres: larger where a map has surfaces so wide, and askew, that they would fill the memory.
-fn cell_m(patches: &[Patch]) -> f64 {
+/// Edge of the cells of a grid over all patches, metres: `least_m`, or more where a map has surfaces so wide, and askew,
+/// that as many cells as they touch would fill the memory or take minutes to go through.
+pub(super) fn cell_m(patches: &[Patch], least_m: f64) -> f64 {
     let touched = |cell_m: f64| -> f64 {
         let boxes = patches.iter().map(|patch| bounds(&patch.quad));
         boxes.map(|[low, high]| [0, 1].map(|axis| (high[axis] - low[axis]) / cell_m + 1.0)).map(|[x, y]| x * y).sum()
     };
-    let mut cell_m = CELL_M;
+    let mut cell_m = least_m;
     // Every patch touches one cell at least, and there are far fewer patches than that.
     while touched(cell_m) > MAX_TOUCHED && cell_m < 1e9 {
         cell_m *= 2.0;
@@ -179,10 +180,10 @@ mod tests {
     #[test]
     fn wide_surfaces_askew_get_larger_cells() {
         let surface = Surface::new(&super::super::layout::town1(1).network);
-        assert_eq!(cell_m(&surface.patches), CELL_M);
+        assert_eq!(cell_m(&surface.patches, CELL_M), CELL_M);
         let (right, left) = ([0.0, 0.0], [9_000.0, 9_000.0]);
         let wide = Patch { quad: [right, right, left, left], z_m: [0.0; 2], road: 0, carriageway: true };
-        let cells = (9_000.0 / cell_m(&[wide; 100]) + 1.0).powi(2) * 100.0;
+        let cells = (9_000.0 / cell_m(&[wide; 100], CELL_M) + 1.0).powi(2) * 100.0;
         assert!((MAX_TOUCHED / 5.0..=MAX_TOUCHED).contains(&cells), "{cells}");
     }
 

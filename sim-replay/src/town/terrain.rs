@@ -4,9 +4,10 @@
 use super::convex::{Quad, Rectangle, bounds, overlap};
 use super::ground::{Ground, HeightGrid, Terrain, Triangle};
 use super::noise::hills_m;
-use super::surface::{Patch, Surface};
+use super::surface::{Patch, Surface, cell_m};
 
-/// Distance between terrain nodes, metres; larger on maps that would need more than [`MAX_NODES`].
+/// Distance between terrain nodes, metres; larger on maps that would need more than [`MAX_NODES`], or have very wide
+/// surfaces.
 const CELL_M: f64 = 2.0;
 /// Most nodes of a terrain.
 const MAX_NODES: f64 = 4e6;
@@ -45,7 +46,7 @@ pub(crate) fn ground(surface: &Surface, seed: u64) -> Ground {
 fn empty_grid(surface: &Surface) -> HeightGrid {
     let [low, high] = surface.bounds_m;
     let extent = [0, 1].map(|axis| high[axis] - low[axis] + 2.0 * MARGIN_M);
-    let cell_m = CELL_M.max((extent[0] * extent[1] / MAX_NODES).sqrt());
+    let cell_m = cell_m(&surface.patches, CELL_M.max((extent[0] * extent[1] / MAX_NODES).sqrt()));
     let [columns, rows] = extent.map(|extent| (extent / cell_m).ceil() as usize + 1);
     let origin_m = low.map(|low| low - MARGIN_M);
     HeightGrid { origin_m, cell_m, columns, rows, heights_m: vec![f32::NAN; columns * rows] }
@@ -274,6 +275,17 @@ mod tests {
             assert!((2.0..4.0).contains(&middle), "{middle}");
         }
         assert!(heights.iter().all(|height| (-0.001..=6.001).contains(height)));
+    }
+
+    #[test]
+    fn wide_roads_askew_get_a_coarser_terrain() {
+        let mut surface = Surface::new(&super::super::layout::town1(2).network);
+        assert_eq!(empty_grid(&surface).cell_m, CELL_M);
+        let (right, left) = ([0.0, 0.0], [3_000.0, 3_000.0]);
+        surface.patches =
+            vec![Patch { quad: [right, right, left, left], z_m: [0.0; 2], road: 0, carriageway: true }; 500];
+        surface.bounds_m = [right, left];
+        assert!(empty_grid(&surface).cell_m > 4.0 * CELL_M);
     }
 
     #[test]
