@@ -7,9 +7,10 @@ use std::hint::black_box;
 use agent::model_config::DetectorConfig;
 use agent::process;
 use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
-use ego_fuser::fusion::{FusionStage, SentMaps, ViewFacts};
+use ego_fuser::fusion::{FusionConfig, FusionStage, SentMaps, ViewFacts};
 use ego_fuser::{Exchange, Method};
 use protocol::Pose;
+use tch::nn::VarStore;
 use tch::{Device, Kind, Tensor, no_grad};
 
 fn fuse(criterion: &mut Criterion) {
@@ -21,8 +22,7 @@ fn fuse(criterion: &mut Criterion) {
     let shape = [config.feature_channels(), i64::from(grid.height), i64::from(grid.width)];
     let mut group = criterion.benchmark_group("lean");
     for agents in [1usize, 2, 4] {
-        for method in Method::ALL.into_iter().filter(|method| method.exchange() == Exchange::Features) {
-            let stage = FusionStage::untrained(method, &config).expect("lean is a valid configuration");
+        for (method, stage) in stages(&config) {
             // The newest of all first, as the ego gives them.
             let entries = (0..stage.frames()).flat_map(|step| (0..agents).map(move |agent| (step, agent)));
             let facts: Vec<_> = entries.map(|(step, agent)| entry(step, agent)).collect();
@@ -47,6 +47,19 @@ fn fuse(criterion: &mut Criterion) {
         }
     }
     group.finish();
+}
+
+/// All that fuse maps, by name.
+fn stages(config: &DetectorConfig) -> Vec<(String, FusionStage)> {
+    let methods = Method::ALL.into_iter().filter(|method| method.exchange() == Exchange::Features);
+    let untrained = |method: Method| {
+        (method.to_string(), FusionStage::untrained(method, config).expect("lean is a valid configuration"))
+    };
+    let recalling = FusionConfig::for_detector(Method::Pastat, config).recalling().expect("it is a PASTAT");
+    let variables = VarStore::new(Device::Cpu);
+    let recalling = FusionStage::new(&variables.root(), &recalling, Method::Pastat, config);
+    let recalling = ("pastat-recall".to_owned(), recalling.expect("lean is a valid configuration"));
+    methods.map(untrained).chain([recalling]).collect()
 }
 
 /// What is known of a vehicle's map from some time steps ago.

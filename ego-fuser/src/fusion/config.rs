@@ -115,6 +115,19 @@ impl FusionConfig {
         }
     }
 
+    /// The same with a recall, by which a PASTAT looks at earlier maps to the cell.
+    ///
+    /// # Errors
+    /// [`ConfigError`] where there is no PASTAT.
+    pub fn recalling(self) -> Result<Self, ConfigError> {
+        match self {
+            Self::Pastat(config) => Ok(Self::Pastat(config.recalling())),
+            _ => {
+                Err(ConfigError::Value { field: "fusion", value: "recall".to_owned(), must: "as it is but for pastat" })
+            }
+        }
+    }
+
     /// Builds the fusion with its variables below `path`.
     ///
     /// # Errors

@@ -103,6 +103,10 @@ pub struct PastatConfig {
     /// Channels inside the two convolutions that sharpen the fused map; absent: there are none.
     #[serde(default)]
     pub refine: Option<i64>,
+    /// Channels from which it is told how much of earlier maps is blended into the newest, cell by cell; absent: those are
+    /// heard through their tokens alone.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub recall: Option<i64>,
     /// Time steps wanted of every agent, the T of the paper.
     pub frames: usize,
     /// Along each edge so many cells of a map from before its agent's newest are taken together before it is moved: what
@@ -132,6 +136,7 @@ impl PastatConfig {
             windows: vec![4, 8],
             rows: Rows::Ego,
             refine: Some(96),
+            recall: None,
             frames: 3,
             earlier_cells: 2,
             frame_secs: 0.1,
@@ -156,6 +161,12 @@ impl PastatConfig {
             fsa: Some(FsaConfig { matching: 16, ..FsaConfig::default() }),
             ..Self::lean(channels)
         }
+    }
+
+    /// The same with a recall, which looks at earlier maps to the cell.
+    #[must_use]
+    pub fn recalling(self) -> Self {
+        Self { recall: Some(24), earlier_cells: 1, ..self }
     }
 
     /// The same without some parts.
@@ -195,6 +206,7 @@ impl PastatConfig {
             ("pastat mlp_ratio", self.mlp_ratio, 16),
             ("pastat depth", i64::try_from(self.depth).unwrap_or(i64::MAX), 32),
             ("pastat refine", self.refine.unwrap_or(1), 4096),
+            ("pastat recall", self.recall.unwrap_or(1), 4096),
             ("pastat frames", i64::try_from(self.frames).unwrap_or(i64::MAX), 16),
         ] {
             if !(1..=most).contains(&value) {
@@ -219,6 +231,12 @@ impl PastatConfig {
             && cells % self.earlier_cells != 0
         {
             return error("pastat fsa search cells", cells.to_string(), "a multiple of earlier_cells");
+        }
+        if self.recall.is_some() && self.earlier_cells != 1 {
+            return error("pastat earlier_cells", self.earlier_cells.to_string(), "1, as earlier maps are recalled");
+        }
+        if self.recall.is_some() && self.frames < 2 {
+            return error("pastat frames", self.frames.to_string(), "2 or more, as earlier maps are recalled");
         }
         self.fsa.as_ref().map_or(Ok(()), FsaConfig::validate)
     }
@@ -265,7 +283,8 @@ mod tests {
 
     #[test]
     fn presets_are_valid_and_come_back_from_json() {
-        for config in [PastatConfig::lean(64), PastatConfig::full(256)] {
+        let recalling = PastatConfig::lean(64).recalling();
+        for config in [PastatConfig::lean(64), PastatConfig::full(256), recalling] {
             config.validate().unwrap();
             let text = serde_json::to_string(&config).unwrap();
             assert_eq!(serde_json::from_str::<PastatConfig>(&text).unwrap(), config);
@@ -290,6 +309,9 @@ mod tests {
                 },
                 "search cells is 3",
             ),
+            (PastatConfig { earlier_cells: 2, ..PastatConfig::lean(64).recalling() }, "earlier_cells is 2"),
+            (PastatConfig { frames: 1, ..PastatConfig::lean(64).recalling() }, "frames is 1"),
+            (PastatConfig { recall: Some(0), ..PastatConfig::lean(64).recalling() }, "recall is 0"),
             (PastatConfig { frames: 0, ..PastatConfig::lean(64) }, "frames is 0"),
             (PastatConfig { frame_secs: f64::NAN, ..PastatConfig::lean(64) }, "frame_secs is NaN"),
         ] {

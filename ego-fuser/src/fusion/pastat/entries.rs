@@ -19,7 +19,7 @@ pub(super) struct Maps {
 
 impl Maps {
     /// Some entries, as floats.
-    fn picked(features: &Tensor, mask: &Tensor, entries: &[i64]) -> Result<Self, TchError> {
+    pub(super) fn picked(features: &Tensor, mask: &Tensor, entries: &[i64]) -> Result<Self, TchError> {
         let index = Tensor::f_from_slice(entries)?.f_to_device(features.device())?;
         let is_all = entries.len() as i64 == features.size()[0];
         let pick = |tensor: &Tensor| match is_all {
@@ -57,6 +57,8 @@ impl Maps {
 pub(super) struct Told {
     pub(super) ego_from_cav: Vec<Pose>,
     pub(super) age_secs: Vec<f64>,
+    /// Their places among those of their agents, 0 for the newest.
+    pub(super) steps_back: Vec<usize>,
     /// Eq. 7.
     pub(super) shares: Vec<f32>,
     /// What FSA is told of each entry: its share, its confidence and the ego's. Shares alone do not tell whether all
@@ -65,16 +67,24 @@ pub(super) struct Told {
 }
 
 impl Told {
+    /// The entries of a time step before the newest, of which there are `newest`, counted behind those.
+    pub(super) fn earlier(&self, step_back: usize, newest: i64) -> Vec<i64> {
+        let of_step = |entry: &i64| self.steps_back[*entry as usize] == step_back;
+        (newest..self.steps_back.len() as i64).filter(of_step).map(|entry| entry - newest).collect()
+    }
+
     fn new(facts: &[ViewFacts]) -> Self {
         let agent: Vec<usize> = facts.iter().map(|facts| facts.agent).collect();
         let age_secs: Vec<f64> = facts.iter().map(|facts| facts.age_secs).collect();
         let confidence: Vec<f64> = facts.iter().map(|facts| facts.confidence).collect();
-        let shares = shares(&confidence, &steps_back(&agent, &age_secs));
+        let steps_back = steps_back(&agent, &age_secs);
+        let shares = shares(&confidence, &steps_back);
         let of_entry = |(share, &own): (&f32, &f64)| [*share, own as f32, confidence[0] as f32];
         Self {
             trust: shares.iter().zip(&confidence).flat_map(of_entry).collect(),
             ego_from_cav: facts.iter().map(|facts| facts.ego_from_cav).collect(),
             shares,
+            steps_back,
             age_secs,
         }
     }

@@ -4,8 +4,8 @@
 //! added. FSA compares each map with the ego's: it moves the map and its tokens to where they fit, and tells the tokens how
 //! well they do. Pre-norm blocks (Eq. 8, 9) attend over agents and time at each cell and across cells within windows of
 //! several sizes. What they find comes back onto the cells in two ways: as a weight of each neighbour's newest map, of
-//! which the maximum is taken, and as a change of that. Untrained, both are neutral: the fusion begins as the
-//! element-wise maximum.
+//! which the maximum is taken, and as a change of that. Where it is asked for, earlier maps steady that maximum to the cell
+//! (recall). Untrained, all are neutral: the fusion begins as the element-wise maximum.
 //!
 //! Entries are real maps, so nothing is padded over agents or time.
 
@@ -17,6 +17,7 @@ mod config;
 mod correlation;
 mod entries;
 mod gather;
+mod recall;
 mod refiner;
 mod search;
 mod temporal;
@@ -32,6 +33,7 @@ use self::alignment::{Area, Found, SpatialAlignment, TRUST, lattice, resample};
 use self::block::Block;
 use self::entries::{Maps, Shown, Told};
 use self::gather::Others;
+use self::recall::{Earlier, Recall};
 use self::refiner::Refiner;
 use self::tokens::{Decoder, Tokeniser, TrustGate};
 use super::{AlignedViews, Fusion};
@@ -45,6 +47,7 @@ pub struct Pastat {
     blocks: Vec<Block>,
     gate: TrustGate,
     decoder: Decoder,
+    recall: Option<Recall>,
     refiner: Option<Refiner>,
 }
 
@@ -60,6 +63,8 @@ struct Entries {
     valid: Tensor,
     /// `[N - 1, 3]`: how FSA has moved all but the ego's newest.
     deltas: Option<Tensor>,
+    /// What all have shown at earlier time steps, where there is a recall.
+    earlier: Vec<Earlier>,
 }
 
 /// What lies somewhere on the ego's lattice, where poses put it or where FSA does.
@@ -107,6 +112,10 @@ impl Pastat {
             blocks: (0..config.depth).map(|index| Block::new(&(path / "blocks" / index), config)).collect(),
             gate: TrustGate::new(&(path / "gate"), config),
             decoder: Decoder::new(&(path / "decoder"), config),
+            recall: config.recall.map(|hidden| {
+                let PastatConfig { channels, dim, patch, frames, .. } = *config;
+                Recall::new(&(path / "recall"), [channels, dim, patch, frames as i64 - 1], hidden)
+            }),
             refiner: config.refine.map(|hidden| Refiner::new(&(path / "refine"), config.channels, hidden)),
             config: config.clone(),
         })
@@ -139,7 +148,39 @@ impl Pastat {
         };
         let Placed { others, seen, valid } = placed;
         let tokens = seen + facts.f_unsqueeze(2)?.f_unsqueeze(3)?;
-        Ok(Entries { own, others, tokens, valid, deltas })
+        let earlier = match earlier {
+            Some(earlier) if self.recall.is_some() => self.recalled(earlier, told, deltas.as_ref(), grid)?,
+            _ => Vec::new(),
+        };
+        Ok(Entries { own, others, tokens, valid, deltas, earlier })
+    }
+
+    /// Earlier maps by time step, moved to where FSA says that they fit.
+    fn recalled(
+        &self,
+        earlier: Maps,
+        told: &Told,
+        deltas: Option<&Tensor>,
+        grid: &BevGrid,
+    ) -> Result<Vec<Earlier>, TchError> {
+        let (count, _, height, width) = earlier.features.size4()?;
+        let newest = told.age_secs.len() as i64 - count;
+        let maps = match deltas {
+            Some(deltas) => {
+                // Their tokens teach where they lie.
+                let deltas = deltas.f_narrow(0, newest - 1, count)?.f_detach()?;
+                let (poses, area) = (&told.ego_from_cav[newest as usize..], Area::new(grid, [height, width], 0));
+                let places = lattice(&deltas, poses, &area, [height, width])?;
+                let (features, mask) = resample(&earlier.features, &earlier.mask, &places)?;
+                Maps { features, mask }
+            }
+            None => earlier,
+        };
+        let of_step = |step: usize| {
+            let entries = told.earlier(step, newest);
+            (!entries.is_empty()).then(|| Earlier::strongest(step as i64 - 1, &maps, &entries))
+        };
+        (1..self.config.frames).filter_map(of_step).collect()
     }
 
     /// How all entries but the ego's newest lie beside that.
@@ -224,7 +265,12 @@ impl Fusion for Pastat {
         let shown = Shown::of(views)?;
         let entries = self.align(&shown, views.grid)?;
         let ego = self.transform(&entries)?;
-        let fused = self.strongest(&entries, &ego)? + self.decoder.forward(&ego)?;
+        let newest = self.strongest(&entries, &ego)?;
+        let steadied = match &self.recall {
+            Some(recall) => recall.forward(&newest, &entries.earlier, &ego)?,
+            None => newest,
+        };
+        let fused = steadied + self.decoder.forward(&ego)?;
         // What was padded on is off before convolutions look around: nothing is known there.
         let fused = fused.f_narrow(1, 0, height)?.f_narrow(2, 0, width)?;
         let fused = match &self.refiner {

@@ -89,7 +89,8 @@ fn distance(a: &Tensor, b: &Tensor) -> f64 {
 
 #[test]
 fn untrained_it_is_the_maximum_of_the_newest_maps() {
-    for config in [small(), PastatConfig { rows: Rows::All, patch: 1, earlier_cells: 1, ..small() }] {
+    let recalling = small().recalling();
+    for config in [small(), PastatConfig { rows: Rows::All, patch: 1, earlier_cells: 1, ..small() }, recalling] {
         let variables = VarStore::new(Device::Cpu);
         let pastat = Pastat::new(&variables.root(), &config).unwrap();
         let scene = Scene::new(&[0, 1, 2, 0, 1], &[0.0, 0.1, 0.0, 0.1, 0.2]);
@@ -193,4 +194,29 @@ fn fsa_learns_a_shift_from_the_maps_alone() {
     });
     let after: f64 = (300..310).map(|step| error(step, false)).sum();
     assert!(after < 0.5 * before, "{before} before, {after} after");
+}
+
+#[test]
+fn a_recall_takes_of_earlier_maps_where_they_show_something() {
+    let (_store, pastat) = trained(&PastatConfig { fsa: None, ..small().recalling() });
+    let scene = Scene::new(&[0, 1, 0, 1, 0], &[0.0, 0.0, 0.1, 0.1, 0.2]);
+    let fused = scene.fused(&pastat);
+    let _ = scene.mask.get(4).fill_(0.0);
+    let without = scene.fused(&pastat);
+    assert!(distance(&fused, &without) > 1e-3);
+    // What is masked is nowhere read.
+    let _ = scene.features.get(4).fill_(9.0);
+    assert!(distance(&scene.fused(&pastat), &without) < 1e-4);
+    assert!(distance(&scene.only(&[0, 1, 2, 3]).fused(&pastat), &without) < 1e-4);
+    assert!(scene.only(&[0, 1]).fused(&pastat).isfinite().all().int64_value(&[]) == 1, "nothing to recall");
+}
+
+#[test]
+fn a_gradient_reaches_all_that_recalls() {
+    let (store, pastat) = trained(&small().recalling());
+    let scene = Scene::new(&[0, 1, 0, 1], &[0.0, 0.0, 0.1, 0.1]);
+    scene.fused(&pastat).square().sum(Kind::Float).backward();
+    for (name, variable) in store.variables().iter().filter(|(name, _)| name.contains("recall")) {
+        assert!(variable.grad().abs().max().double_value(&[]) > 0.0, "{name}");
+    }
 }
