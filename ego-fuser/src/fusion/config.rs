@@ -122,9 +122,7 @@ impl FusionConfig {
     pub fn recalling(self) -> Result<Self, ConfigError> {
         match self {
             Self::Pastat(config) => Ok(Self::Pastat(config.recalling())),
-            _ => {
-                Err(ConfigError::Value { field: "fusion", value: "recall".to_owned(), must: "as it is but for pastat" })
-            }
+            _ => Err(ConfigError::Value { field: "fusion recall", value: "on".to_owned(), must: "off but for pastat" }),
         }
     }
 

@@ -273,6 +273,14 @@ pub(super) fn resample(maps: &Tensor, valid: &Tensor, lattice: &Tensor) -> Resul
     Ok((maps.f_grid_sampler(lattice, BILINEAR, PADDING_ZEROS, false)?, valid))
 }
 
+/// Maps moved by `deltas`, made by vehicles at `ego_from_cav`.
+pub(super) fn moved(maps: &Maps, deltas: &Tensor, ego_from_cav: &[Pose], area: &Area) -> Result<Maps, TchError> {
+    let (.., height, width) = maps.features.size4()?;
+    let places = lattice(deltas, ego_from_cav, area, [height, width])?;
+    let (features, mask) = resample(&maps.features, &maps.mask, &places)?;
+    Ok(Maps { features, mask })
+}
+
 #[cfg(test)]
 mod tests {
     use tch::Device;
@@ -298,7 +306,7 @@ mod tests {
         Maps { features: Tensor::randn([maps, 4, 16, 32], FLOAT), mask: Tensor::ones([maps, 1, 16, 32], FLOAT) }
     }
 
-    fn moved(maps: &Tensor, delta: [f32; 3], ego_from_cav: Pose) -> Tensor {
+    fn map_moved(maps: &Tensor, delta: [f32; 3], ego_from_cav: Pose) -> Tensor {
         let deltas = Tensor::from_slice(&delta).view([1, 3]);
         let lattice = lattice(&deltas, &[ego_from_cav], &area(), [16, 32]).unwrap();
         resample(maps, &Tensor::ones([1, 1, 16, 32], FLOAT), &lattice).unwrap().0
@@ -328,7 +336,7 @@ mod tests {
         let maps = Tensor::randn([1, 2, 16, 32], FLOAT);
         // A vehicle at the ego's own place: turning about it and then shifting is a pose.
         let by_pose = warp_to_ego(&maps, None, &[Pose::from_xyz_yaw([1.0, -0.5, 0.0], 0.1)], &GRID).unwrap();
-        let by_delta = moved(&maps, [1.0, -0.5, 0.1], Pose::IDENTITY);
+        let by_delta = map_moved(&maps, [1.0, -0.5, 0.1], Pose::IDENTITY);
         let inside = |map: &Tensor| map.narrow(2, 4, 8).narrow(3, 8, 16);
         assert!(inside(&by_delta).allclose(&inside(&by_pose.features), 1e-3, 1e-3, false));
     }
@@ -339,9 +347,9 @@ mod tests {
         // The cell of the vehicle itself, at (3.25, 1.25), stays where it is; one beside it does not.
         let _ = map.get(0).get(0).get(10).get(22).fill_(1.0);
         let vehicle = Pose::from_xyz_yaw([3.25, 1.25, 0.0], 0.7);
-        assert!((moved(&map, [0.0, 0.0, 0.5], vehicle).double_value(&[0, 0, 10, 22]) - 1.0).abs() < 1e-3);
+        assert!((map_moved(&map, [0.0, 0.0, 0.5], vehicle).double_value(&[0, 0, 10, 22]) - 1.0).abs() < 1e-3);
         let _ = map.get(0).get(0).get(10).get(28).fill_(1.0);
-        assert!(moved(&map, [0.0, 0.0, 0.5], vehicle).double_value(&[0, 0, 10, 28]) < 0.1);
+        assert!(map_moved(&map, [0.0, 0.0, 0.5], vehicle).double_value(&[0, 0, 10, 28]) < 0.1);
     }
 
     #[test]

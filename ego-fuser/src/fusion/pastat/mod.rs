@@ -29,7 +29,7 @@ use tch::{Device, TchError, Tensor, nn};
 
 pub use config::{FsaConfig, Part, PastatConfig, Rows, SearchConfig, Wavelengths};
 
-use self::alignment::{Area, Found, SpatialAlignment, TRUST, lattice, resample};
+use self::alignment::{Area, Found, SpatialAlignment, TRUST, lattice, moved, resample};
 use self::block::Block;
 use self::entries::{Maps, Shown, Told};
 use self::gather::Others;
@@ -83,18 +83,16 @@ impl Placed {
         let Self { others, seen, valid } = self;
         let (entries, _, rows, columns) = seen.size4()?;
         let after_first = |tensor: &Tensor| tensor.f_narrow(0, 1, entries - 1);
-        let with_first = |first: &Tensor, moved: Tensor| Tensor::f_cat(&[first.f_narrow(0, 0, 1)?, moved], 0);
+        let with_first = |first: &Tensor, after: Tensor| Tensor::f_cat(&[first.f_narrow(0, 0, 1)?, after], 0);
         let places = lattice(deltas, ego_from_cav, area, [rows, columns])?;
-        let (moved, moved_valid) = resample(&after_first(&seen)?, &after_first(&valid)?.f_unsqueeze(1)?, &places)?;
-        let (seen, valid) = (with_first(&seen, moved)?, with_first(&valid, moved_valid.f_squeeze_dim(1)?)?);
+        let (after, after_valid) = resample(&after_first(&seen)?, &after_first(&valid)?.f_unsqueeze(1)?, &places)?;
+        let (seen, valid) = (with_first(&seen, after)?, with_first(&valid, after_valid.f_squeeze_dim(1)?)?);
         let count = others.count()?;
         if count == 0 {
             return Ok(Self { others, seen, valid });
         }
-        let (.., height, width) = others.features.size4()?;
-        let places = lattice(&deltas.f_narrow(0, 0, count)?, &ego_from_cav[..count as usize], area, [height, width])?;
-        let (features, mask) = resample(&others.features, &others.mask, &places)?;
-        Ok(Self { others: Maps { features, mask }, seen, valid })
+        let others = moved(&others, &deltas.f_narrow(0, 0, count)?, &ego_from_cav[..count as usize], area)?;
+        Ok(Self { others, seen, valid })
     }
 }
 
@@ -170,9 +168,7 @@ impl Pastat {
                 // Their tokens teach where they lie.
                 let deltas = deltas.f_narrow(0, newest - 1, count)?.f_detach()?;
                 let (poses, area) = (&told.ego_from_cav[newest as usize..], Area::new(grid, [height, width], 0));
-                let places = lattice(&deltas, poses, &area, [height, width])?;
-                let (features, mask) = resample(&earlier.features, &earlier.mask, &places)?;
-                Maps { features, mask }
+                moved(&earlier, &deltas, poses, &area)?
             }
             None => earlier,
         };
