@@ -255,9 +255,8 @@ impl Observer for Progress {
     }
 
     fn encoded(&mut self, done: usize, all: usize) {
-        let share = done as f64 / all.max(1) as f64;
         if done.is_multiple_of(50) || done == all {
-            self.0.report(share, 0.0, &format!("{done} of {all} sweeps encoded"));
+            self.0.encoded(done, all);
         }
     }
 

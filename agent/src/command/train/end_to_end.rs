@@ -58,7 +58,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     };
     let bar = TrainingBar::default();
     let trained = train_end_to_end(&config, &mut |report| match report {
-        EndToEndReport::Encoding(done, total) => bar.report(0.0, 0.0, &format!("{done} of {total} sweeps encoded")),
+        EndToEndReport::Encoding(done, total) => bar.encoded(*done, *total),
         EndToEndReport::Stepped { step, share_done, seconds, error_m } => {
             bar.report(*share_done, *seconds, &format!("step {step} error {error_m:.2} m"));
         }

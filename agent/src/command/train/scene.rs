@@ -81,7 +81,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
 
 fn tell(bar: &TrainingBar, report: &SceneReport) {
     match report {
-        SceneReport::Encoding(done, total) => bar.report(0.0, 0.0, &format!("{done} of {total} sweeps encoded")),
+        SceneReport::Encoding(done, total) => bar.encoded(*done, *total),
         SceneReport::Encoded(data) => say_left_out(bar, data),
         SceneReport::Classified(share) => {
             bar.say(&format!("{:.1} % of the training sweeps are put into their cluster", 100.0 * share));
