@@ -22,6 +22,7 @@ use crate::fusion::{FusionStage, SentMaps, StageError, ViewFacts};
 use crate::history::{History, KeptMap};
 use crate::method::{Exchange, Method};
 use crate::model::{METHOD_KEY, SCORE_THRESHOLD};
+use crate::numbers;
 use crate::samples::merge_points;
 use crate::trust::{Belief, Trust, TrustConfig};
 
@@ -239,7 +240,7 @@ impl Ego {
         let earlier = (!earlier.is_empty()).then(|| SentMaps::together(&earlier)).transpose()?;
         let moved = self.fusion.align_kept(&newest, earlier.as_ref(), &facts)?;
         stages.lap("align");
-        let fused = self.fusion.fuse(&moved, &facts, false)?.f_unsqueeze(0)?.f_contiguous()?;
+        let fused = numbers::as_batch(&self.fusion.fuse(&moved, &facts, false)?)?;
         stages.lap("fuse");
         let detections = self.boxes_of(&fused, stages)?;
         self.keep(aligned, maps.into_iter().zip(sent))?;

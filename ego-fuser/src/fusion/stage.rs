@@ -11,7 +11,7 @@ use tch::{Device, TchError, Tensor};
 use super::steering::{self, Steering};
 use super::{AlignedViews, EarlierViews, FUSION_KEY, Fusion, FusionConfig, ViewFacts};
 use crate::method::{Exchange, Method};
-use crate::warp::{WarpError, Warped, warp_to_ego};
+use crate::warp::{Order, WarpError, Warped, warp_in_order};
 
 /// Where the fusion's variables lie in a weights file.
 pub(crate) const FUSION_PREFIX: &str = "fusion.";
@@ -184,17 +184,21 @@ impl FusionStage {
         if maps != poses.len() as i64 {
             return Err(WarpError::PoseCount { maps, poses: poses.len() });
         }
-        let (cells, Some(earlier)) = (self.fusion.earlier_cells(), earlier) else {
-            let (own_frame, warped) = self.moved(newest, &poses, &self.grid)?;
+        let cells = self.fusion.earlier_cells();
+        // What keeps earlier maps in another form takes the maximum over the newest, cell by cell.
+        let order = if cells.is_some() { Order::Cells } else { Order::Planes };
+        let (cells, Some(earlier)) = (cells, earlier) else {
+            let (own_frame, warped) = self.moved(newest, &poses, &self.grid, order)?;
             return Ok(AlignedMaps { own_frame, warped, earlier: None });
         };
         let Some(cells) = cells else {
-            let (own_frame, warped) = self.moved(&SentMaps::together(&[newest, earlier])?, &poses, &self.grid)?;
+            let (own_frame, warped) =
+                self.moved(&SentMaps::together(&[newest, earlier])?, &poses, &self.grid, order)?;
             return Ok(AlignedMaps { own_frame, warped, earlier: None });
         };
         let (of_newest, of_earlier) = poses.split_at(count as usize);
-        let (own_frame, warped) = self.moved(newest, of_newest, &self.grid)?;
-        let earlier = self.moved(earlier, of_earlier, &with_cells_of(&self.grid, cells))?.1;
+        let (own_frame, warped) = self.moved(newest, of_newest, &self.grid, order)?;
+        let earlier = self.moved(earlier, of_earlier, &with_cells_of(&self.grid, cells), Order::Planes)?.1;
         Ok(AlignedMaps { own_frame, warped, earlier: Some(earlier) })
     }
 
@@ -204,12 +208,13 @@ impl FusionStage {
         SentMaps { maps, sent }: &SentMaps,
         poses: &[Pose],
         grid: &BevGrid,
+        order: Order,
     ) -> Result<(Tensor, Warped), WarpError> {
         let own_frame = match &self.steering {
             Some(steering) => steering.turn(maps, poses)?,
             None => maps.shallow_clone(),
         };
-        let warped = warp_to_ego(&own_frame, sent.as_ref(), poses, grid)?;
+        let warped = warp_in_order(&own_frame, sent.as_ref(), poses, grid, order)?;
         Ok((own_frame, warped))
     }
 

@@ -9,9 +9,10 @@ pub mod opencood;
 mod sampling;
 
 use protocol::{BevGrid, Pose};
-use tch::{Device, Kind, TchError, Tensor};
+use tch::{Kind, TchError, Tensor};
 
-use self::sampling::Cells;
+pub(crate) use self::sampling::{Cells, Order};
+use crate::numbers::{self, are_numbers, as_batch};
 
 /// `grid_sampler` reads zeros outside of the map.
 pub(crate) const PADDING_ZEROS: i64 = 0;
@@ -77,6 +78,17 @@ pub fn warp_to_ego(
     ego_from_cav: &[Pose],
     grid: &BevGrid,
 ) -> Result<Warped, WarpError> {
+    warp_in_order(features, sent, ego_from_cav, grid, Order::Planes)
+}
+
+/// The same with the numbers of what is moved in some order, where no gradient flows.
+pub(crate) fn warp_in_order(
+    features: &Tensor,
+    sent: Option<&Tensor>,
+    ego_from_cav: &[Pose],
+    grid: &BevGrid,
+    order: Order,
+) -> Result<Warped, WarpError> {
     let size = features.size();
     let &[maps, _, height, width] = size.as_slice() else { return Err(shape_error(size, grid)) };
     if (height, width) != (i64::from(grid.height), i64::from(grid.width)) {
@@ -100,28 +112,38 @@ pub fn warp_to_ego(
         let map = features.f_narrow(0, index as i64, 1)?;
         let sent = sent.f_narrow(0, index as i64, 1)?;
         if *affine == UNMOVED {
-            moved.push(map);
+            moved.push(match order {
+                Order::Planes => map,
+                Order::Cells => numbers::by_cell(&map.f_squeeze_dim(0)?)?,
+            });
             masks.push(sent.f_to_kind(features.kind())?);
             continue;
         }
         let theta = Tensor::from_slice(affine).f_view([1, 2, 3])?.f_to_device(features.device())?;
         let lattice = Tensor::f_affine_grid_generator(&theta, [1, 1, height, width], false)?;
-        let (map, mask) = read(&map, &sent, &lattice)?;
+        let (map, mask) = read(&map, &sent, &lattice, order)?;
         moved.push(map);
         masks.push(mask);
     }
-    Ok(Warped { features: Tensor::f_cat(&moved, 0)?, mask: Tensor::f_cat(&masks, 0)? })
+    let features = match order {
+        // In the order of memory: copied as a whole.
+        Order::Cells if moved.iter().all(are_numbers) => {
+            let cells: Vec<Tensor> = moved.iter().map(|map| map.f_permute([0, 2, 3, 1])).collect::<Result<_, _>>()?;
+            Tensor::f_cat(&cells, 0)?.f_permute([0, 3, 1, 2])?
+        }
+        _ => Tensor::f_cat(&moved, 0)?,
+    };
+    Ok(Warped { features, mask: Tensor::f_cat(&masks, 0)? })
 }
 
 /// A map `[1, C, H, W]` and which of its cells were sent `[1, 1, H, W]`, read at `lattice` `[1, h, w, 2]`.
-fn read(map: &Tensor, sent: &Tensor, lattice: &Tensor) -> Result<(Tensor, Tensor), TchError> {
-    let are_numbers = map.device() == Device::Cpu && map.kind() == Kind::Float && map.numel() > 0;
-    if !are_numbers || map.requires_grad() {
+fn read(map: &Tensor, sent: &Tensor, lattice: &Tensor, order: Order) -> Result<(Tensor, Tensor), TchError> {
+    if !are_numbers(map) {
         return read_by_tensors(map, sent, lattice);
     }
     let first = |tensor: &Tensor| tensor.f_squeeze_dim(0);
-    let (map, mask) = Cells::of(&first(map)?)?.read(&first(&first(sent)?)?, &first(lattice)?)?;
-    Ok((map.f_unsqueeze(0)?, mask.f_unsqueeze(0)?))
+    let (map, mask) = Cells::of(&first(map)?)?.read(&first(&first(sent)?)?, &first(lattice)?, order)?;
+    Ok((as_batch(&map)?, mask.f_unsqueeze(0)?))
 }
 
 /// [`read`] on any device, in any precision, with gradients.
@@ -158,6 +180,7 @@ mod tests {
     use std::f64::consts::{FRAC_PI_2, PI};
 
     use proptest::prelude::*;
+    use tch::Device;
 
     use super::*;
     use crate::made_up::uniform;
@@ -207,6 +230,16 @@ mod tests {
         assert!((at(&warped.features, 12, 14) - 1.0).abs() < 1e-4);
     }
 
+    #[test]
+    fn the_order_of_numbers_in_memory_changes_none_of_them() {
+        let maps = uniform(5, &[2, 3, 16, 32]);
+        let poses = [Pose::IDENTITY, Pose::from_xyz_yaw([1.3, -0.4, 0.0], 0.2)];
+        let [planes, cells] =
+            [Order::Planes, Order::Cells].map(|order| warp_in_order(&maps, None, &poses, &GRID, order).unwrap());
+        assert_eq!(planes.features, cells.features);
+        assert_eq!(planes.mask, cells.mask);
+    }
+
     proptest! {
         #[test]
         fn numbers_and_tensors_read_the_same(
@@ -217,7 +250,7 @@ mod tests {
             let affine = cav_from_ego_normalized(&Pose::from_xyz_yaw([x_m, y_m, 0.0], yaw), &GRID);
             let theta = Tensor::from_slice(&affine).view([1, 2, 3]);
             let lattice = Tensor::affine_grid_generator(&theta, [1, 1, 16, 32], false);
-            let (numbers, reached) = read(&map, &sent, &lattice).unwrap();
+            let (numbers, reached) = read(&map, &sent, &lattice, Order::Planes).unwrap();
             let (tensors, mask) = read_by_tensors(&map, &sent, &lattice).unwrap();
             prop_assert_eq!(numbers.size(), tensors.size());
             // A place between two cells may be nearest to either.

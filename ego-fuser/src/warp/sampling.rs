@@ -5,18 +5,24 @@
 
 use tch::{TchError, Tensor};
 
-use crate::numbers::numbers;
-
-/// Cells that are transposed together; what they show fits into a core's nearest cache.
-const BLOCK: usize = 16;
+use crate::numbers::{self, BLOCK, numbers};
 
 /// A map with the channels of each cell together.
-pub(super) struct Cells {
+pub(crate) struct Cells {
     /// `[height * width, channels]`.
     values: Vec<f32>,
     channels: usize,
     height: usize,
     width: usize,
+}
+
+/// How the numbers of what is read lie in memory; they are the same.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Order {
+    /// A channel after another.
+    Planes,
+    /// A cell after another.
+    Cells,
 }
 
 /// A place on a map: the four cells around it with their weights, none beyond the edges.
@@ -30,42 +36,59 @@ struct Place {
 
 impl Cells {
     /// Of a map `[C, H, W]` that is not empty.
-    pub(super) fn of(map: &Tensor) -> Result<Self, TchError> {
+    pub(crate) fn of(map: &Tensor) -> Result<Self, TchError> {
         let (channels, height, width) = map.size3()?;
         let [channels, height, width] = [channels, height, width].map(|size| size as usize);
-        let planes = numbers(map)?;
-        let mut values = vec![0.0; planes.len()];
-        for (block, values) in values.chunks_mut(BLOCK * channels).enumerate() {
-            for (channel, plane) in planes.chunks(height * width).enumerate() {
-                let cells = plane[block * BLOCK..].iter().zip(values[channel..].iter_mut().step_by(channels));
-                cells.for_each(|(cell, value)| *value = *cell);
-            }
-        }
-        Ok(Self { values, channels, height, width })
+        Ok(Self { values: numbers::cells(map)?, channels, height, width })
     }
 
     /// The map `[C, h, w]` read bilinearly at `lattice` `[h, w, 2]` (`grid_sampler`'s coordinates), and what is valid there
     /// `[1, h, w]` by the nearest cell of `valid` `[H, W]`. Zeros beyond the edges, and where nothing is valid.
-    pub(super) fn read(&self, valid: &Tensor, lattice: &Tensor) -> Result<(Tensor, Tensor), TchError> {
+    pub(super) fn read(&self, valid: &Tensor, lattice: &Tensor, order: Order) -> Result<(Tensor, Tensor), TchError> {
         let (rows, columns, _) = lattice.size3()?;
         let (valid, lattice) = (numbers(valid)?, numbers(lattice)?);
         let cells = (rows * columns) as usize;
-        let (mut planes, mut reached) = (vec![0.0; self.channels * cells], vec![0.0; cells]);
+        let (mut read, mut reached) = (vec![0.0; self.channels * cells], vec![0.0; cells]);
+        if order == Order::Cells {
+            let places = lattice.chunks_exact(2).zip(&mut reached).zip(read.chunks_mut(self.channels));
+            places.for_each(|((at, reached), values)| *reached = self.read_at([at[0], at[1]], &valid, values));
+            let read = Tensor::f_from_slice(&read)?.f_view([rows, columns, -1])?.f_permute([2, 0, 1])?;
+            return Ok((read, Tensor::f_from_slice(&reached)?.f_view([1, rows, columns])?));
+        }
         let mut block = vec![0.0; BLOCK * self.channels];
         for (index, (lattice, reached)) in lattice.chunks(2 * BLOCK).zip(reached.chunks_mut(BLOCK)).enumerate() {
             let places = lattice.chunks_exact(2).zip(reached.iter_mut()).zip(block.chunks_mut(self.channels));
-            for ((at, reached), values) in places {
-                let place = self.place([at[0], at[1]]);
-                *reached = place.nearest.map_or(0.0, |nearest| valid[nearest]);
-                self.read_cell(&place, *reached, values);
-            }
-            for (channel, plane) in planes.chunks_mut(cells).enumerate() {
-                let read = plane[index * BLOCK..].iter_mut().take(reached.len());
-                read.zip(block[channel..].iter().step_by(self.channels)).for_each(|(cell, value)| *cell = *value);
+            places.for_each(|((at, reached), values)| *reached = self.read_at([at[0], at[1]], &valid, values));
+            for (channel, plane) in read.chunks_mut(cells).enumerate() {
+                let plane = plane[index * BLOCK..].iter_mut().take(reached.len());
+                plane.zip(block[channel..].iter().step_by(self.channels)).for_each(|(cell, value)| *cell = *value);
             }
         }
-        let planes = Tensor::f_from_slice(&planes)?.f_view([-1, rows, columns])?;
-        Ok((planes, Tensor::f_from_slice(&reached)?.f_view([1, rows, columns])?))
+        let read = Tensor::f_from_slice(&read)?.f_view([-1, rows, columns])?;
+        Ok((read, Tensor::f_from_slice(&reached)?.f_view([1, rows, columns])?))
+    }
+
+    /// Raises `strongest` `[h * w, C]` to what the map shows at `lattice` `[h, w, 2]`, times `shares` `[h, w]`, where
+    /// that is more, and where the nearest cell of `valid` `[H, W]` says that it shows something.
+    pub(crate) fn raise(&self, strongest: &mut [f32], [valid, lattice, shares]: [&Tensor; 3]) -> Result<(), TchError> {
+        let (valid, lattice, shares) = (numbers(valid)?, numbers(lattice)?, numbers(shares)?);
+        let mut shown = vec![0.0; self.channels];
+        for ((strongest, at), share) in
+            strongest.chunks_exact_mut(self.channels).zip(lattice.chunks_exact(2)).zip(shares)
+        {
+            if self.read_at([at[0], at[1]], &valid, &mut shown) != 0.0 {
+                strongest.iter_mut().zip(&shown).for_each(|(most, shown)| *most = most.max(share * shown));
+            }
+        }
+        Ok(())
+    }
+
+    /// The channels at a place, and what is valid there.
+    fn read_at(&self, at: [f32; 2], valid: &[f32], values: &mut [f32]) -> f32 {
+        let place = self.place(at);
+        let valid = place.nearest.map_or(0.0, |nearest| valid[nearest]);
+        self.read_cell(&place, valid, values);
+        valid
     }
 
     fn read_cell(&self, place: &Place, valid: f32, values: &mut [f32]) {

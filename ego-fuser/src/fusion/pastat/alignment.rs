@@ -273,14 +273,6 @@ pub(super) fn resample(maps: &Tensor, valid: &Tensor, lattice: &Tensor) -> Resul
     Ok((maps.f_grid_sampler(lattice, BILINEAR, PADDING_ZEROS, false)?, valid))
 }
 
-/// Maps moved by `deltas`, made by vehicles at `ego_from_cav`.
-pub(super) fn moved(maps: &Maps, deltas: &Tensor, ego_from_cav: &[Pose], area: &Area) -> Result<Maps, TchError> {
-    let (.., height, width) = maps.features.size4()?;
-    let places = lattice(deltas, ego_from_cav, area, [height, width])?;
-    let (features, mask) = resample(&maps.features, &maps.mask, &places)?;
-    Ok(Maps { features, mask })
-}
-
 #[cfg(test)]
 mod tests {
     use tch::Device;

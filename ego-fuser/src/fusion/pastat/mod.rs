@@ -17,6 +17,7 @@ mod config;
 mod correlation;
 mod entries;
 mod gather;
+mod moved;
 mod recall;
 mod refiner;
 mod search;
@@ -29,14 +30,16 @@ use tch::{Device, TchError, Tensor, nn};
 
 pub use config::{FsaConfig, Part, PastatConfig, Rows, SearchConfig, Wavelengths};
 
-use self::alignment::{Area, Found, SpatialAlignment, TRUST, lattice, moved, resample};
+use self::alignment::{Area, Found, SpatialAlignment, TRUST, lattice, resample};
 use self::block::Block;
 use self::entries::{Maps, Shown, Told};
 use self::gather::Others;
+use self::moved::MovedMaps;
 use self::recall::{Earlier, Recall};
 use self::refiner::Refiner;
 use self::tokens::{Decoder, Tokeniser, TrustGate};
 use super::{AlignedViews, Fusion};
+use crate::numbers;
 
 /// PASTAT between encoder and head.
 #[derive(Debug)]
@@ -56,7 +59,7 @@ struct Entries {
     /// `[C, H, W]`: the ego's newest map.
     own: Tensor,
     /// The newest maps of all others.
-    others: Maps,
+    others: MovedMaps,
     /// `[N, D, h, w]`: tokens of all entries.
     tokens: Tensor,
     /// `[N, h, w]`.
@@ -70,7 +73,7 @@ struct Entries {
 /// What lies somewhere on the ego's lattice, where poses put it or where FSA does.
 struct Placed {
     /// The newest maps of all but the ego.
-    others: Maps,
+    others: MovedMaps,
     /// `[N, D, h, w]`: what tokens of all entries have seen.
     seen: Tensor,
     /// `[N, h, w]`: where they have.
@@ -91,7 +94,7 @@ impl Placed {
         if count == 0 {
             return Ok(Self { others, seen, valid });
         }
-        let others = moved(&others, &deltas.f_narrow(0, 0, count)?, &ego_from_cav[..count as usize], area)?;
+        let others = others.moved(&deltas.f_narrow(0, 0, count)?, &ego_from_cav[..count as usize], area)?;
         Ok(Self { others, seen, valid })
     }
 }
@@ -131,7 +134,7 @@ impl Pastat {
         }
         let (told, count) = (&shown.told, newest.count()?);
         let facts = self.tokeniser.facts(&told.shares, &told.age_secs)?;
-        let (own, others) = (newest.features.f_get(0)?, newest.only(1, count)?);
+        let (own, others) = (newest.features.f_get(0)?, MovedMaps::still(newest.only(1, count)?));
         let placed = Placed { others, seen, valid };
         let (placed, facts, deltas) = match &self.alignment {
             Some(alignment) if told.age_secs.len() > 1 => {
@@ -168,7 +171,9 @@ impl Pastat {
                 // Their tokens teach where they lie.
                 let deltas = deltas.f_narrow(0, newest - 1, count)?.f_detach()?;
                 let (poses, area) = (&told.ego_from_cav[newest as usize..], Area::new(grid, [height, width], 0));
-                moved(&earlier, &deltas, poses, &area)?
+                let places = lattice(&deltas, poses, &area, [height, width])?;
+                let (features, mask) = resample(&earlier.features, &earlier.mask, &places)?;
+                Maps { features, mask }
             }
             None => earlier,
         };
@@ -228,21 +233,14 @@ impl Pastat {
         tokens.f_narrow(0, 0, 1)
     }
 
-    /// The maximum of the ego's map and its neighbours' newest ones, these by how much they are trusted.
+    /// `[1, C, H, W]`: the maximum of the ego's map and its neighbours' newest ones, these by how much they are trusted.
     fn strongest(&self, Entries { own, others, tokens, .. }: &Entries, ego: &Tensor) -> Result<Tensor, TchError> {
         let count = others.count()?;
         if count == 0 {
-            return Ok(own.shallow_clone());
+            return numbers::by_cell(own);
         }
         let trust = self.gate.forward(&by_cell(&tokens.f_narrow(0, 1, count)?)?, ego)?;
-        // Out of reach nothing is the strongest.
-        let reach = others.mask.f_zeros_like()?.f_masked_fill(&others.mask.f_eq(0.0)?, f64::NEG_INFINITY)?;
-        let mut strongest = own.shallow_clone();
-        for index in 0..count {
-            let [map, trust, reach] = [&others.features, &trust, &reach].map(|tensor| tensor.f_get(index));
-            strongest = strongest.f_maximum(&reach?.f_addcmul(&map?, &trust?)?)?;
-        }
-        Ok(strongest)
+        others.strongest_with(own, &trust)
     }
 }
 
@@ -263,18 +261,22 @@ impl Fusion for Pastat {
         let ego = self.transform(&entries)?;
         let newest = self.strongest(&entries, &ego)?;
         let steadied = match &self.recall {
-            Some(recall) => recall.forward(&newest, &entries.earlier, &ego)?,
+            // Plane by plane, as earlier maps are.
+            Some(recall) => {
+                let newest = newest.f_squeeze_dim(0)?.f_contiguous()?;
+                recall.forward(&newest, &entries.earlier, &ego)?.f_unsqueeze(0)?
+            }
             None => newest,
         };
         let fused = steadied + self.decoder.forward(&ego)?;
         // What was padded on is off before convolutions look around: nothing is known there.
-        let fused = fused.f_narrow(1, 0, height)?.f_narrow(2, 0, width)?;
+        let fused = fused.f_narrow(2, 0, height)?.f_narrow(3, 0, width)?;
         let fused = match &self.refiner {
             Some(refiner) => refiner.forward(&fused, train)?,
             None => fused,
         };
         let deltas = entries.deltas.map(|deltas| shown.among_all(&deltas)).transpose()?;
-        Ok((fused.f_to_kind(views.features.kind())?, deltas))
+        Ok((fused.f_squeeze_dim(0)?.f_to_kind(views.features.kind())?, deltas))
     }
 
     fn frames(&self) -> usize {

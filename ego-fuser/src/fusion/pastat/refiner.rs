@@ -26,7 +26,7 @@ impl Refiner {
         }
     }
 
-    /// `[C, H, W]` of a fused map of that shape.
+    /// `[1, C, H, W]` of a fused map of that shape.
     pub(super) fn forward(&self, fused: &Tensor, train: bool) -> Result<Tensor, TchError> {
         let kind = if train { Kind::Float } else { fastest(fused.device()) };
         Ok(fused + self.change(fused, kind)?)
@@ -35,8 +35,8 @@ impl Refiner {
     /// What is added, computed in `kind`.
     fn change(&self, fused: &Tensor, kind: Kind) -> Result<Tensor, TchError> {
         let [first, second] = &self.convolutions;
-        let hidden = convolve(first, &fused.f_unsqueeze(0)?.f_to_kind(kind)?)?.f_relu()?;
-        convolve(second, &hidden)?.f_squeeze_dim(0)?.f_to_kind(fused.kind())
+        let hidden = convolve(first, &fused.f_to_kind(kind)?)?.f_relu()?;
+        convolve(second, &hidden)?.f_to_kind(fused.kind())
     }
 }
 
@@ -73,7 +73,7 @@ mod tests {
         tch::set_num_threads(1);
         let variables = VarStore::new(Device::Cpu);
         let refiner = Refiner::new(&variables.root(), 8, 12);
-        let fused = Tensor::rand([8, 16, 24], (Kind::Float, Device::Cpu));
+        let fused = Tensor::rand([1, 8, 16, 24], (Kind::Float, Device::Cpu));
         assert_eq!(refiner.forward(&fused, false).unwrap(), fused, "untrained it changes nothing");
         let _ = tch::no_grad(|| variables.variables()["conv1.weight"].shallow_clone().normal_(0.0, 0.1));
         let [single, half] = [Kind::Float, Kind::BFloat16].map(|kind| refiner.change(&fused, kind).unwrap());

@@ -179,7 +179,7 @@ fn fsa_learns_a_shift_from_the_maps_alone() {
         scene.features = Tensor::cat(&[&cells, &cells.roll([shift], [3])], 0);
         let entries = scene.seen_by(&pastat, |views| pastat.align(&Shown::of(&views).unwrap(), &GRID).unwrap());
         let inside = |map: Tensor| map.narrow(1, 2, 8).narrow(2, 4, 12);
-        let difference = inside(entries.others.features.get(0)) - inside(cells.get(0));
+        let difference = inside(entries.others.maps().features.get(0)) - inside(cells.get(0));
         let loss = difference.square().mean(Kind::Float);
         if train {
             optimizer.zero_grad();

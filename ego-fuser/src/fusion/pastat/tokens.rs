@@ -120,14 +120,18 @@ impl Decoder {
         }
     }
 
-    /// `[C, H, W]` of tokens `[1, h, w, D]`.
+    /// `[1, C, H, W]` of tokens `[1, h, w, D]`, the channels of a cell side by side in memory.
     pub(super) fn forward(&self, ego: &Tensor) -> Result<Tensor, TchError> {
-        let (_, rows, columns, _) = ego.size4()?;
-        let cells = self.cells.forward(&self.norm.forward(ego)).f_to_kind(Kind::Float)?;
-        cells.f_view([rows, columns, self.channels, self.patch, self.patch])?.f_permute([2, 0, 3, 1, 4])?.f_reshape([
-            self.channels,
-            rows * self.patch,
-            columns * self.patch,
-        ])
+        let (_, rows, columns, dim) = ego.size4()?;
+        let Self { channels, patch, .. } = *self;
+        // Weights are kept by channel and then by cell; few as they are, they are cheaper to turn than what they make.
+        let by_cell = |weights: &Tensor, each: i64| {
+            weights.f_view([channels, patch * patch, each])?.f_transpose(0, 1)?.f_reshape([-1, each])
+        };
+        let bias = self.cells.bs.as_ref().map(|bias| by_cell(bias, 1)?.f_squeeze_dim(1)).transpose()?;
+        let cells = self.norm.forward(ego).f_linear(&by_cell(&self.cells.ws, dim)?, bias.as_ref())?;
+        let cells = cells.f_to_kind(Kind::Float)?.f_view([1, rows, columns, patch, patch, channels].as_slice())?;
+        let cells = cells.f_permute([0, 1, 3, 2, 4, 5])?.f_reshape([1, rows * patch, columns * patch, channels])?;
+        cells.f_permute([0, 3, 1, 2])
     }
 }
