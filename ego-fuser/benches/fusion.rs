@@ -31,12 +31,13 @@ fn fuse(criterion: &mut Criterion) {
             // As the ego keeps them.
             let of = |first: i64, count: i64| SentMaps { maps: features.narrow(0, first, count), sent: None };
             let (newest, earlier) = (of(0, agents as i64), of(agents as i64, size[0] - agents as i64));
-            let kept = (stage.frames() > 1).then(|| stage.kept(&earlier).expect("maps are maps"));
+            let kept = (stage.frames() > 1).then(|| no_grad(|| stage.kept(&earlier).expect("maps are maps")));
             let align = || stage.align_kept(&newest, kept.as_ref(), &facts).expect("maps lie on the lattice");
             group.bench_function(BenchmarkId::new(format!("warp/{method}"), agents), |bencher| {
                 bencher.iter(|| black_box(no_grad(align)));
             });
-            let maps = align();
+            // No gradient, as in the ego: what has one lies elsewhere in memory, and takes longer.
+            let maps = no_grad(align);
             group.bench_function(BenchmarkId::new(format!("fuse/{method}"), agents), |bencher| {
                 bencher.iter(|| {
                     let fused = no_grad(|| stage.fuse(&maps, &facts, false)).expect("views fit together");

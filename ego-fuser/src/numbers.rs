@@ -1,6 +1,6 @@
 //! Tensors as plain numbers, for loops that visit memory in an order that the tensor library does not.
 
-use tch::{Device, Kind, TchError, Tensor};
+use tch::{Device, Kind, TchError, Tensor, nn};
 
 /// Cells that are transposed together; what they show fits into a core's nearest cache.
 pub(crate) const BLOCK: usize = 16;
@@ -44,6 +44,17 @@ pub(crate) fn by_cell(map: &Tensor) -> Result<Tensor, TchError> {
     Tensor::f_from_slice(&cells(map)?)?.f_view([1, height, width, channels])?.f_permute([0, 3, 1, 2])
 }
 
+/// A convolution of single cells of maps `[N, C, H, W]`, in the order of memory that these have: where the channels of a cell lie
+/// side by side it is one product of matrices.
+pub(crate) fn pointwise(convolution: &nn::Conv2D, maps: &Tensor) -> Result<Tensor, TchError> {
+    let cells = maps.f_permute([0, 2, 3, 1])?;
+    let (weight, bias) = (&convolution.ws, convolution.bs.as_ref());
+    if !cells.is_contiguous() || maps.is_contiguous() {
+        return maps.f_conv2d(weight, bias, [1, 1], [0, 0], [1, 1], 1);
+    }
+    cells.f_linear(&weight.f_flatten(1, 3)?, bias)?.f_permute([0, 3, 1, 2])
+}
+
 /// `[1, C, H, W]` of a map `[C, H, W]` in the order that it has in memory, such that convolutions see that order.
 pub(crate) fn as_batch(map: &Tensor) -> Result<Tensor, TchError> {
     map.f_permute([1, 2, 0])?.f_unsqueeze(0)?.f_permute([0, 3, 1, 2])
@@ -53,6 +64,17 @@ pub(crate) fn as_batch(map: &Tensor) -> Result<Tensor, TchError> {
 mod tests {
     use super::*;
     use crate::made_up::uniform;
+
+    #[test]
+    fn a_convolution_of_cells_is_the_same_in_either_order() {
+        let variables = nn::VarStore::new(Device::Cpu);
+        let convolution = nn::conv2d(variables.root(), 5, 3, 1, nn::ConvConfig::default());
+        let map = uniform(3, &[5, 6, 7]);
+        let [planes, cells] = [map.unsqueeze(0), by_cell(&map).unwrap()];
+        let [planes, cells] = [planes, cells].map(|maps| pointwise(&convolution, &maps).unwrap());
+        assert!(planes.allclose(&cells, 1e-6, 1e-6, false));
+        assert!(cells.allclose(&by_cell(&map).unwrap().apply(&convolution), 1e-5, 1e-5, false));
+    }
 
     #[test]
     fn a_map_by_cell_is_the_same_map_in_another_order() {

@@ -11,6 +11,7 @@ use tch::{Device, TchError, Tensor};
 use super::steering::{self, Steering};
 use super::{AlignedViews, EarlierViews, FUSION_KEY, Fusion, FusionConfig, ViewFacts};
 use crate::method::{Exchange, Method};
+use crate::numbers::are_numbers;
 use crate::warp::{Order, WarpError, Warped, warp_in_order};
 
 /// Where the fusion's variables lie in a weights file.
@@ -162,10 +163,12 @@ impl FusionStage {
     /// # Errors
     /// [`TchError`] when the maps are none.
     pub fn kept(&self, SentMaps { maps, sent }: &SentMaps) -> Result<SentMaps, TchError> {
-        let cells = self.fusion.earlier_cells().unwrap_or(1);
+        let Some(cells) = self.fusion.earlier_cells() else {
+            return Ok(SentMaps { maps: maps.shallow_clone(), sent: sent.as_ref().map(Tensor::shallow_clone) });
+        };
         // A larger cell was sent where any of its cells was.
         let sent = sent.as_ref().map(|sent| larger_cells(sent, cells)?.f_ceil()).transpose()?;
-        Ok(SentMaps { maps: larger_cells(maps, cells)?, sent })
+        Ok(SentMaps { maps: cell_by_cell(&larger_cells(maps, cells)?)?, sent })
     }
 
     /// [`Self::align`] with the maps that are older as they were [`Self::kept`].
@@ -198,7 +201,7 @@ impl FusionStage {
         };
         let (of_newest, of_earlier) = poses.split_at(count as usize);
         let (own_frame, warped) = self.moved(newest, of_newest, &self.grid, order)?;
-        let earlier = self.moved(earlier, of_earlier, &with_cells_of(&self.grid, cells), Order::Planes)?.1;
+        let earlier = self.moved(earlier, of_earlier, &with_cells_of(&self.grid, cells), order)?.1;
         Ok(AlignedMaps { own_frame, warped, earlier: Some(earlier) })
     }
 
@@ -277,6 +280,14 @@ pub(super) fn larger_cells(maps: &Tensor, cells: i64) -> Result<Tensor, TchError
     // The tensor library's pooling takes three times as long.
     let rows = sum_of_every(maps, 2, cells)?;
     Ok(sum_of_every(&rows, 3, cells)? / (cells * cells) as f64)
+}
+
+/// The same maps, the channels of a cell side by side in memory, where no gradient flows.
+fn cell_by_cell(maps: &Tensor) -> Result<Tensor, TchError> {
+    match are_numbers(maps) {
+        true => maps.f_permute([0, 2, 3, 1])?.f_contiguous()?.f_permute([0, 3, 1, 2]),
+        false => Ok(maps.shallow_clone()),
+    }
 }
 
 /// The sums of each `count` neighbours along `dim`.

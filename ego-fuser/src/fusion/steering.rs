@@ -38,16 +38,25 @@ impl Steering {
         let mut turned = Vec::with_capacity(ego_from_cav.len());
         for (index, pose) in ego_from_cav.iter().enumerate() {
             let map = features.f_narrow(0, index as i64, 1)?;
-            turned.push(if *pose == Pose::IDENTITY { map } else { self.turn_one(&map, pose.yaw_rad())? });
+            turned.push(self.turn_one(&map, pose)?);
         }
         Tensor::f_cat(&turned, 0)
     }
 
-    fn turn_one(&self, map: &Tensor, yaw_rad: f64) -> Result<Tensor, TchError> {
-        let ((sin, cos), (sin_2, cos_2)) = (yaw_rad.sin_cos(), (2.0 * yaw_rad).sin_cos());
-        let basis = [1.0, cos, sin, cos_2, sin_2].map(|value| value as f32);
-        let basis = Tensor::f_from_slice(&basis)?.f_view([BASIS, 1, 1])?.f_to_device(map.device())?;
-        let matrix = (&self.weight * basis).f_sum_dim_intlist([0i64].as_slice(), false, Kind::Float)?;
+    /// The same of one map `[1, C, H, W]`.
+    ///
+    /// # Errors
+    /// [`TchError`] when the channels are not those it was made for.
+    fn turn_one(&self, map: &Tensor, ego_from_cav: &Pose) -> Result<Tensor, TchError> {
+        if *ego_from_cav == Pose::IDENTITY {
+            return Ok(map.shallow_clone());
+        }
+        let matrix = self.matrix(ego_from_cav)?;
+        let cells = map.f_permute([0, 2, 3, 1])?;
+        if cells.is_contiguous() {
+            let change = cells.f_linear(&matrix, None::<&Tensor>)?;
+            return (cells + change).f_relu()?.f_permute([0, 3, 1, 2]);
+        }
         let change = map.f_conv2d(
             &matrix.f_unsqueeze(-1)?.f_unsqueeze(-1)?,
             None::<Tensor>,
@@ -57,6 +66,15 @@ impl Steering {
             1,
         )?;
         (map + change).f_relu()
+    }
+
+    /// `[C, C]`: what is added of each channel to each.
+    fn matrix(&self, ego_from_cav: &Pose) -> Result<Tensor, TchError> {
+        let yaw_rad = ego_from_cav.yaw_rad();
+        let ((sin, cos), (sin_2, cos_2)) = (yaw_rad.sin_cos(), (2.0 * yaw_rad).sin_cos());
+        let basis = [1.0, cos, sin, cos_2, sin_2].map(|value| value as f32);
+        let basis = Tensor::f_from_slice(&basis)?.f_view([BASIS, 1, 1])?.f_to_device(self.weight.device())?;
+        (&self.weight * basis).f_sum_dim_intlist([0i64].as_slice(), false, Kind::Float)
     }
 }
 
@@ -94,6 +112,15 @@ mod tests {
         let out = Vec::<f32>::try_from(steering.turn(&features, &poses).unwrap().view(-1)).unwrap();
         let expected = [1.0, 1.0, 2.0, 1.0, 1.0, 1.0];
         assert!(out.iter().zip(expected).all(|(found, expected)| (found - expected).abs() < 1e-6), "{out:?}");
+    }
+
+    #[test]
+    fn the_order_of_numbers_in_memory_changes_nothing() {
+        let weight = Tensor::rand([BASIS, 3, 3], FLOAT) - 0.5;
+        let (steering, planes) = (Steering { weight }, Tensor::rand([1, 3, 4, 5], FLOAT));
+        let cells = planes.permute([0, 2, 3, 1]).contiguous().permute([0, 3, 1, 2]);
+        let [planes, cells] = [planes, cells].map(|maps| steering.turn(&maps, &[turned(0.4)]).unwrap());
+        assert!(planes.allclose(&cells, 1e-6, 1e-6, false));
     }
 
     #[test]

@@ -119,21 +119,40 @@ pub(crate) fn warp_in_order(
             masks.push(sent.f_to_kind(features.kind())?);
             continue;
         }
-        let theta = Tensor::from_slice(affine).f_view([1, 2, 3])?.f_to_device(features.device())?;
-        let lattice = Tensor::f_affine_grid_generator(&theta, [1, 1, height, width], false)?;
+        let lattice = lattice(*affine, grid)?.f_to_device(features.device())?;
         let (map, mask) = read(&map, &sent, &lattice, order)?;
         moved.push(map);
         masks.push(mask);
     }
     let features = match order {
-        // In the order of memory: copied as a whole.
-        Order::Cells if moved.iter().all(are_numbers) => {
-            let cells: Vec<Tensor> = moved.iter().map(|map| map.f_permute([0, 2, 3, 1])).collect::<Result<_, _>>()?;
-            Tensor::f_cat(&cells, 0)?.f_permute([0, 3, 1, 2])?
-        }
-        _ => Tensor::f_cat(&moved, 0)?,
+        Order::Cells => one_after_another(&moved)?,
+        Order::Planes => Tensor::f_cat(&moved, 0)?,
     };
     Ok(Warped { features, mask: Tensor::f_cat(&masks, 0)? })
+}
+
+/// The cells of a lattice by an affine map of their normalised coordinates.
+fn places_by([xx, xy, x0, yx, yy, y0]: [f32; 6], onto: &BevGrid) -> Vec<f32> {
+    let middles = |count: u32| (0..count).map(move |cell| (2 * cell + 1) as f32 / count as f32 - 1.0);
+    let columns: Vec<f32> = middles(onto.width).collect();
+    let row = |y: f32| columns.iter().flat_map(move |x| [xx * x + xy * y + x0, yx * x + yy * y + y0]);
+    middles(onto.height).flat_map(row).collect()
+}
+
+/// The same as `[1, h, w, 2]`.
+fn lattice(affine: [f32; 6], onto: &BevGrid) -> Result<Tensor, TchError> {
+    let places = Tensor::f_from_slice(&places_by(affine, onto))?;
+    places.f_view([1, i64::from(onto.height), i64::from(onto.width), 2])
+}
+
+/// Maps `[1, C, H, W]` as `[N, C, H, W]`, in the order that they have in memory.
+fn one_after_another(maps: &[Tensor]) -> Result<Tensor, TchError> {
+    if !maps.iter().all(are_numbers) {
+        return Tensor::f_cat(maps, 0);
+    }
+    // Copied as a whole.
+    let cells: Vec<Tensor> = maps.iter().map(|map| map.f_permute([0, 2, 3, 1])).collect::<Result<_, _>>()?;
+    Tensor::f_cat(&cells, 0)?.f_permute([0, 3, 1, 2])
 }
 
 /// A map `[1, C, H, W]` and which of its cells were sent `[1, 1, H, W]`, read at `lattice` `[1, h, w, 2]`.
@@ -248,8 +267,10 @@ mod tests {
             let map = uniform(seed, &[1, channels, 16, 32]);
             let sent = uniform(seed + 1, &[1, 1, 16, 32]).gt(0.3).to_kind(Kind::Float);
             let affine = cav_from_ego_normalized(&Pose::from_xyz_yaw([x_m, y_m, 0.0], yaw), &GRID);
+            let lattice = lattice(affine, &GRID).unwrap();
             let theta = Tensor::from_slice(&affine).view([1, 2, 3]);
-            let lattice = Tensor::affine_grid_generator(&theta, [1, 1, 16, 32], false);
+            let apart = &lattice - Tensor::affine_grid_generator(&theta, [1, 1, 16, 32], false);
+            prop_assert!(apart.abs().max().double_value(&[]) < 1e-4);
             let (numbers, reached) = read(&map, &sent, &lattice, Order::Planes).unwrap();
             let (tensors, mask) = read_by_tensors(&map, &sent, &lattice).unwrap();
             prop_assert_eq!(numbers.size(), tensors.size());

@@ -8,6 +8,7 @@ use super::config::FsaConfig;
 use super::correlation::{PARTS, correlate, peaks, shifts};
 use super::entries::Maps;
 use super::search::offsets;
+use crate::numbers::pointwise;
 use crate::warp::{BILINEAR, NEAREST, PADDING_ZEROS};
 
 /// Keeps the weight of a map that fits nowhere from being divided by.
@@ -130,10 +131,15 @@ impl SpatialAlignment {
         self.config.radius
     }
 
+    /// What is compared of maps: few channels.
+    pub(super) fn looked_at(&self, Maps { features, mask }: &Maps) -> Result<Maps, TchError> {
+        Ok(Maps { features: pointwise(&self.matching[0], features)?, mask: mask.shallow_clone() })
+    }
+
     /// Compares `K` maps with the ego's.
     ///
     /// # Shapes
-    /// - `ego`, `others`: 1 and `K` maps on the lattice of `area`
+    /// - `ego`, `others`: what is [looked at](Self::looked_at) of 1 and `K` maps, on the lattice of `area`
     /// - `trust`: `[K, 3]`, the confidence embedding, the confidence itself and the ego's; zeros: nothing is known
     /// - `ego_from_cav`: `K` poses of the maps' senders
     pub(super) fn compare(
@@ -184,8 +190,7 @@ impl SpatialAlignment {
 
     /// What is compared, `[N, M, H, W]`: zero in the mean of what a map shows, so that empty road fits nothing.
     fn shown(&self, Maps { features, mask }: &Maps) -> Result<Tensor, TchError> {
-        let [cell, around] = &self.matching;
-        let shown = around.forward(&cell.forward(features).f_relu()?);
+        let shown = self.matching[1].forward(&features.f_relu()?);
         let over_map = |tensor: &Tensor| tensor.f_sum_dim_intlist([2_i64, 3].as_slice(), true, None);
         let mean = over_map(&(&shown * mask))? / over_map(mask)?.f_clamp_min(1.0)?;
         Ok((shown - mean) * mask)
@@ -309,7 +314,10 @@ mod tests {
         let variables = VarStore::new(Device::Cpu);
         let fsa = SpatialAlignment::new(&variables.root(), [4, 6], &near());
         let poses = [Pose::from_xyz_yaw([3.0, 1.0, 0.0], 0.3), Pose::IDENTITY];
-        let found = fsa.compare(&random(1), &random(2), &Tensor::ones([2, TRUST], FLOAT), &poses, &area()).unwrap();
+        let look = |maps: &Maps| fsa.looked_at(maps).unwrap();
+        let found = fsa
+            .compare(&look(&random(1)), &look(&random(2)), &Tensor::ones([2, TRUST], FLOAT), &poses, &area())
+            .unwrap();
         assert_eq!(found.fit, Tensor::zeros([2, 6], FLOAT));
         let deltas = found.deltas;
         assert_eq!(deltas, Tensor::zeros([2, 3], FLOAT));
@@ -351,7 +359,9 @@ mod tests {
         let fsa = SpatialAlignment::new(&variables.root(), [4, 6], &config);
         let _ = tch::no_grad(|| variables.variables()["delta.bias"].shallow_clone().fill_(1e6));
         let trust = Tensor::ones([1, TRUST], FLOAT);
-        let deltas = fsa.compare(&random(1), &random(1), &trust, &[Pose::IDENTITY], &area()).unwrap().deltas;
+        let look = |maps: &Maps| fsa.looked_at(maps).unwrap();
+        let deltas =
+            fsa.compare(&look(&random(1)), &look(&random(1)), &trust, &[Pose::IDENTITY], &area()).unwrap().deltas;
         let found = Vec::<f32>::try_from(deltas.view(-1)).unwrap();
         assert!((found[0] - 3.0).abs() < 1e-6 && (f64::from(found[2]) - config.max_turn_rad).abs() < 1e-6);
     }
@@ -371,7 +381,8 @@ mod tests {
         };
         let others = with_mask(Tensor::cat(&[&features, &far], 0));
         let poses = [Pose::IDENTITY, Pose::from_xyz_yaw([3.0, 1.0, 0.0], 0.3)];
-        let deltas = fsa.compare(&with_mask(features), &others, &trust, &poses, &area).unwrap().deltas;
+        let look = |maps: &Maps| fsa.looked_at(maps).unwrap();
+        let deltas = fsa.compare(&look(&with_mask(features)), &look(&others), &trust, &poses, &area).unwrap().deltas;
         let found = Vec::<f32>::try_from(deltas.view(-1)).unwrap();
         assert_eq!(found, [0.0, 0.0, 0.0, -6.0, 8.0, 0.0]);
     }

@@ -18,6 +18,7 @@ mod correlation;
 mod entries;
 mod gather;
 mod moved;
+mod precision;
 mod recall;
 mod refiner;
 mod search;
@@ -195,7 +196,8 @@ impl Pastat {
     ) -> Result<Found, TchError> {
         let trust = Tensor::f_from_slice(&told.trust)?.f_view([-1, TRUST])?.f_to_device(newest.features.device())?;
         let trust = if self.config.ce { trust } else { trust.f_zeros_like()? };
-        let (ego, agents, poses) = (newest.only(0, 1)?, newest.count()?, &told.ego_from_cav);
+        let (newest, agents, poses) = (alignment.looked_at(newest)?, newest.count()?, &told.ego_from_cav);
+        let ego = newest.only(0, 1)?;
         let of = |first: i64, end: i64| trust.f_narrow(0, first, end - first);
         let mut found = Vec::with_capacity(2);
         if agents > 1 {
@@ -204,9 +206,10 @@ impl Pastat {
         }
         if let Some(earlier) = earlier {
             let larger = self.config.earlier_cells;
+            // Means of what is looked at are what is looked at of means.
             let (ego, area) = (ego.with_cells_of(larger)?, area.with_cells_of(larger));
-            let trust = of(agents, poses.len() as i64)?;
-            found.push(alignment.compare(&ego, earlier, &trust, &poses[agents as usize..], &area)?);
+            let (earlier, trust) = (alignment.looked_at(earlier)?, of(agents, poses.len() as i64)?);
+            found.push(alignment.compare(&ego, &earlier, &trust, &poses[agents as usize..], &area)?);
         }
         Found::all(&found)
     }

@@ -1,7 +1,9 @@
 //! Convolutions behind the fusion.
 
 use tch::nn::{self, Init};
-use tch::{Device, Kind, TchError, Tensor};
+use tch::{Kind, TchError, Tensor};
+
+use super::precision::{convolve, fastest};
 
 /// Sharpens the fused map, cell by cell and its neighbours, by what it shows itself: maps were blurred when they were
 /// moved, and heads of one cell cannot mend that. Changes nothing before it is trained.
@@ -40,30 +42,9 @@ impl Refiner {
     }
 }
 
-/// A convolution in the precision of `maps`; its parameters stay as they are.
-fn convolve(convolution: &nn::Conv2D, maps: &Tensor) -> Result<Tensor, TchError> {
-    let weight = convolution.ws.f_to_kind(maps.kind())?;
-    let bias = convolution.bs.as_ref().map(|bias| bias.f_to_kind(maps.kind())).transpose()?;
-    maps.f_conv2d(&weight, bias.as_ref(), [1, 1], [1, 1], [1, 1], 1)
-}
-
-/// The precision in which convolutions are fastest without being wrong.
-fn fastest(device: Device) -> Kind {
-    if device == Device::Cpu && multiplies_bfloat16() { Kind::BFloat16 } else { Kind::Float }
-}
-
-#[cfg(target_arch = "x86_64")]
-fn multiplies_bfloat16() -> bool {
-    std::arch::is_x86_feature_detected!("avx512bf16")
-}
-
-#[cfg(not(target_arch = "x86_64"))]
-fn multiplies_bfloat16() -> bool {
-    false
-}
-
 #[cfg(test)]
 mod tests {
+    use tch::Device;
     use tch::nn::VarStore;
 
     use super::*;

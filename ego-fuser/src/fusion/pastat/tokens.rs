@@ -4,7 +4,9 @@ use tch::nn::{self, Init, Module};
 use tch::{Kind, TchError, Tensor};
 
 use super::config::PastatConfig;
+use super::precision::fastest;
 use super::temporal::encoding;
+use crate::numbers::are_numbers;
 
 /// Patches of cells to tokens, with what is known of a map beside what it shows.
 #[derive(Debug)]
@@ -31,14 +33,18 @@ impl Tokeniser {
 
     /// What tokens see of maps `[N, C, H, W]`: `[N, D, h, w]`; each cell of the maps is one of `cells` by `cells`.
     pub(super) fn seen(&self, maps: &Tensor, cells: i64) -> Result<Tensor, TchError> {
-        if cells == 1 {
-            return Ok(self.patches.forward(maps));
-        }
+        let Self { patches: nn::Conv2D { ws, bs, .. }, config, .. } = self;
+        let edge = config.patch / cells;
         // As if each of the cells that were taken together showed their mean.
-        let weight =
-            self.patches.ws.f_avg_pool2d([cells, cells], [cells, cells], [0_i64, 0], false, true, None::<i64>)?;
-        let (weight, edge) = (weight * (cells * cells) as f64, self.config.patch / cells);
-        maps.f_conv2d(&weight, self.patches.bs.as_ref(), [edge, edge], [0, 0], [1, 1], 1)
+        let weight = match cells {
+            1 => ws.shallow_clone(),
+            _ => ws.f_avg_pool2d([cells, cells], [cells, cells], [0_i64, 0], false, true, None::<i64>)?,
+        };
+        let weight = weight * (cells * cells) as f64;
+        let kind = if are_numbers(maps) { fastest(maps.device()) } else { maps.kind() };
+        let bias = bs.as_ref().map(|bias| bias.f_to_kind(kind)).transpose()?;
+        let (maps, weight) = (maps.f_to_kind(kind)?, weight.f_to_kind(kind)?);
+        maps.f_conv2d(&weight, bias.as_ref(), [edge, edge], [0, 0], [1, 1], 1)?.f_to_kind(Kind::Float)
     }
 
     /// What tokens are told of the map that they are of, `[N, D]`: its share of all trust (CE) and its age (TE).
