@@ -50,17 +50,18 @@ fn fuse(criterion: &mut Criterion) {
     group.finish();
 }
 
-/// All that fuse maps, by name.
+/// All that fuse maps, by name, and the turning of channels that comes with each.
 fn stages(config: &DetectorConfig) -> Vec<(String, FusionStage)> {
-    let methods = Method::ALL.into_iter().filter(|method| method.exchange() == Exchange::Features);
-    let untrained = |method: Method| {
-        (method.to_string(), FusionStage::untrained(method, config).expect("lean is a valid configuration"))
-    };
+    let usual = |method: Method| (method.to_string(), method, FusionConfig::for_detector(method, config));
     let recalling = FusionConfig::for_detector(Method::Pastat, config).recalling().expect("it is a PASTAT");
-    let variables = VarStore::new(Device::Cpu);
-    let recalling = FusionStage::new(&variables.root(), &recalling, Method::Pastat, config);
-    let recalling = ("pastat-recall".to_owned(), recalling.expect("lean is a valid configuration"));
-    methods.map(untrained).chain([recalling]).collect()
+    let methods = Method::ALL.into_iter().filter(|method| method.exchange() == Exchange::Features);
+    let all = methods.map(usual).chain([("pastat-recall".to_owned(), Method::Pastat, recalling)]);
+    let stage = |(name, method, fusion): (String, Method, FusionConfig)| {
+        let variables = VarStore::new(Device::Cpu);
+        let stage = FusionStage::new(&variables.root(), &fusion, method, config);
+        (name, stage.expect("lean is a valid configuration"))
+    };
+    all.map(stage).collect()
 }
 
 /// What is known of a vehicle's map from some time steps ago.

@@ -151,7 +151,7 @@ impl Pastat {
         let Placed { others, seen, valid } = placed;
         let tokens = seen + facts.f_unsqueeze(2)?.f_unsqueeze(3)?;
         let earlier = match earlier {
-            Some(earlier) if self.recall.is_some() => self.recalled(earlier, told, deltas.as_ref(), grid)?,
+            Some(earlier) if self.recall.is_some() => self.recalled(&earlier, told, deltas.as_ref(), grid)?,
             _ => Vec::new(),
         };
         Ok(Entries { own, others, tokens, valid, deltas, earlier })
@@ -160,27 +160,25 @@ impl Pastat {
     /// Earlier maps by time step, moved to where FSA says that they fit.
     fn recalled(
         &self,
-        earlier: Maps,
+        earlier: &Maps,
         told: &Told,
         deltas: Option<&Tensor>,
         grid: &BevGrid,
     ) -> Result<Vec<Earlier>, TchError> {
         let (count, _, height, width) = earlier.features.size4()?;
         let newest = told.age_secs.len() as i64 - count;
-        let maps = match deltas {
+        let places = match deltas {
             Some(deltas) => {
                 // Their tokens teach where they lie.
                 let deltas = deltas.f_narrow(0, newest - 1, count)?.f_detach()?;
                 let (poses, area) = (&told.ego_from_cav[newest as usize..], Area::new(grid, [height, width], 0));
-                let places = lattice(&deltas, poses, &area, [height, width])?;
-                let (features, mask) = resample(&earlier.features, &earlier.mask, &places)?;
-                Maps { features, mask }
+                Some(lattice(&deltas, poses, &area, [height, width])?)
             }
-            None => earlier,
+            None => None,
         };
         let of_step = |step: usize| {
             let entries = told.earlier(step, newest);
-            (!entries.is_empty()).then(|| Earlier::strongest(step as i64 - 1, &maps, &entries))
+            (!entries.is_empty()).then(|| Earlier::strongest(step as i64 - 1, earlier, places.as_ref(), &entries))
         };
         (1..self.config.frames).filter_map(of_step).collect()
     }
@@ -264,11 +262,7 @@ impl Fusion for Pastat {
         let ego = self.transform(&entries)?;
         let newest = self.strongest(&entries, &ego)?;
         let steadied = match &self.recall {
-            // Plane by plane, as earlier maps are.
-            Some(recall) => {
-                let newest = newest.f_squeeze_dim(0)?.f_contiguous()?;
-                recall.forward(&newest, &entries.earlier, &ego)?.f_unsqueeze(0)?
-            }
+            Some(recall) => recall.forward(&newest, &entries.earlier, &ego, train)?,
             None => newest,
         };
         let fused = steadied + self.decoder.forward(&ego)?;
