@@ -131,18 +131,13 @@ pub(crate) fn warp_in_order(
     Ok(Warped { features, mask: Tensor::f_cat(&masks, 0)? })
 }
 
-/// The cells of a lattice by an affine map of their normalised coordinates.
-fn places_by([xx, xy, x0, yx, yy, y0]: [f32; 6], onto: &BevGrid) -> Vec<f32> {
+/// Where an affine map of normalised coordinates puts the cells of a lattice, `[1, h, w, 2]` for `grid_sampler`.
+fn lattice([xx, xy, x0, yx, yy, y0]: [f32; 6], grid: &BevGrid) -> Result<Tensor, TchError> {
     let middles = |count: u32| (0..count).map(move |cell| (2 * cell + 1) as f32 / count as f32 - 1.0);
-    let columns: Vec<f32> = middles(onto.width).collect();
+    let columns: Vec<f32> = middles(grid.width).collect();
     let row = |y: f32| columns.iter().flat_map(move |x| [xx * x + xy * y + x0, yx * x + yy * y + y0]);
-    middles(onto.height).flat_map(row).collect()
-}
-
-/// The same as `[1, h, w, 2]`.
-fn lattice(affine: [f32; 6], onto: &BevGrid) -> Result<Tensor, TchError> {
-    let places = Tensor::f_from_slice(&places_by(affine, onto))?;
-    places.f_view([1, i64::from(onto.height), i64::from(onto.width), 2])
+    let places: Vec<f32> = middles(grid.height).flat_map(row).collect();
+    Tensor::f_from_slice(&places)?.f_view([1, i64::from(grid.height), i64::from(grid.width), 2])
 }
 
 /// Maps `[1, C, H, W]` as `[N, C, H, W]`, in the order that they have in memory.

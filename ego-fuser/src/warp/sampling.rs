@@ -8,7 +8,6 @@ use tch::{TchError, Tensor};
 use crate::numbers::{self, BLOCK, numbers};
 
 /// A map with the channels of each cell together.
-#[derive(Debug)]
 pub(crate) struct Cells {
     /// `[height * width, channels]`.
     values: Vec<f32>,
@@ -45,7 +44,7 @@ impl Cells {
 
     /// The map `[C, h, w]` read bilinearly at `lattice` `[h, w, 2]` (`grid_sampler`'s coordinates), and what is valid there
     /// `[1, h, w]` by the nearest cell of `valid` `[H, W]`. Zeros beyond the edges, and where nothing is valid.
-    pub(crate) fn read(&self, valid: &Tensor, lattice: &Tensor, order: Order) -> Result<(Tensor, Tensor), TchError> {
+    pub(super) fn read(&self, valid: &Tensor, lattice: &Tensor, order: Order) -> Result<(Tensor, Tensor), TchError> {
         let (rows, columns, _) = lattice.size3()?;
         let (valid, lattice) = (numbers(valid)?, numbers(lattice)?);
         let cells = (rows * columns) as usize;
@@ -149,6 +148,8 @@ impl Pair {
     #[inline]
     fn around(at: f32, size: usize) -> Self {
         // Without the processor's own rounding, which not every one has, a call for each would take most of the time.
+        // What is no number is a place beyond the edge, not the first cell.
+        let at = if at.is_nan() { f32::NEG_INFINITY } else { at };
         let truncated = at as i32;
         let first = truncated.saturating_sub(i32::from(truncated as f32 > at));
         let (second, share) = (first.saturating_add(1), at - first as f32);
@@ -190,7 +191,7 @@ mod tests {
     fn half_way_the_even_cell_is_the_nearest_and_what_is_no_place_has_none() {
         let nearest = |at: f32| Pair::around(at, 4).nearest;
         assert_eq!([0.5, 1.5, 2.5, -0.5, 3.5].map(nearest), [Some(0), Some(2), Some(2), Some(0), None]);
-        for at in [f32::INFINITY, f32::NEG_INFINITY, 3e9, -3e9] {
+        for at in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, 3e9, -3e9] {
             assert_eq!(nearest(at), None);
             assert_eq!(Pair::around(at, 4).weights.map(|weight| weight == 0.0), [true; 2]);
         }
