@@ -7,7 +7,8 @@ use std::hint::black_box;
 use agent::model_config::DetectorConfig;
 use agent::process;
 use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
-use ego_fuser::fusion::{FusionConfig, FusionStage, SentMaps, ViewFacts};
+use ego_fuser::fusion::pastat::Part;
+use ego_fuser::fusion::{FusionConfig, FusionStage, KeptMaps, SentMaps, ViewFacts};
 use ego_fuser::{Exchange, Method};
 use protocol::Pose;
 use tch::nn::VarStore;
@@ -30,9 +31,16 @@ fn fuse(criterion: &mut Criterion) {
             let features = Tensor::rand(size, (Kind::Float, Device::Cpu));
             // As the ego keeps them.
             let of = |first: i64, count: i64| SentMaps { maps: features.narrow(0, first, count), sent: None };
-            let (newest, earlier) = (of(0, agents as i64), of(agents as i64, size[0] - agents as i64));
-            let kept = (stage.frames() > 1).then(|| no_grad(|| stage.kept(&earlier).expect("maps are maps")));
-            let align = || stage.align_kept(&newest, kept.as_ref(), &facts).expect("maps lie on the lattice");
+            let newest = of(0, agents as i64);
+            let kept: Vec<KeptMaps> = no_grad(|| {
+                let kept = |map| stage.kept(&of(map, 1), &of(map, 1).maps).expect("maps are maps");
+                (agents as i64..size[0]).map(kept).collect()
+            });
+            let align = || {
+                let kept: Vec<&KeptMaps> = kept.iter().collect();
+                let earlier = (!kept.is_empty()).then(|| KeptMaps::together(&kept).expect("maps of one size"));
+                stage.align_kept(&newest, earlier, &facts).expect("maps lie on the lattice")
+            };
             group.bench_function(BenchmarkId::new(format!("warp/{method}"), agents), |bencher| {
                 bencher.iter(|| black_box(no_grad(align)));
             });
@@ -53,9 +61,10 @@ fn fuse(criterion: &mut Criterion) {
 /// All that fuse maps, by name, and the turning of channels that comes with each.
 fn stages(config: &DetectorConfig) -> Vec<(String, FusionStage)> {
     let usual = |method: Method| (method.to_string(), method, FusionConfig::for_detector(method, config));
-    let recalling = FusionConfig::for_detector(Method::Pastat, config).recalling().expect("it is a PASTAT");
+    let usual_pastat = FusionConfig::for_detector(Method::Pastat, config);
+    let without = usual_pastat.ablated(&[Part::Recall], None).expect("it is a PASTAT");
     let methods = Method::ALL.into_iter().filter(|method| method.exchange() == Exchange::Features);
-    let all = methods.map(usual).chain([("pastat-recall".to_owned(), Method::Pastat, recalling)]);
+    let all = methods.map(usual).chain([("pastat-no-recall".to_owned(), Method::Pastat, without)]);
     let stage = |(name, method, fusion): (String, Method, FusionConfig)| {
         let variables = VarStore::new(Device::Cpu);
         let stage = FusionStage::new(&variables.root(), &fusion, method, config);

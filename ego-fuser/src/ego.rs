@@ -18,7 +18,7 @@ use nalgebra::Isometry3;
 use protocol::{DecodedFeatures, Detection, DropReason, Pose, StageTiming};
 use tch::{Kind, TchError, Tensor, no_grad};
 
-use crate::fusion::{FusionStage, SentMaps, StageError, ViewFacts};
+use crate::fusion::{AlignedMaps, FusionStage, KeptMaps, SentMaps, StageError, ViewFacts};
 use crate::history::{History, KeptMap};
 use crate::method::{Exchange, Method};
 use crate::model::{METHOD_KEY, SCORE_THRESHOLD};
@@ -237,13 +237,13 @@ impl Ego {
             });
         }
         let newest = SentMaps { maps: Tensor::f_cat(&maps, 0)?, sent: Some(Tensor::f_cat(&sent, 0)?) };
-        let earlier = (!earlier.is_empty()).then(|| SentMaps::together(&earlier)).transpose()?;
-        let moved = self.fusion.align_kept(&newest, earlier.as_ref(), &facts)?;
+        let earlier = (!earlier.is_empty()).then(|| KeptMaps::together(&earlier)).transpose()?;
+        let moved = self.fusion.align_kept(&newest, earlier, &facts)?;
         stages.lap("align");
         let fused = numbers::as_batch(&self.fusion.fuse(&moved, &facts, false)?)?;
         stages.lap("fuse");
         let detections = self.boxes_of(&fused, stages)?;
-        self.keep(aligned, maps.into_iter().zip(sent))?;
+        self.keep(aligned, maps.into_iter().zip(sent), &moved)?;
         Ok(detections)
     }
 
@@ -275,14 +275,19 @@ impl Ego {
     }
 
     /// Keeps the maps of this frame for those to come.
-    fn keep(&mut self, aligned: &[Aligned<'_>], maps: impl Iterator<Item = (Tensor, Tensor)>) -> Result<(), EgoError> {
+    fn keep(
+        &mut self,
+        aligned: &[Aligned<'_>],
+        maps: impl Iterator<Item = (Tensor, Tensor)>,
+        moved: &AlignedMaps,
+    ) -> Result<(), EgoError> {
         if self.fusion.frames() < 2 {
             return Ok(());
         }
-        for (Aligned { view, .. }, (map, sent)) in aligned.iter().zip(maps) {
+        for ((Aligned { view, .. }, (map, sent)), index) in aligned.iter().zip(maps).zip(0..) {
             let Some(world_from_cav) = view.pose.world_from_cav().copied() else { continue };
             let confidence = f64::from(view.pose.confidence());
-            let shown = self.fusion.kept(&SentMaps { maps: map, sent: Some(sent) })?;
+            let shown = self.fusion.kept(&SentMaps { maps: map, sent: Some(sent) }, &moved.turned(index)?)?;
             let kept = KeptMap { capture_nanos: view.capture_nanos, world_from_cav, confidence, shown };
             self.history.keep(&view.cav, kept);
         }

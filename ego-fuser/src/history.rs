@@ -7,7 +7,7 @@ use std::collections::{BTreeMap, VecDeque};
 
 use protocol::{CavId, Pose};
 
-use crate::fusion::SentMaps;
+use crate::fusion::KeptMaps;
 
 /// Maps older than this tell of another situation, nanoseconds.
 pub(crate) const MAX_AGE_NANOS: u64 = 1_000_000_000;
@@ -24,7 +24,7 @@ pub(crate) struct KeptMap {
     /// How sure it was.
     pub(crate) confidence: f64,
     /// One map, as the fusion keeps it.
-    pub(crate) shown: SentMaps,
+    pub(crate) shown: KeptMaps,
 }
 
 /// Maps by vehicle, oldest first.
@@ -85,7 +85,6 @@ impl History {
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;
-    use tch::{Device, Kind, Tensor};
 
     use super::*;
 
@@ -96,12 +95,11 @@ mod tests {
     }
 
     fn map(frame: u64) -> KeptMap {
-        let empty = || Tensor::zeros([1, 1, 1, 1], (Kind::Float, Device::Cpu));
         KeptMap {
             capture_nanos: frame * FRAME,
             world_from_cav: Pose::IDENTITY,
             confidence: 1.0,
-            shown: SentMaps { maps: empty(), sent: None },
+            shown: KeptMaps::of_nothing(),
         }
     }
 

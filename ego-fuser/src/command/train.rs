@@ -83,9 +83,6 @@ pub(crate) struct Arguments {
     /// Parts of pastat to leave out.
     #[arg(long, value_enum, value_delimiter = ',')]
     without: Vec<Part>,
-    /// Let earlier maps steady the newest, cell by cell (pastat).
-    #[arg(long)]
-    recall: bool,
     /// Weight of what teaches a fusion that corrects poses (pastat) the errors that were put on top of them.
     #[arg(long, default_value_t = 0.0)]
     alignment_weight: f64,
@@ -197,7 +194,7 @@ impl Arguments {
 
     /// The fusion, where the command line changes it.
     fn fusion(&self) -> Result<Option<FusionConfig>> {
-        if self.without.is_empty() && self.frames.is_none() && !self.recall {
+        if self.without.is_empty() && self.frames.is_none() {
             return Ok(None);
         }
         let detector = match &self.init {
@@ -207,9 +204,7 @@ impl Arguments {
             }
             None => self.config.clone(),
         };
-        let usual = FusionConfig::for_detector(self.method, &detector);
-        let fusion = if self.recall { usual.recalling() } else { Ok(usual) };
-        let fusion = fusion.and_then(|fusion| fusion.ablated(&self.without, self.frames));
+        let fusion = FusionConfig::for_detector(self.method, &detector).ablated(&self.without, self.frames);
         Ok(Some(fusion.map_err(|error| BadInput(error.to_string()))?))
     }
 }

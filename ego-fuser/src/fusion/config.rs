@@ -105,24 +105,15 @@ impl FusionConfig {
         match self {
             Self::Pastat(config) => {
                 let frames = frames.unwrap_or(config.frames);
-                Ok(Self::Pastat(PastatConfig { frames, ..config.without(without) }))
+                // One time step has nothing to recall.
+                let without = if frames == 1 { [without, &[Part::Recall]].concat() } else { without.to_vec() };
+                Ok(Self::Pastat(PastatConfig { frames, ..config.without(&without) }))
             }
             other if without.is_empty() && frames.is_none() => Ok(other),
             _ => {
                 let value = format!("without {without:?}, {frames:?} frames");
                 Err(ConfigError::Value { field: "fusion", value, must: "as it is but for pastat" })
             }
-        }
-    }
-
-    /// The same with a recall, by which a PASTAT looks at earlier maps to the cell.
-    ///
-    /// # Errors
-    /// [`ConfigError`] where there is no PASTAT.
-    pub fn recalling(self) -> Result<Self, ConfigError> {
-        match self {
-            Self::Pastat(config) => Ok(Self::Pastat(config.recalling())),
-            _ => Err(ConfigError::Value { field: "fusion recall", value: "on".to_owned(), must: "off but for pastat" }),
         }
     }
 

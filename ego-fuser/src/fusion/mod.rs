@@ -2,6 +2,7 @@
 
 mod attention;
 mod block_order;
+mod classes;
 pub mod coalign;
 pub mod cobevt;
 mod config;
@@ -20,6 +21,7 @@ pub mod traf_align;
 pub mod v2vnet;
 pub mod v2xvit;
 pub mod where2comm;
+mod whole;
 
 use std::fmt::Debug;
 
@@ -28,11 +30,13 @@ use tch::{TchError, Tensor};
 
 pub use attention::AttentionFusion;
 pub use block_order::BlockOrder;
+use classes::Classes;
 pub use config::{FUSION_KEY, FusionConfig};
 pub use max::MaxFusion;
-pub use stage::{AlignedMaps, FusionStage, SentMaps, StageError};
+pub use stage::{AlignedMaps, FusionStage, KeptMaps, SentMaps, StageError};
 pub(crate) use stage::{FUSION_PREFIX, stored_config};
 pub use steering::Steering;
+pub(crate) use whole::{Seen, WholeMap};
 
 /// What is known of one map besides its values.
 #[derive(Debug, Clone, Copy, PartialEq)]
@@ -83,6 +87,17 @@ pub struct EarlierViews<'a> {
     pub mask: &'a Tensor,
     /// `O`: what is known of each.
     pub facts: &'a [ViewFacts],
+    /// The same to the cell, for a method that [recalls](Fusion::recalls).
+    pub(crate) whole: Option<WholeViews<'a>>,
+}
+
+/// Maps from before the newest of their agents, to the cell and not moved yet.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct WholeViews<'a> {
+    /// `O` maps.
+    pub(crate) maps: &'a [WholeMap],
+    /// Where on a map vehicles may be.
+    pub(crate) classes: &'a Classes,
 }
 
 /// A way to fuse aligned feature maps.
@@ -112,6 +127,11 @@ pub trait Fusion: Debug + Send {
     /// maps come among the newest, as they are.
     fn earlier_cells(&self) -> Option<i64> {
         None
+    }
+
+    /// Whether earlier maps are wanted to the cell too.
+    fn recalls(&self) -> bool {
+        false
     }
 }
 

@@ -8,8 +8,10 @@ use protocol::{BevGrid, Pose};
 use tch::nn::{self, VarStore};
 use tch::{Device, TchError, Tensor};
 
+use super::classes::Classes;
 use super::steering::{self, Steering};
-use super::{AlignedViews, EarlierViews, FUSION_KEY, Fusion, FusionConfig, ViewFacts};
+use super::whole::WholeMap;
+use super::{AlignedViews, EarlierViews, FUSION_KEY, Fusion, FusionConfig, ViewFacts, WholeViews};
 use crate::method::{Exchange, Method};
 use crate::numbers::are_numbers;
 use crate::warp::{Order, WarpError, Warped, warp_in_order};
@@ -34,6 +36,8 @@ pub struct FusionStage {
     config: FusionConfig,
     fusion: Box<dyn Fusion>,
     steering: Option<Steering>,
+    /// For a fusion that recalls.
+    classes: Option<Classes>,
     grid: BevGrid,
     /// In which world the maps are.
     y_axis: YAxis,
@@ -73,17 +77,56 @@ impl SentMaps {
     }
 }
 
+/// What is kept of maps for later frames.
+#[derive(Debug)]
+pub struct KeptMaps {
+    /// With larger cells, see [`Fusion::earlier_cells`].
+    shown: SentMaps,
+    /// To the cell, for a fusion that [recalls](Fusion::recalls); else none.
+    whole: Vec<WholeMap>,
+}
+
+impl KeptMaps {
+    /// Of a map of one cell.
+    #[cfg(test)]
+    pub(crate) fn of_nothing() -> Self {
+        let maps = Tensor::zeros([1, 1, 1, 1], (tch::Kind::Float, Device::Cpu));
+        Self { shown: SentMaps { maps, sent: None }, whole: Vec::new() }
+    }
+
+    /// What is kept of several maps, one after another.
+    ///
+    /// # Errors
+    /// [`TchError`] when there are none, or of several sizes.
+    pub fn together(all: &[&Self]) -> Result<Self, TchError> {
+        let shown: Vec<&SentMaps> = all.iter().map(|kept| &kept.shown).collect();
+        Ok(Self {
+            shown: SentMaps::together(&shown)?,
+            whole: all.iter().flat_map(|kept| &kept.whole).map(WholeMap::shallow_clone).collect(),
+        })
+    }
+}
+
 /// Maps on the ego lattice, with what they were made from.
 #[derive(Debug)]
 pub struct AlignedMaps {
     own_frame: Tensor,
     warped: Warped,
     earlier: Option<Warped>,
+    /// Earlier maps that are not moved yet.
+    whole: Vec<WholeMap>,
+}
+
+impl AlignedMaps {
+    /// One of the newest maps, `[1, C, H, W]`, where it was made but in the axes of the ego.
+    pub(crate) fn turned(&self, map: i64) -> Result<Tensor, TchError> {
+        self.own_frame.f_narrow(0, map, 1)
+    }
 }
 
 impl FusionStage {
-    /// The fusion of `method` with random parameters below `path`: `fusion.*` and, where maps are exchanged,
-    /// `steering.weight`.
+    /// The fusion of `method` with random parameters below `path`: `fusion.*`, where maps are exchanged `steering.weight` and,
+    /// for one that recalls, the detector's `cls_head.*` where that has not made them.
     ///
     /// # Errors
     /// [`ConfigError`] names the field that no fusion can be built from.
@@ -96,7 +139,10 @@ impl FusionStage {
         let shares_maps = method.exchange() == Exchange::Features;
         let steering = shares_maps.then(|| Steering::new(path, detector.feature_channels()));
         let fusion = config.build(&(path / "fusion"))?;
-        Ok(Self { config: config.clone(), fusion, steering, grid: detector.feature_grid(), y_axis: detector.y_axis })
+        let sizes = [detector.feature_channels(), detector.anchors.yaws_deg.len() as i64];
+        let classes = fusion.recalls().then(|| Classes::under(path, sizes));
+        let (grid, y_axis) = (detector.feature_grid(), detector.y_axis);
+        Ok(Self { config: config.clone(), fusion, steering, classes, grid, y_axis })
     }
 
     /// The fusion of a weights file, or the one of `method` where it is another and has no parameters.
@@ -154,21 +200,39 @@ impl FusionStage {
         if count == newest {
             return self.align_kept(&all, None, facts);
         }
-        let earlier = self.kept(&all.only(newest, count)?)?;
-        self.align_kept(&all.only(0, newest.min(count))?, Some(&earlier), facts)
+        let earlier = all.only(newest, count)?;
+        let then = then_from_cav(&self.of_network(facts), newest as usize);
+        let earlier = self.kept(&earlier, &self.turned(&earlier.maps, &then)?)?;
+        self.align_kept(&all.only(0, newest.min(count))?, Some(earlier), facts)
     }
 
-    /// What is kept of maps for later frames, see [`Fusion::earlier_cells`].
+    /// What is kept of maps for later frames, given the same maps in the axes of the ego.
     ///
     /// # Errors
     /// [`TchError`] when the maps are none.
-    pub fn kept(&self, SentMaps { maps, sent }: &SentMaps) -> Result<SentMaps, TchError> {
-        let Some(cells) = self.fusion.earlier_cells() else {
-            return Ok(SentMaps { maps: maps.shallow_clone(), sent: sent.as_ref().map(Tensor::shallow_clone) });
+    pub fn kept(&self, SentMaps { maps, sent }: &SentMaps, turned: &Tensor) -> Result<KeptMaps, TchError> {
+        let shown = match self.fusion.earlier_cells() {
+            Some(cells) => SentMaps {
+                maps: cell_by_cell(&larger_cells(maps, cells)?)?,
+                // A larger cell was sent where any of its cells was.
+                sent: sent.as_ref().map(|sent| larger_cells(sent, cells)?.f_ceil()).transpose()?,
+            },
+            None => SentMaps { maps: maps.shallow_clone(), sent: sent.as_ref().map(Tensor::shallow_clone) },
         };
-        // A larger cell was sent where any of its cells was.
-        let sent = sent.as_ref().map(|sent| larger_cells(sent, cells)?.f_ceil()).transpose()?;
-        Ok(SentMaps { maps: cell_by_cell(&larger_cells(maps, cells)?)?, sent })
+        let whole = |map: i64| {
+            let of = |tensor: &Tensor| tensor.f_narrow(0, map, 1);
+            WholeMap::of(&of(turned)?, sent.as_ref().map(of).transpose()?.as_ref())
+        };
+        let wanted = if self.fusion.recalls() { maps.size4()?.0 } else { 0 };
+        Ok(KeptMaps { shown, whole: (0..wanted).map(whole).collect::<Result<_, TchError>>()? })
+    }
+
+    /// Maps in the axes of the ego.
+    fn turned(&self, maps: &Tensor, poses: &[Pose]) -> Result<Tensor, TchError> {
+        match &self.steering {
+            Some(steering) => steering.turn(maps, poses),
+            None => Ok(maps.shallow_clone()),
+        }
     }
 
     /// [`Self::align`] with the maps that are older as they were [`Self::kept`].
@@ -178,31 +242,31 @@ impl FusionStage {
     pub fn align_kept(
         &self,
         newest: &SentMaps,
-        earlier: Option<&SentMaps>,
+        earlier: Option<KeptMaps>,
         facts: &[ViewFacts],
     ) -> Result<AlignedMaps, WarpError> {
         let poses: Vec<Pose> = self.of_network(facts).iter().map(|facts| facts.ego_from_cav).collect();
         let count = newest.maps.size4()?.0;
-        let maps = count + earlier.map_or(Ok(0), |earlier| earlier.maps.size4().map(|size| size.0))?;
+        let maps = count + earlier.as_ref().map_or(Ok(0), |earlier| earlier.shown.maps.size4().map(|size| size.0))?;
         if maps != poses.len() as i64 {
             return Err(WarpError::PoseCount { maps, poses: poses.len() });
         }
         let cells = self.fusion.earlier_cells();
         // What keeps earlier maps in another form takes the maximum over the newest, cell by cell.
         let order = if cells.is_some() { Order::Cells } else { Order::Planes };
-        let (cells, Some(earlier)) = (cells, earlier) else {
-            let (own_frame, warped) = self.moved(newest, &poses, &self.grid, order)?;
-            return Ok(AlignedMaps { own_frame, warped, earlier: None });
-        };
-        let Some(cells) = cells else {
-            let (own_frame, warped) =
-                self.moved(&SentMaps::together(&[newest, earlier])?, &poses, &self.grid, order)?;
-            return Ok(AlignedMaps { own_frame, warped, earlier: None });
-        };
-        let (of_newest, of_earlier) = poses.split_at(count as usize);
-        let (own_frame, warped) = self.moved(newest, of_newest, &self.grid, order)?;
-        let earlier = self.moved(earlier, of_earlier, &with_cells_of(&self.grid, cells), order)?.1;
-        Ok(AlignedMaps { own_frame, warped, earlier: Some(earlier) })
+        match (cells, earlier) {
+            (Some(cells), Some(KeptMaps { shown, whole })) => {
+                let (of_newest, of_earlier) = poses.split_at(count as usize);
+                let (own_frame, warped) = self.moved(newest, of_newest, &self.grid, order)?;
+                let earlier = self.moved(&shown, of_earlier, &with_cells_of(&self.grid, cells), order)?.1;
+                Ok(AlignedMaps { own_frame, warped, earlier: Some(earlier), whole })
+            }
+            (_, earlier) => {
+                let all = earlier.map(|earlier| SentMaps::together(&[newest, &earlier.shown])).transpose()?;
+                let (own_frame, warped) = self.moved(all.as_ref().unwrap_or(newest), &poses, &self.grid, order)?;
+                Ok(AlignedMaps { own_frame, warped, earlier: None, whole: Vec::new() })
+            }
+        }
     }
 
     /// Maps turned, and moved onto the ego's `grid`.
@@ -213,10 +277,7 @@ impl FusionStage {
         grid: &BevGrid,
         order: Order,
     ) -> Result<(Tensor, Warped), WarpError> {
-        let own_frame = match &self.steering {
-            Some(steering) => steering.turn(maps, poses)?,
-            None => maps.shallow_clone(),
-        };
+        let own_frame = self.turned(maps, poses)?;
         let warped = warp_in_order(&own_frame, sent.as_ref(), poses, grid, order)?;
         Ok((own_frame, warped))
     }
@@ -239,13 +300,13 @@ impl FusionStage {
         facts: &[ViewFacts],
         train: bool,
     ) -> Result<(Tensor, Option<Tensor>), WarpError> {
-        let AlignedMaps { own_frame, warped, earlier } = maps;
+        let AlignedMaps { own_frame, warped, earlier, whole } = maps;
         let facts = &*self.of_network(facts);
         let (facts, before) = facts.split_at(if earlier.is_some() { newest(facts) } else { facts.len() });
         let Warped { features, mask } = warped;
-        let earlier = earlier.as_ref();
+        let whole = self.classes.as_ref().map(|classes| WholeViews { maps: whole, classes });
         let earlier =
-            earlier.map(|warped| EarlierViews { features: &warped.features, mask: &warped.mask, facts: before });
+            earlier.as_ref().map(|Warped { features, mask }| EarlierViews { features, mask, facts: before, whole });
         let views = AlignedViews { features, mask, own_frame, grid: &self.grid, facts, earlier };
         Ok(self.fusion.fuse_and_correct(&views, train)?)
     }
@@ -266,6 +327,21 @@ impl FusionStage {
 fn newest(facts: &[ViewFacts]) -> usize {
     let is_first = |(entry, of): &(usize, &ViewFacts)| facts[..*entry].iter().all(|before| before.agent != of.agent);
     facts.iter().enumerate().take_while(is_first).count()
+}
+
+/// Poses of the entries from `newest` on in the frame that the ego had when they were the newest of their agents: its own
+/// entry as many steps back tells of it, and where there is none it counts as standing still.
+fn then_from_cav(facts: &[ViewFacts], newest: usize) -> Vec<Pose> {
+    let step = |entry: usize| facts[..entry].iter().filter(|before| before.agent == facts[entry].agent).count();
+    let ego_of = |wanted: usize| (0..facts.len()).find(|&entry| facts[entry].agent == 0 && step(entry) == wanted);
+    let of_entry = |entry: usize| {
+        if facts[entry].agent == 0 {
+            return Pose::IDENTITY;
+        }
+        let ego = ego_of(step(entry)).map_or(Pose::IDENTITY, |ego| facts[ego].ego_from_cav);
+        ego.from_world(&facts[entry].ego_from_cav)
+    };
+    (newest..facts.len()).map(of_entry).collect()
 }
 
 /// Maps `[N, C, H, W]` with cells of `cells` by `cells`, each their mean; those at the edges of fewer.
@@ -343,6 +419,17 @@ mod tests {
         let here = fused(&plain, &maps);
         let there = fused(&mirrored, &maps.flip([2])).flip([1]);
         assert!(here.allclose(&there, 1e-3, 1e-3, false));
+    }
+
+    #[test]
+    fn earlier_maps_are_turned_as_when_they_were_the_newest() {
+        let turned = |yaw_rad: f64| Pose::from_xyz_yaw([1.0, 2.0, 0.0], yaw_rad);
+        let fact = |agent: usize, yaw_rad: f64| ViewFacts::fresh(agent, turned(yaw_rad));
+        // The ego has turned by 0.1 since; of a third time step it has no map.
+        let facts = [ViewFacts::fresh(0, Pose::IDENTITY), fact(1, 0.7), fact(0, -0.1), fact(1, 0.5), fact(1, 0.4)];
+        let yaws: Vec<f64> = then_from_cav(&facts, 2).iter().map(Pose::yaw_rad).collect();
+        assert!(yaws.iter().zip([0.0, 0.6, 0.4]).all(|(found, expected)| (found - expected).abs() < 1e-9), "{yaws:?}");
+        assert_eq!(then_from_cav(&facts, 2)[0], Pose::IDENTITY);
     }
 
     #[test]

@@ -140,6 +140,18 @@ fn lattice([xx, xy, x0, yx, yy, y0]: [f32; 6], grid: &BevGrid) -> Result<Tensor,
     Tensor::f_from_slice(&places)?.f_view([1, i64::from(grid.height), i64::from(grid.width), 2])
 }
 
+/// Where some cells of the ego's lattice, by row and column, lie on a map of the same `grid`, in `grid_sampler`'s coordinates,
+/// two for each.
+pub(crate) fn places_of(cells: &[[usize; 2]], ego_from_cav: &Pose, grid: &BevGrid) -> Vec<f32> {
+    let [xx, xy, x0, yx, yy, y0] = cav_from_ego_normalized(ego_from_cav, grid);
+    let middle = |cell: usize, count: u32| (2 * cell + 1) as f32 / count as f32 - 1.0;
+    let place = |[row, column]: &[usize; 2]| {
+        let (x, y) = (middle(*column, grid.width), middle(*row, grid.height));
+        [xx * x + xy * y + x0, yx * x + yy * y + y0]
+    };
+    cells.iter().flat_map(place).collect()
+}
+
 /// Maps `[1, C, H, W]` as `[N, C, H, W]`, in the order that they have in memory.
 fn one_after_another(maps: &[Tensor]) -> Result<Tensor, TchError> {
     if !maps.iter().all(are_numbers) {

@@ -8,6 +8,7 @@ use tch::{TchError, Tensor};
 use crate::numbers::{self, BLOCK, numbers};
 
 /// A map with the channels of each cell together.
+#[derive(Debug)]
 pub(crate) struct Cells {
     /// `[height * width, channels]`.
     values: Vec<f32>,
@@ -77,6 +78,11 @@ impl Cells {
             strongest.iter_mut().zip(shown).for_each(|(most, shown)| *most = most.max(shares[cell] * shown));
         });
         Ok(())
+    }
+
+    /// Channels of each cell.
+    pub(crate) fn channels(&self) -> usize {
+        self.channels
     }
 
     /// Shows `see` what lies at each place of `lattice` (`grid_sampler`'s coordinates, two a place) where the nearest cell of

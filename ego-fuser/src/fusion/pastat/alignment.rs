@@ -271,6 +271,12 @@ pub(super) fn lattice(deltas: &Tensor, ego_from_cav: &[Pose], area: &Area, size:
     Tensor::f_affine_grid_generator(&affine, [maps, 1, size[0], size[1]], false)
 }
 
+/// Where a vehicle was by a `delta`, see [`lattice`].
+pub(super) fn moved(ego_from_cav: &Pose, delta: &[f64]) -> Pose {
+    let [x, y, z] = ego_from_cav.translation_m;
+    Pose::from_xyz_yaw([x + delta[0], y + delta[1], z], ego_from_cav.yaw_rad() + delta[2])
+}
+
 /// Maps `[N, C, H, W]` and what is valid of them `[N, 1, H, W]`, read at `lattice`. Nothing is valid beyond their edges; maps
 /// are not zero where nothing is valid.
 pub(super) fn resample(maps: &Tensor, valid: &Tensor, lattice: &Tensor) -> Result<(Tensor, Tensor), TchError> {

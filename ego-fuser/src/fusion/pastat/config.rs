@@ -34,6 +34,8 @@ pub enum Part {
     Fsa,
     /// Temporal Encoding.
     Te,
+    /// The recall of earlier maps to the cell.
+    Recall,
 }
 
 /// Feature Spatial Alignment.
@@ -80,7 +82,23 @@ impl Default for FsaConfig {
     }
 }
 
-/// A PASTAT from its tokens to its output. `ce`, `fsa`, `te` and `frames` are the switches of the ablation.
+/// The recall of earlier maps, cell by cell.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RecallConfig {
+    /// Channels from which it is told how much of an earlier map is taken.
+    pub hidden: i64,
+    /// In such a share of all tokens' patches, those where vehicles are most likely.
+    pub share: f64,
+}
+
+impl Default for RecallConfig {
+    fn default() -> Self {
+        Self { hidden: 24, share: 0.125 }
+    }
+}
+
+/// A PASTAT from its tokens to its output. `ce`, `fsa`, `te`, `recall` and `frames` are the switches of the ablation.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PastatConfig {
@@ -103,10 +121,9 @@ pub struct PastatConfig {
     /// Channels inside the two convolutions that sharpen the fused map; absent: there are none.
     #[serde(default)]
     pub refine: Option<i64>,
-    /// Channels from which it is told how much of earlier maps is blended into the newest, cell by cell; absent: those are
-    /// heard through their tokens alone.
+    /// How earlier maps are blended into the newest; absent: they are heard through their tokens alone.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub recall: Option<i64>,
+    pub recall: Option<RecallConfig>,
     /// Time steps wanted of every agent, the T of the paper.
     pub frames: usize,
     /// Along each edge so many cells of a map from before its agent's newest are taken together before it is moved: what
@@ -136,7 +153,7 @@ impl PastatConfig {
             windows: vec![4, 8],
             rows: Rows::Ego,
             refine: Some(96),
-            recall: None,
+            recall: Some(RecallConfig::default()),
             frames: 3,
             earlier_cells: 2,
             frame_secs: 0.1,
@@ -157,16 +174,11 @@ impl PastatConfig {
             windows: vec![4, 8],
             rows: Rows::All,
             refine: Some(channels),
+            recall: None,
             earlier_cells: 1,
             fsa: Some(FsaConfig { matching: 16, ..FsaConfig::default() }),
             ..Self::lean(channels)
         }
-    }
-
-    /// The same with a recall, which looks at earlier maps to the cell.
-    #[must_use]
-    pub fn recalling(self) -> Self {
-        Self { recall: Some(24), earlier_cells: 1, ..self }
     }
 
     /// The same without some parts.
@@ -177,6 +189,7 @@ impl PastatConfig {
                 Part::Ce => self.ce = false,
                 Part::Fsa => self.fsa = None,
                 Part::Te => self.te = None,
+                Part::Recall => self.recall = None,
             }
         }
         self
@@ -206,7 +219,7 @@ impl PastatConfig {
             ("pastat mlp_ratio", self.mlp_ratio, 16),
             ("pastat depth", i64::try_from(self.depth).unwrap_or(i64::MAX), 32),
             ("pastat refine", self.refine.unwrap_or(1), 4096),
-            ("pastat recall", self.recall.unwrap_or(1), 4096),
+            ("pastat recall hidden", self.recall.map_or(1, |recall| recall.hidden), 4096),
             ("pastat frames", i64::try_from(self.frames).unwrap_or(i64::MAX), 16),
         ] {
             if !(1..=most).contains(&value) {
@@ -232,8 +245,10 @@ impl PastatConfig {
         {
             return error("pastat fsa search cells", cells.to_string(), "a multiple of earlier_cells");
         }
-        if self.recall.is_some() && self.earlier_cells != 1 {
-            return error("pastat earlier_cells", self.earlier_cells.to_string(), "1, as earlier maps are recalled");
+        if let Some(RecallConfig { share, .. }) = self.recall
+            && !(share > 0.0 && share <= 1.0)
+        {
+            return error("pastat recall share", share.to_string(), "above 0, up to 1");
         }
         if self.recall.is_some() && self.frames < 2 {
             return error("pastat frames", self.frames.to_string(), "2 or more, as earlier maps are recalled");
@@ -283,8 +298,7 @@ mod tests {
 
     #[test]
     fn presets_are_valid_and_come_back_from_json() {
-        let recalling = PastatConfig::lean(64).recalling();
-        for config in [PastatConfig::lean(64), PastatConfig::full(256), recalling] {
+        for config in [PastatConfig::lean(64), PastatConfig::full(256)] {
             config.validate().unwrap();
             let text = serde_json::to_string(&config).unwrap();
             assert_eq!(serde_json::from_str::<PastatConfig>(&text).unwrap(), config);
@@ -295,6 +309,7 @@ mod tests {
 
     #[test]
     fn what_cannot_be_built_is_named() {
+        let recall = |recall| PastatConfig { recall: Some(recall), ..PastatConfig::lean(64) };
         for (config, part) in [
             (PastatConfig { dim: 36, ..PastatConfig::lean(64) }, "dim is 36"),
             (PastatConfig { windows: vec![4, 8, 16], ..PastatConfig::lean(64) }, "windows is [4, 8, 16]"),
@@ -309,9 +324,9 @@ mod tests {
                 },
                 "search cells is 3",
             ),
-            (PastatConfig { earlier_cells: 2, ..PastatConfig::lean(64).recalling() }, "earlier_cells is 2"),
-            (PastatConfig { frames: 1, ..PastatConfig::lean(64).recalling() }, "frames is 1"),
-            (PastatConfig { recall: Some(0), ..PastatConfig::lean(64).recalling() }, "recall is 0"),
+            (PastatConfig { frames: 1, ..PastatConfig::lean(64) }, "frames is 1"),
+            (recall(RecallConfig { hidden: 0, ..RecallConfig::default() }), "recall hidden is 0"),
+            (recall(RecallConfig { share: f64::NAN, ..RecallConfig::default() }), "recall share is NaN"),
             (PastatConfig { frames: 0, ..PastatConfig::lean(64) }, "frames is 0"),
             (PastatConfig { frame_secs: f64::NAN, ..PastatConfig::lean(64) }, "frame_secs is NaN"),
         ] {

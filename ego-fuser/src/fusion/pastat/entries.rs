@@ -52,9 +52,14 @@ impl Maps {
     }
 }
 
+/// FSA sees earlier maps with larger cells than the newest, and puts one that lies well a few tenths of a metre beside its
+/// place: what it puts within this distance of its agent's newest belongs where that does.
+const SAME_PLACE_M: f64 = 0.6;
+
 /// What is told of entries, by property.
 #[derive(Debug)]
 pub(super) struct Told {
+    pub(super) agent: Vec<usize>,
     pub(super) ego_from_cav: Vec<Pose>,
     pub(super) age_secs: Vec<f64>,
     /// Their places among those of their agents, 0 for the newest.
@@ -67,10 +72,20 @@ pub(super) struct Told {
 }
 
 impl Told {
-    /// The entries of a time step before the newest, of which there are `newest`, counted behind those.
-    pub(super) fn earlier(&self, step_back: usize, newest: i64) -> Vec<i64> {
-        let of_step = |entry: &i64| self.steps_back[*entry as usize] == step_back;
-        (newest..self.steps_back.len() as i64).filter(of_step).map(|entry| entry - newest).collect()
+    /// Along x and y, metres, and turned by, radians, what FSA says of the entries from `first` on, the earlier ones, given what it
+    /// says of all but the very first, `deltas` `[N - 1, 3]`: one that lies about where its agent's newest does lies there.
+    pub(super) fn settled(&self, deltas: &Tensor, first: usize) -> Result<Vec<[f64; 3]>, TchError> {
+        let deltas = Vec::<f64>::try_from(deltas.f_detach()?.f_to_kind(Kind::Double)?.f_reshape(-1)?)?;
+        let all: Vec<[f64; 3]> = std::iter::once([0.0; 3])
+            .chain(deltas.chunks_exact(3).map(|found| [found[0], found[1], found[2]]))
+            .collect();
+        let settle = |entry: usize| {
+            let newest = (0..first).find(|&newest| self.agent[newest] == self.agent[entry]).map(|newest| all[newest]);
+            let is_same =
+                |newest: &[f64; 3]| (newest[0] - all[entry][0]).hypot(newest[1] - all[entry][1]) < SAME_PLACE_M;
+            newest.filter(is_same).unwrap_or(all[entry])
+        };
+        Ok((first..all.len()).map(settle).collect())
     }
 
     fn new(facts: &[ViewFacts]) -> Self {
@@ -84,6 +99,7 @@ impl Told {
             trust: shares.iter().zip(&confidence).flat_map(of_entry).collect(),
             ego_from_cav: facts.iter().map(|facts| facts.ego_from_cav).collect(),
             shares,
+            agent,
             steps_back,
             age_secs,
         }
@@ -98,6 +114,8 @@ pub(super) struct Shown {
     pub(super) newest: Maps,
     /// What is older, with larger cells.
     pub(super) earlier: Option<Maps>,
+    /// Which of the views' earlier maps those are.
+    pub(super) earlier_entries: Vec<usize>,
     /// What is told of both, in this order.
     pub(super) told: Told,
     /// Their places among all entries, and how many those are.
@@ -115,6 +133,7 @@ impl Shown {
         let places: Vec<i64> = newest.iter().copied().chain(earlier.iter().map(|entry| entry + before)).collect();
         let told: Vec<ViewFacts> = places.iter().map(|&place| facts[place as usize]).collect();
         Ok(Self {
+            earlier_entries: earlier.iter().map(|&entry| entry as usize).collect(),
             newest: Maps::picked(views.features, views.mask, &newest)?,
             earlier: match views.earlier.filter(|_| !earlier.is_empty()) {
                 Some(views) => Some(Maps::picked(views.features, views.mask, &earlier)?),
@@ -142,4 +161,20 @@ fn reaching(mask: &Tensor, with_ego: bool) -> Result<Vec<i64>, TchError> {
     let reach: Vec<f32> = Vec::try_from(mask.f_amax([1_i64, 2, 3].as_slice(), false)?.f_to_kind(Kind::Float)?)?;
     let counts = |(entry, reach): &(i64, f32)| (with_ego && *entry == 0) || *reach > 0.0;
     Ok((0..).zip(reach).filter(counts).map(|(entry, _)| entry).collect())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_lies_about_where_its_agents_newest_does_lies_there() {
+        let fact = |agent| ViewFacts::fresh(agent, Pose::IDENTITY);
+        let told = Told::new(&[fact(0), fact(7), fact(0), fact(7), fact(7), fact(3)]);
+        let deltas = [0.5, 0.4, 0.01, 0.3, -0.3, 0.02, 0.9, 0.1, 0.0, 1.5, 0.4, 0.03, 0.1, 0.0, 0.0];
+        let deltas = Tensor::from_slice(&deltas).view([5, 3]);
+        let settled = told.settled(&deltas, 2).unwrap();
+        // The ego's newest is not moved; another of the same vehicle is too far off; of the last there is no newest.
+        assert_eq!(settled, [[0.0; 3], [0.5, 0.4, 0.01], [1.5, 0.4, 0.03], [0.1, 0.0, 0.0]]);
+    }
 }

@@ -4,14 +4,15 @@
 //! added. FSA compares each map with the ego's: it moves the map and its tokens to where they fit, and tells the tokens how
 //! well they do. Pre-norm blocks (Eq. 8, 9) attend over agents and time at each cell and across cells within windows of
 //! several sizes. What they find comes back onto the cells in two ways: as a weight of each neighbour's newest map, of
-//! which the maximum is taken, and as a change of that. Where it is asked for, earlier maps steady that maximum to the cell
-//! (recall). Untrained, all are neutral: the fusion begins as the element-wise maximum.
+//! which the maximum is taken, and as a change of that. Where it is asked for, earlier maps steady that maximum to the
+//! cell where vehicles may be (recall). Untrained, all are neutral: the fusion begins as the element-wise maximum.
 //!
 //! Entries are real maps, so nothing is padded over agents or time.
 
 mod alignment;
 mod attention;
 mod block;
+mod chosen;
 mod confidence;
 mod config;
 mod correlation;
@@ -29,7 +30,7 @@ use agent::model_config::ConfigError;
 use protocol::{BevGrid, Pose};
 use tch::{Device, TchError, Tensor, nn};
 
-pub use config::{FsaConfig, Part, PastatConfig, Rows, SearchConfig, Wavelengths};
+pub use config::{FsaConfig, Part, PastatConfig, RecallConfig, Rows, SearchConfig, Wavelengths};
 
 use self::alignment::{Area, Found, SpatialAlignment, TRUST, lattice, resample};
 use self::block::Block;
@@ -67,8 +68,6 @@ struct Entries {
     valid: Tensor,
     /// `[N - 1, 3]`: how FSA has moved all but the ego's newest.
     deltas: Option<Tensor>,
-    /// What all have shown at earlier time steps, where there is a recall.
-    earlier: Vec<Earlier>,
 }
 
 /// What lies somewhere on the ego's lattice, where poses put it or where FSA does.
@@ -114,9 +113,9 @@ impl Pastat {
             blocks: (0..config.depth).map(|index| Block::new(&(path / "blocks" / index), config)).collect(),
             gate: TrustGate::new(&(path / "gate"), config),
             decoder: Decoder::new(&(path / "decoder"), config),
-            recall: config.recall.map(|hidden| {
+            recall: config.recall.as_ref().map(|recall| {
                 let PastatConfig { channels, dim, patch, frames, .. } = *config;
-                Recall::new(&(path / "recall"), [channels, dim, patch, frames as i64 - 1], hidden)
+                Recall::new(&(path / "recall"), [channels, dim, patch, frames as i64 - 1], recall)
             }),
             refiner: config.refine.map(|hidden| Refiner::new(&(path / "refine"), config.channels, hidden)),
             config: config.clone(),
@@ -150,37 +149,33 @@ impl Pastat {
         };
         let Placed { others, seen, valid } = placed;
         let tokens = seen + facts.f_unsqueeze(2)?.f_unsqueeze(3)?;
-        let earlier = match earlier {
-            Some(earlier) if self.recall.is_some() => self.recalled(&earlier, told, deltas.as_ref(), grid)?,
-            _ => Vec::new(),
-        };
-        Ok(Entries { own, others, tokens, valid, deltas, earlier })
+        Ok(Entries { own, others, tokens, valid, deltas })
     }
 
-    /// Earlier maps by time step, moved to where FSA says that they fit.
-    fn recalled(
+    /// `newest` `[1, C, H, W]`, steadied by the ego's own and by earlier maps where FSA says that they belong.
+    fn steadied(
         &self,
-        earlier: &Maps,
-        told: &Told,
-        deltas: Option<&Tensor>,
-        grid: &BevGrid,
-    ) -> Result<Vec<Earlier>, TchError> {
-        let (count, _, height, width) = earlier.features.size4()?;
-        let newest = told.age_secs.len() as i64 - count;
-        let places = match deltas {
-            Some(deltas) => {
-                // Their tokens teach where they lie.
-                let deltas = deltas.f_narrow(0, newest - 1, count)?.f_detach()?;
-                let (poses, area) = (&told.ego_from_cav[newest as usize..], Area::new(grid, [height, width], 0));
-                Some(lattice(&deltas, poses, &area, [height, width])?)
-            }
-            None => None,
+        newest: Tensor,
+        (views, shown): (&AlignedViews<'_>, &Shown),
+        Entries { own, deltas, .. }: &Entries,
+        ego: &Tensor,
+    ) -> Result<Tensor, TchError> {
+        let whole = views.earlier.and_then(|earlier| earlier.whole);
+        let (Some(recall), Some(whole)) = (&self.recall, whole) else { return Ok(newest) };
+        let Told { ego_from_cav, steps_back, .. } = &shown.told;
+        let first = ego_from_cav.len() - shown.earlier_entries.len();
+        let deltas = deltas.as_ref().map(|deltas| shown.told.settled(deltas, first)).transpose()?;
+        let of_entry = |(index, &entry): (usize, &usize)| {
+            let step = steps_back[first + index].checked_sub(1).filter(|step| step + 1 < self.config.frames)?;
+            let (pose, map) = (&ego_from_cav[first + index], whole.maps.get(entry)?);
+            Some((step, deltas.as_ref().map_or(*pose, |deltas| alignment::moved(pose, &deltas[index])), map))
         };
-        let of_step = |step: usize| {
-            let entries = told.earlier(step, newest);
-            (!entries.is_empty()).then(|| Earlier::strongest(step as i64 - 1, earlier, places.as_ref(), &entries))
-        };
-        (1..self.config.frames).filter_map(of_step).collect()
+        let maps: Vec<_> = shown.earlier_entries.iter().enumerate().filter_map(of_entry).collect();
+        if maps.is_empty() {
+            return Ok(newest);
+        }
+        let likely = whole.classes.likely(&newest)?;
+        recall.forward([&newest, own], &Earlier { maps, grid: views.grid }, ego, &likely)
     }
 
     /// How all entries but the ego's newest lie beside that.
@@ -261,10 +256,7 @@ impl Fusion for Pastat {
         let entries = self.align(&shown, views.grid)?;
         let ego = self.transform(&entries)?;
         let newest = self.strongest(&entries, &ego)?;
-        let steadied = match &self.recall {
-            Some(recall) => recall.forward(&newest, &entries.earlier, &ego, train)?,
-            None => newest,
-        };
+        let steadied = self.steadied(newest, (views, &shown), &entries, &ego)?;
         let fused = steadied + self.decoder.forward(&ego)?;
         // What was padded on is off before convolutions look around: nothing is known there.
         let fused = fused.f_narrow(2, 0, height)?.f_narrow(3, 0, width)?;
@@ -282,6 +274,10 @@ impl Fusion for Pastat {
 
     fn earlier_cells(&self) -> Option<i64> {
         Some(self.config.earlier_cells)
+    }
+
+    fn recalls(&self) -> bool {
+        self.recall.is_some()
     }
 }
 

@@ -1,91 +1,43 @@
 //! What was seen a moment before, to the cell: earlier maps steady what the newest show.
 //!
 //! A map errs anew in every sweep: points fall elsewhere, and cells begin elsewhere on a vehicle. Part of that is not there in
-//! the mean of several sweeps.
+//! the mean of several sweeps. It matters where a vehicle may be: elsewhere no map is recalled, which costs most of what a
+//! recall of all would and none of its precision.
 
+use protocol::{BevGrid, Pose};
 use tch::nn::{self, Init, Module};
-use tch::{Kind, TchError, Tensor};
+use tch::{TchError, Tensor};
 
-use super::alignment::resample;
-use super::entries::Maps;
-use super::precision::{convolve, fastest};
-use crate::numbers::{are_numbers, numbers};
-use crate::warp::Cells;
+use super::chosen::{AROUND, Chosen};
+use super::config::RecallConfig;
+use crate::fusion::{Seen, WholeMap};
 
-/// What all agents have shown at one time step before their newest.
-#[derive(Debug)]
-pub(super) struct Earlier {
-    /// 0 for the step before the newest.
-    pub(super) step: i64,
-    /// One map.
-    pub(super) maps: Maps,
+/// Maps from before their agents' newest.
+pub(super) struct Earlier<'a> {
+    /// Of each the time step, 0 for the one before the newest; where it was made; what it shows.
+    pub(super) maps: Vec<(usize, Pose, &'a WholeMap)>,
+    /// The lattice of all.
+    pub(super) grid: &'a BevGrid,
 }
 
-impl Earlier {
-    /// Of the maps `entries` of one time step the strongest at each cell; `places` `[O, H, W, 2]` tell where on all `maps` the
-    /// ego's cells lie, for `grid_sampler`; absent: maps lie where they belong.
-    pub(super) fn strongest(
-        step: i64,
-        maps: &Maps,
-        places: Option<&Tensor>,
-        entries: &[i64],
-    ) -> Result<Self, TchError> {
-        let Maps { features, mask } = match places {
-            Some(places) if are_numbers(&maps.features) && are_numbers(places) => {
-                return Ok(Self { step, maps: strongest_of_numbers(maps, places, entries)? });
-            }
-            Some(places) => {
-                let of_step = Maps::picked(&maps.features, &maps.mask, entries)?;
-                let entries = Tensor::f_from_slice(entries)?.f_to_device(places.device())?;
-                let places = places.f_index_select(0, &entries)?;
-                let (features, mask) = resample(&of_step.features, &of_step.mask, &places)?;
-                Maps { features, mask }
-            }
-            None => Maps::picked(&maps.features, &maps.mask, entries)?,
-        };
-        let over_all = |tensor: &Tensor| tensor.f_amax([0_i64].as_slice(), true);
-        let strongest = over_all(&features.f_masked_fill(&mask.f_eq(0.0)?, f64::NEG_INFINITY)?)?;
-        let mask = over_all(&mask)?;
-        let features = strongest.f_masked_fill(&mask.f_eq(0.0)?, 0.0)?;
-        Ok(Self { step, maps: Maps { features, mask } })
-    }
-}
-
-/// The strongest at each cell of maps that are read at `places`, in one walk over the cells of each.
-fn strongest_of_numbers(maps: &Maps, places: &Tensor, entries: &[i64]) -> Result<Maps, TchError> {
-    let (_, channels, height, width) = maps.features.size4()?;
-    let (each, cells) = (channels as usize, (height * width) as usize);
-    let (mut most, mut reached) = (vec![f32::NEG_INFINITY; cells * each], vec![0.0; cells]);
-    for &entry in entries {
-        let [map, valid, places] = [&maps.features, &maps.mask, places].map(|tensor| tensor.f_get(entry));
-        Cells::of(&map?)?.look(&numbers(&valid?)?, &numbers(&places?)?, |cell, shown| {
-            let most = &mut most[cell * each..][..each];
-            most.iter_mut().zip(shown).for_each(|(most, shown)| *most = most.max(*shown));
-            reached[cell] = 1.0;
-        });
-    }
-    let unreached = most.chunks_exact_mut(each).zip(&reached).filter(|(_, reached)| **reached == 0.0);
-    unreached.for_each(|(most, _)| most.fill(0.0));
-    let features = Tensor::f_from_slice(&most)?.f_view([1, height, width, channels])?.f_permute([0, 3, 1, 2])?;
-    Ok(Maps { features, mask: Tensor::f_from_slice(&reached)?.f_view([1, 1, height, width])? })
-}
-
-/// Blends earlier maps into the newest, by cell and channel; nothing of them before it is trained.
+/// Blends earlier maps into the strongest of the newest, by cell and channel, and the ego's own newest, which takes back what
+/// neighbours have added; nothing before it is trained.
 #[derive(Debug)]
 pub(super) struct Recall {
     now: nn::Conv2D,
     past: nn::Conv2D,
     token: nn::Linear,
-    /// `[steps, hidden]`.
+    /// `[1 + steps, hidden]`: of the ego's own newest and of earlier time steps.
     step: Tensor,
     gate: nn::Conv2D,
     patch: i64,
+    share: f64,
 }
 
 impl Recall {
-    /// For maps of `channels`, tokens of `dim` with `patch` cells along each edge, and `steps` time steps before the newest;
-    /// from `hidden` channels it is told how much of an earlier map is taken.
-    pub(super) fn new(path: &nn::Path<'_>, [channels, dim, patch, steps]: [i64; 4], hidden: i64) -> Self {
+    /// For maps of `channels`, tokens of `dim` with `patch` cells along each edge, and `steps` time steps before the newest.
+    pub(super) fn new(path: &nn::Path<'_>, [channels, dim, patch, steps]: [i64; 4], config: &RecallConfig) -> Self {
+        let RecallConfig { hidden, share } = *config;
         let around = nn::ConvConfig { padding: 1, ..Default::default() };
         let bare = nn::ConvConfig { bias: false, ..around };
         let neutral = nn::ConvConfig { ws_init: Init::Const(0.0), bs_init: Init::Const(0.0), ..Default::default() };
@@ -93,74 +45,123 @@ impl Recall {
             now: nn::conv2d(path / "now", channels, hidden, 3, around),
             past: nn::conv2d(path / "past", channels, hidden, 3, bare),
             token: nn::linear(path / "token", dim, hidden, nn::LinearConfig { bias: false, ..Default::default() }),
-            step: path.var("step", &[steps, hidden], Init::Const(0.0)),
+            step: path.var("step", &[1 + steps, hidden], Init::Const(0.0)),
             gate: nn::conv2d(path / "gate", hidden, channels, 1, neutral),
             patch,
+            share,
         }
     }
 
-    /// `[1, C, H, W]` of the newest `now` of that shape.
+    /// `[1, C, H, W]` of `now`, the strongest of all agents' newest, of that shape, and the ego's `own`, `[C, H, W]`.
     ///
     /// # Shapes
-    /// - `past`: maps of the same size
     /// - `ego`: `[1, h, w, D]`, the ego's tokens after the transformer
+    /// - `likely`: `[1, 1, H, W]`, more where a vehicle is more likely
     pub(super) fn forward(
         &self,
-        now: &Tensor,
-        past: &[Earlier],
+        [now, own]: [&Tensor; 2],
+        past: &Earlier<'_>,
         ego: &Tensor,
-        train: bool,
+        likely: &Tensor,
     ) -> Result<Tensor, TchError> {
-        if past.is_empty() {
-            return Ok(now.shallow_clone());
-        }
-        let kind = if train { Kind::Float } else { fastest(now.device()) };
-        let known = convolve(&self.now, &now.f_to_kind(kind)?)? + self.told(ego)?.f_to_kind(kind)?;
-        let blend = |blended: Tensor, earlier: &Earlier| -> Result<Tensor, TchError> {
-            let Earlier { step, maps: Maps { features, mask } } = earlier;
-            let step = self.step.f_get(*step)?.f_view([1, -1, 1, 1])?.f_to_kind(kind)?;
-            let past = convolve(&self.past, &(features * mask).f_to_kind(kind)?)?;
-            let gate = convolve(&self.gate, &(&known + step + past).f_relu()?)?.f_tanh()?.f_to_kind(Kind::Float)?;
+        let (_, channels, height, width) = now.size4()?;
+        let chosen = Chosen::most_likely(likely, self.patch, self.share)?;
+        let index = |places: &[i64]| Tensor::f_from_slice(places)?.f_to_device(now.device());
+        let around = index(&chosen.around)?.f_view([-1, AROUND])?;
+        let middle = around.f_select(1, AROUND / 2)?;
+        let near = chosen.near.iter().map(|[row, column]| row * width as usize + column).map(|cell| cell as i64);
+        let near = index(&near.collect::<Vec<_>>())?;
+        let cells = now.f_permute([0, 2, 3, 1])?.f_reshape([height * width, channels])?;
+        let own = own.f_permute([1, 2, 0])?.f_reshape([height * width, channels])?.f_index_select(0, &near)?;
+        let shown = cells.f_index_select(0, &near)?;
+        let known = beside(&self.now, &shown, &around)? + self.told(ego, &index(&chosen.patches)?)?;
+        let now = shown.f_index_select(0, &middle)?;
+        let blend = |change: Tensor, (step, features, mask): (usize, Tensor, Option<Tensor>)| {
+            let step = self.step.f_get(step as i64)?;
+            let hidden = (beside(&self.past, &features, &around)? + &known + step).f_relu()?;
+            let gate = hidden.f_linear(&self.gate.ws.f_flatten(1, 3)?, self.gate.bs.as_ref())?.f_tanh()?;
+            let apart = features.f_index_select(0, &middle)? - &now;
             // Where nobody has shown anything nothing is blended in.
-            blended.f_addcmul(&gate, &(features.f_sub(now)? * mask))
+            let apart = match mask {
+                Some(mask) => apart * mask.f_index_select(0, &middle)?,
+                None => apart,
+            };
+            change.f_addcmul(&gate, &apart)
         };
-        past.iter().try_fold(now.shallow_clone(), blend)
+        let seen = WholeMap::seen(&past.maps, &chosen.near, past.grid)?;
+        let seen = seen.into_iter().map(|(step, Seen { features, mask })| (step + 1, features, Some(mask)));
+        let change = std::iter::once((0, own, None)).chain(seen).try_fold(now.f_zeros_like()?, blend)?;
+        let blended = cells.f_index_add(0, &index(&chosen.cells)?, &change)?;
+        blended.f_view([1, height, width, channels])?.f_permute([0, 3, 1, 2])
     }
 
-    /// What the tokens know, on the cells.
-    fn told(&self, ego: &Tensor) -> Result<Tensor, TchError> {
-        let (_, rows, columns, _) = ego.size4()?;
-        let told = self.token.forward(ego).f_permute([0, 3, 1, 2])?;
-        told.f_upsample_nearest2d([rows * self.patch, columns * self.patch], None, None)
+    /// What the tokens know, on the cells of some `patches`: `[P, hidden]`.
+    fn told(&self, ego: &Tensor, patches: &Tensor) -> Result<Tensor, TchError> {
+        let told = self.token.forward(&ego.f_flatten(0, 2)?.f_index_select(0, patches)?);
+        let (patches, hidden) = told.size2()?;
+        let each = self.patch * self.patch;
+        told.f_unsqueeze(1)?.f_expand([patches, each, hidden], false)?.f_reshape([-1, hidden])
     }
+}
+
+/// A convolution of three by three at some cells: `[P, hidden]` of what cells show `[R, C]`, given `around` `[P, 9]` of which it looks
+/// at; the place behind the last is beyond the edge.
+fn beside(convolution: &nn::Conv2D, shown: &Tensor, around: &Tensor) -> Result<Tensor, TchError> {
+    let channels = shown.size2()?.1;
+    let shown = shown.f_constant_pad_nd([0, 0, 0, 1])?.f_index_select(0, &around.f_reshape(-1)?)?;
+    let weight = convolution.ws.f_permute([0, 2, 3, 1])?.f_flatten(1, 3)?;
+    shown.f_view([-1, AROUND * channels])?.f_linear(&weight, convolution.bs.as_ref())
 }
 
 #[cfg(test)]
 mod tests {
-    use protocol::{BevGrid, Pose};
+    use tch::nn::VarStore;
+    use tch::{Device, Kind, no_grad};
 
-    use super::super::alignment::{Area, lattice};
     use super::*;
-    use crate::made_up::uniform;
+    use crate::made_up::{redraw, uniform};
 
     #[test]
-    fn numbers_and_tensors_find_the_same_strongest() {
+    fn a_convolution_at_some_cells_is_that_of_all_of_them() {
+        let variables = VarStore::new(Device::Cpu);
+        let around = nn::ConvConfig { padding: 1, ..Default::default() };
+        let convolution = nn::conv2d(variables.root(), 3, 5, 3, around);
+        let map = uniform(4, &[1, 3, 4, 6]);
+        let all = convolution.forward(&map).flatten(2, 3).squeeze_dim(0).transpose(0, 1);
+        let chosen = Chosen::most_likely(&uniform(5, &[1, 1, 4, 6]), 2, 0.5).unwrap();
+        let of = |places: &[i64]| Tensor::from_slice(places);
+        let near: Vec<i64> = chosen.near.iter().map(|[row, column]| (row * 6 + column) as i64).collect();
+        let shown = map.flatten(2, 3).squeeze_dim(0).transpose(0, 1).index_select(0, &of(&near));
+        let some = beside(&convolution, &shown, &of(&chosen.around).view([-1, AROUND])).unwrap();
+        assert!(some.allclose(&all.index_select(0, &of(&chosen.cells)), 1e-5, 1e-5, false));
+    }
+
+    /// Where a vehicle may be the blend is that of a recall everywhere, elsewhere the newest is left as it is.
+    #[test]
+    fn what_is_recalled_is_the_same_wherever_else_one_looks() {
         let grid = BevGrid { x_min_m: -8.0, y_min_m: -4.0, cell_m: 0.5, width: 32, height: 16 };
-        let poses = [0.0, 3.0, -2.0].map(|x_m| Pose::from_xyz_yaw([x_m, 1.0, 0.0], 0.1 * x_m));
-        let deltas = Tensor::from_slice(&[0.7f32, -0.4, 0.05, -1.3, 0.2, 0.0, 9.0, 9.0, 1.0]).view([3, 3]);
-        let places = lattice(&deltas, &poses, &Area::new(&grid, [16, 32], 0), [16, 32]).unwrap();
-        let mask = uniform(4, &[3, 1, 16, 32]).gt(0.2).to_kind(Kind::Float);
-        let features = (uniform(5, &[3, 4, 16, 32]) - 0.3) * &mask;
-        let strongest = |with_gradient: bool| {
-            let features = features.copy().set_requires_grad(with_gradient);
-            let maps = Maps { features, mask: mask.shallow_clone() };
-            Earlier::strongest(0, &maps, Some(&places), &[0, 2]).unwrap().maps
+        let variables = VarStore::new(Device::Cpu);
+        let mut recall = Recall::new(&variables.root(), [4, 6, 2, 2], &RecallConfig { hidden: 5, share: 0.25 });
+        redraw(&variables, &["now", "past", "token", "step", "gate"], 0.3);
+        let maps: Vec<WholeMap> =
+            (0..3).map(|seed| WholeMap::of(&uniform(seed, &[1, 4, 16, 32]), None).unwrap()).collect();
+        let poses = [0.0, 2.0, -1.0].map(|x_m| Pose::from_xyz_yaw([x_m, 0.3, 0.0], 0.1 * x_m));
+        let maps =
+            || [0, 1, 1].into_iter().zip(poses).zip(&maps).map(|((step, pose), map)| (step, pose, map)).collect();
+        let (now, likely) = (uniform(7, &[1, 4, 16, 32]), uniform(8, &[1, 1, 16, 32]));
+        let own = now.get(0) * 0.9;
+        let ego = uniform(9, &[1, 8, 16, 6]);
+        let blended = |recall: &Recall| {
+            no_grad(|| recall.forward([&now, &own], &Earlier { maps: maps(), grid: &grid }, &ego, &likely)).unwrap()
         };
-        let (numbers, tensors) = (strongest(false), strongest(true));
-        assert!(tensors.features.requires_grad() && !numbers.features.requires_grad());
-        // A place between two cells may be nearest to either.
-        let apart = |a: &Tensor, b: &Tensor| (a - b).abs().gt(1e-4).sum(Kind::Int64).int64_value(&[]);
-        assert!(apart(&numbers.features, &tensors.features) <= 8 && apart(&numbers.mask, &tensors.mask) <= 2);
-        assert!(tensors.mask.sum(Kind::Float).double_value(&[]) > 50.0);
+        let few = blended(&recall);
+        recall.share = 1.0;
+        let everywhere = blended(&recall);
+        let differs = |a: &Tensor, b: &Tensor| (a - b).abs().amax([1], false).gt(1e-5);
+        let (changed, apart) = (differs(&few, &now), differs(&few, &everywhere));
+        let count = |cells: &Tensor| cells.sum(Kind::Int64).int64_value(&[]);
+        assert_eq!(count(&differs(&everywhere, &now)), 16 * 32);
+        assert_eq!(count(&changed), 16 * 32 / 4);
+        assert_eq!(count(&changed.logical_and(&apart)), 0);
     }
 }

@@ -1,0 +1,110 @@
+//! The cells of a lattice that are recalled.
+
+use tch::{Kind, TchError, Tensor};
+
+/// A cell and those beside it.
+pub(super) const AROUND: i64 = 9;
+/// So many cells around a patch count as much as its own: a vehicle's cell says that it is there, others show its outline.
+const MARGIN_CELLS: i64 = 2;
+
+/// How far those lie below and right of the first of them, row by row.
+const BESIDE: [[usize; 2]; AROUND as usize] = [[0, 0], [0, 1], [0, 2], [1, 0], [1, 1], [1, 2], [2, 0], [2, 1], [2, 2]];
+
+/// The cells of a few patches, patch by patch and row by row, and what lies beside them.
+#[derive(Debug)]
+pub(super) struct Chosen {
+    /// `K`: their patches, counted row by row.
+    pub(super) patches: Vec<i64>,
+    /// `P`: the cells of those, counted row by row.
+    pub(super) cells: Vec<i64>,
+    /// `R`: row and column of these cells and of those beside them, each once, in the order of the lattice.
+    pub(super) near: Vec<[usize; 2]>,
+    /// `P * 9`: of each cell the places in `near` of the cells around it, row by row; `R` for what is beyond the edge.
+    pub(super) around: Vec<i64>,
+}
+
+impl Chosen {
+    /// A `share` of all patches of `patch` cells along each edge, at least one: those in or close to which a vehicle is most
+    /// likely, which `likely` `[1, 1, H, W]` tells. H and W are multiples of `patch`.
+    pub(super) fn most_likely(likely: &Tensor, patch: i64, share: f64) -> Result<Self, TchError> {
+        let (_, _, height, width) = likely.size4()?;
+        let window = patch + 2 * MARGIN_CELLS;
+        let margin = [MARGIN_CELLS; 2];
+        let by_patch = likely.f_max_pool2d([window, window], [patch, patch], margin, [1, 1], false)?;
+        let by_patch: Vec<f32> = Vec::try_from(by_patch.f_to_kind(Kind::Float)?.f_reshape(-1)?)?;
+        let wanted = ((by_patch.len() as f64 * share).ceil() as usize).clamp(1, by_patch.len());
+        let mut patches: Vec<usize> = (0..by_patch.len()).collect();
+        patches.sort_by(|a, b| by_patch[*b].total_cmp(&by_patch[*a]));
+        patches.truncate(wanted);
+        patches.sort_unstable();
+        Ok(Self::of(&patches, patch as usize, [height as usize, width as usize]))
+    }
+
+    fn of(patches: &[usize], patch: usize, [height, width]: [usize; 2]) -> Self {
+        let cells_of = |index: &usize| {
+            let (row, column) = (index / (width / patch) * patch, index % (width / patch) * patch);
+            (row..row + patch).flat_map(move |row| (column..column + patch).map(move |column| [row, column]))
+        };
+        let cells: Vec<[usize; 2]> = patches.iter().flat_map(cells_of).collect();
+        let on_map = |[row, column]: [usize; 2], [down, right]: [usize; 2]| {
+            let [row, column] = [(row + down).checked_sub(1)?, (column + right).checked_sub(1)?];
+            (row < height && column < width).then_some(row * width + column)
+        };
+        let beside = |&cell: &[usize; 2]| BESIDE.map(|step| on_map(cell, step));
+        let mut place = vec![None; height * width];
+        for cell in cells.iter().flat_map(beside).flatten() {
+            place[cell] = Some(0);
+        }
+        let mut near = Vec::new();
+        for (cell, place) in place.iter_mut().enumerate().filter(|(_, place)| place.is_some()) {
+            *place = Some(near.len() as i64);
+            near.push([cell / width, cell % width]);
+        }
+        let place_of = |cell: Option<usize>| cell.and_then(|cell| place[cell]).unwrap_or(near.len() as i64);
+        Self {
+            patches: patches.iter().map(|&patch| patch as i64).collect(),
+            around: cells.iter().flat_map(beside).map(place_of).collect(),
+            cells: cells.iter().map(|[row, column]| (row * width + column) as i64).collect(),
+            near,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tch::Device;
+
+    use super::*;
+
+    #[test]
+    fn patches_around_what_is_likely_are_chosen() {
+        let likely = Tensor::zeros([1, 1, 16, 24], (Kind::Float, Device::Cpu));
+        let _ = likely.get(0).get(0).get(7).get(11).fill_(1.0);
+        // Four cells along each edge: within two cells of it lie the patches in rows 1 and 2, columns 2 and 3.
+        let chosen = Chosen::most_likely(&likely, 4, 4.0 / 24.0).unwrap();
+        assert_eq!(chosen.patches, [8, 9, 14, 15]);
+        assert_eq!((chosen.cells.len(), chosen.around.len()), (64, 64 * 9));
+        assert_eq!(&chosen.cells[..6], [4 * 24 + 8, 4 * 24 + 9, 4 * 24 + 10, 4 * 24 + 11, 5 * 24 + 8, 5 * 24 + 9]);
+        // One cell more on each side.
+        assert_eq!(chosen.near.len(), 100);
+        assert_eq!((chosen.near[0], chosen.near[99]), ([3, 7], [12, 16]));
+        assert_eq!(chosen.around[..9], [0, 1, 2, 10, 11, 12, 20, 21, 22]);
+    }
+
+    #[test]
+    fn beyond_the_edges_is_nothing() {
+        let chosen = Chosen::of(&[0, 5], 2, [4, 6]);
+        assert_eq!(chosen.near.len(), 3 * 3 + 3 * 3);
+        let beyond = chosen.near.len() as i64;
+        assert_eq!(chosen.around[..9], [beyond, beyond, beyond, beyond, 0, 1, beyond, 3, 4]);
+        assert_eq!(chosen.around[7 * 9..], [13, 14, beyond, 16, 17, beyond, beyond, beyond, beyond]);
+    }
+
+    #[test]
+    fn there_is_always_one_and_never_more_than_all() {
+        let likely = Tensor::full([1, 1, 4, 4], f64::NAN, (Kind::Float, Device::Cpu));
+        for (share, count) in [(0.0, 1), (0.3, 2), (1.0, 4), (9.0, 4), (f64::NAN, 1)] {
+            assert_eq!(Chosen::most_likely(&likely, 2, share).unwrap().patches.len(), count);
+        }
+    }
+}
