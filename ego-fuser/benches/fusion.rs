@@ -14,6 +14,9 @@ use protocol::Pose;
 use tch::nn::VarStore;
 use tch::{Device, Kind, Tensor, no_grad};
 
+/// Edge of what a vehicle covers of a map together with what lies close to it, cells of 0.8 m.
+const VEHICLE_CELLS: i64 = 8;
+
 fn fuse(criterion: &mut Criterion) {
     // As in the programs.
     process::ensure(&process::KEPT_MEMORY).expect("this program can be started again");
@@ -28,7 +31,10 @@ fn fuse(criterion: &mut Criterion) {
             let entries = (0..stage.frames()).flat_map(|step| (0..agents).map(move |agent| (step, agent)));
             let facts: Vec<_> = entries.map(|(step, agent)| entry(step, agent)).collect();
             let size = [facts.len() as i64, shape[0], shape[1], shape[2]];
-            let features = Tensor::rand(size, (Kind::Float, Device::Cpu));
+            // Alike over about a vehicle's length and width, so that what is worth a recall lies together as around vehicles.
+            let places = [size[0], size[1], size[2] / VEHICLE_CELLS, size[3] / VEHICLE_CELLS];
+            let features = Tensor::rand(places, (Kind::Float, Device::Cpu));
+            let features = features.upsample_nearest2d([size[2], size[3]], None, None);
             // As the ego keeps them.
             let of = |first: i64, count: i64| SentMaps { maps: features.narrow(0, first, count), sent: None };
             let newest = of(0, agents as i64);
