@@ -8,7 +8,7 @@ use agent::model_config::DetectorConfig;
 use agent::process;
 use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
 use ego_fuser::fusion::pastat::Part;
-use ego_fuser::fusion::{FusionConfig, FusionStage, KeptMaps, SentMaps, ViewFacts};
+use ego_fuser::fusion::{EarlierMaps, FusionConfig, FusionStage, SentMaps, ViewFacts};
 use ego_fuser::{Exchange, Method};
 use protocol::Pose;
 use tch::nn::VarStore;
@@ -38,13 +38,13 @@ fn fuse(criterion: &mut Criterion) {
             // As the ego keeps them.
             let of = |first: i64, count: i64| SentMaps { maps: features.narrow(0, first, count), sent: None };
             let newest = of(0, agents as i64);
-            let kept: Vec<KeptMaps> = no_grad(|| {
+            let kept: Vec<EarlierMaps> = no_grad(|| {
                 let kept = |map| stage.kept(&of(map, 1), &of(map, 1).maps).expect("maps are maps");
                 (agents as i64..size[0]).map(kept).collect()
             });
             let align = || {
-                let kept: Vec<&KeptMaps> = kept.iter().collect();
-                let earlier = (!kept.is_empty()).then(|| KeptMaps::together(&kept).expect("maps of one size"));
+                let kept: Vec<&EarlierMaps> = kept.iter().collect();
+                let earlier = (!kept.is_empty()).then(|| EarlierMaps::together(&kept).expect("maps of one size"));
                 stage.align_kept(&newest, earlier, &facts).expect("maps lie on the lattice")
             };
             group.bench_function(BenchmarkId::new(format!("warp/{method}"), agents), |bencher| {

@@ -18,7 +18,7 @@ use nalgebra::Isometry3;
 use protocol::{DecodedFeatures, Detection, DropReason, Pose, StageTiming};
 use tch::{Kind, TchError, Tensor, no_grad};
 
-use crate::fusion::{AlignedMaps, FusionStage, KeptMaps, SentMaps, StageError, ViewFacts};
+use crate::fusion::{AlignedMaps, EarlierMaps, FusionStage, SentMaps, StageError, ViewFacts};
 use crate::history::{History, KeptMap};
 use crate::method::{Exchange, Method};
 use crate::model::{METHOD_KEY, SCORE_THRESHOLD};
@@ -237,7 +237,7 @@ impl Ego {
             });
         }
         let newest = SentMaps { maps: Tensor::f_cat(&maps, 0)?, sent: Some(Tensor::f_cat(&sent, 0)?) };
-        let earlier = (!earlier.is_empty()).then(|| KeptMaps::together(&earlier)).transpose()?;
+        let earlier = (!earlier.is_empty()).then(|| EarlierMaps::together(&earlier)).transpose()?;
         let moved = self.fusion.align_kept(&newest, earlier, &facts)?;
         stages.lap("align");
         let fused = numbers::as_batch(&self.fusion.fuse(&moved, &facts, false)?)?;

@@ -7,7 +7,7 @@ use std::collections::{BTreeMap, VecDeque};
 
 use protocol::{CavId, Pose};
 
-use crate::fusion::KeptMaps;
+use crate::fusion::EarlierMaps;
 
 /// Maps older than this tell of another situation, nanoseconds.
 pub(crate) const MAX_AGE_NANOS: u64 = 1_000_000_000;
@@ -24,7 +24,7 @@ pub(crate) struct KeptMap {
     /// How sure it was.
     pub(crate) confidence: f64,
     /// One map, as the fusion keeps it.
-    pub(crate) shown: KeptMaps,
+    pub(crate) shown: EarlierMaps,
 }
 
 /// Maps by vehicle, oldest first.
@@ -99,7 +99,7 @@ mod tests {
             capture_nanos: frame * FRAME,
             world_from_cav: Pose::IDENTITY,
             confidence: 1.0,
-            shown: KeptMaps::of_nothing(),
+            shown: EarlierMaps::of_nothing(),
         }
     }
 

@@ -33,7 +33,7 @@ pub use block_order::BlockOrder;
 use classes::Classes;
 pub use config::{FUSION_KEY, FusionConfig};
 pub use max::MaxFusion;
-pub use stage::{AlignedMaps, FusionStage, KeptMaps, SentMaps, StageError};
+pub use stage::{AlignedMaps, EarlierMaps, FusionStage, SentMaps, StageError};
 pub(crate) use stage::{FUSION_PREFIX, stored_config};
 pub use steering::Steering;
 pub(crate) use whole::{Seen, WholeMap};

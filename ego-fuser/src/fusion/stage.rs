@@ -79,14 +79,14 @@ impl SentMaps {
 
 /// What is kept of maps for later frames.
 #[derive(Debug)]
-pub struct KeptMaps {
+pub struct EarlierMaps {
     /// With larger cells, see [`Fusion::earlier_cells`].
     shown: SentMaps,
     /// To the cell, for a fusion that [recalls](Fusion::recalls); else none.
     whole: Vec<WholeMap>,
 }
 
-impl KeptMaps {
+impl EarlierMaps {
     /// Of a map of one cell.
     #[cfg(test)]
     pub(crate) fn of_nothing() -> Self {
@@ -206,11 +206,11 @@ impl FusionStage {
         self.align_kept(&all.only(0, newest.min(count))?, Some(earlier), facts)
     }
 
-    /// What is kept of maps for later frames, given the same maps in the axes of the ego.
+    /// What is kept of maps `[N, C, H, W]` for later frames, given the same maps in the axes of the ego, `turned`.
     ///
     /// # Errors
     /// [`TchError`] when the maps are none.
-    pub fn kept(&self, SentMaps { maps, sent }: &SentMaps, turned: &Tensor) -> Result<KeptMaps, TchError> {
+    pub fn kept(&self, SentMaps { maps, sent }: &SentMaps, turned: &Tensor) -> Result<EarlierMaps, TchError> {
         let shown = match self.fusion.earlier_cells() {
             Some(cells) => SentMaps {
                 maps: cell_by_cell(&larger_cells(maps, cells)?)?,
@@ -224,7 +224,7 @@ impl FusionStage {
             WholeMap::of(&of(turned)?, sent.as_ref().map(of).transpose()?.as_ref())
         };
         let wanted = if self.fusion.recalls() { maps.size4()?.0 } else { 0 };
-        Ok(KeptMaps { shown, whole: (0..wanted).map(whole).collect::<Result<_, TchError>>()? })
+        Ok(EarlierMaps { shown, whole: (0..wanted).map(whole).collect::<Result<_, TchError>>()? })
     }
 
     /// Maps in the axes of the ego.
@@ -242,7 +242,7 @@ impl FusionStage {
     pub fn align_kept(
         &self,
         newest: &SentMaps,
-        earlier: Option<KeptMaps>,
+        earlier: Option<EarlierMaps>,
         facts: &[ViewFacts],
     ) -> Result<AlignedMaps, WarpError> {
         let poses: Vec<Pose> = self.of_network(facts).iter().map(|facts| facts.ego_from_cav).collect();
@@ -255,7 +255,7 @@ impl FusionStage {
         // What keeps earlier maps in another form takes the maximum over the newest, cell by cell.
         let order = if cells.is_some() { Order::Cells } else { Order::Planes };
         match (cells, earlier) {
-            (Some(cells), Some(KeptMaps { shown, whole })) => {
+            (Some(cells), Some(EarlierMaps { shown, whole })) => {
                 let (of_newest, of_earlier) = poses.split_at(count as usize);
                 let (own_frame, warped) = self.moved(newest, of_newest, &self.grid, order)?;
                 let earlier = self.moved(&shown, of_earlier, &with_cells_of(&self.grid, cells), order)?.1;

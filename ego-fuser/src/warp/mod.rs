@@ -132,24 +132,25 @@ pub(crate) fn warp_in_order(
 }
 
 /// Where an affine map of normalised coordinates puts the cells of a lattice, `[1, h, w, 2]` for `grid_sampler`.
-fn lattice([xx, xy, x0, yx, yy, y0]: [f32; 6], grid: &BevGrid) -> Result<Tensor, TchError> {
-    let middles = |count: u32| (0..count).map(move |cell| (2 * cell + 1) as f32 / count as f32 - 1.0);
-    let columns: Vec<f32> = middles(grid.width).collect();
-    let row = |y: f32| columns.iter().flat_map(move |x| [xx * x + xy * y + x0, yx * x + yy * y + y0]);
-    let places: Vec<f32> = middles(grid.height).flat_map(row).collect();
+fn lattice(affine: [f32; 6], grid: &BevGrid) -> Result<Tensor, TchError> {
+    let [rows, columns] = [grid.height, grid.width].map(|count| count as usize);
+    let row = |row| (0..columns).flat_map(move |column| place_of([row, column], affine, grid));
+    let places: Vec<f32> = (0..rows).flat_map(row).collect();
     Tensor::f_from_slice(&places)?.f_view([1, i64::from(grid.height), i64::from(grid.width), 2])
+}
+
+/// The same of one cell, by row and column.
+fn place_of([row, column]: [usize; 2], [xx, xy, x0, yx, yy, y0]: [f32; 6], grid: &BevGrid) -> [f32; 2] {
+    let middle = |cell: usize, count: u32| (2 * cell + 1) as f32 / count as f32 - 1.0;
+    let (x, y) = (middle(column, grid.width), middle(row, grid.height));
+    [xx * x + xy * y + x0, yx * x + yy * y + y0]
 }
 
 /// Where some cells of the ego's lattice, by row and column, lie on a map of the same `grid`, in `grid_sampler`'s coordinates,
 /// two for each.
 pub(crate) fn places_of(cells: &[[usize; 2]], ego_from_cav: &Pose, grid: &BevGrid) -> Vec<f32> {
-    let [xx, xy, x0, yx, yy, y0] = cav_from_ego_normalized(ego_from_cav, grid);
-    let middle = |cell: usize, count: u32| (2 * cell + 1) as f32 / count as f32 - 1.0;
-    let place = |[row, column]: &[usize; 2]| {
-        let (x, y) = (middle(*column, grid.width), middle(*row, grid.height));
-        [xx * x + xy * y + x0, yx * x + yy * y + y0]
-    };
-    cells.iter().flat_map(place).collect()
+    let affine = cav_from_ego_normalized(ego_from_cav, grid);
+    cells.iter().flat_map(|&cell| place_of(cell, affine, grid)).collect()
 }
 
 /// Maps `[1, C, H, W]` as `[N, C, H, W]`, in the order that they have in memory.

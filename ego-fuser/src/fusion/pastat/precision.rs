@@ -2,12 +2,19 @@
 
 use tch::{Device, Kind, TchError, Tensor, nn};
 
+use crate::numbers::are_numbers;
+
 /// A convolution in the precision of `maps` and without a change of size; its parameters stay as they are.
 pub(super) fn convolve(convolution: &nn::Conv2D, maps: &Tensor) -> Result<Tensor, TchError> {
     let weight = convolution.ws.f_to_kind(maps.kind())?;
     let bias = convolution.bs.as_ref().map(|bias| bias.f_to_kind(maps.kind())).transpose()?;
     let around = convolution.ws.size4()?.3 / 2;
     maps.f_conv2d(&weight, bias.as_ref(), [1, 1], [around, around], [1, 1], 1)
+}
+
+/// The precision in which what is made of `maps` is fastest without being wrong; their own where a gradient flows.
+pub(super) fn fastest_of(maps: &Tensor) -> Kind {
+    if are_numbers(maps) { fastest(maps.device()) } else { maps.kind() }
 }
 
 /// The precision in which convolutions are fastest without being wrong.

@@ -10,9 +10,8 @@ use tch::{Kind, TchError, Tensor};
 
 use super::chosen::{AROUND, Chosen};
 use super::config::RecallConfig;
-use super::precision::fastest;
+use super::precision::fastest_of;
 use crate::fusion::{Seen, WholeMap};
-use crate::numbers::are_numbers;
 
 /// Maps from before their agents' newest.
 pub(super) struct Earlier<'a> {
@@ -106,11 +105,11 @@ impl Recall {
     }
 }
 
-/// In the precision that is fastest a convolution of three by three at some cells: `[P, hidden]` of what cells show `[R, C]`, given `around` `[P, 9]` of which it looks
-/// at; the place behind the last is beyond the edge.
+/// A convolution of three by three at some cells, in the precision that is fastest: `[P, hidden]` of what cells show
+/// `[R, C]`, given the places `[P, 9]` `around` each; the place behind the last is beyond the edge.
 fn beside(convolution: &nn::Conv2D, shown: &Tensor, around: &Tensor) -> Result<Tensor, TchError> {
     let channels = shown.size2()?.1;
-    let kind = if are_numbers(shown) { fastest(shown.device()) } else { shown.kind() };
+    let kind = fastest_of(shown);
     let shown = shown.f_to_kind(kind)?.f_constant_pad_nd([0, 0, 0, 1])?.f_index_select(0, &around.f_reshape(-1)?)?;
     let weight = convolution.ws.f_permute([0, 2, 3, 1])?.f_flatten(1, 3)?.f_to_kind(kind)?;
     let bias = convolution.bs.as_ref().map(|bias| bias.f_to_kind(kind)).transpose()?;

@@ -4,9 +4,8 @@ use tch::nn::{self, Init, Module};
 use tch::{Kind, TchError, Tensor};
 
 use super::config::PastatConfig;
-use super::precision::fastest;
+use super::precision::fastest_of;
 use super::temporal::encoding;
-use crate::numbers::are_numbers;
 
 /// Patches of cells to tokens, with what is known of a map beside what it shows.
 #[derive(Debug)]
@@ -41,7 +40,7 @@ impl Tokeniser {
             _ => ws.f_avg_pool2d([cells, cells], [cells, cells], [0_i64, 0], false, true, None::<i64>)?,
         };
         let weight = weight * (cells * cells) as f64;
-        let kind = if are_numbers(maps) { fastest(maps.device()) } else { maps.kind() };
+        let kind = fastest_of(maps);
         let bias = bs.as_ref().map(|bias| bias.f_to_kind(kind)).transpose()?;
         let (maps, weight) = (maps.f_to_kind(kind)?, weight.f_to_kind(kind)?);
         maps.f_conv2d(&weight, bias.as_ref(), [edge, edge], [0, 0], [1, 1], 1)?.f_to_kind(Kind::Float)
