@@ -48,9 +48,9 @@ pub struct FsaConfig {
     pub radius: i64,
     /// Neurons of the fully connected layer.
     pub hidden: i64,
-    /// Largest shift along x or y, metres.
+    /// Largest shift of one look along x or y, metres.
     pub max_shift_m: f64,
-    /// Largest turn, radians.
+    /// Largest turn of one look, radians.
     pub max_turn_rad: f64,
     /// The search for maps that are further away than all that; absent: such maps stay where they are.
     #[serde(default)]
@@ -65,7 +65,8 @@ pub struct SearchConfig {
     pub cells: i64,
     /// Maps are looked for up to so many of these larger cells away, along x and along y.
     pub radius: i64,
-    /// A map is moved when its correlation with the ego's is higher elsewhere by more than this.
+    /// In training a map is moved when its correlation with the ego's is higher elsewhere by more than this. Once trained,
+    /// what is higher there by anything is compared closely at both places.
     pub margin: f64,
 }
 

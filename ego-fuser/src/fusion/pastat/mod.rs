@@ -10,6 +10,7 @@
 //! Entries are real maps, so nothing is padded over agents or time.
 
 mod alignment;
+mod area;
 mod attention;
 mod block;
 mod chosen;
@@ -19,6 +20,7 @@ mod correlation;
 mod entries;
 mod gather;
 mod moved;
+mod pairs;
 mod precision;
 mod recall;
 mod refiner;
@@ -32,11 +34,13 @@ use tch::{Device, TchError, Tensor, nn};
 
 pub use config::{FsaConfig, Part, PastatConfig, RecallConfig, Rows, SearchConfig, Wavelengths};
 
-use self::alignment::{Area, Found, SpatialAlignment, TRUST, lattice, resample};
+use self::alignment::{SpatialAlignment, TRUST};
+use self::area::{Area, lattice, resample};
 use self::block::Block;
 use self::entries::{Maps, Shown, Told};
 use self::gather::Others;
 use self::moved::MovedMaps;
+use self::pairs::Found;
 use self::recall::{Earlier, Recall};
 use self::refiner::Refiner;
 use self::tokens::{Decoder, Tokeniser, TrustGate};
@@ -140,7 +144,7 @@ impl Pastat {
             Some(alignment) if told.age_secs.len() > 1 => {
                 let (_, height, width) = own.size3()?;
                 let area = Area::new(grid, [height, width], alignment.radius());
-                let Found { deltas, fit } = self.compare(alignment, &newest, earlier.as_ref(), told, &area)?;
+                let Found { deltas, fit, .. } = self.compare(alignment, &newest, earlier.as_ref(), told, &area)?;
                 // The ego's newest, which fits itself, is told nothing.
                 let facts = facts + fit.f_constant_pad_nd([0, 0, 1, 0])?;
                 (placed.moved(&deltas, &told.ego_from_cav[1..], &area)?, facts, Some(deltas))
@@ -168,7 +172,7 @@ impl Pastat {
         let of_entry = |(index, &entry): (usize, &usize)| {
             let step = steps_back[first + index].checked_sub(1).filter(|step| step + 1 < self.config.frames)?;
             let (pose, map) = (&ego_from_cav[first + index], whole.maps.get(entry)?);
-            Some((step, deltas.as_ref().map_or(*pose, |deltas| alignment::moved(pose, &deltas[index])), map))
+            Some((step, deltas.as_ref().map_or(*pose, |deltas| area::moved(pose, &deltas[index])), map))
         };
         let maps: Vec<_> = shown.earlier_entries.iter().enumerate().filter_map(of_entry).collect();
         if maps.is_empty() {
@@ -195,14 +199,14 @@ impl Pastat {
         let mut found = Vec::with_capacity(2);
         if agents > 1 {
             let others = newest.only(1, agents)?;
-            found.push(alignment.compare(&ego, &others, &of(1, agents)?, &poses[1..agents as usize], area)?);
+            found.push(alignment.compare([&ego, &others], &of(1, agents)?, &poses[1..agents as usize], area)?);
         }
         if let Some(earlier) = earlier {
             let larger = self.config.earlier_cells;
             // Means of what is looked at are what is looked at of means.
             let (ego, area) = (ego.with_cells_of(larger)?, area.with_cells_of(larger));
             let (earlier, trust) = (alignment.looked_at(earlier)?, of(agents, poses.len() as i64)?);
-            found.push(alignment.compare(&ego, &earlier, &trust, &poses[agents as usize..], &area)?);
+            found.push(alignment.compare([&ego, &earlier], &trust, &poses[agents as usize..], &area)?);
         }
         Found::all(&found)
     }

@@ -3,7 +3,7 @@
 use protocol::Pose;
 use tch::{TchError, Tensor};
 
-use super::alignment::{Area, lattice, resample};
+use super::area::{Area, lattice, resample};
 use super::entries::Maps;
 use crate::numbers::{self, are_numbers};
 use crate::warp::Cells;

@@ -2,7 +2,7 @@
 
 use tch::{TchError, Tensor};
 
-use super::alignment::Area;
+use super::area::Area;
 use super::config::SearchConfig;
 use super::correlation::{correlate, shifts};
 
