@@ -6,7 +6,7 @@
 
 use protocol::{BevGrid, Pose};
 use tch::nn::{self, Init, Module};
-use tch::{Kind, TchError, Tensor};
+use tch::{Device, Kind, TchError, Tensor};
 
 use super::chosen::{AROUND, Chosen};
 use super::config::RecallConfig;
@@ -67,33 +67,29 @@ impl Recall {
     ) -> Result<Tensor, TchError> {
         let (_, channels, height, width) = now.size4()?;
         let chosen = Chosen::most_likely(likely, self.patch, self.share)?;
-        let index = |places: &[i64]| Tensor::f_from_slice(places)?.f_to_device(now.device());
-        let around = index(&chosen.around)?.f_view([-1, AROUND])?;
-        let middle = around.f_select(1, AROUND / 2)?;
-        let near = chosen.near.iter().map(|[row, column]| row * width as usize + column).map(|cell| cell as i64);
-        let near = index(&near.collect::<Vec<_>>())?;
-        let cells = now.f_permute([0, 2, 3, 1])?.f_reshape([height * width, channels])?;
-        let own = own.f_permute([1, 2, 0])?.f_reshape([height * width, channels])?.f_index_select(0, &near)?;
-        let shown = cells.f_index_select(0, &near)?;
-        let known = beside(&self.now, &shown, &around)? + self.told(ego, &index(&chosen.patches)?)?;
-        let now = shown.f_index_select(0, &middle)?;
-        let blend = |change: Tensor, (step, features, mask): (usize, Tensor, Option<Tensor>)| {
-            let step = self.step.f_get(step as i64)?;
-            let hidden = (beside(&self.past, &features, &around)? + &known + step).f_relu()?;
-            let gate = hidden.f_linear(&self.gate.ws.f_flatten(1, 3)?, self.gate.bs.as_ref())?.f_tanh()?;
-            let apart = features.f_index_select(0, &middle)? - &now;
+        let at = Places::of(&chosen, width, now.device())?;
+        let [cells, own] = [&now.f_squeeze_dim(0)?, own].map(by_cell);
+        let (cells, own) = (cells?, own?.f_index_select(0, &at.near)?);
+        let shown = cells.f_index_select(0, &at.near)?;
+        let known = beside(&self.now, &shown, &at.around)? + self.told(ego, &at.patches)?;
+        let now = shown.f_index_select(0, &at.middle)?;
+        let gate = self.gate(0, &own, &known, &at)?;
+        let mut change = gate * (own.f_index_select(0, &at.middle)? - &now);
+        for (step, Seen { features, mask }) in WholeMap::seen(&past.maps, &chosen.near, past.grid)? {
+            let gate = self.gate(1 + step, &features, &known, &at)?;
+            let apart = features.f_index_select(0, &at.middle)? - &now;
             // Where nobody has shown anything nothing is blended in.
-            let apart = match mask {
-                Some(mask) => apart * mask.f_index_select(0, &middle)?,
-                None => apart,
-            };
-            change.f_addcmul(&gate, &apart)
-        };
-        let seen = WholeMap::seen(&past.maps, &chosen.near, past.grid)?;
-        let seen = seen.into_iter().map(|(step, Seen { features, mask })| (step + 1, features, Some(mask)));
-        let change = std::iter::once((0, own, None)).chain(seen).try_fold(now.f_zeros_like()?, blend)?;
-        let blended = cells.f_index_add(0, &index(&chosen.cells)?, &change)?;
+            change = change.f_addcmul(&gate, &(apart * mask.f_index_select(0, &at.middle)?))?;
+        }
+        let blended = cells.f_index_add(0, &at.cells, &change)?;
         blended.f_view([1, height, width, channels])?.f_permute([0, 3, 1, 2])
+    }
+
+    /// `[P, C]`: how much is taken of what was seen at a time step, `features` `[R, C]`, given what is `known` `[P, hidden]`.
+    fn gate(&self, step: usize, features: &Tensor, known: &Tensor, at: &Places) -> Result<Tensor, TchError> {
+        let step = self.step.f_get(step as i64)?;
+        let hidden = (beside(&self.past, features, &at.around)? + known + step).f_relu()?;
+        hidden.f_linear(&self.gate.ws.f_flatten(1, 3)?, self.gate.bs.as_ref())?.f_tanh()
     }
 
     /// What the tokens know, on the cells of some `patches`: `[P, hidden]`.
@@ -103,6 +99,40 @@ impl Recall {
         let each = self.patch * self.patch;
         told.f_unsqueeze(1)?.f_expand([patches, each, hidden], false)?.f_reshape([-1, hidden])
     }
+}
+
+/// [`Chosen`] cells as indices.
+struct Places {
+    /// `[K]`, of patches.
+    patches: Tensor,
+    /// `[P]`, of the cells of those.
+    cells: Tensor,
+    /// `[R]`, of these cells and those beside them.
+    near: Tensor,
+    /// `[P, 9]`: of each cell the places in `near` of those around it.
+    around: Tensor,
+    /// `[P]`: of each cell its own place in `near`.
+    middle: Tensor,
+}
+
+impl Places {
+    fn of(chosen: &Chosen, width: i64, device: Device) -> Result<Self, TchError> {
+        let index = |places: &[i64]| Tensor::f_from_slice(places)?.f_to_device(device);
+        let near: Vec<i64> = chosen.near.iter().map(|&[row, column]| row as i64 * width + column as i64).collect();
+        let around = index(&chosen.around)?.f_view([-1, AROUND])?;
+        Ok(Self {
+            patches: index(&chosen.patches)?,
+            cells: index(&chosen.cells)?,
+            near: index(&near)?,
+            middle: around.f_select(1, AROUND / 2)?,
+            around,
+        })
+    }
+}
+
+/// A map `[C, H, W]` as `[H * W, C]`.
+fn by_cell(map: &Tensor) -> Result<Tensor, TchError> {
+    map.f_flatten(1, 2)?.f_transpose(0, 1)?.f_contiguous()
 }
 
 /// A convolution of three by three at some cells, in the precision that is fastest: `[P, hidden]` of what cells show
@@ -119,7 +149,7 @@ fn beside(convolution: &nn::Conv2D, shown: &Tensor, around: &Tensor) -> Result<T
 #[cfg(test)]
 mod tests {
     use tch::nn::VarStore;
-    use tch::{Device, no_grad};
+    use tch::no_grad;
 
     use super::*;
     use crate::made_up::{redraw, uniform};
