@@ -144,7 +144,7 @@ impl SpatialAlignment {
         let [fit, alike] = [&found.parts, &found.whole].map(|found| found.f_amax([-1_i64].as_slice(), false));
         let (fit, alike) = (fit?, alike?);
         let weight = fit.f_relu()?.f_square()? * &found.energy;
-        let senders = area.from_middle(ego_from_cav)?.f_to_device(device)? + deltas.f_narrow(1, 0, 2)?;
+        let senders = area.places_of(ego_from_cav)?.f_to_device(device)? + deltas.f_narrow(1, 0, 2)?;
         let motion = rigid_motion(&parts, &weight, &senders, area)?;
         let by_entry = |parts: Tensor| parts.f_transpose(0, 1)?.f_reshape([ego_from_cav.len() as i64, -1]);
         let inputs = [
@@ -337,7 +337,7 @@ mod tests {
     fn shifts_of_parts_make_the_motion_that_a_wrong_pose_needs() {
         let sender = Pose::from_xyz_yaw([3.0, -1.0, 0.0], 0.4);
         let (turn, shift) = (0.02_f64, [0.7, -0.3]);
-        let (middles, senders) = (area().middles_of_parts().unwrap(), area().from_middle(&[sender]).unwrap());
+        let (middles, senders) = (area().middles_of_parts().unwrap(), area().places_of(&[sender]).unwrap());
         // Each part moves by the shift, and by the turn about the sender.
         let parts: Vec<f32> = (0..PARTS * PARTS)
             .flat_map(|part| {

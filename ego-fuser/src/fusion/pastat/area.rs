@@ -48,9 +48,9 @@ impl Area {
     }
 
     /// Where vehicles are, metres from the middle of the area, `[N, 2]`.
-    pub(super) fn from_middle(&self, ego_from_cav: &[Pose]) -> Result<Tensor, TchError> {
-        let from_middle = |pose: &Pose| [0, 1].map(|axis| (pose.translation_m[axis] - self.middle_m[axis]) as f32);
-        let places: Vec<f32> = ego_from_cav.iter().flat_map(from_middle).collect();
+    pub(super) fn places_of(&self, ego_from_cav: &[Pose]) -> Result<Tensor, TchError> {
+        let place = |pose: &Pose| [0, 1].map(|axis| (pose.translation_m[axis] - self.middle_m[axis]) as f32);
+        let places: Vec<f32> = ego_from_cav.iter().flat_map(place).collect();
         Tensor::f_from_slice(&places)?.f_view([-1, 2])
     }
 

@@ -5,7 +5,8 @@
 //! well they do. Pre-norm blocks (Eq. 8, 9) attend over agents and time at each cell and across cells within windows of
 //! several sizes. What they find comes back onto the cells in two ways: as a weight of each neighbour's newest map, of
 //! which the maximum is taken, and as a change of that. Where vehicles may be, earlier maps and the ego's own are blended
-//! into that maximum to the cell (recall), if the configuration has it. Untrained, all are neutral: the fusion begins as the element-wise maximum.
+//! into that maximum to the cell (recall), if the configuration has it. Untrained, all are neutral: the fusion begins as
+//! the element-wise maximum.
 //!
 //! Entries are real maps, so nothing is padded over agents or time.
 
