@@ -10,7 +10,7 @@ use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
 use ego_fuser::fusion::pastat::Part;
 use ego_fuser::fusion::{EarlierMaps, FusionConfig, FusionStage, SentMaps, ViewFacts};
 use ego_fuser::{Exchange, Method};
-use protocol::Pose;
+use protocol::{BevGrid, Pose};
 use tch::nn::VarStore;
 use tch::{Device, Kind, Tensor, no_grad};
 
@@ -24,6 +24,7 @@ fn fuse(criterion: &mut Criterion) {
     let config = DetectorConfig::lean();
     let grid = config.feature_grid();
     let shape = [config.feature_channels(), i64::from(grid.height), i64::from(grid.width)];
+    let world = World::random(shape, &grid);
     let mut group = criterion.benchmark_group("lean");
     for agents in [1usize, 2, 4] {
         for (method, stage) in stages(&config) {
@@ -31,10 +32,8 @@ fn fuse(criterion: &mut Criterion) {
             let entries = (0..stage.frames()).flat_map(|step| (0..agents).map(move |agent| (step, agent)));
             let facts: Vec<_> = entries.map(|(step, agent)| entry(step, agent)).collect();
             let size = [facts.len() as i64, shape[0], shape[1], shape[2]];
-            // Alike over about a vehicle's length and width, so that what is worth a recall lies together as around vehicles.
-            let places = [size[0], size[1], size[2] / VEHICLE_CELLS, size[3] / VEHICLE_CELLS];
-            let features = Tensor::rand(places, (Kind::Float, Device::Cpu));
-            let features = features.upsample_nearest2d([size[2], size[3]], None, None);
+            let seen: Vec<Tensor> = facts.iter().map(|facts| world.seen_from(&facts.ego_from_cav)).collect();
+            let features = Tensor::cat(&seen, 0);
             // As the ego keeps them.
             let of = |first: i64, count: i64| SentMaps { maps: features.narrow(0, first, count), sent: None };
             let newest = of(0, agents as i64);
@@ -62,6 +61,34 @@ fn fuse(criterion: &mut Criterion) {
         }
     }
     group.finish();
+}
+
+/// What is around the ego: all vehicles' maps show the same, so that they fit where poses put them.
+struct World {
+    /// `[1, C, H, W]`, on the ego's lattice.
+    map: Tensor,
+    /// Half the lattice, metres along x and y; its middle is the ego.
+    half_m: [f64; 2],
+}
+
+impl World {
+    fn random(shape: [i64; 3], grid: &BevGrid) -> Self {
+        let [channels, height, width] = shape;
+        // Alike over about a vehicle's length and width, so that what is worth a recall lies together as around vehicles.
+        let places = [1, channels, height / VEHICLE_CELLS, width / VEHICLE_CELLS];
+        let map = Tensor::rand(places, (Kind::Float, Device::Cpu)).upsample_nearest2d([height, width], None, None);
+        Self { map, half_m: [width, height].map(|cells| cells as f64 * grid.cell_m / 2.0) }
+    }
+
+    fn seen_from(&self, ego_from_cav: &Pose) -> Tensor {
+        let ([x, y, _], (sin, cos)) = (ego_from_cav.translation_m, ego_from_cav.yaw_rad().sin_cos());
+        let [half_x, half_y] = self.half_m;
+        let affine = [cos, -sin * half_y / half_x, x / half_x, sin * half_x / half_y, cos, y / half_y];
+        let affine = Tensor::from_slice(&affine.map(|number| number as f32)).view([1, 2, 3]);
+        let places = Tensor::affine_grid_generator(&affine, self.map.size(), false);
+        // Bilinear; zeros beyond.
+        self.map.grid_sampler(&places, 0, 0, false)
+    }
 }
 
 /// All that fuse maps, by name, and the turning of channels that comes with each.
