@@ -75,8 +75,9 @@ impl SpatialAlignment {
 
     /// Compares `K` maps with the ego's.
     ///
-    /// Once trained it looks twice: what fits better far away is compared there as closely as where its pose puts it, and what was
-    /// moved is compared once more where it lies then. Training goes by the first look, and by the search's margin.
+    /// Unless it is to `train` it looks twice: what fits better far away is compared there as closely as where its pose puts
+    /// it, and what was moved is compared once more where it lies then. Training goes by the first look, and by the search's
+    /// margin.
     ///
     /// # Shapes
     /// - `ego`, `others`: what is [looked at](Self::looked_at) of 1 and `K` maps, on the lattice of `area`
@@ -88,20 +89,20 @@ impl SpatialAlignment {
         trust: &Tensor,
         ego_from_cav: &[Pose],
         area: &Area,
+        train: bool,
     ) -> Result<Found, TchError> {
         let (own, shown) = (self.shown(ego)?, self.shown(others)?);
-        let is_training = own.requires_grad();
         let nowhere = Tensor::f_zeros([ego_from_cav.len() as i64, 3], (Kind::Float, own.device()))?;
         let far = match self.config.search {
             Some(SearchConfig { cells, radius, margin }) => {
-                let margin = if is_training { margin } else { 0.0 };
+                let margin = if train { margin } else { 0.0 };
                 offsets([&own, &shown], area, SearchConfig { cells, radius, margin })?.f_constant_pad_nd([0, 1])?
             }
             None => nowhere.shallow_clone(),
         };
         let (mask, trust, ego_from_cav) = (others.mask.shallow_clone(), trust.shallow_clone(), ego_from_cav.to_vec());
         let pairs = Pairs { own, shown, mask, trust, ego_from_cav };
-        if is_training {
+        if train {
             return self.compare_near(&pairs, &far, area);
         }
         let near = self.compare_near(&pairs, &nowhere, area)?;
@@ -109,7 +110,8 @@ impl SpatialAlignment {
         self.compare_again(&pairs, found, area)
     }
 
-    /// What was found `near` where poses put maps, or what is found around `far` `[K, 3]`, where that fits better.
+    /// What was found `near` where poses put maps, or what is found around `far` `[K, 3]`, metres and radians in the ego's
+    /// frame, where that fits better.
     fn compare_there(&self, pairs: &Pairs, near: Found, far: &Tensor, area: &Area) -> Result<Found, TchError> {
         let rows = rows_where(&far.f_count_nonzero_dim_intlist([1_i64].as_slice())?)?;
         if rows.is_empty() {
@@ -132,7 +134,8 @@ impl SpatialAlignment {
         found.with(&rows, &again)
     }
 
-    /// Compares maps where `deltas` `[K, 3]` put them; what is found is added to those.
+    /// Compares maps where `deltas` `[K, 3]`, metres and radians in the ego's frame, put them; what is found is added to
+    /// those.
     fn compare_near(&self, pairs: &Pairs, deltas: &Tensor, area: &Area) -> Result<Found, TchError> {
         let Pairs { own, trust, ego_from_cav, .. } = pairs;
         let device = own.device();
@@ -246,7 +249,7 @@ mod tests {
         let poses = [Pose::from_xyz_yaw([3.0, 1.0, 0.0], 0.3), Pose::IDENTITY];
         let look = |maps: &Maps| fsa.looked_at(maps).unwrap();
         let maps = [&look(&random(1)), &look(&random(2))];
-        let found = fsa.compare(maps, &Tensor::ones([2, TRUST], FLOAT), &poses, &area()).unwrap();
+        let found = fsa.compare(maps, &Tensor::ones([2, TRUST], FLOAT), &poses, &area(), true).unwrap();
         assert_eq!(found.fit, Tensor::zeros([2, 6], FLOAT));
         let deltas = found.deltas;
         assert_eq!(deltas, Tensor::zeros([2, 3], FLOAT));
@@ -268,15 +271,17 @@ mod tests {
         let _ = tch::no_grad(|| variables.variables()["delta.bias"].shallow_clone().fill_(1e6));
         let trust = Tensor::ones([1, TRUST], FLOAT);
         let look = |maps: &Maps| fsa.looked_at(maps).unwrap();
-        let deltas =
-            fsa.compare([&look(&random(1)), &look(&random(1))], &trust, &[Pose::IDENTITY], &area()).unwrap().deltas;
+        let deltas = fsa
+            .compare([&look(&random(1)), &look(&random(1))], &trust, &[Pose::IDENTITY], &area(), true)
+            .unwrap()
+            .deltas;
         let found = Vec::<f32>::try_from(deltas.view(-1)).unwrap();
         assert!((found[0] - 3.0).abs() < 1e-6 && (f64::from(found[2]) - config.max_turn_rad).abs() < 1e-6);
     }
 
     /// What FSA with some search does to maps: the ego's; the same twelve cells too far along x and sixteen back along y; and
     /// somebody else's.
-    fn far_off(search: SearchConfig, is_training: bool) -> Vec<f32> {
+    fn far_off(search: SearchConfig, train: bool) -> Vec<f32> {
         let grid = BevGrid { x_min_m: -24.0, y_min_m: -16.0, cell_m: 0.5, width: 96, height: 64 };
         let (area, trust) = (Area::new(&grid, [64, 96], 4), Tensor::ones([3, TRUST], FLOAT));
         let variables = VarStore::new(Device::Cpu);
@@ -292,9 +297,9 @@ mod tests {
         let poses = [Pose::IDENTITY, Pose::from_xyz_yaw([3.0, 1.0, 0.0], 0.3), Pose::IDENTITY];
         let compared = || {
             let [ego, others] = [&with_mask(map(5)), &others].map(|maps| fsa.looked_at(maps).unwrap());
-            fsa.compare([&ego, &others], &trust, &poses, &area).unwrap().deltas
+            fsa.compare([&ego, &others], &trust, &poses, &area, train).unwrap().deltas
         };
-        Vec::try_from(if is_training { compared() } else { no_grad(compared) }.view(-1)).unwrap()
+        Vec::try_from(no_grad(compared).view(-1)).unwrap()
     }
 
     #[test]
@@ -324,11 +329,12 @@ mod tests {
         let map = uniform(5, &[1, 4, 16, 32]).gt(0.97).to_kind(Kind::Float);
         let maps = [map.shallow_clone(), map.roll([3], [3])]
             .map(|features| fsa.looked_at(&Maps { mask: features.ones_like().narrow(1, 0, 1), features }).unwrap());
-        let shift_x_m = || {
-            let found = fsa.compare([&maps[0], &maps[1]], &Tensor::ones([1, TRUST], FLOAT), &[Pose::IDENTITY], &area());
+        let shift_x_m = |train| {
+            let found =
+                fsa.compare([&maps[0], &maps[1]], &Tensor::ones([1, TRUST], FLOAT), &[Pose::IDENTITY], &area(), train);
             found.unwrap().deltas.double_value(&[0, 0])
         };
-        let (first, both) = (shift_x_m(), no_grad(shift_x_m));
+        let (first, both) = (shift_x_m(true), shift_x_m(false));
         assert!(first < -AGAIN_M, "{first}");
         assert!((both + 1.5).abs() < 0.7 * (first + 1.5).abs(), "{first} {both}");
     }

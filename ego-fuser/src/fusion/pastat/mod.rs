@@ -128,7 +128,7 @@ impl Pastat {
     }
 
     /// Tokens of all entries, moved by FSA; of each agent's newest map the map too.
-    fn align(&self, shown: &Shown, grid: &BevGrid) -> Result<Entries, TchError> {
+    fn align(&self, shown: &Shown, grid: &BevGrid, train: bool) -> Result<Entries, TchError> {
         let (padding, larger) = (self.config.padding_cells(), self.config.earlier_cells);
         let newest = shown.newest.padded(padding)?;
         let earlier = shown.earlier.as_ref().map(|earlier| earlier.padded(padding / larger)).transpose()?;
@@ -145,7 +145,8 @@ impl Pastat {
             Some(alignment) if told.age_secs.len() > 1 => {
                 let (_, height, width) = own.size3()?;
                 let area = Area::new(grid, [height, width], alignment.radius());
-                let Found { deltas, fit, .. } = self.compare(alignment, &newest, earlier.as_ref(), told, &area)?;
+                let Found { deltas, fit, .. } =
+                    self.compare(alignment, &newest, earlier.as_ref(), told, &area, train)?;
                 // The ego's newest, which fits itself, is told nothing.
                 let facts = facts + fit.f_constant_pad_nd([0, 0, 1, 0])?;
                 (placed.moved(&deltas, &told.ego_from_cav[1..], &area)?, facts, Some(deltas))
@@ -191,6 +192,7 @@ impl Pastat {
         earlier: Option<&Maps>,
         told: &Told,
         area: &Area,
+        train: bool,
     ) -> Result<Found, TchError> {
         let trust = Tensor::f_from_slice(&told.trust)?.f_view([-1, TRUST])?.f_to_device(newest.features.device())?;
         let trust = if self.config.ce { trust } else { trust.f_zeros_like()? };
@@ -200,14 +202,14 @@ impl Pastat {
         let mut found = Vec::with_capacity(2);
         if agents > 1 {
             let others = newest.only(1, agents)?;
-            found.push(alignment.compare([&ego, &others], &of(1, agents)?, &poses[1..agents as usize], area)?);
+            found.push(alignment.compare([&ego, &others], &of(1, agents)?, &poses[1..agents as usize], area, train)?);
         }
         if let Some(earlier) = earlier {
             let larger = self.config.earlier_cells;
             // Means of what is looked at are what is looked at of means.
             let (ego, area) = (ego.with_cells_of(larger)?, area.with_cells_of(larger));
             let (earlier, trust) = (alignment.looked_at(earlier)?, of(agents, poses.len() as i64)?);
-            found.push(alignment.compare([&ego, &earlier], &trust, &poses[agents as usize..], &area)?);
+            found.push(alignment.compare([&ego, &earlier], &trust, &poses[agents as usize..], &area, train)?);
         }
         Found::all(&found)
     }
@@ -258,7 +260,7 @@ impl Fusion for Pastat {
     fn fuse_and_correct(&self, views: &AlignedViews<'_>, train: bool) -> Result<(Tensor, Option<Tensor>), TchError> {
         let (_, _, height, width) = views.features.size4()?;
         let shown = Shown::of(views)?;
-        let entries = self.align(&shown, views.grid)?;
+        let entries = self.align(&shown, views.grid, train)?;
         let ego = self.transform(&entries)?;
         let newest = self.strongest(&entries, &ego)?;
         let steadied = self.steadied(newest, (views, &shown), &entries, &ego)?;

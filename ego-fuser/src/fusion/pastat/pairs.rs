@@ -34,7 +34,7 @@ impl Pairs {
 /// What the comparison of `K` maps with the ego's has found.
 #[derive(Debug)]
 pub(super) struct Found {
-    /// `[K, 3]`: shift along x and y in metres, turn in radians.
+    /// `[K, 3]`: shift along x and y of the ego in metres, turn about the sender in radians.
     pub(super) deltas: Tensor,
     /// `[K, D]`: how well each map fits, as a token. A map that fits nowhere is of a sender that is not where it says.
     pub(super) fit: Tensor,

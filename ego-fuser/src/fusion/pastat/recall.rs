@@ -8,6 +8,7 @@ use protocol::{BevGrid, Pose};
 use tch::nn::{self, Init, Module};
 use tch::{Device, Kind, TchError, Tensor};
 
+use super::by_cell;
 use super::chosen::{AROUND, Chosen};
 use super::config::RecallConfig;
 use super::precision::fastest_of;
@@ -68,8 +69,8 @@ impl Recall {
         let (_, channels, height, width) = now.size4()?;
         let chosen = Chosen::most_likely(likely, self.patch, self.share)?;
         let at = Places::of(&chosen, width, now.device())?;
-        let [cells, own] = [&now.f_squeeze_dim(0)?, own].map(by_cell);
-        let (cells, own) = (cells?, own?.f_index_select(0, &at.near)?);
+        let cells = by_cell(now)?.f_flatten(0, 2)?;
+        let own = by_cell(&own.f_unsqueeze(0)?)?.f_flatten(0, 2)?.f_index_select(0, &at.near)?;
         let shown = cells.f_index_select(0, &at.near)?;
         let known = beside(&self.now, &shown, &at.around)? + self.told(ego, &at.patches)?;
         let now = shown.f_index_select(0, &at.middle)?;
@@ -128,11 +129,6 @@ impl Places {
             around,
         })
     }
-}
-
-/// A map `[C, H, W]` as `[H * W, C]`.
-fn by_cell(map: &Tensor) -> Result<Tensor, TchError> {
-    map.f_flatten(1, 2)?.f_transpose(0, 1)?.f_contiguous()
 }
 
 /// A convolution of three by three at some cells, in the precision that is fastest: `[P, hidden]` of what cells show

@@ -185,7 +185,7 @@ fn fsa_learns_a_shift_from_the_maps_alone() {
         let cells = uniform(step, &[1, 4, 12, 20]).gt(0.9).to_kind(Kind::Float) * 3.0;
         let shift = if step.is_multiple_of(2) { 1 } else { -1 };
         scene.features = Tensor::cat(&[&cells, &cells.roll([shift], [3])], 0);
-        let entries = scene.seen_by(&pastat, |views| pastat.align(&Shown::of(&views).unwrap(), &GRID).unwrap());
+        let entries = scene.seen_by(&pastat, |views| pastat.align(&Shown::of(&views).unwrap(), &GRID, true).unwrap());
         let inside = |map: Tensor| map.narrow(1, 2, 8).narrow(2, 4, 12);
         let difference = inside(entries.others.maps().features.get(0)) - inside(cells.get(0));
         let loss = difference.square().mean(Kind::Float);
