@@ -104,6 +104,7 @@ fn measure(criterion: &mut Criterion, name: &str, fusion: &dyn Fusion, agents: i
         features: &features,
         mask: &mask,
         own_frame: &features,
+        sent: None,
         grid: &grid,
         facts: &facts,
         earlier: None,

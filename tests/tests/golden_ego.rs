@@ -271,8 +271,15 @@ fn check_fusion(golden: &Golden, name: &str, fusion: &dyn Fusion, features: &Ten
             let facts: Vec<_> = (0..views as usize).map(|agent| ViewFacts::fresh(agent, Pose::IDENTITY)).collect();
             let [width, height] = [width, height].map(|size| size as u32);
             let grid = BevGrid { x_min_m: 0.0, y_min_m: 0.0, cell_m: 0.4, width, height };
-            let views =
-                AlignedViews { features, mask: &mask, own_frame: features, grid: &grid, facts: &facts, earlier: None };
+            let views = AlignedViews {
+                features,
+                mask: &mask,
+                own_frame: features,
+                sent: None,
+                grid: &grid,
+                facts: &facts,
+                earlier: None,
+            };
             fusion.fuse(&views, false).unwrap()
         })
         .collect();

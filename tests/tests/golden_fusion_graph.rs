@@ -317,8 +317,15 @@ fn fuse(fusion: &dyn Fusion, maps: &Tensor) -> Tensor {
     let mask = Tensor::ones([agents, 1, height, width], (Kind::Float, Device::Cpu));
     let facts: Vec<_> = (0..agents as usize).map(|agent| ViewFacts::fresh(agent, Pose::IDENTITY)).collect();
     let grid = BevGrid { x_min_m: 0.0, y_min_m: 0.0, cell_m: 0.4, width: width as u32, height: height as u32 };
-    let views =
-        AlignedViews { features: maps, mask: &mask, own_frame: maps, grid: &grid, facts: &facts, earlier: None };
+    let views = AlignedViews {
+        features: maps,
+        mask: &mask,
+        own_frame: maps,
+        sent: None,
+        grid: &grid,
+        facts: &facts,
+        earlier: None,
+    };
     no_grad(|| fusion.fuse(&views, false)).unwrap()
 }
 

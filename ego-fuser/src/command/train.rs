@@ -104,6 +104,10 @@ pub(crate) struct Arguments {
     /// Vehicles of a sample at most.
     #[arg(long, default_value_t = 5)]
     max_agents: usize,
+    /// Learn what an ego can find that nobody helps: samples of one vehicle, which is to find what its neighbours have annotated
+    /// as well [default for none: what itself has annotated].
+    #[arg(long)]
+    alone: bool,
     /// Steps between two validations and checkpoints.
     #[arg(long, default_value_t = 500)]
     validate_every: u64,
@@ -145,6 +149,7 @@ impl Arguments {
             poses: self.poses()?,
             moments: Moments { frames: 1, gap: self.gap, max_delay_nanos: self.max_delay * 1_000_000 },
             max_agents: self.max_agents.max(1),
+            merged_truth: self.alone,
             ..SampleConfig::training(SampleKind::Single)
         };
         let unassigned = if self.ignore_unassigned { Unassigned::Ignored } else { Unassigned::Background };

@@ -37,8 +37,15 @@ mod tests {
         let _ = mask.narrow(0, 2, 1).narrow(2, 1, 2).fill_(0.0);
         let facts = [0, 1, 2].map(|agent| ViewFacts::fresh(agent, Pose::IDENTITY));
         let own_frame = &features;
-        let views =
-            AlignedViews { features: &features, mask: &mask, own_frame, grid: &grid, facts: &facts, earlier: None };
+        let views = AlignedViews {
+            features: &features,
+            mask: &mask,
+            own_frame,
+            sent: None,
+            grid: &grid,
+            facts: &facts,
+            earlier: None,
+        };
         let scores = (features.narrow(0, 0, 1) * &features).sum_dim_intlist([1_i64].as_slice(), true, None) / 2.0;
         let shares = scores.masked_fill(&mask.eq(0.0), f64::NEG_INFINITY).softmax(0, None);
         let expected = (shares * &features).sum_dim_intlist([0_i64].as_slice(), false, None);

@@ -70,6 +70,8 @@ pub struct AlignedViews<'a> {
     pub mask: &'a Tensor,
     /// `[N, C, H, W]` the maps before they were moved, for methods that move them themselves.
     pub own_frame: &'a Tensor,
+    /// `[N, 1, H, W]` which of their cells were sent; absent: all.
+    pub sent: Option<&'a Tensor>,
     /// The lattice of all maps, each in the frame of its vehicle.
     pub grid: &'a BevGrid,
     /// `N`: what is known of each.
@@ -209,8 +211,15 @@ mod tests {
             .collect();
         let (height, width) = (SHAPE[1] as u32, SHAPE[2] as u32);
         let grid = BevGrid { x_min_m: -12.0, y_min_m: -8.0, cell_m: 1.0, width, height };
-        let views =
-            AlignedViews { features, mask: &mask, own_frame: features, grid: &grid, facts: &facts, earlier: None };
+        let views = AlignedViews {
+            features,
+            mask: &mask,
+            own_frame: features,
+            sent: None,
+            grid: &grid,
+            facts: &facts,
+            earlier: None,
+        };
         let fused = no_grad(|| fusion.fuse(&views, false)).unwrap();
         assert_eq!(fused.size(), SHAPE);
         fused
@@ -268,7 +277,15 @@ mod tests {
             let (height, width) = (SHAPE[1] as u32, SHAPE[2] as u32);
             let grid = BevGrid { x_min_m: -12.0, y_min_m: -8.0, cell_m: 1.0, width, height };
             let (own_frame, facts) = (&features, &facts[..]);
-            let views = AlignedViews { features: &features, mask: &mask, own_frame, grid: &grid, facts, earlier: None };
+            let views = AlignedViews {
+                features: &features,
+                mask: &mask,
+                own_frame,
+                sent: None,
+                grid: &grid,
+                facts,
+                earlier: None,
+            };
             let fused = fusion.fuse(&views, true).unwrap();
             if variables.is_empty() {
                 continue;

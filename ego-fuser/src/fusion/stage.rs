@@ -110,7 +110,7 @@ impl EarlierMaps {
 /// Maps on the ego lattice, with what they were made from.
 #[derive(Debug)]
 pub struct AlignedMaps {
-    own_frame: Tensor,
+    own_frame: SentMaps,
     warped: Warped,
     earlier: Option<Warped>,
     /// Earlier maps that are not moved yet.
@@ -120,7 +120,7 @@ pub struct AlignedMaps {
 impl AlignedMaps {
     /// One of the newest maps, `[1, C, H, W]`, where it was made but in the axes of the ego.
     pub(crate) fn turned(&self, map: i64) -> Result<Tensor, TchError> {
-        self.own_frame.f_narrow(0, map, 1)
+        self.own_frame.maps.f_narrow(0, map, 1)
     }
 }
 
@@ -276,10 +276,10 @@ impl FusionStage {
         poses: &[Pose],
         grid: &BevGrid,
         order: Order,
-    ) -> Result<(Tensor, Warped), WarpError> {
-        let own_frame = self.turned(maps, poses)?;
-        let warped = warp_in_order(&own_frame, sent.as_ref(), poses, grid, order)?;
-        Ok((own_frame, warped))
+    ) -> Result<(SentMaps, Warped), WarpError> {
+        let maps = self.turned(maps, poses)?;
+        let warped = warp_in_order(&maps, sent.as_ref(), poses, grid, order)?;
+        Ok((SentMaps { maps, sent: sent.as_ref().map(Tensor::shallow_clone) }, warped))
     }
 
     /// Fuses aligned maps into `[C, H, W]` in the frame of the ego.
@@ -307,7 +307,8 @@ impl FusionStage {
         let whole = self.classes.as_ref().map(|classes| WholeViews { maps: whole, classes });
         let earlier =
             earlier.as_ref().map(|Warped { features, mask }| EarlierViews { features, mask, facts: before, whole });
-        let views = AlignedViews { features, mask, own_frame, grid: &self.grid, facts, earlier };
+        let SentMaps { maps: own_frame, sent } = own_frame;
+        let views = AlignedViews { features, mask, own_frame, sent: sent.as_ref(), grid: &self.grid, facts, earlier };
         Ok(self.fusion.fuse_and_correct(&views, train)?)
     }
 }

@@ -229,6 +229,7 @@ mod tests {
                 features: &features,
                 mask: &mask,
                 own_frame: &own_frame,
+                sent: None,
                 grid: &grid,
                 facts: &facts,
                 earlier: None,

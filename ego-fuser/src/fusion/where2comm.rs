@@ -174,6 +174,7 @@ mod tests {
             features: &features,
             mask: &mask,
             own_frame: &features,
+            sent: None,
             grid: &grid,
             facts: &facts,
             earlier: None,

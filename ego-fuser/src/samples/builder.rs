@@ -49,7 +49,8 @@ pub struct SampleConfig {
     pub max_agents: usize,
     /// Vehicles farther away do not take part, metres in the plane.
     pub comm_range_m: f64,
-    /// Whether a single vehicle is also to find what only its neighbours have annotated: the rule of the evaluation.
+    /// Whether a single vehicle is also to find what only its neighbours have annotated: the rule of the evaluation. A
+    /// training by it is of single vehicles, whatever their method shares.
     pub merged_truth: bool,
 }
 

@@ -22,7 +22,8 @@ pub(super) fn card(config: &TrainConfig, model: &CooperativeModel, scenes: &Scen
     );
     card.row("anchors between the thresholds", format_args!("{:?}", config.loss.unassigned));
     let samples = super::frozen::sample_config(config, model);
-    let SampleConfig { augmentation, drop_neighbour, poses, moments, max_agents, comm_range_m, .. } = &samples;
+    let SampleConfig { augmentation, drop_neighbour, poses, moments, max_agents, comm_range_m, merged_truth, .. } =
+        &samples;
     card.row(
         "augmentation",
         format_args!(
@@ -40,6 +41,9 @@ pub(super) fn card(config: &TrainConfig, model: &CooperativeModel, scenes: &Scen
             moments.max_delay_nanos as f64 * 1e-9
         ),
     );
+    if *merged_truth {
+        card.row("alone", "samples of one vehicle, which is to find what its neighbours have annotated as well");
+    }
     card.row(
         "moments",
         format_args!("{} frames of each vehicle, up to {} ticks from one to the next", moments.frames, moments.gap),

@@ -37,9 +37,10 @@ pub fn run(config: &TrainConfig, observer: &mut dyn Observer) -> Result<Summary,
     Training::prepare(config, observer)?.run(observer)
 }
 
-/// The views that a method learns from; `is_frozen` says that its encoder does not learn.
-fn sample_kind(method: Method, is_frozen: bool) -> Result<SampleKind, TrainError> {
+/// The views that a method learns from; `is_frozen` says that its encoder does not learn, `is_alone` that nobody shares maps.
+fn sample_kind(method: Method, is_frozen: bool, is_alone: bool) -> Result<SampleKind, TrainError> {
     match method.exchange() {
+        Exchange::Features if is_alone => Ok(SampleKind::Single),
         Exchange::Nothing => Ok(SampleKind::Single),
         Exchange::Points if is_frozen => Err(TrainError::NothingToKeep(method)),
         Exchange::Points => Ok(SampleKind::Merged),
@@ -74,7 +75,7 @@ struct Training<'a> {
 
 impl<'a> Training<'a> {
     fn prepare(config: &'a TrainConfig, observer: &mut dyn Observer) -> Result<Self, TrainError> {
-        let kind = sample_kind(config.method, config.frozen_encoder.is_some())?;
+        let kind = sample_kind(config.method, config.frozen_encoder.is_some(), config.samples.merged_truth)?;
         let run = &config.run;
         run.start()?;
         let mut model = first_model(config)?;
@@ -231,8 +232,9 @@ mod tests {
 
     #[test]
     fn merged_points_are_not_learnt_from_behind_a_frozen_encoder() {
-        assert!(matches!(sample_kind(Method::Early, true), Err(TrainError::NothingToKeep(Method::Early))));
-        assert_eq!(sample_kind(Method::Early, false).unwrap(), SampleKind::Merged);
-        assert_eq!(sample_kind(Method::Max, true).unwrap(), SampleKind::Cooperative);
+        assert!(matches!(sample_kind(Method::Early, true, false), Err(TrainError::NothingToKeep(Method::Early))));
+        assert_eq!(sample_kind(Method::Early, false, false).unwrap(), SampleKind::Merged);
+        let of_max = |is_alone| sample_kind(Method::Max, true, is_alone).unwrap();
+        assert_eq!([false, true].map(of_max), [SampleKind::Cooperative, SampleKind::Single]);
     }
 }

@@ -11,6 +11,8 @@ use crate::warp::{BILINEAR, NEAREST, PADDING_ZEROS};
 pub(super) struct Area {
     middle_m: [f64; 2],
     half_m: [f64; 2],
+    /// Rows and columns.
+    size: [i64; 2],
     cell_m: f64,
     /// Cells of the ego's lattice along each edge of a cell.
     cells: i64,
@@ -25,6 +27,7 @@ impl Area {
         Self {
             middle_m: [grid.x_min_m + half_m[0], grid.y_min_m + half_m[1]],
             half_m,
+            size: [height, width],
             cell_m: grid.cell_m,
             cells: 1,
             radius,
@@ -34,7 +37,13 @@ impl Area {
     /// The same with cells of `cells` by `cells`, compared up to about as many metres away.
     pub(super) fn with_cells_of(self, cells: i64) -> Self {
         let (cell_m, radius) = (self.cell_m * cells as f64, (self.radius + cells - 1) / cells);
-        Self { cell_m, cells: self.cells * cells, radius, ..self }
+        let size = self.size.map(|count| count / cells);
+        Self { size, cell_m, cells: self.cells * cells, radius, ..self }
+    }
+
+    /// Rows and columns.
+    pub(super) fn size(&self) -> [i64; 2] {
+        self.size
     }
 
     /// Edge of a cell, metres.
@@ -70,29 +79,52 @@ impl Area {
     }
 }
 
-/// Where the cells of the ego's lattice lie on maps that are moved by `deltas`, for `grid_sampler`: `[N, H, W, 2]`.
+/// Where the cells of the ego's lattice lie on maps that are moved by `deltas` `[N, 3]`, for `grid_sampler`: `[N, H, W, 2]`.
 ///
 /// A map is turned about the place of the vehicle that made it and then shifted, both in the ego's frame, so that an
 /// error of its pose's heading is one number and not three.
 pub(super) fn lattice(deltas: &Tensor, ego_from_cav: &[Pose], area: &Area, size: [i64; 2]) -> Result<Tensor, TchError> {
-    let maps = ego_from_cav.len() as i64;
-    let [half_x, half_y] = area.half_m;
-    let along = |axis: usize| {
-        let offsets: Vec<f32> =
-            ego_from_cav.iter().map(|pose| (area.middle_m[axis] - pose.translation_m[axis]) as f32).collect();
-        Tensor::f_from_slice(&offsets)?.f_to_device(deltas.device())
-    };
-    // p_map = v + R^T (p_ego - v - d), with v the vehicle's place and d the shift; then p = middle + half * normalised.
-    let (middle_x, middle_y) = (along(0)?, along(1)?);
-    let theta = deltas.f_select(1, 2)?;
-    let (cos, sin) = (theta.f_cos()?, theta.f_sin()?);
-    let from_x = &middle_x - deltas.f_select(1, 0)?;
-    let from_y = &middle_y - deltas.f_select(1, 1)?;
-    let x0 = (&cos * &from_x + &sin * &from_y - middle_x) / half_x;
-    let y0 = (&cos * &from_y - &sin * &from_x - middle_y) / half_y;
-    let affine = [&cos, &(&sin * (half_y / half_x)), &x0, &(&sin * (-half_x / half_y)), &cos, &y0];
-    let affine = Tensor::f_stack(&affine, 1)?.f_view([maps, 2, 3])?;
-    Tensor::f_affine_grid_generator(&affine, [maps, 1, size[0], size[1]], false)
+    let senders = said(ego_from_cav)?.f_to_device(deltas.device())?.f_narrow(1, 0, 2)?;
+    // p_map = v + R^T (p_ego - v - d), with v the vehicle's place and d the shift.
+    let moved = senders.f_constant_pad_nd([0, 1])? + deltas;
+    places(&moved, &senders, [area, area], size)
+}
+
+/// Where the cells of the ego's lattice, that of `area`, lie on maps that are still where they were made, on `own`, given that
+/// their senders are `deltas` `[N, 3]` from where they say: `[N, H, W, 2]`.
+pub(super) fn own_lattice(
+    deltas: &Tensor,
+    ego_from_cav: &[Pose],
+    [area, own]: [&Area; 2],
+    size: [i64; 2],
+) -> Result<Tensor, TchError> {
+    let moved = said(ego_from_cav)?.f_to_device(deltas.device())? + deltas;
+    // p_cav = R^T (p_ego - v - d).
+    places(&moved, &moved.f_narrow(1, 0, 2)?.f_zeros_like()?, [area, own], size)
+}
+
+/// `[N, 3]`: x and y, metres, and yaw, radians.
+fn said(ego_from_cav: &[Pose]) -> Result<Tensor, TchError> {
+    let of_pose = |pose: &Pose| [pose.translation_m[0] as f32, pose.translation_m[1] as f32, pose.yaw_rad() as f32];
+    let values: Vec<f32> = ego_from_cav.iter().flat_map(of_pose).collect();
+    Tensor::f_from_slice(&values)?.f_view([-1, 3])
+}
+
+/// Where the cells of a lattice over `area` lie on lattices over `on`, given where on `area` lies, and how it is turned there,
+/// `[N, 3]`, what lies at `origin` `[N, 2]` on those: `[N, H, W, 2]`.
+fn places(pose: &Tensor, origin: &Tensor, [area, on]: [&Area; 2], size: [i64; 2]) -> Result<Tensor, TchError> {
+    let yaw = pose.f_select(1, 2)?;
+    let (cos, sin) = (yaw.f_cos()?, yaw.f_sin()?);
+    let from = |axis: usize| Ok::<_, TchError>(area.middle_m[axis] - pose.f_select(1, axis as i64)?);
+    let at = |axis: usize| Ok::<_, TchError>(origin.f_select(1, axis as i64)? - on.middle_m[axis]);
+    let ([half_x, half_y], [on_x, on_y]) = (area.half_m, on.half_m);
+    let (from_x, from_y) = (from(0)?, from(1)?);
+    let x0 = (&cos * &from_x + &sin * &from_y + at(0)?) / on_x;
+    let y0 = (&cos * &from_y - &sin * &from_x + at(1)?) / on_y;
+    let (xx, xy) = (&cos * (half_x / on_x), &sin * (half_y / on_x));
+    let (yx, yy) = (&sin * (-half_x / on_y), &cos * (half_y / on_y));
+    let affine = Tensor::f_stack(&[xx, xy, x0, yx, yy, y0], 1)?.f_view([-1, 2, 3])?;
+    Tensor::f_affine_grid_generator(&affine, [pose.size2()?.0, 1, size[0], size[1]], false)
 }
 
 /// Where a vehicle was by a `delta`, see [`lattice`].
@@ -113,6 +145,7 @@ mod tests {
     use tch::Device;
 
     use super::*;
+    use crate::made_up::uniform;
     use crate::warp::warp_to_ego;
 
     const FLOAT: (Kind, Device) = (Kind::Float, Device::Cpu);
@@ -136,6 +169,22 @@ mod tests {
         let by_delta = map_moved(&maps, [1.0, -0.5, 0.1], Pose::IDENTITY);
         let inside = |map: &Tensor| map.narrow(2, 4, 8).narrow(3, 8, 16);
         assert!(inside(&by_delta).allclose(&inside(&by_pose.features), 1e-3, 1e-3, false));
+    }
+
+    #[test]
+    fn a_map_read_where_it_was_made_is_one_warped_by_the_right_pose() {
+        let maps = uniform(3, &[1, 2, 16, 32]);
+        let (pose, delta) = (Pose::from_xyz_yaw([2.3, -1.2, 0.0], 0.7), [0.8, -0.3, 0.1]);
+        let by_pose = warp_to_ego(&maps, None, &[moved(&pose, &delta)], &GRID).unwrap();
+        let deltas = Tensor::from_slice(&delta).to_kind(Kind::Float).view([1, 3]);
+        // Rows and columns that were padded on show what the ego's do, and more.
+        let padded = Area::new(&GRID, [20, 40], 4);
+        let places = own_lattice(&deltas, &[pose], [&padded, &area()], [20, 40]).unwrap();
+        let (read, valid) = resample(&maps, &Tensor::ones([1, 1, 16, 32], FLOAT), &places).unwrap();
+        let inside = |map: &Tensor| map.narrow(2, 0, 16).narrow(3, 0, 32);
+        assert!((inside(&(read * &valid)) - by_pose.features).abs().mean(Kind::Float).double_value(&[]) < 1e-3);
+        assert_eq!(inside(&valid), by_pose.mask);
+        assert!(valid.sum(Kind::Float).double_value(&[]) > by_pose.mask.sum(Kind::Float).double_value(&[]));
     }
 
     #[test]

@@ -29,6 +29,11 @@ impl Maps {
         Ok(Self { features: pick(features)?, mask: pick(mask)? })
     }
 
+    /// Maps that show something everywhere.
+    fn whole(features: Tensor) -> Result<Self, TchError> {
+        Ok(Self { mask: features.f_narrow(1, 0, 1)?.f_ones_like()?, features })
+    }
+
     /// How many.
     pub(super) fn count(&self) -> Result<i64, TchError> {
         Ok(self.features.size4()?.0)
@@ -112,6 +117,8 @@ impl Told {
 pub(super) struct Shown {
     /// The newest of each agent, the ego's first.
     pub(super) newest: Maps,
+    /// The same where they were made.
+    pub(super) own_frame: Maps,
     /// What is older, with larger cells.
     pub(super) earlier: Option<Maps>,
     /// Which of the views' earlier maps those are.
@@ -134,6 +141,10 @@ impl Shown {
         let told: Vec<ViewFacts> = places.iter().map(|&place| facts[place as usize]).collect();
         Ok(Self {
             earlier_entries: earlier.iter().map(|&entry| entry as usize).collect(),
+            own_frame: match views.sent {
+                Some(sent) => Maps::picked(views.own_frame, sent, &newest)?,
+                None => Maps::whole(Maps::picked(views.own_frame, views.mask, &newest)?.features)?,
+            },
             newest: Maps::picked(views.features, views.mask, &newest)?,
             earlier: match views.earlier.filter(|_| !earlier.is_empty()) {
                 Some(views) => Some(Maps::picked(views.features, views.mask, &earlier)?),

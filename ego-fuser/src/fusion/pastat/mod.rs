@@ -30,13 +30,13 @@ mod temporal;
 mod tokens;
 
 use agent::model_config::ConfigError;
-use protocol::{BevGrid, Pose};
+use protocol::BevGrid;
 use tch::{Device, TchError, Tensor, nn};
 
 pub use config::{FsaConfig, Part, PastatConfig, RecallConfig, Rows, SearchConfig, Wavelengths};
 
 use self::alignment::{SpatialAlignment, TRUST};
-use self::area::{Area, lattice, resample};
+use self::area::{Area, lattice, own_lattice, resample};
 use self::block::Block;
 use self::entries::{Maps, Shown, Told};
 use self::gather::Others;
@@ -86,10 +86,12 @@ struct Placed {
 }
 
 impl Placed {
-    /// Everything but the ego's newest, the first entry, moved to where FSA says that it fits.
-    fn moved(self, deltas: &Tensor, ego_from_cav: &[Pose], area: &Area) -> Result<Self, TchError> {
+    /// Everything but the ego's newest, the first entry, moved to where FSA says that it fits; newest maps are read where
+    /// they were made.
+    fn moved(self, deltas: &Tensor, shown: &Shown, area: &Area, grid: &BevGrid) -> Result<Self, TchError> {
         let Self { others, seen, valid } = self;
         let (entries, _, rows, columns) = seen.size4()?;
+        let ego_from_cav = &shown.told.ego_from_cav[1..];
         let after_first = |tensor: &Tensor| tensor.f_narrow(0, 1, entries - 1);
         let with_first = |first: &Tensor, after: Tensor| Tensor::f_cat(&[first.f_narrow(0, 0, 1)?, after], 0);
         let places = lattice(deltas, ego_from_cav, area, [rows, columns])?;
@@ -99,8 +101,10 @@ impl Placed {
         if count == 0 {
             return Ok(Self { others, seen, valid });
         }
-        let others = others.moved(&deltas.f_narrow(0, 0, count)?, &ego_from_cav[..count as usize], area)?;
-        Ok(Self { others, seen, valid })
+        let own = Area::new(grid, [i64::from(grid.height), i64::from(grid.width)], area.radius());
+        let (deltas, ego_from_cav) = (deltas.f_narrow(0, 0, count)?, &ego_from_cav[..count as usize]);
+        let places = own_lattice(&deltas, ego_from_cav, [area, &own], area.size())?;
+        Ok(Self { others: MovedMaps::at(shown.own_frame.only(1, count + 1)?, places)?, seen, valid })
     }
 }
 
@@ -149,7 +153,7 @@ impl Pastat {
                     self.compare(alignment, &newest, earlier.as_ref(), told, &area, train)?;
                 // The ego's newest, which fits itself, is told nothing.
                 let facts = facts + fit.f_constant_pad_nd([0, 0, 1, 0])?;
-                (placed.moved(&deltas, &told.ego_from_cav[1..], &area)?, facts, Some(deltas))
+                (placed.moved(&deltas, shown, &area, grid)?, facts, Some(deltas))
             }
             _ => (placed, facts, None),
         };

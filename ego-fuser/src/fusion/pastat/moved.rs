@@ -1,15 +1,15 @@
 //! Neighbours' maps that FSA may have moved, and the maximum over them and the ego's.
 
-use protocol::Pose;
 use tch::{TchError, Tensor};
 
-use super::area::{Area, lattice, resample};
+use super::area::resample;
 use super::entries::Maps;
 use crate::numbers::{self, are_numbers};
 use crate::warp::Cells;
 
-/// Maps; FSA may have said that they lie elsewhere. Where no gradient flows they are read there only when the maximum over
-/// them is wanted, once and cell by cell.
+/// Maps; FSA may have said that they lie elsewhere than their poses do. Then they are read anew where they were made, as
+/// reading what was read before would blur it, and what a wrong pose has put beyond the ego's edges would be lost. Where no
+/// gradient flows that is done only when the maximum over them is wanted, once and cell by cell.
 pub(super) struct MovedMaps {
     maps: Maps,
     /// `[M, H, W, 2]`: where on the maps the ego's cells lie, for `grid_sampler`; absent: maps lie where they belong.
@@ -34,15 +34,12 @@ impl MovedMaps {
         &self.maps
     }
 
-    /// Moved by `deltas` `[M, 3]`, as vehicles at `ego_from_cav` have made them.
-    pub(super) fn moved(self, deltas: &Tensor, ego_from_cav: &[Pose], area: &Area) -> Result<Self, TchError> {
-        let Maps { features, mask } = &self.maps;
-        let (.., height, width) = features.size4()?;
-        let places = lattice(deltas, ego_from_cav, area, [height, width])?;
-        if are_numbers(features) && are_numbers(&places) {
-            return Ok(Self { places: Some(places), ..self });
+    /// Of maps where they were made, to be read at `places`.
+    pub(super) fn at(maps: Maps, places: Tensor) -> Result<Self, TchError> {
+        if are_numbers(&maps.features) && are_numbers(&places) {
+            return Ok(Self { maps, places: Some(places) });
         }
-        let (features, mask) = resample(features, mask, &places)?;
+        let (features, mask) = resample(&maps.features, &maps.mask, &places)?;
         Ok(Self::still(Maps { features, mask }))
     }
 
@@ -77,24 +74,26 @@ impl MovedMaps {
 
 #[cfg(test)]
 mod tests {
-    use protocol::BevGrid;
+    use protocol::{BevGrid, Pose};
     use tch::Kind;
 
+    use super::super::area::{Area, own_lattice};
     use super::*;
     use crate::made_up::uniform;
 
     #[test]
     fn numbers_and_tensors_find_the_same_maximum() {
         let grid = BevGrid { x_min_m: -8.0, y_min_m: -4.0, cell_m: 0.5, width: 32, height: 16 };
+        let area = Area::new(&grid, [16, 32], 4);
         let poses = [Pose::from_xyz_yaw([3.0, 1.0, 0.0], 0.3), Pose::IDENTITY];
         let deltas = Tensor::from_slice(&[0.7f32, -0.4, 0.05, -1.3, 0.2, 0.0]).view([2, 3]);
+        let places = own_lattice(&deltas, &poses, [&area, &area], [16, 32]).unwrap();
         let mask = uniform(4, &[2, 1, 16, 32]).gt(0.2).to_kind(Kind::Float);
         let features = (uniform(5, &[2, 3, 16, 32]) - 0.3) * &mask;
         let (own, trust) = (uniform(6, &[3, 16, 32]) - 0.5, uniform(7, &[2, 1, 16, 32]) * 2.0);
         let found = |with_gradient| {
             let maps = Maps { features: features.shallow_clone(), mask: mask.shallow_clone() };
-            let deltas = deltas.copy().set_requires_grad(with_gradient);
-            let moved = MovedMaps::still(maps).moved(&deltas, &poses, &Area::new(&grid, [16, 32], 4)).unwrap();
+            let moved = MovedMaps::at(maps, places.copy().set_requires_grad(with_gradient)).unwrap();
             assert_eq!(moved.places.is_none(), with_gradient);
             moved.strongest_with(&own, &trust).unwrap()
         };

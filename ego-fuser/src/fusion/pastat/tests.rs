@@ -21,16 +21,17 @@ impl Scene {
     fn new(agent: &[usize], age_secs: &[f64]) -> Self {
         tch::set_num_threads(1);
         let entries = agent.len() as i64;
-        let fact = |(entry, (&agent, &age_secs)): (usize, (&usize, &f64))| ViewFacts {
+        let fact = |(&agent, &age_secs): (&usize, &f64)| ViewFacts {
             agent,
-            ego_from_cav: Pose::from_xyz_yaw([entry as f64, -0.5 * entry as f64, 0.0], 0.1),
+            // All stand where the ego does: where a map was made it is what it is on the ego's lattice.
+            ego_from_cav: Pose::IDENTITY,
             confidence: 0.8,
             age_secs,
         };
         Self {
             features: uniform(9, &[entries, 4, 12, 20]),
             mask: Tensor::ones([entries, 1, 12, 20], FLOAT),
-            facts: agent.iter().zip(age_secs).enumerate().map(fact).collect(),
+            facts: agent.iter().zip(age_secs).map(fact).collect(),
         }
     }
 
@@ -59,6 +60,7 @@ impl Scene {
             features: &newest.features,
             mask: &newest.mask,
             own_frame: &newest.features,
+            sent: Some(&newest.mask),
             grid: &GRID,
             facts: &newest.facts,
             earlier: (!earlier.facts.is_empty()).then_some(before),

@@ -19,7 +19,10 @@ fn network() -> (VarStore, TrafAlign) {
 fn fuse(fusion: &dyn Fusion, features: &Tensor, facts: &[ViewFacts], train: bool) -> Tensor {
     let mask = Tensor::ones([features.size()[0], 1, 18, 22], FLOAT);
     fusion
-        .fuse(&AlignedViews { features, mask: &mask, own_frame: features, grid: &GRID, facts, earlier: None }, train)
+        .fuse(
+            &AlignedViews { features, mask: &mask, own_frame: features, sent: None, grid: &GRID, facts, earlier: None },
+            train,
+        )
         .unwrap()
 }
 
