@@ -5,7 +5,7 @@ use tch::nn::{self, Init, Module};
 use tch::{Kind, TchError, Tensor};
 
 use super::area::{Area, lattice, resample};
-use super::config::{FsaConfig, SearchConfig};
+use super::config::FsaConfig;
 use super::correlation::{PARTS, correlate, peaks, shifts};
 use super::entries::Maps;
 use super::pairs::{Found, Pairs, picked, rows_where};
@@ -76,8 +76,8 @@ impl SpatialAlignment {
     /// Compares `K` maps with the ego's.
     ///
     /// Unless it is to `train` it looks twice: what fits better far away is compared there as closely as where its pose puts
-    /// it, and what was moved is compared once more where it lies then. Training goes by the first look, and by the search's
-    /// margin.
+    /// it, and what was moved is compared once more where it lies then. Training goes by the first look, and searches shifts
+    /// alone.
     ///
     /// # Shapes
     /// - `ego`, `others`: what is [looked at](Self::looked_at) of 1 and `K` maps, on the lattice of `area`
@@ -94,10 +94,7 @@ impl SpatialAlignment {
         let (own, shown) = (self.shown(ego)?, self.shown(others)?);
         let nowhere = Tensor::f_zeros([ego_from_cav.len() as i64, 3], (Kind::Float, own.device()))?;
         let far = match self.config.search {
-            Some(SearchConfig { cells, radius, margin }) => {
-                let margin = if train { margin } else { 0.0 };
-                offsets([&own, &shown], area, SearchConfig { cells, radius, margin })?.f_constant_pad_nd([0, 1])?
-            }
+            Some(search) => offsets([&own, &shown], ego_from_cav, area, search, train)?,
             None => nowhere.shallow_clone(),
         };
         let (mask, trust, ego_from_cav) = (others.mask.shallow_clone(), trust.shallow_clone(), ego_from_cav.to_vec());
@@ -223,6 +220,7 @@ mod tests {
     use tch::nn::VarStore;
     use tch::{Device, no_grad};
 
+    use super::super::config::SearchConfig;
     use super::*;
     use crate::made_up::{redraw, uniform};
 

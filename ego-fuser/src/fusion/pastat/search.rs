@@ -1,31 +1,65 @@
 //! The search for a map that lies far from where its pose puts it.
 
+use protocol::Pose;
 use tch::{TchError, Tensor};
 
-use super::area::Area;
+use super::area::{Area, lattice};
 use super::config::SearchConfig;
 use super::correlation::{correlate, shifts};
+use crate::warp::{BILINEAR, PADDING_ZEROS};
 
-/// How far each map lies from where its pose puts it, to the large cell, `[K, 2]` along x and y, metres: what FSA compares is
-/// compared once more with large cells and far around, and what fits better somewhere else by a margin belongs there.
+/// Turns that are tried, radians, none of them first: each step is about twice what FSA itself undoes to either side.
+const TURNS_RAD: [f64; 5] = [0.0, -0.17, 0.17, -0.34, 0.34];
+/// A turned map has to fit better by this, as one more try fits better by chance.
+const TURN_MARGIN: f64 = 0.03;
+
+/// How far each map lies from where its pose puts it, to the large cell, `[K, 3]` along x and y, metres, and about its sender,
+/// radians: what FSA compares is compared once more with large cells and far around, and what fits better somewhere else
+/// belongs there.
 ///
-/// No gradient flows: what is compared is learnt from near.
+/// Training has a margin for that and tries shifts alone. No gradient flows: what is compared is learnt from near.
 ///
 /// # Shapes
 /// - `ego`, `others`: `[1, M, H, W]`, `[K, M, H, W]`: what is compared, on the lattice of `area`
+/// - `ego_from_cav`: `K` poses of the maps' senders
 pub(super) fn offsets(
     [ego, others]: [&Tensor; 2],
+    ego_from_cav: &[Pose],
     area: &Area,
     SearchConfig { cells, radius, margin }: SearchConfig,
+    train: bool,
 ) -> Result<Tensor, TchError> {
     let cells = cells / area.cells();
     let none: [i64; 2] = [0, 0];
     let large =
         |maps: &Tensor| maps.f_detach()?.f_avg_pool2d([cells, cells], [cells, cells], none, false, true, None::<i64>);
-    let fit = correlate([&large(ego)?, &large(others)?], radius, 1)?.whole;
-    let shifts = (shifts(radius)? * (area.cell_m() * cells as f64)).f_to_device(fit.device())?;
-    let _ = fit.f_select(1, shifts.size()[0] / 2)?.f_add_scalar_(margin)?;
-    shifts.f_index_select(0, &fit.f_argmax(-1, false)?)
+    let (ego, others) = (large(ego)?, large(others)?);
+    let turns_rad: &[f64] = if train { &TURNS_RAD[..1] } else { &TURNS_RAD };
+    let tries = turns_rad.iter().map(|&turn_rad| turned(&others, turn_rad, ego_from_cav, area));
+    // All tries at once, as the ego's map at each shift is the same for all.
+    let fit = correlate([&ego, &Tensor::f_cat(&tries.collect::<Result<Vec<_>, _>>()?, 0)?], radius, 1)?.whole;
+    let shifts = shifts(radius)? * (area.cell_m() * cells as f64);
+    let all = shifts.size()[0];
+    let fit = fit.f_view([turns_rad.len() as i64, -1, all])?;
+    let _ = fit.f_narrow(0, 1, turns_rad.len() as i64 - 1)?.f_sub_scalar_(TURN_MARGIN)?;
+    if train {
+        let _ = fit.f_select(2, all / 2)?.f_add_scalar_(margin)?;
+    }
+    let best = fit.f_transpose(0, 1)?.f_flatten(1, 2)?.f_argmax(-1, false)?;
+    let offsets = turns_rad.iter().map(|&turn_rad| shifts.f_pad([0, 1], "constant", turn_rad));
+    let offsets = Tensor::f_cat(&offsets.collect::<Result<Vec<_>, _>>()?, 0)?;
+    offsets.f_to_device(best.device())?.f_index_select(0, &best)
+}
+
+/// Maps turned about their senders.
+fn turned(maps: &Tensor, turn_rad: f64, ego_from_cav: &[Pose], area: &Area) -> Result<Tensor, TchError> {
+    if turn_rad == 0.0 {
+        return Ok(maps.shallow_clone());
+    }
+    let (count, _, rows, columns) = maps.size4()?;
+    let turn = Tensor::f_from_slice(&[0.0, 0.0, turn_rad as f32])?.f_expand([count, 3], false)?;
+    let places = lattice(&turn, ego_from_cav, area, [rows, columns])?.f_to_device(maps.device())?;
+    maps.f_grid_sampler(&places, BILINEAR, PADDING_ZEROS, false)
 }
 
 #[cfg(test)]
@@ -49,8 +83,10 @@ mod tests {
         &cells - cells.mean(Kind::Float)
     }
 
-    fn found(maps: [&Tensor; 2], area: &Area) -> Vec<f32> {
-        Vec::try_from(offsets(maps, area, CONFIG).unwrap().view(-1)).unwrap()
+    /// Seen by senders where the ego is.
+    fn found(maps: [&Tensor; 2], area: &Area, config: SearchConfig, train: bool) -> Vec<f32> {
+        let poses = vec![Pose::IDENTITY; maps[1].size()[0] as usize];
+        Vec::try_from(offsets(maps, &poses, area, config, train).unwrap().view(-1)).unwrap()
     }
 
     #[test]
@@ -58,18 +94,37 @@ mod tests {
         let ego = map(1);
         // Where its pose puts it; twelve cells too far along x and sixteen back along y; somebody else's.
         let others = Tensor::cat(&[&ego, &ego.roll([-16, 12], [2, 3]), &map(2)], 0);
-        assert_eq!(found([&ego, &others], &area()), [0.0, 0.0, -6.0, 8.0, 0.0, 0.0]);
+        let expected = [0.0, 0.0, 0.0, -6.0, 8.0, 0.0, 0.0, 0.0, 0.0];
+        assert_eq!(found([&ego, &others], &area(), CONFIG, true), expected);
         // The same in cells of two by two, of which two by two are a large cell.
         let [ego, others] = [&ego, &others].map(|maps| maps.avg_pool2d([2, 2], [2, 2], [0, 0], false, true, None));
-        assert_eq!(found([&ego, &others], &area().with_cells_of(2)), [0.0, 0.0, -6.0, 8.0, 0.0, 0.0]);
+        assert_eq!(found([&ego, &others], &area().with_cells_of(2), CONFIG, true), expected);
     }
 
     #[test]
-    fn what_fits_better_by_less_than_the_margin_stays() {
+    fn once_trained_a_turned_map_is_found() {
+        // Vehicles of several large cells, which a turn on large cells leaves what they are.
+        let ego = map(1).avg_pool2d([9, 9], [1, 1], [4, 4], false, true, None);
+        for turn_rad in TURNS_RAD {
+            let turned = turned(&ego, -turn_rad, &[Pose::IDENTITY], &area()).unwrap();
+            let moved = turned.roll([8], [3]);
+            let others = Tensor::cat(&[&ego, &turned, &moved], 0);
+            let turn_rad = turn_rad as f32;
+            let expected = [0.0, 0.0, 0.0, 0.0, 0.0, turn_rad];
+            let found = found([&ego, &others], &area(), CONFIG, false);
+            assert_eq!(found[..6], expected);
+            // Turned about where its sender is, after which the shift is another.
+            assert_eq!(found[8], turn_rad);
+        }
+    }
+
+    #[test]
+    fn in_training_what_fits_better_by_less_than_the_margin_stays() {
         let ego = map(1);
         let other = ego.roll([12], [3]) * 0.6 + &ego * 0.5;
-        let with = |margin| offsets([&ego, &other], &area(), SearchConfig { margin, ..CONFIG }).unwrap();
-        assert_eq!(Vec::<f32>::try_from(with(0.0).view(-1)).unwrap(), [-6.0, 0.0]);
-        assert_eq!(Vec::<f32>::try_from(with(0.2).view(-1)).unwrap(), [0.0, 0.0]);
+        let with = |margin, train| found([&ego, &other], &area(), SearchConfig { margin, ..CONFIG }, train);
+        assert_eq!(with(0.0, true), [-6.0, 0.0, 0.0]);
+        assert_eq!(with(0.2, true), [0.0; 3]);
+        assert_eq!(with(0.2, false), [-6.0, 0.0, 0.0]);
     }
 }
