@@ -8,9 +8,11 @@ use super::config::SearchConfig;
 use super::correlation::{correlate, shifts};
 use crate::warp::{BILINEAR, PADDING_ZEROS};
 
-/// Turns that are tried, radians, none of them first: each step is about twice what FSA itself undoes to either side.
-const TURNS_RAD: [f64; 5] = [0.0, -0.17, 0.17, -0.34, 0.34];
-/// A turned map has to fit better by this, as one more try fits better by chance.
+/// Turns that are tried beside none, radians: FSA undoes what lies between two of them.
+const TURNS_RAD: [f64; 8] = [-0.08, 0.08, -0.16, 0.16, -0.24, 0.24, -0.32, 0.32];
+/// A turned map is looked for up to so many large cells away: a try is cheap then, and few err far in both.
+const TURNED_RADIUS: i64 = 4;
+/// A turned map has to fit better by this, as one of many tries fits better by chance.
 const TURN_MARGIN: f64 = 0.03;
 
 /// How far each map lies from where its pose puts it, to the large cell, `[K, 3]` along x and y, metres, and about its sender,
@@ -34,28 +36,30 @@ pub(super) fn offsets(
     let large =
         |maps: &Tensor| maps.f_detach()?.f_avg_pool2d([cells, cells], [cells, cells], none, false, true, None::<i64>);
     let (ego, others) = (large(ego)?, large(others)?);
-    let turns_rad: &[f64] = if train { &TURNS_RAD[..1] } else { &TURNS_RAD };
-    let tries = turns_rad.iter().map(|&turn_rad| turned(&others, turn_rad, ego_from_cav, area));
-    // All tries at once, as the ego's map at each shift is the same for all.
-    let fit = correlate([&ego, &Tensor::f_cat(&tries.collect::<Result<Vec<_>, _>>()?, 0)?], radius, 1)?.whole;
-    let shifts = shifts(radius)? * (area.cell_m() * cells as f64);
-    let all = shifts.size()[0];
-    let fit = fit.f_view([turns_rad.len() as i64, -1, all])?;
-    let _ = fit.f_narrow(0, 1, turns_rad.len() as i64 - 1)?.f_sub_scalar_(TURN_MARGIN)?;
+    let shifts_m = |radius: i64| Ok::<_, TchError>(shifts(radius)? * (area.cell_m() * cells as f64));
+    let fit = correlate([&ego, &others], radius, 1)?.whole;
+    let (mut fits, mut offsets) = (vec![], vec![shifts_m(radius)?.f_constant_pad_nd([0, 1])?]);
     if train {
-        let _ = fit.f_select(2, all / 2)?.f_add_scalar_(margin)?;
+        let _ = fit.f_select(1, fit.size2()?.1 / 2)?.f_add_scalar_(margin)?;
+    } else {
+        let turned = TURNS_RAD.iter().map(|&turn_rad| turned(&others, turn_rad, ego_from_cav, area));
+        let turned = Tensor::f_cat(&turned.collect::<Result<Vec<_>, _>>()?, 0)?;
+        let radius = radius.min(TURNED_RADIUS);
+        // All turns at once, as the ego's map at each shift is the same for all.
+        let fit = correlate([&ego, &turned], radius, 1)?.whole.f_sub_scalar(TURN_MARGIN)?;
+        fits.extend(fit.f_split(others.size4()?.0, 0)?);
+        let shifts_m = shifts_m(radius)?;
+        for turn_rad in TURNS_RAD {
+            offsets.push(shifts_m.f_pad([0, 1], "constant", turn_rad)?);
+        }
     }
-    let best = fit.f_transpose(0, 1)?.f_flatten(1, 2)?.f_argmax(-1, false)?;
-    let offsets = turns_rad.iter().map(|&turn_rad| shifts.f_pad([0, 1], "constant", turn_rad));
-    let offsets = Tensor::f_cat(&offsets.collect::<Result<Vec<_>, _>>()?, 0)?;
-    offsets.f_to_device(best.device())?.f_index_select(0, &best)
+    fits.insert(0, fit);
+    let best = Tensor::f_cat(&fits, 1)?.f_argmax(-1, false)?;
+    Tensor::f_cat(&offsets, 0)?.f_to_device(best.device())?.f_index_select(0, &best)
 }
 
 /// Maps turned about their senders.
 fn turned(maps: &Tensor, turn_rad: f64, ego_from_cav: &[Pose], area: &Area) -> Result<Tensor, TchError> {
-    if turn_rad == 0.0 {
-        return Ok(maps.shallow_clone());
-    }
     let (count, _, rows, columns) = maps.size4()?;
     let turn = Tensor::f_from_slice(&[0.0, 0.0, turn_rad as f32])?.f_expand([count, 3], false)?;
     let places = lattice(&turn, ego_from_cav, area, [rows, columns])?.f_to_device(maps.device())?;
