@@ -35,27 +35,37 @@ pub(super) fn offsets(
     let none: [i64; 2] = [0, 0];
     let large =
         |maps: &Tensor| maps.f_detach()?.f_avg_pool2d([cells, cells], [cells, cells], none, false, true, None::<i64>);
-    let (ego, others) = (large(ego)?, large(others)?);
-    let shifts_m = |radius: i64| Ok::<_, TchError>(shifts(radius)? * (area.cell_m() * cells as f64));
-    let fit = correlate([&ego, &others], radius, 1)?.whole;
-    let (mut fits, mut offsets) = (vec![], vec![shifts_m(radius)?.f_constant_pad_nd([0, 1])?]);
+    let maps = [&large(ego)?, &large(others)?];
+    let cell_m = area.cell_m() * cells as f64;
+    let fit = correlate(maps, radius, 1)?.whole;
     if train {
         let _ = fit.f_select(1, fit.size2()?.1 / 2)?.f_add_scalar_(margin)?;
-    } else {
-        let turned = TURNS_RAD.iter().map(|&turn_rad| turned(&others, turn_rad, ego_from_cav, area));
-        let turned = Tensor::f_cat(&turned.collect::<Result<Vec<_>, _>>()?, 0)?;
-        let radius = radius.min(TURNED_RADIUS);
-        // All turns at once, as the ego's map at each shift is the same for all.
-        let fit = correlate([&ego, &turned], radius, 1)?.whole.f_sub_scalar(TURN_MARGIN)?;
-        fits.extend(fit.f_split(others.size4()?.0, 0)?);
-        let shifts_m = shifts_m(radius)?;
-        for turn_rad in TURNS_RAD {
-            offsets.push(shifts_m.f_pad([0, 1], "constant", turn_rad)?);
-        }
     }
-    fits.insert(0, fit);
+    let mut tries = vec![(fit, (shifts(radius)? * cell_m).f_constant_pad_nd([0, 1])?)];
+    if !train {
+        tries.extend(turned_tries(maps, ego_from_cav, area, cell_m, radius.min(TURNED_RADIUS))?);
+    }
+    let (fits, offsets): (Vec<_>, Vec<_>) = tries.into_iter().unzip();
     let best = Tensor::f_cat(&fits, 1)?.f_argmax(-1, false)?;
     Tensor::f_cat(&offsets, 0)?.f_to_device(best.device())?.f_index_select(0, &best)
+}
+
+/// Of each turn how well maps fit, `[K, P]`, less the margin, and the offsets `[P, 3]` of which that is.
+fn turned_tries(
+    [ego, others]: [&Tensor; 2],
+    ego_from_cav: &[Pose],
+    area: &Area,
+    cell_m: f64,
+    radius: i64,
+) -> Result<Vec<(Tensor, Tensor)>, TchError> {
+    let turned = TURNS_RAD.iter().map(|&turn_rad| turned(others, turn_rad, ego_from_cav, area));
+    let turned = Tensor::f_cat(&turned.collect::<Result<Vec<_>, _>>()?, 0)?;
+    // All at once, as the ego's map at each shift is the same for all.
+    let fit = correlate([ego, &turned], radius, 1)?.whole.f_sub_scalar(TURN_MARGIN)?;
+    let shifts_m = shifts(radius)? * cell_m;
+    let offsets = |turn_rad: f64| shifts_m.f_pad([0, 1], "constant", turn_rad);
+    let of_turn = |(fit, turn_rad)| Ok((fit, offsets(turn_rad)?));
+    fit.f_split(others.size4()?.0, 0)?.into_iter().zip(TURNS_RAD).map(of_turn).collect()
 }
 
 /// Maps turned about their senders.
