@@ -50,7 +50,7 @@ pub struct SampleConfig {
     /// Vehicles farther away do not take part, metres in the plane.
     pub comm_range_m: f64,
     /// Whether a single vehicle is also to find what only its neighbours have annotated: the rule of the evaluation. A
-    /// training by it is of single vehicles, whatever their method shares.
+    /// training by it is of single vehicles, whatever their method shares; a neighbour that is dropped has annotated nothing.
     pub merged_truth: bool,
 }
 

@@ -40,9 +40,9 @@ pub fn run(config: &TrainConfig, observer: &mut dyn Observer) -> Result<Summary,
 /// The views that a method learns from; `is_frozen` says that its encoder does not learn, `is_alone` that nobody shares maps.
 fn sample_kind(method: Method, is_frozen: bool, is_alone: bool) -> Result<SampleKind, TrainError> {
     match method.exchange() {
-        Exchange::Features if is_alone => Ok(SampleKind::Single),
         Exchange::Nothing => Ok(SampleKind::Single),
         Exchange::Points if is_frozen => Err(TrainError::NothingToKeep(method)),
+        Exchange::Points | Exchange::Features if is_alone => Ok(SampleKind::Single),
         Exchange::Points => Ok(SampleKind::Merged),
         Exchange::Features => Ok(SampleKind::Cooperative),
         Exchange::Boxes => Err(TrainError::NotTrained(method)),
@@ -234,7 +234,14 @@ mod tests {
     fn merged_points_are_not_learnt_from_behind_a_frozen_encoder() {
         assert!(matches!(sample_kind(Method::Early, true, false), Err(TrainError::NothingToKeep(Method::Early))));
         assert_eq!(sample_kind(Method::Early, false, false).unwrap(), SampleKind::Merged);
-        let of_max = |is_alone| sample_kind(Method::Max, true, is_alone).unwrap();
-        assert_eq!([false, true].map(of_max), [SampleKind::Cooperative, SampleKind::Single]);
+        assert_eq!(sample_kind(Method::Max, true, false).unwrap(), SampleKind::Cooperative);
+    }
+
+    #[test]
+    fn alone_every_method_that_is_trained_learns_from_single_vehicles() {
+        for method in [Method::None, Method::Early, Method::Max, Method::Pastat] {
+            assert_eq!(sample_kind(method, false, true).unwrap(), SampleKind::Single, "{method}");
+        }
+        assert!(matches!(sample_kind(Method::Late, false, true), Err(TrainError::NotTrained(Method::Late))));
     }
 }

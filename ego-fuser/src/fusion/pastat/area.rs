@@ -41,11 +41,6 @@ impl Area {
         Self { size, cell_m, cells: self.cells * cells, radius, ..self }
     }
 
-    /// Rows and columns.
-    pub(super) fn size(&self) -> [i64; 2] {
-        self.size
-    }
-
     /// Edge of a cell, metres.
     pub(super) fn cell_m(&self) -> f64 {
         self.cell_m
@@ -92,15 +87,10 @@ pub(super) fn lattice(deltas: &Tensor, ego_from_cav: &[Pose], area: &Area, size:
 
 /// Where the cells of the ego's lattice, that of `area`, lie on maps that are still where they were made, on `own`, given that
 /// their senders are `deltas` `[N, 3]` from where they say: `[N, H, W, 2]`.
-pub(super) fn own_lattice(
-    deltas: &Tensor,
-    ego_from_cav: &[Pose],
-    [area, own]: [&Area; 2],
-    size: [i64; 2],
-) -> Result<Tensor, TchError> {
+pub(super) fn own_lattice(deltas: &Tensor, ego_from_cav: &[Pose], [area, own]: [&Area; 2]) -> Result<Tensor, TchError> {
     let moved = said(ego_from_cav)?.f_to_device(deltas.device())? + deltas;
     // p_cav = R^T (p_ego - v - d).
-    places(&moved, &moved.f_narrow(1, 0, 2)?.f_zeros_like()?, [area, own], size)
+    places(&moved, &moved.f_narrow(1, 0, 2)?.f_zeros_like()?, [area, own], area.size)
 }
 
 /// `[N, 3]`: x and y, metres, and yaw, radians.
@@ -179,7 +169,7 @@ mod tests {
         let deltas = Tensor::from_slice(&delta).to_kind(Kind::Float).view([1, 3]);
         // Rows and columns that were padded on show what the ego's do, and more.
         let padded = Area::new(&GRID, [20, 40], 4);
-        let places = own_lattice(&deltas, &[pose], [&padded, &area()], [20, 40]).unwrap();
+        let places = own_lattice(&deltas, &[pose], [&padded, &area()]).unwrap();
         let (read, valid) = resample(&maps, &Tensor::ones([1, 1, 16, 32], FLOAT), &places).unwrap();
         let inside = |map: &Tensor| map.narrow(2, 0, 16).narrow(3, 0, 32);
         assert!((inside(&(read * &valid)) - by_pose.features).abs().mean(Kind::Float).double_value(&[]) < 1e-3);

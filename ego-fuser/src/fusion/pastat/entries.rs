@@ -29,11 +29,6 @@ impl Maps {
         Ok(Self { features: pick(features)?, mask: pick(mask)? })
     }
 
-    /// Maps that show something everywhere.
-    fn whole(features: Tensor) -> Result<Self, TchError> {
-        Ok(Self { mask: features.f_narrow(1, 0, 1)?.f_ones_like()?, features })
-    }
-
     /// How many.
     pub(super) fn count(&self) -> Result<i64, TchError> {
         Ok(self.features.size4()?.0)
@@ -143,7 +138,7 @@ impl Shown {
             earlier_entries: earlier.iter().map(|&entry| entry as usize).collect(),
             own_frame: match views.sent {
                 Some(sent) => Maps::picked(views.own_frame, sent, &newest)?,
-                None => Maps::whole(Maps::picked(views.own_frame, views.mask, &newest)?.features)?,
+                None => Maps::picked(views.own_frame, &views.mask.f_ones_like()?, &newest)?,
             },
             newest: Maps::picked(views.features, views.mask, &newest)?,
             earlier: match views.earlier.filter(|_| !earlier.is_empty()) {

@@ -103,7 +103,7 @@ impl Placed {
         }
         let own = Area::new(grid, [i64::from(grid.height), i64::from(grid.width)], area.radius());
         let (deltas, ego_from_cav) = (deltas.f_narrow(0, 0, count)?, &ego_from_cav[..count as usize]);
-        let places = own_lattice(&deltas, ego_from_cav, [area, &own], area.size())?;
+        let places = own_lattice(&deltas, ego_from_cav, [area, &own])?;
         Ok(Self { others: MovedMaps::at(shown.own_frame.only(1, count + 1)?, places)?, seen, valid })
     }
 }
