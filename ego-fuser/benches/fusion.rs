@@ -27,12 +27,16 @@ fn fuse(criterion: &mut Criterion) {
     let world = World::random(shape, &grid);
     let mut group = criterion.benchmark_group("lean");
     for agents in [1usize, 2, 4] {
-        for (method, stage) in stages(&config) {
+        for Case { name, stage, is_lost } in cases(&config) {
             // The newest of all first, as the ego gives them.
             let entries = (0..stage.frames()).flat_map(|step| (0..agents).map(move |agent| (step, agent)));
             let facts: Vec<_> = entries.map(|(step, agent)| entry(step, agent)).collect();
             let size = [facts.len() as i64, shape[0], shape[1], shape[2]];
-            let seen: Vec<Tensor> = facts.iter().map(|facts| world.seen_from(&facts.ego_from_cav)).collect();
+            let seen = facts.iter().enumerate().map(|(index, ViewFacts { ego_from_cav, .. })| {
+                let own = (is_lost && index > 0).then(|| World::random(shape, &grid));
+                own.as_ref().unwrap_or(&world).seen_from(ego_from_cav)
+            });
+            let seen: Vec<Tensor> = seen.collect();
             let features = Tensor::cat(&seen, 0);
             // As the ego keeps them.
             let of = |first: i64, count: i64| SentMaps { maps: features.narrow(0, first, count), sent: None };
@@ -46,12 +50,12 @@ fn fuse(criterion: &mut Criterion) {
                 let earlier = (!kept.is_empty()).then(|| EarlierMaps::together(&kept).expect("maps of one size"));
                 stage.align_kept(&newest, earlier, &facts).expect("maps lie on the lattice")
             };
-            group.bench_function(BenchmarkId::new(format!("warp/{method}"), agents), |bencher| {
+            group.bench_function(BenchmarkId::new(format!("warp/{name}"), agents), |bencher| {
                 bencher.iter(|| black_box(no_grad(align)));
             });
             // No gradient, as in the ego: what has one lies elsewhere in memory, and takes longer.
             let maps = no_grad(align);
-            group.bench_function(BenchmarkId::new(format!("fuse/{method}"), agents), |bencher| {
+            group.bench_function(BenchmarkId::new(format!("fuse/{name}"), agents), |bencher| {
                 bencher.iter(|| {
                     let fused = no_grad(|| stage.fuse(&maps, &facts, false)).expect("views fit together");
                     assert_eq!(fused.size(), shape);
@@ -63,7 +67,7 @@ fn fuse(criterion: &mut Criterion) {
     group.finish();
 }
 
-/// What is around the ego: all vehicles' maps show the same, so that they fit where poses put them.
+/// What is around the ego. Vehicles' maps show the same world, so that they fit where poses put them.
 struct World {
     /// `[1, C, H, W]`, on the ego's lattice.
     map: Tensor,
@@ -91,19 +95,28 @@ impl World {
     }
 }
 
-/// All that fuse maps, by name, and the turning of channels that comes with each.
-fn stages(config: &DetectorConfig) -> Vec<(String, FusionStage)> {
-    let usual = |method: Method| (method.to_string(), method, FusionConfig::for_detector(method, config));
-    let usual_pastat = FusionConfig::for_detector(Method::Pastat, config);
-    let without = usual_pastat.ablated(&[Part::Recall], None).expect("it is a PASTAT");
-    let methods = Method::ALL.into_iter().filter(|method| method.exchange() == Exchange::Features);
-    let all = methods.map(usual).chain([("pastat-no-recall".to_owned(), Method::Pastat, without)]);
-    let stage = |(name, method, fusion): (String, Method, FusionConfig)| {
+struct Case {
+    name: String,
+    stage: FusionStage,
+    /// Every map but the ego's newest shows a world of its own: the most that FSA may have to do.
+    is_lost: bool,
+}
+
+/// All that fuse maps, and the turning of channels that comes with each.
+fn cases(config: &DetectorConfig) -> Vec<Case> {
+    let case = |name: &str, method: Method, fusion: &FusionConfig, is_lost: bool| {
         let variables = VarStore::new(Device::Cpu);
-        let stage = FusionStage::new(&variables.root(), &fusion, method, config);
-        (name, stage.expect("lean is a valid configuration"))
+        let stage = FusionStage::new(&variables.root(), fusion, method, config).expect("lean is a valid configuration");
+        Case { name: name.to_owned(), stage, is_lost }
     };
-    all.map(stage).collect()
+    let usual = |method: Method| FusionConfig::for_detector(method, config);
+    let methods = Method::ALL.into_iter().filter(|method| method.exchange() == Exchange::Features);
+    let mut cases: Vec<_> = methods.map(|method| case(&method.to_string(), method, &usual(method), false)).collect();
+    let pastat = usual(Method::Pastat);
+    let no_recall = pastat.clone().ablated(&[Part::Recall], None).expect("it is a PASTAT");
+    cases.push(case("pastat-no-recall", Method::Pastat, &no_recall, false));
+    cases.push(case("pastat-lost", Method::Pastat, &pastat, true));
+    cases
 }
 
 /// What is known of a vehicle's map from some time steps ago.

@@ -6,7 +6,7 @@ use tch::{Kind, TchError, Tensor};
 
 use super::area::{Area, lattice, resample};
 use super::config::FsaConfig;
-use super::correlation::{PARTS, correlate, peaks, shifts};
+use super::correlation::{PARTS, Shifted, peaks, shifts};
 use super::entries::Maps;
 use super::pairs::{Found, Pairs, picked, rows_where};
 use super::search::offsets;
@@ -97,8 +97,9 @@ impl SpatialAlignment {
             Some(search) => offsets([&own, &shown], ego_from_cav, area, search, train)?,
             None => nowhere.shallow_clone(),
         };
+        let own = Shifted::new(&own, area.radius(), PARTS)?;
         let (mask, trust, ego_from_cav) = (others.mask.shallow_clone(), trust.shallow_clone(), ego_from_cav.to_vec());
-        let pairs = Pairs { own, shown, mask, trust, ego_from_cav };
+        let pairs = Pairs { own: &own, shown, mask, trust, ego_from_cav };
         if train {
             return self.compare_near(&pairs, &far, area);
         }
@@ -109,7 +110,7 @@ impl SpatialAlignment {
 
     /// What was found `near` where poses put maps, or what is found around `far` `[K, 3]`, metres and radians in the ego's
     /// frame, where that fits better.
-    fn compare_there(&self, pairs: &Pairs, near: Found, far: &Tensor, area: &Area) -> Result<Found, TchError> {
+    fn compare_there(&self, pairs: &Pairs<'_>, near: Found, far: &Tensor, area: &Area) -> Result<Found, TchError> {
         let rows = rows_where(&far.f_count_nonzero_dim_intlist([1_i64].as_slice())?)?;
         if rows.is_empty() {
             return Ok(near);
@@ -121,7 +122,7 @@ impl SpatialAlignment {
     }
 
     /// What was `found`, of maps that were moved by some distance where they lie then.
-    fn compare_again(&self, pairs: &Pairs, found: Found, area: &Area) -> Result<Found, TchError> {
+    fn compare_again(&self, pairs: &Pairs<'_>, found: Found, area: &Area) -> Result<Found, TchError> {
         let square = found.deltas.f_narrow(1, 0, 2)?.f_square()?.f_sum_dim_intlist([1_i64].as_slice(), false, None)?;
         let rows = rows_where(&square.f_gt(AGAIN_M * AGAIN_M)?)?;
         if rows.is_empty() {
@@ -133,10 +134,10 @@ impl SpatialAlignment {
 
     /// Compares maps where `deltas` `[K, 3]`, metres and radians in the ego's frame, put them; what is found is added to
     /// those.
-    fn compare_near(&self, pairs: &Pairs, deltas: &Tensor, area: &Area) -> Result<Found, TchError> {
+    fn compare_near(&self, pairs: &Pairs<'_>, deltas: &Tensor, area: &Area) -> Result<Found, TchError> {
         let Pairs { own, trust, ego_from_cav, .. } = pairs;
-        let device = own.device();
-        let found = correlate([own, &shifted(pairs, deltas, area)?], area.radius(), PARTS)?;
+        let device = deltas.device();
+        let found = own.correlate(&moved(pairs, deltas, area)?)?;
         let shifts = (shifts(area.radius())? * area.cell_m()).f_to_device(device)?;
         let sharpness = self.sharpness.f_exp()?;
         let parts = peaks(&found.parts, &sharpness, &shifts)?;
@@ -179,7 +180,11 @@ impl SpatialAlignment {
 }
 
 /// What is compared of others, moved by `deltas` `[K, 3]`.
-fn shifted(Pairs { shown, mask, ego_from_cav, .. }: &Pairs, deltas: &Tensor, area: &Area) -> Result<Tensor, TchError> {
+fn moved(
+    Pairs { shown, mask, ego_from_cav, .. }: &Pairs<'_>,
+    deltas: &Tensor,
+    area: &Area,
+) -> Result<Tensor, TchError> {
     if deltas.f_count_nonzero(None::<i64>)?.f_int64_value(&[])? == 0 {
         return Ok(shown.shallow_clone());
     }

@@ -25,37 +25,54 @@ pub(super) fn shifts(radius: i64) -> Result<Tensor, TchError> {
     Tensor::f_from_slice(&all)?.f_view([-1, 2])
 }
 
-/// Compares the maps of neighbours with the ego's, moved by up to `radius` cells, in `parts` parts along each edge.
-///
-/// # Shapes
-/// - `ego`: `[1, M, H, W]`, `H` and `W` multiples of `parts`; no gradient flows into it: `others` learn the same
-/// - `others`: `[N, M, H, W]`
-pub(super) fn correlate([ego, others]: [&Tensor; 2], radius: i64, parts: i64) -> Result<Correlation, TchError> {
-    let (count, channels, height, width) = others.size4()?;
-    let (rows, columns, edge) = (height / parts, width / parts, 2 * radius + 1);
-    let cells = channels * rows * columns;
-    let others = others
-        .f_reshape([count, channels, parts, rows, parts, columns])?
-        .f_permute([2, 4, 0, 1, 3, 5])?
-        .f_reshape([parts * parts, count, cells])?;
-    let around = ego.f_detach()?.f_constant_pad_nd([radius; 4])?.f_squeeze_dim(0)?;
-    // [M, edge, edge, H, W]: the map at each shift, without a copy until all is sorted by part.
-    let shifted = around.f_unfold(1, height, 1)?.f_unfold(2, width, 1)?;
-    let shifted = shifted
-        .f_view([channels, edge, edge, parts, rows, parts, columns].as_slice())?
-        .f_permute([3, 5, 1, 2, 0, 4, 6])?
-        .f_reshape([parts * parts, edge * edge, cells])?;
-    let products = others.f_matmul(&shifted.f_transpose(1, 2)?)?;
-    let own = shifted.f_select(1, edge * edge / 2)?.f_square()?.f_sum_dim_intlist([1_i64].as_slice(), false, None)?;
-    let theirs = others.f_square()?.f_sum_dim_intlist([2_i64].as_slice(), false, None)?;
-    let length = |square: Tensor| square.f_add_scalar(EPSILON)?.f_sqrt();
-    let energy = length(own.f_unsqueeze(1)? * &theirs)?;
-    let whole_energy = length(own.f_sum(None::<Kind>)? * theirs.f_sum_dim_intlist([0_i64].as_slice(), false, None)?)?;
-    Ok(Correlation {
-        parts: &products / energy.f_unsqueeze(2)?,
-        whole: products.f_sum_dim_intlist([0_i64].as_slice(), false, None)? / whole_energy.f_unsqueeze(1)?,
-        energy,
-    })
+/// The ego's map at every shift, part by part: made once for all that is compared with it.
+#[derive(Debug)]
+pub(super) struct Shifted {
+    /// `[parts^2, K, M * H/parts * W/parts]`.
+    maps: Tensor,
+    /// `[parts^2]`: sums of the squares of the map where it is.
+    squares: Tensor,
+    parts: i64,
+}
+
+impl Shifted {
+    /// `ego` `[1, M, H, W]`, `H` and `W` multiples of `parts`, moved by up to `radius` cells, in `parts` parts along each
+    /// edge. No gradient flows into it: what it is compared with learns the same.
+    pub(super) fn new(ego: &Tensor, radius: i64, parts: i64) -> Result<Self, TchError> {
+        let (_, channels, height, width) = ego.size4()?;
+        let (rows, columns, edge) = (height / parts, width / parts, 2 * radius + 1);
+        let around = ego.f_detach()?.f_constant_pad_nd([radius; 4])?.f_squeeze_dim(0)?;
+        // [M, edge, edge, H, W]: the map at each shift, without a copy until all is sorted by part.
+        let maps = around.f_unfold(1, height, 1)?.f_unfold(2, width, 1)?;
+        let maps = maps
+            .f_view([channels, edge, edge, parts, rows, parts, columns].as_slice())?
+            .f_permute([3, 5, 1, 2, 0, 4, 6])?
+            .f_reshape([parts * parts, edge * edge, channels * rows * columns])?;
+        let still = maps.f_select(1, edge * edge / 2)?;
+        let squares = still.f_square()?.f_sum_dim_intlist([1_i64].as_slice(), false, None)?;
+        Ok(Self { maps, squares, parts })
+    }
+
+    /// Compares it with the maps of `others`, `[N, M, H, W]`.
+    pub(super) fn correlate(&self, others: &Tensor) -> Result<Correlation, TchError> {
+        let (count, channels, height, width) = others.size4()?;
+        let parts = self.parts;
+        let others = others
+            .f_reshape([count, channels, parts, height / parts, parts, width / parts])?
+            .f_permute([2, 4, 0, 1, 3, 5])?
+            .f_reshape([parts * parts, count, -1])?;
+        let products = others.f_matmul(&self.maps.f_transpose(1, 2)?)?;
+        let theirs = others.f_square()?.f_sum_dim_intlist([2_i64].as_slice(), false, None)?;
+        let over_parts = |tensor: &Tensor| tensor.f_sum_dim_intlist([0_i64].as_slice(), false, None);
+        let length = |square: Tensor| square.f_add_scalar(EPSILON)?.f_sqrt();
+        let energy = length(self.squares.f_unsqueeze(1)? * &theirs)?;
+        let whole_energy = length(self.squares.f_sum(None::<Kind>)? * over_parts(&theirs)?)?;
+        Ok(Correlation {
+            parts: &products / energy.f_unsqueeze(2)?,
+            whole: over_parts(&products)? / whole_energy.f_unsqueeze(1)?,
+            energy,
+        })
+    }
 }
 
 /// The shift at which correlations `[.., K]` are highest, `[.., 2]`, as a mean weighted by `exp(sharpness * correlation)`.
@@ -75,7 +92,7 @@ mod tests {
         let ego = Tensor::randn([1, 3, 16, 24], (Kind::Float, Device::Cpu));
         // Two cells further along x, one back along y.
         let other = ego.roll([-1, 2], [2, 3]);
-        let found = correlate([&ego, &other], 3, PARTS).unwrap();
+        let found = Shifted::new(&ego, 3, PARTS).unwrap().correlate(&other).unwrap();
         let shifts = shifts(3).unwrap();
         let whole = peaks(&found.whole, &Tensor::from(60f32), &shifts).unwrap();
         let parts = peaks(&found.parts, &Tensor::from(60f32), &shifts).unwrap();
@@ -92,7 +109,8 @@ mod tests {
     #[test]
     fn where_nothing_is_to_be_seen_nothing_fits() {
         let options = (Kind::Float, Device::Cpu);
-        let found = correlate([1, 2].map(|maps| Tensor::zeros([maps, 2, 8, 8], options)).each_ref(), 2, PARTS).unwrap();
+        let [ego, others] = [1, 2].map(|maps| Tensor::zeros([maps, 2, 8, 8], options));
+        let found = Shifted::new(&ego, 2, PARTS).unwrap().correlate(&others).unwrap();
         assert_eq!(found.parts.abs().max().double_value(&[]), 0.0);
         assert_eq!(found.whole.size(), [2, 25]);
     }

@@ -3,11 +3,12 @@
 use protocol::Pose;
 use tch::{TchError, Tensor};
 
+use super::correlation::Shifted;
+
 /// The ego's map and `K` others, as they are compared.
 #[derive(Debug)]
-pub(super) struct Pairs {
-    /// `[1, M, H, W]`.
-    pub(super) own: Tensor,
+pub(super) struct Pairs<'a> {
+    pub(super) own: &'a Shifted,
     /// `[K, M, H, W]`, where their poses put them.
     pub(super) shown: Tensor,
     /// `[K, 1, H, W]`, 1 where they show something.
@@ -18,11 +19,11 @@ pub(super) struct Pairs {
     pub(super) ego_from_cav: Vec<Pose>,
 }
 
-impl Pairs {
+impl Pairs<'_> {
     /// Some of the others.
     pub(super) fn only(&self, rows: &[i64]) -> Result<Self, TchError> {
         Ok(Self {
-            own: self.own.shallow_clone(),
+            own: self.own,
             shown: picked(&self.shown, rows)?,
             mask: picked(&self.mask, rows)?,
             trust: picked(&self.trust, rows)?,

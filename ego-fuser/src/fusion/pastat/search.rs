@@ -5,7 +5,7 @@ use tch::{TchError, Tensor};
 
 use super::area::{Area, lattice};
 use super::config::SearchConfig;
-use super::correlation::{correlate, shifts};
+use super::correlation::{Shifted, shifts};
 use crate::warp::{BILINEAR, PADDING_ZEROS};
 
 /// Turns that are tried beside none, radians: FSA undoes what lies between two of them.
@@ -37,7 +37,7 @@ pub(super) fn offsets(
         |maps: &Tensor| maps.f_detach()?.f_avg_pool2d([cells, cells], [cells, cells], none, false, true, None::<i64>);
     let maps = [&large(ego)?, &large(others)?];
     let cell_m = area.cell_m() * cells as f64;
-    let fit = correlate(maps, radius, 1)?.whole;
+    let fit = Shifted::new(maps[0], radius, 1)?.correlate(maps[1])?.whole;
     if train {
         let _ = fit.f_select(1, fit.size2()?.1 / 2)?.f_add_scalar_(margin)?;
     }
@@ -61,7 +61,7 @@ fn turned_tries(
     let turned = TURNS_RAD.iter().map(|&turn_rad| turned(others, turn_rad, ego_from_cav, area));
     let turned = Tensor::f_cat(&turned.collect::<Result<Vec<_>, _>>()?, 0)?;
     // All at once, as the ego's map at each shift is the same for all.
-    let fit = correlate([ego, &turned], radius, 1)?.whole.f_sub_scalar(TURN_MARGIN)?;
+    let fit = Shifted::new(ego, radius, 1)?.correlate(&turned)?.whole.f_sub_scalar(TURN_MARGIN)?;
     let shifts_m = shifts(radius)? * cell_m;
     let offsets = |turn_rad: f64| shifts_m.f_pad([0, 1], "constant", turn_rad);
     let of_turn = |(fit, turn_rad)| Ok((fit, offsets(turn_rad)?));
