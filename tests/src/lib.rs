@@ -12,3 +12,4 @@ pub mod mutation;
 pub mod scene;
 pub mod sequences;
 pub mod tensors;
+pub mod training;

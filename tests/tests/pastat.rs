@@ -4,12 +4,9 @@
 use std::fs;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
-use std::sync::{Mutex, MutexGuard, PoisonError};
 
-use agent::model_config::DetectorConfig;
 use agent::pose_source::{CachedPoseConfig, NoiseMode, NoisyPoseConfig, PoseRow, PoseSourceConfig, PoseTable};
 use agent::rate::RateConfig;
-use agent::training::{Length, RunConfig};
 use agent::weights::Weights;
 use deploy::table::{self, TableObserver, TableSpec};
 use ego_fuser::Method;
@@ -17,76 +14,15 @@ use ego_fuser::evaluate::{EvaluateConfig, EvaluatedFrame, Evaluator};
 use ego_fuser::feature_store::{FeatureStore, KeptMaps, MapSource, is_encoder};
 use ego_fuser::fusion::FusionConfig;
 use ego_fuser::fusion::pastat::Part;
-use ego_fuser::loss::LossConfig;
-use ego_fuser::samples::{Moments, SampleConfig, SampleKind, SamplePoses};
-use ego_fuser::train::{self, Accuracy, Observer, StepReport, TrainConfig};
+use ego_fuser::samples::{Moments, SamplePoses};
+use ego_fuser::train::{self, TrainConfig};
 use protocol::{CodecConfig, Dtype, NoPoseReason, PoseEstimate};
 use sim_replay::dataset::{self, LoadOptions, Scenario};
 use tests::scene;
+use tests::training::{Ear, alone, config, small};
 
 const AGENTS: [&str; 3] = ["4279", "4288", "4301"];
 const TICKS: usize = 7;
-
-/// libtorch has one generator of random numbers per process: who begins a training has it alone.
-fn alone() -> MutexGuard<'static, ()> {
-    static GENERATOR: Mutex<()> = Mutex::new(());
-    tch::set_num_threads(1);
-    GENERATOR.lock().unwrap_or_else(PoisonError::into_inner)
-}
-
-/// Hears of losses and of sweeps that are encoded.
-#[derive(Default)]
-struct Ear {
-    losses: Vec<f64>,
-    encoded: usize,
-}
-
-impl Observer for Ear {
-    fn encoded(&mut self, _: usize, _: usize) {
-        self.encoded += 1;
-    }
-    fn stepped(&mut self, report: &StepReport) {
-        self.losses.push(report.score_loss + report.box_loss);
-    }
-    fn validated(&mut self, _: u64, _: &Accuracy) {}
-}
-
-/// A network that a test has time for, on a lattice that no window of a transformer divides.
-fn small() -> DetectorConfig {
-    DetectorConfig {
-        pillar_channels: 8,
-        layer_nums: vec![1, 1],
-        layer_strides: vec![2, 2],
-        num_filters: vec![8, 16],
-        upsample_strides: vec![1, 2],
-        num_upsample_filters: vec![8; 2],
-        shrink: None,
-        lidar_range_m: [-25.6, -17.6, -3.0, 25.6, 17.6, 1.0],
-        ..DetectorConfig::lean()
-    }
-}
-
-fn config(data: &Path, out: &Path, method: Method, steps: u64) -> TrainConfig {
-    TrainConfig {
-        data: vec![data.to_owned()],
-        validation: vec![],
-        method,
-        detector: small(),
-        init: None,
-        fusion: None,
-        frozen_encoder: None,
-        run: RunConfig {
-            learning_rate: 2e-3,
-            seed: 3,
-            command: "a test".to_owned(),
-            ..RunConfig::new(Length::Steps(steps), out)
-        },
-        validate_every: 1_000,
-        validation_frames: 1,
-        samples: SampleConfig::training(SampleKind::Single),
-        loss: LossConfig::default(),
-    }
-}
 
 /// A scene, and weights of `none` to begin with.
 fn begin(folder: &Path) -> (PathBuf, PathBuf) {

@@ -1,0 +1,79 @@
+//! Trainings that a test has time for.
+
+use std::path::Path;
+use std::sync::{Mutex, MutexGuard, PoisonError};
+
+use agent::model_config::DetectorConfig;
+use agent::training::{Length, RunConfig};
+use ego_fuser::Method;
+use ego_fuser::loss::LossConfig;
+use ego_fuser::samples::{SampleConfig, SampleKind};
+use ego_fuser::train::{Accuracy, Observer, StepReport, TrainConfig};
+
+/// libtorch has one generator of random numbers per process: who begins a training has it alone.
+pub fn alone() -> MutexGuard<'static, ()> {
+    static GENERATOR: Mutex<()> = Mutex::new(());
+    tch::set_num_threads(1);
+    GENERATOR.lock().unwrap_or_else(PoisonError::into_inner)
+}
+
+/// Hears what a training says.
+#[derive(Default)]
+pub struct Ear {
+    /// Of each step that was reported.
+    pub losses: Vec<f64>,
+    /// The steps of the validations.
+    pub validations: Vec<u64>,
+    /// Sweeps that were encoded.
+    pub encoded: usize,
+}
+
+impl Observer for Ear {
+    fn encoded(&mut self, _: usize, _: usize) {
+        self.encoded += 1;
+    }
+    fn stepped(&mut self, report: &StepReport) {
+        self.losses.push(report.score_loss + report.box_loss);
+    }
+    fn validated(&mut self, step: u64, _: &Accuracy) {
+        self.validations.push(step);
+    }
+}
+
+/// A small network, maps of 16 channels on 44 x 64 cells: a lattice that no window of a transformer divides.
+pub fn small() -> DetectorConfig {
+    DetectorConfig {
+        pillar_channels: 8,
+        layer_nums: vec![1, 1],
+        layer_strides: vec![2, 2],
+        num_filters: vec![8, 16],
+        upsample_strides: vec![1, 2],
+        num_upsample_filters: vec![8; 2],
+        shrink: None,
+        lidar_range_m: [-25.6, -17.6, -3.0, 25.6, 17.6, 1.0],
+        ..DetectorConfig::lean()
+    }
+}
+
+/// Some steps of a method, from nothing and without validation.
+pub fn config(data: &Path, out: &Path, method: Method, steps: u64) -> TrainConfig {
+    TrainConfig {
+        data: vec![data.to_owned()],
+        validation: vec![],
+        method,
+        detector: small(),
+        init: None,
+        fusion: None,
+        frozen_encoder: None,
+        run: RunConfig {
+            learning_rate: 2e-3,
+            seed: 3,
+            command: "a test".to_owned(),
+            ..RunConfig::new(Length::Steps(steps), out)
+        },
+        validate_every: 1_000,
+        validation_frames: 1,
+        samples: SampleConfig::training(SampleKind::Single),
+        loss: LossConfig::default(),
+    }
+}
