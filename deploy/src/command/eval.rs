@@ -22,6 +22,7 @@ use ego_fuser::trust::TrustConfig;
 use indicatif::{ProgressBar, ProgressStyle};
 use protocol::{CodecConfig, ConfidenceGate, Dtype};
 use sim_replay::dataset::LeftOut;
+use sim_replay::evaluation_protocol::ProtocolConfig;
 use sim_replay::link::LinkConfig;
 
 use super::{BadInput, Outcome};
@@ -130,6 +131,8 @@ pub(crate) struct Arguments {
     /// Threads to compute with.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
     threads: u16,
+    #[command(flatten)]
+    protocol: ProtocolConfig,
     /// Print JSON in the shape of metrics.json (a list of them for several methods) instead of a table.
     #[arg(long)]
     json: bool,
@@ -204,7 +207,10 @@ impl Arguments {
         match (self.json, &all[..]) {
             (true, [one]) => println!("{}", serde_json::to_string_pretty(one)?),
             (true, several) => println!("{}", serde_json::to_string_pretty(several)?),
-            (false, several) => print!("{}", report::table(several)),
+            (false, several) => {
+                print!("{}", report::table(several));
+                several.iter().take(1).filter_map(|metrics| metrics.protocol.as_ref()).for_each(|it| println!("{it}"));
+            }
         }
         Ok(left_out(&all))
     }
@@ -251,6 +257,7 @@ impl Arguments {
             frames: self.frames.map(at_most),
             stepped: self.link.as_deref().map(|link| self.stepped(link)).transpose()?,
             part: Part { scenarios: self.scenarios.map(at_most), ticks: None },
+            protocol: self.protocol.clone(),
         })
     }
 

@@ -152,6 +152,7 @@ impl Run<'_> {
             scenarios: table.scenarios,
             attack: column.attack,
             trust: column.trust.then(TrustConfig::default),
+            protocol: self.spec.protocol.clone(),
             version: env!("CARGO_PKG_VERSION").to_owned(),
         };
         let known = Cell::read(&key, &self.cells)?;
@@ -175,6 +176,7 @@ impl Run<'_> {
             }),
             frames: self.spec.frames,
             part: Part { scenarios: table.scenarios, ticks: None },
+            protocol: self.spec.protocol.clone(),
             ..EvaluationOptions::default()
         };
         let metrics = evaluate(&options, row.method, &mut || observer.frame()).map_err(Box::new)?;

@@ -60,7 +60,7 @@ impl Arguments {
                 pose_source: PoseSourceConfig::Recorded,
                 codec: CodecConfig::default(),
                 rate: RateConfig::default(),
-                rule: None,
+                protocol: None,
                 delay_nanos: 0,
                 attack: None,
                 trust: None,

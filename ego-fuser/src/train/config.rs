@@ -10,6 +10,7 @@ use crate::fusion::FusionConfig;
 use crate::loss::LossConfig;
 use crate::method::Method;
 use crate::samples::SampleConfig;
+use sim_replay::evaluation_protocol::ProtocolConfig;
 
 /// What to train, on what, for how long.
 #[derive(Debug, Clone)]
@@ -18,6 +19,8 @@ pub struct TrainConfig {
     pub data: Vec<PathBuf>,
     /// Datasets to validate on; without any, AP is not measured.
     pub validation: Vec<PathBuf>,
+    /// Which agents take part. Range and classes stand in `samples`.
+    pub protocol: ProtocolConfig,
     /// The method.
     pub method: Method,
     /// The network, where `init` does not say.

@@ -14,6 +14,8 @@ use super::TrainError;
 use crate::average_precision::{Ordering, Scorer};
 use crate::feature_store::MapSource;
 use crate::model::CooperativeModel;
+use sim_replay::evaluation_protocol::ProtocolConfig;
+
 use crate::samples::{Augmentation, Batch, Moments, SampleBuilder, SampleConfig, SampleError, SceneSet, TickRef};
 
 /// AP over the frames of a validation.
@@ -42,11 +44,12 @@ impl Validator {
     /// [`TrainError::Sample`] when a folder cannot be read.
     pub fn open(
         folders: &[PathBuf],
+        protocol: &ProtocolConfig,
         samples: &SampleConfig,
         model: &CooperativeModel,
         frames: usize,
     ) -> Result<Self, TrainError> {
-        let scenes = Arc::new(SceneSet::open(folders)?);
+        let scenes = Arc::new(SceneSet::open(folders, protocol)?);
         let all = scenes.ticks();
         let frames = frames.clamp(1, all.len());
         let ticks = (0..frames).map(|frame| all[frame * all.len() / frames]).collect();

@@ -4,6 +4,7 @@ use std::io::Write;
 use std::path::PathBuf;
 
 use indicatif::{ProgressBar, ProgressStyle};
+use sim_replay::evaluation_protocol::ProtocolConfig;
 use sim_replay::inspect::{Report, inspect};
 
 use crate::cli::Outcome;
@@ -13,6 +14,8 @@ use crate::cli::Outcome;
 pub(crate) struct Args {
     /// Dataset, split, scenario or sequence; the layout is found out.
     dir: PathBuf,
+    #[command(flatten)]
+    protocol: ProtocolConfig,
     /// Print JSON instead of a table.
     #[arg(long)]
     json: bool,
@@ -38,7 +41,7 @@ fn with_progress(args: &Args) -> Report {
     if let Ok(style) = ProgressStyle::with_template("{bar:40} {pos}/{len} frames, {eta} left") {
         bar.set_style(style);
     }
-    let report = inspect(&args.dir, &|done, total| {
+    let report = inspect(&args.dir, &args.protocol, &|done, total| {
         bar.set_length(total as u64);
         bar.set_position(done as u64);
     });

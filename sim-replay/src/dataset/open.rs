@@ -10,7 +10,8 @@ use super::opv2v::{self, Opv2v};
 use super::presence::Absences;
 use super::v2v4real::V2v4Real;
 use super::{
-    Dataset, FrameSource, Layout, ReadError, Scenario, files, kitti_object, kitti_odometry, localization, recorded,
+    Dataset, FrameSource, Layout, ReadError, Scenario, Tick, files, kitti_object, kitti_odometry, localization,
+    recorded,
 };
 
 /// How far below the opened folder sequences of a single vehicle are looked for.
@@ -108,12 +109,16 @@ fn agent_folder_scenario(
     }
     let layout = if is_v2v4real(&folder) { Layout::V2v4Real } else { Layout::Opv2v };
     let source_handedness = if layout == Layout::Opv2v { Handedness::Left } else { Handedness::Right };
-    let ticks = folder.ticks(options.period_nanos, problems);
+    let moments = folder.ticks(options.period_nanos, problems);
+    let ego_lacks = |tick: &Tick| {
+        folder.missing.iter().any(|frame| Some(&frame.agent) == folder.agents.first() && frame.stem == tick.stem)
+    };
+    let ticks: Vec<Tick> = moments.iter().filter(|tick| !ego_lacks(tick)).cloned().collect();
     let is_unit = |id: &&CavId| id.as_str().starts_with('-');
     Scenario {
         name: files::name_below(root, &folder.dir),
         agents: folder.agents.clone(),
-        absences: Absences::new(&folder.agents, &ticks, &folder.missing),
+        absences: Absences::new(&folder.agents, &ticks, &folder.missing).among(moments),
         ticks,
         missing: folder.missing.clone(),
         roadside_units: folder.agents.iter().filter(is_unit).cloned().collect(),

@@ -12,6 +12,7 @@ pub use survey::inspect;
 
 pub use crate::dataset::Problem;
 use crate::dataset::{Layout, MissingFrame};
+use crate::evaluation_protocol::EvaluationProtocol;
 
 /// The findings. Serializes to the JSON of `sim-replay inspect --json`, prints as its table.
 #[derive(Debug, Clone, Serialize)]
@@ -20,6 +21,8 @@ pub struct Report {
     pub path: String,
     /// Its layout, where it has one that is known.
     pub layout: Option<Layout>,
+    /// The protocol that ground truth was merged by: the one of the layout, unless another was asked for.
+    pub protocol: Option<EvaluationProtocol>,
     /// What was found in each scenario.
     pub scenarios: Vec<ScenarioReport>,
     /// Merged ground truth by tick, ego and set of agents: the ego alone, and with all in range.

@@ -8,7 +8,8 @@ use protocol::{CavId, PointCloud, Pose};
 use rayon::prelude::*;
 
 use super::{AgentReport, Problem, Report, ScenarioReport, Summary, TickReport};
-use crate::dataset::{self, Layout, Scenario};
+use crate::dataset::{self, ReadError, Scenario};
+use crate::evaluation_protocol::ProtocolConfig;
 use crate::frame::{Frame, Object};
 use crate::ground_truth::{self, GroundTruthRule};
 use crate::pcd::{PcdCloud, Place};
@@ -32,11 +33,17 @@ struct TickFindings {
     merged: Vec<TickReport>,
 }
 
-/// Reads all of the dataset in `dir`. `progress` is told how many ticks are done and how many there are.
+/// Reads all of the dataset in `dir`, its ground truth by the protocol. `progress` is told how many ticks are done and how many there are.
 #[must_use]
-pub fn inspect(dir: &Path, progress: &(dyn Fn(usize, usize) + Sync)) -> Report {
-    let mut report =
-        Report { path: dir.display().to_string(), layout: None, scenarios: vec![], ticks: vec![], problems: vec![] };
+pub fn inspect(dir: &Path, options: &ProtocolConfig, progress: &(dyn Fn(usize, usize) + Sync)) -> Report {
+    let mut report = Report {
+        path: dir.display().to_string(),
+        layout: None,
+        protocol: None,
+        scenarios: vec![],
+        ticks: vec![],
+        problems: vec![],
+    };
     let dataset = match dataset::open(dir) {
         Ok(dataset) => dataset,
         Err(error) => {
@@ -45,6 +52,14 @@ pub fn inspect(dir: &Path, progress: &(dyn Fn(usize, usize) + Sync)) -> Report {
         }
     };
     report.layout = Some(dataset.layout);
+    let protocol = match options.resolve(dataset.layout) {
+        Ok(protocol) => protocol,
+        Err(reason) => {
+            report.problems.push(Problem::from(&ReadError::Layout { path: dir.to_owned(), reason }));
+            return report;
+        }
+    };
+    report.protocol = Some(protocol.clone());
     report.problems.extend(dataset.problems.iter().map(Problem::from));
     let total = dataset.scenarios.iter().map(|scenario| scenario.ticks.len()).sum();
     let done = AtomicUsize::new(0);
@@ -52,7 +67,7 @@ pub fn inspect(dir: &Path, progress: &(dyn Fn(usize, usize) + Sync)) -> Report {
         let findings: Vec<TickFindings> = (0..scenario.ticks.len())
             .into_par_iter()
             .map(|tick| {
-                let findings = survey_tick(scenario, tick);
+                let findings = survey_tick(scenario, tick, &protocol.ground_truth);
                 progress(done.fetch_add(1, Ordering::Relaxed) + 1, total);
                 findings
             })
@@ -68,7 +83,7 @@ pub fn inspect(dir: &Path, progress: &(dyn Fn(usize, usize) + Sync)) -> Report {
     report
 }
 
-fn survey_tick(scenario: &Scenario, tick: usize) -> TickFindings {
+fn survey_tick(scenario: &Scenario, tick: usize, rule: &GroundTruthRule) -> TickFindings {
     let mut agents = Vec::with_capacity(scenario.agents.len());
     let mut frames = Vec::with_capacity(scenario.agents.len());
     for agent in 0..scenario.agents.len() {
@@ -81,7 +96,7 @@ fn survey_tick(scenario: &Scenario, tick: usize) -> TickFindings {
         frames.extend(frame);
     }
     let frames: Vec<&Frame> = frames.iter().collect();
-    let merged = merged_counts(scenario, tick, &frames);
+    let merged = merged_counts(scenario, tick, &frames, rule);
     TickFindings { agents, merged }
 }
 
@@ -163,11 +178,7 @@ fn holds_point(world_from_lidar: Option<&Pose>, object: &Object, points: &PointC
 }
 
 /// One entry for every ego alone, and one with all in range of it, where there is anyone.
-fn merged_counts(scenario: &Scenario, tick: usize, frames: &[&Frame]) -> Vec<TickReport> {
-    let rule = match scenario.layout {
-        Layout::V2v4Real => GroundTruthRule::V2V4REAL,
-        _ => GroundTruthRule::OPV2V,
-    };
+fn merged_counts(scenario: &Scenario, tick: usize, frames: &[&Frame], rule: &GroundTruthRule) -> Vec<TickReport> {
     let report = |ego: &CavId, agents: Vec<CavId>, merged_boxes: usize| TickReport {
         scenario: scenario.name.clone(),
         tick: scenario.ticks[tick].stem.clone(),
@@ -177,12 +188,12 @@ fn merged_counts(scenario: &Scenario, tick: usize, frames: &[&Frame]) -> Vec<Tic
     };
     let mut merged = Vec::new();
     for (index, ego) in frames.iter().enumerate() {
-        let alone = ground_truth::merge(&[ego], 0, &rule).len();
+        let alone = ground_truth::merge(&[ego], 0, rule).len();
         merged.push(report(&ego.cav, vec![ego.cav.clone()], alone));
         let contributors = ground_truth::contributors(frames, index, rule.comm_range_m);
         if contributors.len() > 1 {
             let agents = contributors.iter().map(|&other| frames[other].cav.clone()).collect();
-            merged.push(report(&ego.cav, agents, ground_truth::merge(frames, index, &rule).len()));
+            merged.push(report(&ego.cav, agents, ground_truth::merge(frames, index, rule).len()));
         }
     }
     merged
@@ -256,7 +267,7 @@ mod tests {
     }
 
     fn survey(root: &Path) -> (Report, Vec<String>) {
-        let report = inspect(root, &|_, _| {});
+        let report = inspect(root, &ProtocolConfig::default(), &|_, _| {});
         let root = root.to_string_lossy();
         let messages = report.problems.iter().map(|problem| problem.message.replace(&*root, "")).collect();
         (report, messages)
