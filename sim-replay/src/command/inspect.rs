@@ -4,12 +4,14 @@ use std::io::Write;
 use std::path::PathBuf;
 
 use indicatif::{ProgressBar, ProgressStyle};
+use sim_replay::dataset::layouts_text;
 use sim_replay::inspect::{Report, inspect};
 
 use crate::cli::Outcome;
 
 /// Say what a dataset holds (agents, frames, points, rates, boxes, merged ground truth) and what is wrong with it.
 #[derive(Debug, clap::Args)]
+#[command(after_help = format!("Layouts, and the files that decide:\n{}", layouts_text()))]
 pub(crate) struct Args {
     /// Dataset, split, scenario or sequence; the layout is found out.
     dir: PathBuf,

@@ -13,12 +13,14 @@
 //! ```
 
 mod agent_folders;
+mod classes;
 mod error;
 mod files;
 mod hdf5_poses;
 mod kitti_object;
 mod kitti_odometry;
 mod kitti_text;
+mod layouts;
 mod listing;
 mod localization;
 mod nclt_ground_truth;
@@ -37,31 +39,12 @@ use protocol::{CavId, Handedness};
 use serde::Serialize;
 
 pub use error::ReadError;
+pub use layouts::{LAYOUTS, Layout, LayoutDescription, layouts_text};
 pub use listing::{content_sha256, listing_sha256};
 pub use open::{OpenOptions, open, open_with};
 
 use crate::frame::Frame;
 use crate::pcd::PcdCloud;
-
-/// The layouts that are known here.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Layout {
-    /// OPV2V, V2XSet, V2X-R, V2VDet and generated scenes: a folder per agent, YAML and PCD per frame, left-handed.
-    Opv2v,
-    /// V2V4Real: the same folders, with pose matrices and objects in the LiDAR frame, right-handed.
-    V2v4Real,
-    /// Localization sequences of NCLT, as recorded or as converted by LightLoc.
-    Nclt,
-    /// Localization sequences of Oxford and QEOxford, as converted by LightLoc.
-    Oxford,
-    /// KITTI odometry.
-    KittiOdometry,
-    /// KITTI object detection.
-    KittiObject,
-    /// A recording of a live run ([`crate::recording`]).
-    Recording,
-}
 
 /// A dataset, or the part of one that was opened.
 #[derive(Debug)]

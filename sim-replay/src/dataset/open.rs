@@ -9,7 +9,8 @@ use super::agent_folders::{self, ScenarioFolder};
 use super::opv2v::{self, Opv2v};
 use super::v2v4real::V2v4Real;
 use super::{
-    Dataset, FrameSource, Layout, ReadError, Scenario, files, kitti_object, kitti_odometry, localization, recorded,
+    Dataset, FrameSource, Layout, ReadError, Scenario, files, kitti_object, kitti_odometry, layouts_text, localization,
+    recorded,
 };
 
 /// How far below the opened folder sequences of a single vehicle are looked for.
@@ -134,10 +135,8 @@ fn unknown(dir: &Path) -> ReadError {
     let reason = if agent_folders::is_agent(dir) {
         "this is the folder of one agent: open the scenario above it".to_owned()
     } else {
-        "no known layout: expected <scenario>/<agent>/<frame>.yaml and .pcd (OPV2V and its relatives, V2V4Real), \
-         <sequence>/velodyne_left or velodyne_sync/<microseconds>.bin (Oxford, NCLT), velodyne and calib.txt (KITTI \
-         odometry) or velodyne and calib (KITTI object), at most three folders down"
-            .to_owned()
+        let layouts = layouts_text();
+        format!("no known layout; at most three folders down, expected one of\n{}", layouts.trim_end())
     };
     ReadError::Layout { path: dir.to_owned(), reason }
 }
