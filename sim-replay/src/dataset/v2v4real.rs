@@ -59,12 +59,12 @@ fn frame_without_points(agent: &CavId, tick: &Tick, root: &Field<'_>) -> Result<
 }
 
 fn number_or_scalar(field: &Field<'_>) -> Result<f64, ReadError> {
-    if numpy_tags::is_python(field) { Ok(numpy_tags::scalar(field)? / 3.6) } else { speed_mps(field) }
+    if numpy_tags::is_python(field.node()) { Ok(numpy_tags::scalar(field)? / 3.6) } else { speed_mps(field) }
 }
 
 /// A pose in whichever of the three forms it is written.
 fn pose(field: &Field<'_>) -> Result<Pose, ReadError> {
-    let array = if numpy_tags::is_python(field) { numpy_tags::array(field)? } else { nested_list(field)? };
+    let array = if numpy_tags::is_python(field.node()) { numpy_tags::array(field)? } else { nested_list(field)? };
     match array.shape[..] {
         [4, 4] => rigid(&Matrix4::from_row_slice(&array.values), field),
         // The reference's formula for six numbers, in the right-handed axes of this dataset: nothing is mirrored.

@@ -1,18 +1,22 @@
-//! NumPy arrays as PyYAML pickles them into text: the few node shapes that V2V4Real's files contain.
+//! NumPy's arrays and scalars as PyYAML pickles them into text: the few node shapes that data sets contain.
 //!
 //! V2V4Real writes its pose matrices as `!!python/object/apply:numpy.core.multiarray._reconstruct` with a dtype and
-//! base64 data. A Python loader would call what the tag names. Here the tag is compared with the few that are known,
-//! every part of the node is checked, and anything else is an error: nothing is ever looked up or called by name.
+//! base64 data, converters of other data sets do so wherever numbers stand. A Python loader would call what the tag names.
+//! Here the tag is compared with the few that are known, every part of the node is checked, and anything else is an error:
+//! nothing is ever looked up or called by name.
 
-use base64::Engine;
-use base64::engine::general_purpose::STANDARD;
+mod data;
+
+use std::path::Path;
 
 use super::ReadError;
-use super::yaml::{Field, Value};
+use super::yaml::{Field, Node, Value};
+use data::{binary, numbers, read_dtype};
 
-const TAG_PREFIX: &str = "tag:yaml.org,2002:";
-/// The module of NumPy's multiarray before and since 2.0.
-const MULTIARRAY: [&str; 2] = ["numpy.core.multiarray", "numpy._core.multiarray"];
+/// What calls of Python begin with.
+const APPLY: &str = "python/object/apply:";
+/// The modules of NumPy before and since 2.0.
+const PACKAGES: [&str; 2] = ["numpy.core", "numpy._core"];
 /// Most numbers in an array; a pose has 16.
 const MAX_NUMBERS: usize = 4096;
 
@@ -23,23 +27,68 @@ pub(super) struct NumpyArray {
     pub(super) values: Vec<f64>,
 }
 
-/// Little-endian number formats.
-#[derive(Debug, Clone, Copy)]
-enum Dtype {
-    F4,
-    F8,
-    I4,
-    I8,
+/// True where the node carries a tag of Python's.
+pub(super) fn is_python(node: &Node) -> bool {
+    node.tag.as_deref().is_some_and(|tag| tag.starts_with("python/"))
 }
 
-/// Whether the node carries a tag of Python's at all.
-pub(super) fn is_python(field: &Field<'_>) -> bool {
-    tag(field).is_some_and(|tag| tag.starts_with("python/"))
+/// True where the node is a pickled call, and not a tuple or list of Python's.
+pub(super) fn is_call(node: &Node) -> bool {
+    node.tag.as_deref().is_some_and(|tag| tag.starts_with(APPLY))
 }
 
-/// Reads `_reconstruct(ndarray, (0,), b'b')` with its state `(1, shape, dtype, is_fortran, data)`.
+/// The text of a key that NumPy's scalar was used for; `None` where it is none.
+pub(super) fn key_text(node: &Node) -> Option<String> {
+    scalar(&Field::root(Path::new(""), node)).ok().map(|number| number.to_string())
+}
+
+/// Reads `_reconstruct` and `_frombuffer`; a scalar is an array without dimensions.
 pub(super) fn array(field: &Field<'_>) -> Result<NumpyArray, ReadError> {
-    expect_call(field, "_reconstruct")?;
+    match function(field)? {
+        Function::Reconstruct => reconstruct(field),
+        Function::FromBuffer => from_buffer(field),
+        Function::Scalar => Ok(NumpyArray { shape: vec![], values: vec![scalar_value(field)?] }),
+    }
+}
+
+/// Reads `scalar(dtype, data)` or an array with one number; it must be finite.
+pub(super) fn scalar(field: &Field<'_>) -> Result<f64, ReadError> {
+    let NumpyArray { shape, values } = array(field)?;
+    match values[..] {
+        [value] if value.is_finite() => Ok(value),
+        [value] => Err(field.error(format!("{value}, expected a finite number"))),
+        _ => Err(field.error(format!("an array of shape {shape:?}, expected a number"))),
+    }
+}
+
+/// The functions of NumPy that pickled numbers name.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Function {
+    Reconstruct,
+    FromBuffer,
+    Scalar,
+}
+
+fn function(field: &Field<'_>) -> Result<Function, ReadError> {
+    const KNOWN: [(&str, Function); 3] = [
+        ("multiarray._reconstruct", Function::Reconstruct),
+        ("numeric._frombuffer", Function::FromBuffer),
+        ("multiarray.scalar", Function::Scalar),
+    ];
+    let call = field.node().tag.as_deref().and_then(|tag| tag.strip_prefix(APPLY));
+    let in_package = |call: &str| {
+        PACKAGES.iter().find_map(|package| call.strip_prefix(package)?.strip_prefix('.').map(str::to_owned))
+    };
+    let name = call.and_then(in_package);
+    let known = name.and_then(|name| KNOWN.iter().find(|(known, _)| *known == name));
+    known.map(|(_, function)| *function).ok_or_else(|| {
+        let tag = shown(field.node().tag.as_deref());
+        field.error(format!("tag {tag} is none of those that are known, expected numbers or NumPy's arrays of them"))
+    })
+}
+
+/// `_reconstruct(ndarray, (0,), b'b')` with its state `(1, shape, dtype, is_fortran, data)`.
+fn reconstruct(field: &Field<'_>) -> Result<NumpyArray, ReadError> {
     let parts = field.entries()?;
     if parts.len() != 2 {
         return Err(field.error(format!("{} parts, expected args and state", parts.len())));
@@ -52,47 +101,44 @@ pub(super) fn array(field: &Field<'_>) -> Result<NumpyArray, ReadError> {
     }
     let shape = read_shape(&shape)?;
     let values = numbers(&data, read_dtype(&dtype)?, shape.iter().product())?;
-    let values = match is_fortran.node().value {
-        Value::Bool(false) => values,
-        Value::Bool(true) => row_major(&shape, &values),
+    let is_fortran = match is_fortran.node().value {
+        Value::Bool(flag) => flag,
+        Value::Integer(0) => false,
+        Value::Integer(1) => true,
         _ => return Err(is_fortran.error("expected true or false: is the array in Fortran order?")),
     };
-    Ok(NumpyArray { shape, values })
+    Ok(ordered(shape, values, is_fortran))
 }
 
-/// Reads `scalar(dtype, data)`, a finite number.
-pub(super) fn scalar(field: &Field<'_>) -> Result<f64, ReadError> {
-    expect_call(field, "scalar")?;
-    let args = match field.node().value {
-        Value::Map(_) => field.required("args")?,
-        _ => field.clone(),
-    };
-    let [dtype, data] = items::<2>(&args)?;
-    let values = numbers(&data, read_dtype(&dtype)?, 1)?;
-    match values.first() {
-        Some(value) if value.is_finite() => Ok(*value),
-        Some(value) => Err(data.error(format!("{value}, expected a finite number"))),
-        None => Err(data.error("no number")),
+/// `_frombuffer(data, dtype, shape, order)`.
+fn from_buffer(field: &Field<'_>) -> Result<NumpyArray, ReadError> {
+    let [data, dtype, shape, order] = items::<4>(&args(field)?)?;
+    let shape = read_shape(&shape)?;
+    let values = numbers(&data, read_dtype(&dtype)?, shape.iter().product())?;
+    match order.text()? {
+        "C" => Ok(ordered(shape, values, false)),
+        "F" => Ok(ordered(shape, values, true)),
+        other => Err(order.error(format!("order {other:?}, expected C or F"))),
     }
 }
 
-fn tag<'a>(field: &Field<'a>) -> Option<&'a str> {
-    field.node().tag.as_deref().map(|tag| tag.strip_prefix(TAG_PREFIX).unwrap_or(tag))
+/// `scalar(dtype, data)`.
+fn scalar_value(field: &Field<'_>) -> Result<f64, ReadError> {
+    let [dtype, data] = items::<2>(&args(field)?)?;
+    let values = numbers(&data, read_dtype(&dtype)?, 1)?;
+    values.first().copied().ok_or_else(|| data.error("no number"))
+}
+
+/// Arguments of a call without state are its items, or stand under `args`.
+fn args<'a>(field: &Field<'a>) -> Result<Field<'a>, ReadError> {
+    if matches!(field.node().value, Value::Map(_)) { field.required("args") } else { Ok(field.clone()) }
 }
 
 fn expect_tag(field: &Field<'_>, expected: &str) -> Result<(), ReadError> {
-    match tag(field) {
+    match field.node().tag.as_deref() {
         Some(tag) if tag == expected => Ok(()),
         tag => Err(field.error(format!("tag {}, expected !!{expected}", shown(tag)))),
     }
-}
-
-fn expect_call(field: &Field<'_>, function: &str) -> Result<(), ReadError> {
-    let known = MULTIARRAY.map(|module| format!("python/object/apply:{module}.{function}"));
-    if tag(field).is_some_and(|tag| known.iter().any(|known| known == tag)) {
-        return Ok(());
-    }
-    Err(field.error(format!("tag {} is none of those that are known, expected !!{}", shown(tag(field)), known[0])))
 }
 
 fn shown(tag: Option<&str>) -> String {
@@ -118,7 +164,7 @@ fn check_args(args: &Field<'_>) -> Result<(), ReadError> {
     if zero.integer()? != 0 {
         return Err(zero.error("expected 0: the shape comes with the state"));
     }
-    match base64(&code)?.as_slice() {
+    match binary(&code)?.as_slice() {
         b"b" => Ok(()),
         _ => Err(code.error("expected the code b")),
     }
@@ -138,54 +184,9 @@ fn read_shape(field: &Field<'_>) -> Result<Vec<usize>, ReadError> {
     }
 }
 
-/// `dtype('f8', False, True)` with a state whose second item is the byte order.
-fn read_dtype(field: &Field<'_>) -> Result<Dtype, ReadError> {
-    expect_tag(field, "python/object/apply:numpy.dtype")?;
-    let [name, ..] = items::<3>(&field.required("args")?)?;
-    let dtype = match name.text()? {
-        "f4" => Dtype::F4,
-        "f8" => Dtype::F8,
-        "i4" => Dtype::I4,
-        "i8" => Dtype::I8,
-        other => return Err(name.error(format!("dtype {other:?}, expected f4, f8, i4 or i8"))),
-    };
-    let state = field.required("state")?;
-    expect_tag(&state, "python/tuple")?;
-    match state.items()?.get(1) {
-        Some(order) if order.text()? == "<" => Ok(dtype),
-        Some(order) => Err(order.error(format!("byte order {:?}, expected little-endian \"<\"", order.text()?))),
-        None => Err(state.error("no byte order")),
-    }
-}
-
-fn base64(field: &Field<'_>) -> Result<Vec<u8>, ReadError> {
-    expect_tag(field, "binary")?;
-    // The lines of a block are part of the text.
-    let text: String = field.text()?.split_ascii_whitespace().collect();
-    STANDARD.decode(text).map_err(|error| field.error(format!("no base64: {error}")))
-}
-
-fn numbers(field: &Field<'_>, dtype: Dtype, count: usize) -> Result<Vec<f64>, ReadError> {
-    let bytes = base64(field)?;
-    let values: Vec<f64> = match dtype {
-        Dtype::F4 => chunks(&bytes, |bytes| f64::from(f32::from_le_bytes(bytes))),
-        Dtype::F8 => chunks(&bytes, f64::from_le_bytes),
-        Dtype::I4 => chunks(&bytes, |bytes| f64::from(i32::from_le_bytes(bytes))),
-        Dtype::I8 => chunks(&bytes, |bytes| i64::from_le_bytes(bytes) as f64),
-    };
-    let size = match dtype {
-        Dtype::F4 | Dtype::I4 => 4,
-        Dtype::F8 | Dtype::I8 => 8,
-    };
-    if bytes.len() == count * size {
-        Ok(values)
-    } else {
-        Err(field.error(format!("{} bytes for {count} numbers of {size} bytes", bytes.len())))
-    }
-}
-
-fn chunks<const N: usize>(bytes: &[u8], from: impl Fn([u8; N]) -> f64) -> Vec<f64> {
-    bytes.as_chunks::<N>().0.iter().map(|&chunk| from(chunk)).collect()
+fn ordered(shape: Vec<usize>, values: Vec<f64>, is_fortran: bool) -> NumpyArray {
+    let values = if is_fortran { row_major(&shape, &values) } else { values };
+    NumpyArray { shape, values }
 }
 
 /// Turns the order in which the first index runs fastest into the usual one.
