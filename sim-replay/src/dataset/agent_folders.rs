@@ -6,7 +6,8 @@ use std::path::{Path, PathBuf};
 use protocol::CavId;
 
 use super::yaml::{self, Field};
-use super::{MissingFrame, ReadError, Tick, files};
+use super::points::{SweepStorage, Sweeps};
+use super::{MissingFrame, OpenOptions, ReadError, Tick, files};
 
 /// How far below the opened folder scenarios are looked for.
 const MAX_DEPTH: usize = 3;
@@ -118,6 +119,13 @@ impl ScenarioFolder {
     pub(super) fn pcd(&self, agent: &CavId, stem: &str, variant: Option<&str>) -> PathBuf {
         let suffix = variant.map(|variant| format!("_{variant}")).unwrap_or_default();
         self.dir.join(agent.as_str()).join(format!("{stem}{suffix}.pcd"))
+    }
+
+    /// The reader of all agents' sweeps.
+    pub(super) fn sweeps(&self, options: &OpenOptions) -> Sweeps {
+        let of_agent = |agent: &CavId| self.stems.iter().map(|stem| self.pcd(agent, stem, None)).collect::<Vec<_>>();
+        let sweeps = Sweeps::new(SweepStorage::ByName, options);
+        self.agents.iter().fold(sweeps, |sweeps, agent| sweeps.with_agent(agent.clone(), of_agent(agent)))
     }
 
     /// The radar's points of a frame.

@@ -9,7 +9,8 @@ use nalgebra::{Isometry3, Matrix3, Point3, Rotation3, UnitQuaternion};
 use protocol::{CavId, Handedness, Pose};
 
 use super::kitti_text::{self, Calibration};
-use super::{FrameSource, Layout, OpenOptions, ReadError, Scenario, Tick, files, points, single_vehicle};
+use super::points::{SweepStorage, Sweeps};
+use super::{FrameSource, Layout, OpenOptions, ReadError, Scenario, Tick, files, single_vehicle};
 use crate::frame::{Frame, Object, ObjectClass};
 use crate::pcd::PcdCloud;
 
@@ -21,6 +22,7 @@ const LABEL_NUMBERS: usize = 14;
 struct Split {
     dir: PathBuf,
     has_labels: bool,
+    sweeps: Sweeps,
 }
 
 /// Whether a folder is a split.
@@ -30,12 +32,15 @@ pub(super) fn is_split(dir: &Path) -> bool {
 
 /// Opens a split.
 pub(super) fn open(root: &Path, dir: &Path, options: &OpenOptions) -> Result<Scenario, ReadError> {
-    let listing = files::list(&dir.join("velodyne"))?;
+    let velodyne = dir.join("velodyne");
+    let listing = files::list(&velodyne)?;
     let stems = files::stems(&listing.files, ".bin");
     let times = (0u64..).map(|index| options.period_nanos.saturating_mul(index));
     let tick = |(stem, capture_nanos): (&str, u64)| Tick { stem: stem.to_owned(), capture_nanos };
-    let ticks = stems.into_iter().zip(times).map(tick).collect();
-    let source = Split { dir: dir.to_owned(), has_labels: dir.join("label_2").is_dir() };
+    let ticks: Vec<Tick> = stems.into_iter().zip(times).map(tick).collect();
+    let files = ticks.iter().map(|tick| velodyne.join(format!("{}.bin", tick.stem)));
+    let sweeps = Sweeps::of_single_vehicle(SweepStorage::ByName, files, options);
+    let source = Split { dir: dir.to_owned(), has_labels: dir.join("label_2").is_dir(), sweeps };
     Ok(single_vehicle(files::name_below(root, dir), Layout::KittiObject, ticks, Arc::new(source)))
 }
 
@@ -53,7 +58,7 @@ impl FrameSource for Split {
     }
 
     fn points(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> Result<PcdCloud, ReadError> {
-        points::read_interleaved(&self.points_path(agent, tick, variant))
+        self.sweeps.read(agent, &self.points_path(agent, tick, variant))
     }
 
     fn annotation_path(&self, _agent: &CavId, tick: &Tick) -> Option<PathBuf> {

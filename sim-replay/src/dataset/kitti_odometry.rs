@@ -10,7 +10,8 @@ use std::sync::Arc;
 use protocol::{CavId, Handedness, Pose};
 
 use super::kitti_text::{self, Calibration};
-use super::{FrameSource, Layout, OpenOptions, ReadError, Scenario, Tick, files, points, single_vehicle};
+use super::points::{SweepStorage, Sweeps};
+use super::{FrameSource, Layout, OpenOptions, ReadError, Scenario, Tick, files, single_vehicle};
 use crate::frame::Frame;
 use crate::pcd::PcdCloud;
 
@@ -20,6 +21,7 @@ struct Sequence {
     dir: PathBuf,
     /// Poses of the LiDAR by scan number; `None` where the sequence has no poses.
     world_from_lidar: Option<Vec<Pose>>,
+    sweeps: Sweeps,
 }
 
 /// Whether a folder is a sequence.
@@ -42,7 +44,9 @@ pub(super) fn open(root: &Path, dir: &Path, options: &OpenOptions) -> Result<Sce
         ticks.push(Tick { stem: stem.to_owned(), capture_nanos });
     }
     ticks.sort_by_key(|tick| tick.capture_nanos);
-    let source = Sequence { dir: dir.to_owned(), world_from_lidar: poses(dir)? };
+    let files = ticks.iter().map(|tick| velodyne.join(format!("{}.bin", tick.stem)));
+    let sweeps = Sweeps::of_single_vehicle(SweepStorage::ByName, files, options);
+    let source = Sequence { dir: dir.to_owned(), world_from_lidar: poses(dir)?, sweeps };
     Ok(single_vehicle(files::name_below(root, dir), Layout::KittiOdometry, ticks, Arc::new(source)))
 }
 
@@ -60,7 +64,7 @@ impl FrameSource for Sequence {
     }
 
     fn points(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> Result<PcdCloud, ReadError> {
-        points::read_interleaved(&self.points_path(agent, tick, variant))
+        self.sweeps.read(agent, &self.points_path(agent, tick, variant))
     }
 
     fn points_path(&self, _agent: &CavId, tick: &Tick, _variant: Option<&str>) -> PathBuf {

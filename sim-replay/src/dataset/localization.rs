@@ -25,7 +25,8 @@ use protocol::{CavId, Handedness, Pose};
 use super::hdf5_poses::{self, RowOrder};
 use super::kitti_text::{lines, numbers};
 use super::nclt_ground_truth::{self, GroundTruth};
-use super::{FrameSource, Layout, ReadError, Scenario, Tick, files, points, single_vehicle};
+use super::points::{SweepStorage, Sweeps};
+use super::{FrameSource, Layout, OpenOptions, ReadError, Scenario, Tick, files, single_vehicle};
 use crate::frame::Frame;
 use crate::pcd::PcdCloud;
 
@@ -33,8 +34,6 @@ use crate::pcd::PcdCloud;
 const CONVERTED: &str = "velodyne_left";
 /// NCLT's own.
 const RAW: &str = "velodyne_sync";
-/// Intensities are bytes of the sensor, also where they are stored as floats.
-const MAX_INTENSITY: f32 = 255.0;
 
 /// How the points of a sequence are stored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -44,12 +43,22 @@ enum Storage {
     Oxford,
 }
 
+impl Storage {
+    fn of_sweeps(self) -> SweepStorage {
+        match self {
+            Self::NcltRaw => SweepStorage::NcltRaw,
+            Self::NcltConverted => SweepStorage::ByName,
+            Self::Oxford => SweepStorage::Planar,
+        }
+    }
+}
+
 #[derive(Debug)]
 struct Sequence {
     points_dir: PathBuf,
-    storage: Storage,
     /// By microseconds; empty where no file has any.
     world_from_lidar: BTreeMap<u64, Pose>,
+    sweeps: Sweeps,
 }
 
 /// Whether a folder is a sequence.
@@ -62,7 +71,12 @@ fn holds_sweeps(dir: &Path) -> bool {
 }
 
 /// Opens a sequence. Sweeps without pose and poses without sweep are left out, the latter with a problem.
-pub(super) fn open(root: &Path, dir: &Path, problems: &mut Vec<ReadError>) -> Result<Scenario, ReadError> {
+pub(super) fn open(
+    root: &Path,
+    dir: &Path,
+    options: &OpenOptions,
+    problems: &mut Vec<ReadError>,
+) -> Result<Scenario, ReadError> {
     let storage = storage(dir);
     let points_dir = dir.join(if storage == Storage::NcltRaw { RAW } else { CONVERTED });
     let mut stamps = BTreeMap::new();
@@ -88,9 +102,11 @@ pub(super) fn open(root: &Path, dir: &Path, problems: &mut Vec<ReadError>) -> Re
         }
     }
     let tick = |(micros, stem): (u64, String)| Tick { stem, capture_nanos: micros.saturating_mul(1000) };
-    let ticks = stamps.into_iter().map(tick).collect();
+    let ticks: Vec<Tick> = stamps.into_iter().map(tick).collect();
     let layout = if storage == Storage::Oxford { Layout::Oxford } else { Layout::Nclt };
-    let source = Sequence { points_dir, storage, world_from_lidar: poses.unwrap_or_default() };
+    let files = ticks.iter().map(|tick| points_dir.join(format!("{}.bin", tick.stem)));
+    let sweeps = Sweeps::of_single_vehicle(storage.of_sweeps(), files, options);
+    let source = Sequence { points_dir, world_from_lidar: poses.unwrap_or_default(), sweeps };
     Ok(single_vehicle(files::name_below(root, dir), layout, ticks, Arc::new(source)))
 }
 
@@ -177,15 +193,9 @@ impl FrameSource for Sequence {
     }
 
     fn points(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> Result<PcdCloud, ReadError> {
-        let path = self.points_path(agent, tick, variant);
-        let mut cloud = match self.storage {
-            Storage::NcltRaw => points::read_nclt_raw(&path)?,
-            Storage::NcltConverted => points::read_interleaved(&path)?,
-            Storage::Oxford => points::read_planar(&path)?,
-        };
-        for [_, y, z, intensity] in &mut cloud.points.xyzi {
+        let mut cloud = self.sweeps.read(agent, &self.points_path(agent, tick, variant))?;
+        for [_, y, z, _] in &mut cloud.points.xyzi {
             (*y, *z) = (-*y, -*z);
-            *intensity /= MAX_INTENSITY;
         }
         Ok(cloud)
     }

@@ -42,6 +42,7 @@ pub use error::ReadError;
 pub use layouts::{LAYOUTS, Layout, LayoutDescription, layouts_text};
 pub use listing::{content_sha256, listing_sha256};
 pub use open::{OpenOptions, open, open_with};
+pub use points::{IntensityScale, IntensityScaleError};
 
 use crate::frame::Frame;
 use crate::pcd::PcdCloud;
@@ -204,11 +205,16 @@ impl Scenario {
     }
 }
 
+/// The vehicle of a layout that does not name it.
+fn single_vehicle_id() -> CavId {
+    CavId::new("0").expect("a digit is an identifier")
+}
+
 /// A scenario of a layout that knows one vehicle and does not name it.
 fn single_vehicle(name: String, layout: Layout, ticks: Vec<Tick>, source: Arc<dyn FrameSource>) -> Scenario {
     Scenario {
         name,
-        agents: vec![CavId::new("0").expect("a digit is an identifier")],
+        agents: vec![single_vehicle_id()],
         ticks,
         missing: Vec::new(),
         lidar_variants: Vec::new(),

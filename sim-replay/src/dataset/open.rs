@@ -7,6 +7,7 @@ use protocol::Handedness;
 
 use super::agent_folders::{self, ScenarioFolder};
 use super::opv2v::{self, Opv2v};
+use super::points::IntensityScale;
 use super::v2v4real::V2v4Real;
 use super::{
     Dataset, FrameSource, Layout, ReadError, Scenario, files, kitti_object, kitti_odometry, layouts_text, localization,
@@ -19,16 +20,18 @@ const SEQUENCE_DEPTH: usize = 2;
 const FRAMES_TO_TRY: usize = 5;
 
 /// What a dataset does not say of itself.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+#[derive(Debug, Clone, Copy, PartialEq)]
 pub struct OpenOptions {
     /// Time from one stored frame to the next where neither time stamps nor the length of a simulator's tick are
     /// recorded, nanoseconds. The datasets of the OPV2V family store ten frames a second.
     pub period_nanos: u64,
+    /// Divisor of the intensities of LiDAR sweeps.
+    pub intensity_scale: IntensityScale,
 }
 
 impl Default for OpenOptions {
     fn default() -> Self {
-        Self { period_nanos: 100_000_000 }
+        Self { period_nanos: 100_000_000, intensity_scale: IntensityScale::Auto }
     }
 }
 
@@ -73,7 +76,7 @@ fn open_single_vehicles(
     } else if kitti_odometry::is_sequence(dir) {
         scenarios.push(kitti_odometry::open(root, dir, options)?);
     } else if localization::is_sequence(dir) {
-        scenarios.push(localization::open(root, dir, problems)?);
+        scenarios.push(localization::open(root, dir, options, problems)?);
     } else if depth > 0 {
         for folder in files::list(dir)?.folders {
             open_single_vehicles(root, (&dir.join(folder), depth - 1), options, scenarios, problems)?;
@@ -108,6 +111,7 @@ fn agent_folder_scenario(
         problems.push(ReadError::malformed(&folder.dir, reason));
     }
     let layout = if is_v2v4real(&folder) { Layout::V2v4Real } else { Layout::Opv2v };
+    let sweeps = folder.sweeps(options);
     let source_handedness = if layout == Layout::Opv2v { Handedness::Left } else { Handedness::Right };
     Scenario {
         name: files::name_below(root, &folder.dir),
@@ -119,8 +123,8 @@ fn agent_folder_scenario(
         layout,
         source_handedness,
         source: match layout {
-            Layout::V2v4Real => Arc::new(V2v4Real(folder)) as Arc<dyn FrameSource>,
-            _ => Arc::new(Opv2v(folder)),
+            Layout::V2v4Real => Arc::new(V2v4Real(folder, sweeps)) as Arc<dyn FrameSource>,
+            _ => Arc::new(Opv2v(folder, sweeps)),
         },
     }
 }

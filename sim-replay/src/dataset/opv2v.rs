@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 use protocol::{CavId, Handedness, Pose};
 
 use super::agent_folders::ScenarioFolder;
+use super::points::Sweeps;
 use super::yaml::{self, Field};
 use super::{FrameSource, ReadError, Tick, points};
 use crate::carla_pose::CarlaPose;
@@ -18,7 +19,7 @@ const KMH_PER_MPS: f64 = 3.6;
 
 /// A scenario of the family.
 #[derive(Debug)]
-pub(super) struct Opv2v(pub(super) ScenarioFolder);
+pub(super) struct Opv2v(pub(super) ScenarioFolder, pub(super) Sweeps);
 
 impl FrameSource for Opv2v {
     fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame, ReadError> {
@@ -28,11 +29,11 @@ impl FrameSource for Opv2v {
     }
 
     fn points(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> Result<PcdCloud, ReadError> {
-        mirrored(&self.points_path(agent, tick, variant))
+        self.1.read(agent, &self.points_path(agent, tick, variant)).map(mirrored)
     }
 
     fn radar(&self, agent: &CavId, tick: &Tick) -> Result<PcdCloud, ReadError> {
-        mirrored(&self.0.radar(agent, &tick.stem))
+        points::read_pcd(&self.0.radar(agent, &tick.stem)).map(mirrored)
     }
 
     fn annotation_path(&self, agent: &CavId, tick: &Tick) -> Option<PathBuf> {
@@ -44,11 +45,10 @@ impl FrameSource for Opv2v {
     }
 }
 
-/// Reads left-handed points and makes them right-handed.
-fn mirrored(path: &Path) -> Result<PcdCloud, ReadError> {
-    let mut cloud = points::read_pcd(path)?;
+/// Makes left-handed points right-handed.
+fn mirrored(mut cloud: PcdCloud) -> PcdCloud {
     points::mirror_y(&mut cloud.points);
-    Ok(cloud)
+    cloud
 }
 
 fn frame_without_points(agent: &CavId, tick: &Tick, root: &Field<'_>) -> Result<Frame, ReadError> {

@@ -12,8 +12,9 @@ use protocol::{CavId, Handedness, Pose};
 use super::agent_folders::ScenarioFolder;
 use super::numpy_tags::{self, NumpyArray};
 use super::opv2v::{object_entries, object_id, object_pose, object_size, speed_mps};
+use super::points::Sweeps;
 use super::yaml::{self, Field};
-use super::{FrameSource, ReadError, Tick, points};
+use super::{FrameSource, ReadError, Tick};
 use crate::carla_pose::CarlaPose;
 use crate::frame::{Frame, Object, ObjectClass};
 use crate::pcd::PcdCloud;
@@ -23,7 +24,7 @@ const UNMATCHED_STEP: i64 = 100;
 
 /// A scenario of V2V4Real.
 #[derive(Debug)]
-pub(super) struct V2v4Real(pub(super) ScenarioFolder);
+pub(super) struct V2v4Real(pub(super) ScenarioFolder, pub(super) Sweeps);
 
 impl FrameSource for V2v4Real {
     fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame, ReadError> {
@@ -33,7 +34,7 @@ impl FrameSource for V2v4Real {
     }
 
     fn points(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> Result<PcdCloud, ReadError> {
-        points::read_pcd(&self.points_path(agent, tick, variant))
+        self.1.read(agent, &self.points_path(agent, tick, variant))
     }
 
     fn annotation_path(&self, agent: &CavId, tick: &Tick) -> Option<PathBuf> {
