@@ -3,6 +3,9 @@
 //! Letters count, not their case, and neither do blanks, `_` and `-`. Names are those of V2V4Real, V2X-Real and V2XPnP
 //! (their misspellings included), V2X-Radar, RCooper, DAIR-V2X, KITTI, nuScenes, and CARLA's blueprints.
 
+use std::path::Path;
+
+use super::{Problem, ReadError};
 use crate::frame::ObjectClass;
 
 /// CARLA's blueprints of the library `vehicle.*` that are no cars, by their last word.
@@ -55,6 +58,16 @@ pub(super) fn of_name(name: &str) -> Option<ObjectClass> {
         | "animal" | "dog" | "unknown" | "unknownmovable" | "unknownunmovable" | "unknownsmovable"
         | "unknownsunmovable" | "pedestrianignore" | "carignore" | "otherignore" => ObjectClass::Other,
         _ => return None,
+    })
+}
+
+/// The finding about a type that is not known, the same for all its objects below `dir`.
+pub(super) fn unknown(dir: &Path, field: &str, found: &str) -> Problem {
+    Problem::from(&ReadError::Malformed {
+        path: dir.to_owned(),
+        line: None,
+        field: Some(field.to_owned()),
+        reason: format!("{found} is no known type of object: it counts as other, not as a vehicle"),
     })
 }
 

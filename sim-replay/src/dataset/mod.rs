@@ -13,9 +13,12 @@
 //! ```
 
 mod agent_folders;
+mod annotations;
 mod classes;
 mod error;
+mod faults;
 mod files;
+mod frame_files;
 mod hdf5_poses;
 mod kitti_object;
 mod kitti_odometry;
@@ -28,8 +31,10 @@ mod numpy_tags;
 mod open;
 mod opv2v;
 mod points;
+mod problem;
 mod recorded;
 mod v2v4real;
+mod written_pose;
 mod yaml;
 
 use std::path::PathBuf;
@@ -43,6 +48,7 @@ pub use layouts::{LAYOUTS, Layout, LayoutDescription, layouts_text};
 pub use listing::{content_sha256, listing_sha256};
 pub use open::{OpenOptions, open, open_with};
 pub use points::{IntensityScale, IntensityScaleError};
+pub use problem::Problem;
 
 use crate::frame::Frame;
 use crate::pcd::PcdCloud;

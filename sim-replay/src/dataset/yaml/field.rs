@@ -32,6 +32,11 @@ impl<'a> Field<'a> {
         self.path
     }
 
+    /// Kind and content in few words, for messages.
+    pub(in crate::dataset) fn found(&self) -> String {
+        self.node.value.kind()
+    }
+
     /// An error about this field.
     pub(in crate::dataset) fn error(&self, reason: impl Into<String>) -> ReadError {
         ReadError::Malformed {
@@ -44,7 +49,7 @@ impl<'a> Field<'a> {
 
     /// An error that names what was found and what was expected.
     pub(in crate::dataset) fn expected(&self, what: &str) -> ReadError {
-        self.error(format!("{}, expected {what}", self.node.value.kind()))
+        self.error(format!("{}, expected {what}", self.found()))
     }
 
     fn child(&self, key: &str, node: &'a Node) -> Self {
