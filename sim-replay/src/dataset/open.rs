@@ -3,11 +3,12 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use protocol::Handedness;
+use protocol::{CavId, Handedness};
 
 use super::agent_folders::{self, ScenarioFolder};
 use super::opv2v::Opv2v;
 use super::points::IntensityScale;
+use super::presence::Absences;
 use super::v2v4real::V2v4Real;
 use super::written_pose::WrittenPose;
 use super::yaml::{self, Field};
@@ -130,17 +131,20 @@ fn agent_folder_scenario(
     problems: &mut Vec<ReadError>,
 ) -> Scenario {
     if folder.stems.is_empty() {
-        let reason = format!("no frame that all of its {} agents have", folder.agents.len());
-        problems.push(ReadError::malformed(&folder.dir, reason));
+        problems.push(ReadError::malformed(&folder.dir, "no frame of any agent"));
     }
     let layout = family_layout(&folder);
     let sweeps = folder.sweeps(options);
     let source_handedness = if layout == Layout::Opv2v { Handedness::Left } else { Handedness::Right };
+    let ticks = folder.ticks(options.period_nanos, problems);
+    let is_unit = |id: &&CavId| id.as_str().starts_with('-');
     Scenario {
         name: files::name_below(root, &folder.dir),
         agents: folder.agents.clone(),
-        ticks: folder.ticks(options.period_nanos, problems),
+        absences: Absences::new(&folder.agents, &ticks, &folder.missing),
+        ticks,
         missing: folder.missing.clone(),
+        roadside_units: folder.agents.iter().filter(is_unit).cloned().collect(),
         lidar_variants: folder.variants.clone(),
         has_radar: folder.has_radar,
         layout,

@@ -37,7 +37,7 @@ pub struct ScenarioReport {
     pub layout: Layout,
     /// Which way its axes turn on disk.
     pub handedness: Handedness,
-    /// Moments that all agents have.
+    /// Moments of the ego.
     pub frames: usize,
     /// From the first moment to the last, seconds.
     pub seconds: f64,
@@ -58,6 +58,8 @@ pub struct ScenarioReport {
 pub struct AgentReport {
     /// Who.
     pub id: CavId,
+    /// Moments at which it has a sweep that can be read.
+    pub frames: usize,
     /// Points of a sweep.
     pub points: Option<Summary>,
     /// Points left out because a number is not finite, over all sweeps.
