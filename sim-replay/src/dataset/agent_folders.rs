@@ -5,8 +5,8 @@ use std::path::{Path, PathBuf};
 
 use protocol::CavId;
 
-use super::yaml::{self, Field};
 use super::points::{SweepStorage, Sweeps};
+use super::yaml::{self, Field};
 use super::{MissingFrame, OpenOptions, ReadError, Tick, files};
 
 /// How far below the opened folder scenarios are looked for.

@@ -39,6 +39,7 @@ use serde::Serialize;
 pub use error::ReadError;
 pub use listing::{content_sha256, listing_sha256};
 pub use open::{OpenOptions, open, open_with};
+pub(crate) use points::Plausibility;
 pub use points::{IntensityScale, IntensityScaleError};
 
 use crate::frame::Frame;

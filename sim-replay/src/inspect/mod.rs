@@ -2,7 +2,9 @@
 //!
 //! Every frame is read. What cannot be read becomes a [`Problem`] with file, line and field, and the rest goes on.
 
+mod cells;
 mod survey;
+mod sweeps;
 mod table;
 
 use std::path::Path;
@@ -10,7 +12,8 @@ use std::path::Path;
 use protocol::{CavId, Handedness};
 use serde::Serialize;
 
-pub use survey::inspect;
+pub use survey::{inspect, inspect_with};
+pub use sweeps::SweepReport;
 
 use crate::dataset::{Layout, MissingFrame, ReadError};
 
@@ -61,7 +64,9 @@ pub struct AgentReport {
     pub id: CavId,
     /// Points of a sweep.
     pub points: Option<Summary>,
-    /// Points left out because a number is not finite, over all sweeps.
+    /// Form and intensities of its sweeps; `None` where none has a point.
+    pub sweeps: Option<SweepReport>,
+    /// Points left out because a number is not finite, over all sweeps. Organised clouds have many.
     pub dropped_points: usize,
     /// Radar points of a frame.
     pub radar_points: Option<Summary>,

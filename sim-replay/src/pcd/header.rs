@@ -178,7 +178,8 @@ impl Header {
                 Kind::Signed | Kind::Unsigned => &[1, 2, 4, 8],
             };
             if !allowed.contains(size) {
-                let reason = format!("{size} of field {name}, expected one of {allowed:?} for TYPE {}", kinds.values[index]);
+                let reason =
+                    format!("{size} of field {name}, expected one of {allowed:?} for TYPE {}", kinds.values[index]);
                 return Err(PcdError::at(sizes.line, "SIZE", reason));
             }
         }
@@ -337,9 +338,7 @@ fn find_xyz(fields: &[Field], line: u64) -> Result<[usize; 3], PcdError> {
 
 /// The first field of the most preferred name that holds one number.
 fn find_intensity(fields: &[Field]) -> IntensitySource {
-    let find = |name: &&str| {
-        fields.iter().position(|field| field.count == 1 && field.name.eq_ignore_ascii_case(name))
-    };
+    let find = |name: &&str| fields.iter().position(|field| field.count == 1 && field.name.eq_ignore_ascii_case(name));
     let value = INTENSITY.iter().find_map(find).map(IntensitySource::Value);
     value.or_else(|| COLOURS.iter().find_map(find).map(IntensitySource::Red)).unwrap_or(IntensitySource::None)
 }

@@ -71,7 +71,8 @@ impl FloatForm {
             forms.reverse();
         }
         let found = forms.iter().find(|form| form.fault(&numbers).is_none());
-        let fault = |form: &Self| format!("{} floats per point: {}", form.numbers(), form.fault(&numbers).unwrap_or_default());
+        let fault =
+            |form: &Self| format!("{} floats per point: {}", form.numbers(), form.fault(&numbers).unwrap_or_default());
         Some(found.copied().ok_or_else(|| {
             let faults: Vec<String> = forms.iter().map(fault).collect();
             format!("no sweep of x y z intensity or x y z intensity ring as f32: with {}", faults.join("; with "))
@@ -100,7 +101,10 @@ impl FloatForm {
         let negative = count(&|point| point[3] < 0.0) / all;
         let percent = |share: f64| format!("{:.1} %", 100.0 * share);
         if absurd > IMPOSSIBLE_SHARE {
-            return Some(format!("{} of the points have a number beyond 1e7 or below 1e-30, usual is none", percent(absurd)));
+            return Some(format!(
+                "{} of the points have a number beyond 1e7 or below 1e-30, usual is none",
+                percent(absurd)
+            ));
         }
         let fault = || format!("{} of the intensities are negative, usual is none", percent(negative));
         (negative > IMPOSSIBLE_SHARE).then(fault)
@@ -110,10 +114,9 @@ impl FloatForm {
     pub(super) fn points(self, bytes: &[u8]) -> PcdCloud {
         let (numbers, _) = bytes.as_chunks::<4>();
         let points = numbers.chunks_exact(self.numbers());
-        let mut cloud = super::finite_points(points.map(|point| [0, 1, 2, 3].map(|index| f32::from_le_bytes(point[index]))));
-        cloud.form = self.name();
-        cloud.intensity = Some(IntensityOrigin::stored("4th float", IntensityKind::Number));
-        cloud
+        let points = points.map(|point| [0, 1, 2, 3].map(|index| f32::from_le_bytes(point[index]))).collect();
+        let intensity = Some(IntensityOrigin::stored("4th float", IntensityKind::Number));
+        PcdCloud { intensity, form: self.name(), ..PcdCloud::of_finite(points, Vec::new()) }
     }
 }
 

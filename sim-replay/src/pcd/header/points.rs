@@ -16,7 +16,9 @@ impl Entries<'_> {
                 ("POINTS", line, points)
             }
             (None, Some((line, points))) => ("POINTS", line, points),
-            (Some((line, width)), None) => ("WIDTH", line, width.saturating_mul(height.map_or(1, |(_, height)| height))),
+            (Some((line, width)), None) => {
+                ("WIDTH", line, width.saturating_mul(height.map_or(1, |(_, height)| height)))
+            }
             (None, None) => return Err(PcdError::of("POINTS", "missing in the header, and WIDTH too")),
         };
         if count > MAX_POINTS {
