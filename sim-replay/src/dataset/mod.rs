@@ -50,6 +50,7 @@ pub use layouts::{LAYOUTS, Layout, LayoutDescription, layouts_text};
 pub use left_out::LeftOut;
 pub use listing::{content_sha256, listing_sha256};
 pub use open::{OpenOptions, open, open_with};
+pub(crate) use points::Plausibility;
 pub use points::{IntensityScale, IntensityScaleError};
 pub use presence::LoadedTick;
 pub use problem::Problem;

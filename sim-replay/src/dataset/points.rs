@@ -19,7 +19,7 @@ pub(crate) use plausibility::Plausibility;
 use floats::FloatForm;
 
 use super::{OpenOptions, ReadError, files};
-use crate::pcd::{self, IntensityKind, IntensityOrigin, PcdCloud, Place};
+use crate::pcd::{self, IntensityKind, IntensityOrigin, PcdCloud};
 
 /// Largest point file that is read, bytes: a sweep of a 128-channel LiDAR has some 10 MB.
 const MAX_BYTES: u64 = 1 << 30;
@@ -158,7 +158,11 @@ fn read_planar(path: &Path) -> Result<PcdCloud, ReadError> {
     let count = numbers.len() / 4;
     let points = (0..count).map(|point| [0, 1, 2, 3].map(|c| f32::from_le_bytes(numbers[c * count + point])));
     let intensity = Some(IntensityOrigin::stored("4th block of floats", IntensityKind::Number));
-    Ok(PcdCloud { intensity, form: "floats by component: x, y, z, intensity", ..finite_points(points) })
+    Ok(PcdCloud {
+        intensity,
+        form: "floats by component: x, y, z, intensity",
+        ..PcdCloud::of_finite(points.collect(), Vec::new())
+    })
 }
 
 fn read_nclt_raw(path: &Path) -> Result<PcdCloud, ReadError> {
@@ -172,7 +176,11 @@ fn read_nclt_raw(path: &Path) -> Result<PcdCloud, ReadError> {
         [metres([x0, x1]), metres([y0, y1]), metres([z0, z1]), f32::from(intensity)]
     });
     let intensity = Some(IntensityOrigin::stored("7th byte", IntensityKind::Byte));
-    Ok(PcdCloud { intensity, form: "8 bytes per point, as NCLT records them", ..finite_points(points) })
+    Ok(PcdCloud {
+        intensity,
+        form: "8 bytes per point, as NCLT records them",
+        ..PcdCloud::of_finite(points.collect(), Vec::new())
+    })
 }
 
 /// Turns y round: left-handed points become right-handed ones.
@@ -188,20 +196,6 @@ fn check_whole_points(path: &Path, len: usize, point: usize) -> Result<(), ReadE
     }
     let reason = format!("{len} bytes are not a whole number of points of {point} bytes: the file is cut off");
     Err(ReadError::malformed(path, reason))
-}
-
-fn finite_points(points: impl ExactSizeIterator<Item = [f32; 4]>) -> PcdCloud {
-    let mut cloud = PcdCloud::default();
-    cloud.points.xyzi.reserve_exact(points.len());
-    for (index, point) in points.enumerate() {
-        if point.iter().all(|value| value.is_finite()) {
-            cloud.points.xyzi.push(point);
-        } else {
-            cloud.dropped += 1;
-            cloud.first_dropped.get_or_insert(Place::Point(index as u64));
-        }
-    }
-    cloud
 }
 
 #[cfg(test)]

@@ -7,16 +7,22 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use protocol::{CavId, PointCloud, Pose};
 use rayon::prelude::*;
 
+use super::cells::Cells;
+use super::sweeps::{self, SweepFindings};
 use super::{AgentReport, Problem, Report, ScenarioReport, Summary, TickReport};
-use crate::dataset::{self, Layout, Scenario};
+use crate::dataset::{self, Layout, OpenOptions, Scenario};
 use crate::frame::{Frame, Object};
 use crate::ground_truth::{self, GroundTruthRule};
 use crate::pcd::{PcdCloud, Place};
+
+/// Largest share of points that are not finite: with more of them a sweep is lost, not full of gaps.
+const MOST_DROPPED: f64 = 0.9;
 
 /// What was found in one agent's frame.
 #[derive(Debug, Default)]
 struct FrameFindings {
     points: Option<usize>,
+    sweep: Option<SweepFindings>,
     dropped: usize,
     radar_points: Option<usize>,
     boxes: Option<usize>,
@@ -35,9 +41,15 @@ struct TickFindings {
 /// Reads all of the dataset in `dir`. `progress` is told how many ticks are done and how many there are.
 #[must_use]
 pub fn inspect(dir: &Path, progress: &(dyn Fn(usize, usize) + Sync)) -> Report {
+    inspect_with(dir, &OpenOptions::default(), progress)
+}
+
+/// [`inspect`] with what the dataset does not say of itself.
+#[must_use]
+pub fn inspect_with(dir: &Path, options: &OpenOptions, progress: &(dyn Fn(usize, usize) + Sync)) -> Report {
     let mut report =
         Report { path: dir.display().to_string(), layout: None, scenarios: vec![], ticks: vec![], problems: vec![] };
-    let dataset = match dataset::open(dir) {
+    let dataset = match dataset::open_with(dir, options) {
         Ok(dataset) => dataset,
         Err(error) => {
             report.problems.push(Problem::from(&error));
@@ -58,6 +70,7 @@ pub fn inspect(dir: &Path, progress: &(dyn Fn(usize, usize) + Sync)) -> Report {
             })
             .collect();
         report.scenarios.push(summarize(scenario, &findings));
+        report.problems.extend(sweep_problems(scenario, &findings, options));
         for tick in findings {
             report.ticks.extend(tick.merged);
             report.problems.extend(tick.agents.into_iter().flat_map(|agent| agent.problems));
@@ -99,7 +112,8 @@ fn survey_frame(scenario: &Scenario, agent: usize, tick: usize) -> (FrameFinding
         findings.boxes = Some(frame.objects.len());
         findings.world_from_lidar = frame.world_from_lidar;
         if let Some(points) = &plain {
-            let empty = |object: &&Object| !holds_point(frame.world_from_lidar.as_ref(), object, points);
+            let cells = Cells::new(points);
+            let empty = |object: &&Object| !holds_point(frame.world_from_lidar.as_ref(), object, &cells);
             findings.boxes_without_points = frame.objects.iter().filter(empty).count();
         }
     }
@@ -129,13 +143,15 @@ fn survey_points(
             return None;
         }
     };
-    if cloud.dropped > 0 {
+    // Organised clouds have a point for every ray, also where it met nothing.
+    if cloud.dropped as f64 > MOST_DROPPED * (cloud.dropped + cloud.points.len()) as f64 {
         let path = scenario.points_path(agent, tick, variant).unwrap_or_default();
         findings.problems.push(not_finite(&path, &cloud));
     }
     if variant.is_none() {
         findings.points = Some(cloud.points.len());
         findings.dropped = cloud.dropped;
+        findings.sweep = Some(SweepFindings::of(&cloud));
     }
     Some(cloud.points)
 }
@@ -152,14 +168,26 @@ fn not_finite(path: &Path, cloud: &PcdCloud) -> Problem {
     Problem { path, line, field: Some("x y z intensity".into()), message }
 }
 
-fn holds_point(world_from_lidar: Option<&Pose>, object: &Object, points: &PointCloud) -> bool {
+fn holds_point(world_from_lidar: Option<&Pose>, object: &Object, cells: &Cells) -> bool {
     let Some(world_from_lidar) = world_from_lidar else { return false };
-    let object_from_lidar = object.world_from_object.isometry().inv_mul(&world_from_lidar.isometry()).cast::<f32>();
-    let half = object.size_m.map(|size| (size / 2.0) as f32);
-    points.xyzi.iter().any(|&[x, y, z, _]| {
-        let local = object_from_lidar * nalgebra::Point3::new(x, y, z);
-        (0..3).all(|axis| local[axis].abs() <= half[axis])
-    })
+    let object_from_lidar = object.world_from_object.isometry().inv_mul(&world_from_lidar.isometry());
+    cells.holds_point(&object_from_lidar.cast::<f32>(), object.size_m.map(|size| (size / 2.0) as f32))
+}
+
+/// What is wrong with the sweeps of each agent as a whole.
+fn sweep_problems(scenario: &Scenario, findings: &[TickFindings], options: &OpenOptions) -> Vec<Problem> {
+    let of_agent = |agent: usize| {
+        let sweeps = sweeps_of(findings, agent);
+        let first = findings.iter().position(|tick| tick.agents[agent].sweep.is_some()).unwrap_or(0);
+        let path = scenario.points_path(agent, first, None).unwrap_or_default();
+        let folder = path.parent().unwrap_or(&path);
+        sweeps::problems(folder, &scenario.agents[agent], &sweeps, options.intensity_scale)
+    };
+    (0..scenario.agents.len()).flat_map(of_agent).collect()
+}
+
+fn sweeps_of(findings: &[TickFindings], agent: usize) -> Vec<&SweepFindings> {
+    findings.iter().filter_map(|tick| tick.agents[agent].sweep.as_ref()).collect()
 }
 
 /// One entry for every ego alone, and one with all in range of it, where there is anyone.
@@ -225,6 +253,7 @@ fn summarize_agent(id: &CavId, frames: &[&FrameFindings]) -> AgentReport {
         points: counts(|frame| frame.points),
         dropped_points: frames.iter().map(|frame| frame.dropped).sum(),
         radar_points: counts(|frame| frame.radar_points),
+        sweeps: sweeps::summarize(&frames.iter().filter_map(|frame| frame.sweep.as_ref()).collect::<Vec<_>>()),
         boxes: counts(|frame| frame.boxes),
         boxes_without_points: frames.iter().map(|frame| frame.boxes_without_points).sum(),
         frames: frames.iter().filter(|frame| frame.points.is_some()).count(),
@@ -265,7 +294,7 @@ mod tests {
     #[test]
     fn sound_frames_are_counted() {
         let dir = tempfile::tempdir().unwrap();
-        for (stem, points) in [("000010", vec![[10.0, 0.0, -1.3, 0.5]]), ("000012", vec![[1.0, 0.0, 0.0, 0.5]; 3])] {
+        for (stem, points) in [("000010", vec![[10.0, 0.0, -1.3, 0.5]]), ("000012", vec![[1.0, 0.0, 0.0, 0.25]; 3])] {
             write(dir.path(), &format!("1/{stem}.yaml"), YAML.as_bytes());
             write(dir.path(), &format!("1/{stem}.pcd"), &sweep(&points));
         }
@@ -284,12 +313,14 @@ mod tests {
     fn all_that_is_wrong_is_said_and_the_rest_is_counted() {
         let dir = tempfile::tempdir().unwrap();
         let root = dir.path();
-        let whole = sweep(&[[10.0, 0.0, -1.3, 0.5], [1.0, 2.0, 3.0, 0.5]]);
-        // A cut sweep, a NaN, a wrong pose, a missing YAML and a sound frame.
+        let whole = sweep(&[[10.0, 0.0, -1.3, 0.25], [1.0, 2.0, 3.0, 0.5]]);
+        // A cut sweep, a NaN among others (no problem) and alone, a wrong pose, a missing YAML and a sound frame.
         write(root, "1/000010.yaml", YAML.as_bytes());
         write(root, "1/000010.pcd", &whole[..whole.len() - 3]);
         write(root, "1/000012.yaml", YAML.as_bytes());
         write(root, "1/000012.pcd", &sweep(&[[1.0, 2.0, f32::NAN, 0.5], [1.0, 2.0, 3.0, 0.5]]));
+        write(root, "1/000013.yaml", YAML.as_bytes());
+        write(root, "1/000013.pcd", &sweep(&[[f32::NAN; 4]; 2]));
         write(root, "1/000014.yaml", YAML.replace("[0, 0, 2, 0, 0, 0]", "[0, 0, 2]").as_bytes());
         write(root, "1/000014.pcd", &whole);
         write(root, "1/000016.pcd", &whole);
@@ -300,15 +331,15 @@ mod tests {
             messages,
             [
                 "/1/000010.pcd:13: intensity: \"5e\" is no number: the file is cut off here, after 1 of 2 POINTS",
-                "/1/000012.pcd: 1 of 2 points are not finite and are left out, the first in line 12",
+                "/1/000013.pcd: 2 of 2 points are not finite and are left out, the first in line 12",
                 "/1/000014.yaml:1: lidar_pose: a list of 3, expected 6 numbers",
                 "/1/000016.yaml: does not exist beside 000016.pcd: the frame is left out",
             ]
         );
         assert_eq!((report.problems[2].line, report.problems[2].field.as_deref()), (Some(1), Some("lidar_pose")));
         let agent = &report.scenarios[0].agents[0];
-        assert_eq!((agent.points, agent.dropped_points), (Summary::of(&[1, 2, 2]), 1));
-        assert_eq!(report.ticks.len(), 3, "annotations of sound YAML count even where the sweep is broken");
+        assert_eq!((agent.points, agent.dropped_points), (Summary::of(&[1, 0, 2, 2]), 3));
+        assert_eq!(report.ticks.len(), 4, "annotations of sound YAML count even where the sweep is broken");
     }
 
     #[test]

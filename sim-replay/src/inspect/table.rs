@@ -56,6 +56,11 @@ impl Report {
         for agent in &scenario.agents {
             write_agent(f, agent)?;
         }
+        for agent in &scenario.agents {
+            if let Some(sweeps) = &agent.sweeps {
+                writeln!(f, "  sweeps of {}: {sweeps}", agent.id)?;
+            }
+        }
         if !scenario.lidar_variants.is_empty() {
             writeln!(f, "  LiDAR variants: {}", scenario.lidar_variants.join(", "))?;
         }

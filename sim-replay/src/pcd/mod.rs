@@ -20,6 +20,7 @@ mod binary;
 mod encode;
 mod header;
 mod lzf;
+mod number;
 
 use protocol::PointCloud;
 use serde::Serialize;
@@ -138,34 +139,23 @@ impl IntensityOrigin {
     }
 }
 
-/// Gathers points, leaving out those that are not finite.
-struct Collector {
-    cloud: PcdCloud,
-    labels: Vec<u8>,
-}
-
-impl Collector {
-    fn with_capacity(points: usize, labelled: bool) -> Self {
-        let mut cloud = PcdCloud::default();
-        cloud.points.xyzi.reserve_exact(points);
-        Self { cloud, labels: Vec::with_capacity(if labelled { points } else { 0 }) }
-    }
-
-    fn push(&mut self, point: [f32; 4], label: Option<u8>, place: Place) {
-        if point.iter().all(|value| value.is_finite()) {
-            self.cloud.points.xyzi.push(point);
-            self.labels.extend(label);
-        } else {
-            self.cloud.dropped += 1;
-            self.cloud.first_dropped.get_or_insert(place);
+impl PcdCloud {
+    /// Points without those that are not finite. `labels`: one for each point, or none.
+    pub(crate) fn of_finite(mut points: Vec<[f32; 4]>, mut labels: Vec<u8>) -> Self {
+        let is_finite = |point: &[f32; 4]| point.iter().all(|value| value.is_finite());
+        let (all, first) = (points.len(), points.iter().position(|point| !is_finite(point)));
+        if first.is_some() {
+            let mut kept = points.iter().map(is_finite);
+            labels.retain(|_| kept.next().unwrap_or(false));
+            points.retain(is_finite);
         }
-    }
-
-    fn finish(mut self) -> PcdCloud {
-        if self.labels.iter().any(|&label| label != 0) {
-            self.cloud.labels = Some(self.labels);
+        Self {
+            dropped: all - points.len(),
+            first_dropped: first.map(|point| Place::Point(point as u64)),
+            points: PointCloud { xyzi: points },
+            labels: labels.iter().any(|&label| label != 0).then_some(labels),
+            ..Self::default()
         }
-        self.cloud
     }
 }
 

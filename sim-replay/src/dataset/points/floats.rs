@@ -114,11 +114,9 @@ impl FloatForm {
     pub(super) fn points(self, bytes: &[u8]) -> PcdCloud {
         let (numbers, _) = bytes.as_chunks::<4>();
         let points = numbers.chunks_exact(self.numbers());
-        let mut cloud =
-            super::finite_points(points.map(|point| [0, 1, 2, 3].map(|index| f32::from_le_bytes(point[index]))));
-        cloud.form = self.name();
-        cloud.intensity = Some(IntensityOrigin::stored("4th float", IntensityKind::Number));
-        cloud
+        let points = points.map(|point| [0, 1, 2, 3].map(|index| f32::from_le_bytes(point[index]))).collect();
+        let intensity = Some(IntensityOrigin::stored("4th float", IntensityKind::Number));
+        PcdCloud { intensity, form: self.name(), ..PcdCloud::of_finite(points, Vec::new()) }
     }
 }
 

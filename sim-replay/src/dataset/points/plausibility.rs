@@ -26,12 +26,20 @@ impl Plausibility {
     /// Counts the points of a sweep, which are finite.
     pub(crate) fn add(&mut self, cloud: &PointCloud) {
         for &[x, y, z, _] in &cloud.xyzi {
-            let is_far = x.abs().max(y.abs()).max(z.abs()) > RANGE_M || x.hypot(y).hypot(z) > RANGE_M;
-            self.beyond_range += usize::from(is_far);
+            // Infinite where the square is too large for a float.
+            self.beyond_range += usize::from(x * x + y * y + z * z > RANGE_M * RANGE_M);
             self.at_origin += usize::from([x, y, z] == [0.0; 3]);
             self.tiny += [x, y, z].into_iter().filter(|&value| value != 0.0 && value.abs() < TINY).count();
         }
         self.points += cloud.len();
+    }
+
+    /// Adds what was counted elsewhere.
+    pub(crate) fn join(&mut self, other: &Self) {
+        self.points += other.points;
+        self.beyond_range += other.beyond_range;
+        self.at_origin += other.at_origin;
+        self.tiny += other.tiny;
     }
 
     /// The first figure that no sweep has, and the usual one.

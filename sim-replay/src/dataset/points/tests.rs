@@ -1,6 +1,7 @@
 use std::fs;
 
 use super::*;
+use crate::pcd::Place;
 
 fn id() -> CavId {
     CavId::new("0").unwrap()
