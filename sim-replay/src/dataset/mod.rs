@@ -166,9 +166,18 @@ impl Scenario {
             (frame.points, frame.dropped_points) = (cloud.points, cloud.dropped);
         }
         if options.radar && self.has_radar {
-            frame.radar = Some(self.source.radar(agent, tick)?.points);
+            frame.radar = Some(self.load_radar(agent_index, tick_index)?.points);
         }
         Ok(frame)
+    }
+
+    /// Reads the radar's points alone.
+    ///
+    /// # Errors
+    /// As [`Self::load`].
+    pub fn load_radar(&self, agent_index: usize, tick_index: usize) -> Result<PcdCloud, ReadError> {
+        let (agent, tick) = self.frame_of(agent_index, tick_index)?;
+        self.source.radar(agent, tick)
     }
 
     /// Reads the LiDAR's points alone: the plain sweep, or a variant of [`Self::lidar_variants`].

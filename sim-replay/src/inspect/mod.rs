@@ -2,6 +2,7 @@
 //!
 //! Every frame is read. What cannot be read becomes a [`Problem`] with file, line and field, and the rest goes on.
 
+mod boxes;
 mod cells;
 mod survey;
 mod sweeps;

@@ -1,12 +1,13 @@
 //! Reading everything and counting.
 
-use std::collections::BTreeSet;
+use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use protocol::{CavId, PointCloud, Pose};
 use rayon::prelude::*;
 
+use super::boxes;
 use super::cells::Cells;
 use super::sweeps::{self, SweepFindings};
 use super::{AgentReport, Problem, Report, ScenarioReport, Summary, TickReport};
@@ -26,6 +27,9 @@ struct FrameFindings {
     dropped: usize,
     radar_points: Option<usize>,
     boxes: Option<usize>,
+    vehicles: usize,
+    /// Boxes of a frame whose points were read.
+    boxes_with_sweep: usize,
     boxes_without_points: usize,
     world_from_lidar: Option<Pose>,
     problems: Vec<Problem>,
@@ -69,16 +73,44 @@ pub fn inspect_with(dir: &Path, options: &OpenOptions, progress: &(dyn Fn(usize,
                 findings
             })
             .collect();
-        report.scenarios.push(summarize(scenario, &findings));
+        let summary = summarize(scenario, &findings);
+        report.problems.extend(box_problems(&summary, &findings));
+        report.scenarios.push(summary);
         report.problems.extend(sweep_problems(scenario, &findings, options));
         for tick in findings {
             report.ticks.extend(tick.merged);
             report.problems.extend(tick.agents.into_iter().flat_map(|agent| agent.problems));
         }
     }
-    // A file that several frames need is wrong once.
-    report.problems = report.problems.into_iter().collect::<BTreeSet<_>>().into_iter().collect();
+    report.problems = counted(report.problems);
     report
+}
+
+/// Each problem once, with how often it was found: several frames may need one file, or have objects of one unknown type.
+fn counted(problems: Vec<Problem>) -> Vec<Problem> {
+    let mut counts: BTreeMap<Problem, usize> = BTreeMap::new();
+    for problem in problems {
+        *counts.entry(problem).or_default() += 1;
+    }
+    let with_count = |(problem, count): (Problem, usize)| match count {
+        1 => problem,
+        count => Problem { message: format!("{} ({count} times)", problem.message), ..problem },
+    };
+    counts.into_iter().map(with_count).collect()
+}
+
+/// Doubts about the boxes of a scenario as a whole.
+fn box_problems(scenario: &ScenarioReport, findings: &[TickFindings]) -> Vec<Problem> {
+    let frames = || findings.iter().flat_map(|tick| &tick.agents);
+    let vehicles = frames().map(|frame| frame.vehicles).sum();
+    let merged = findings.iter().flat_map(|tick| &tick.merged).map(|tick| tick.merged_boxes).sum();
+    let mut problems: Vec<Problem> =
+        boxes::without_ground_truth(&scenario.name, vehicles, merged).into_iter().collect();
+    for (index, agent) in scenario.agents.iter().enumerate() {
+        let boxes = findings.iter().map(|tick| tick.agents[index].boxes_with_sweep).sum();
+        problems.extend(boxes::mostly_empty(&scenario.name, agent, boxes));
+    }
+    problems
 }
 
 fn survey_tick(scenario: &Scenario, tick: usize) -> TickFindings {
@@ -110,20 +142,19 @@ fn survey_frame(scenario: &Scenario, agent: usize, tick: usize) -> (FrameFinding
     if let Some(frame) = &frame {
         findings.problems.extend(frame.problems.iter().cloned());
         findings.boxes = Some(frame.objects.len());
+        findings.vehicles = frame.objects.iter().filter(|object| object.class.is_vehicle()).count();
         findings.world_from_lidar = frame.world_from_lidar;
         if let Some(points) = &plain {
             let cells = Cells::new(points);
             let empty = |object: &&Object| !holds_point(frame.world_from_lidar.as_ref(), object, &cells);
+            findings.boxes_with_sweep = frame.objects.len();
             findings.boxes_without_points = frame.objects.iter().filter(empty).count();
         }
     }
     if scenario.has_radar {
-        let with_radar = dataset::LoadOptions { points: false, radar: true, ..Default::default() };
-        match scenario.load(agent, tick, &with_radar) {
-            Ok(frame) => findings.radar_points = frame.radar.map(|cloud| cloud.len()),
-            // The frame itself has been complained about already.
-            Err(error) if frame.is_some() => findings.problems.push(Problem::from(&error)),
-            Err(_) => {}
+        match scenario.load_radar(agent, tick) {
+            Ok(cloud) => findings.radar_points = Some(cloud.points.len()),
+            Err(error) => findings.problems.push(Problem::from(&error)),
         }
     }
     (findings, frame)
@@ -340,6 +371,47 @@ mod tests {
         let agent = &report.scenarios[0].agents[0];
         assert_eq!((agent.points, agent.dropped_points), (Summary::of(&[1, 0, 2, 2]), 3));
         assert_eq!(report.ticks.len(), 4, "annotations of sound YAML count even where the sweep is broken");
+    }
+
+    #[test]
+    fn boxes_that_cannot_be_in_the_right_frame_are_a_problem() {
+        let dir = tempfile::tempdir().unwrap();
+        let car = |id: usize| format!("  {id}: {{location: [900, {id}, 0], angle: [0, 0, 0], extent: [2, 1, 0.7]}}\n");
+        let cars: String = (0..20).map(car).collect();
+        let yaml = format!("lidar_pose: [0, 0, 2, 0, 0, 0]\nvehicles:\n{cars}");
+        write(dir.path(), "scene/1/000010.yaml", yaml.as_bytes());
+        write(dir.path(), "scene/1/000010.pcd", &sweep(&[[10.0, 0.0, -1.3, 0.5], [1.0, 0.0, 0.0, 0.4]]));
+        let (_, messages) = survey(dir.path());
+        assert_eq!(
+            messages,
+            [
+                "scene: agent 1: 20 of 20 boxes (100 %) hold none of its points: frames (axes, order of the pose's \
+                 numbers) or units of the boxes may be wrong",
+                "scene: ground truth 0 for every ego and tick, though agents list 20 vehicles: frames (axes, order of \
+                 the pose's numbers) or units of the boxes may be wrong",
+            ]
+        );
+    }
+
+    #[test]
+    fn parts_that_were_left_out_are_listed_and_counted() {
+        let dir = tempfile::tempdir().unwrap();
+        let yaml = format!("{YAML}  8: {{location: [1, 2, 3]}}\n")
+            + "  9: {type: Ufo, location: [5, 0, 0], angle: [0, 0, 0], extent: [2, 1, 1]}\n";
+        for stem in ["000010", "000012"] {
+            write(dir.path(), &format!("1/{stem}.yaml"), yaml.as_bytes());
+            write(dir.path(), &format!("1/{stem}.pcd"), &sweep(&[[10.0, 0.0, -1.3, 0.5], [1.0, 0.0, 0.0, 0.4]]));
+        }
+        let (report, messages) = survey(dir.path());
+        assert_eq!(
+            messages,
+            [
+                ": type: the text \"Ufo\" is no known type of object: it counts as other, not as a vehicle (2 times)",
+                "/1/000010.yaml:4: vehicles.8.angle: missing: the object is left out",
+                "/1/000012.yaml:4: vehicles.8.angle: missing: the object is left out",
+            ]
+        );
+        assert_eq!(report.scenarios[0].agents[0].boxes, Summary::of(&[2, 2]));
     }
 
     #[test]
