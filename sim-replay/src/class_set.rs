@@ -5,18 +5,8 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
-use crate::frame::ObjectClass;
+use crate::frame::{ObjectClass, UnknownClass};
 
-/// Every class, in the order of their bits.
-const ALL: [ObjectClass; 7] = [
-    ObjectClass::Car,
-    ObjectClass::Van,
-    ObjectClass::Truck,
-    ObjectClass::Bus,
-    ObjectClass::TwoWheeler,
-    ObjectClass::Pedestrian,
-    ObjectClass::Other,
-];
 /// Name of the four classes of motor vehicles together.
 const VEHICLE: &str = "vehicle";
 
@@ -46,20 +36,17 @@ impl ClassSet {
         has_vehicles
             .then(|| VEHICLE.to_owned())
             .into_iter()
-            .chain(ALL.iter().filter(single).map(|c| name(*c)))
+            .chain(ObjectClass::ALL.iter().filter(single).map(|class| class.name().to_owned()))
             .collect()
     }
 
     fn of<'a>(names: impl IntoIterator<Item = &'a str>) -> Result<Self, String> {
         let mut set = Self(0);
         for asked in names.into_iter().map(str::trim) {
-            set.0 |= match ALL.iter().find(|class| name(**class) == asked) {
-                Some(class) => bit(*class),
-                None if asked == VEHICLE => Self::VEHICLES.0,
-                None => {
-                    let known: Vec<String> = ALL.iter().map(|class| name(*class)).collect();
-                    return Err(format!("class {asked:?} is not known; there are {VEHICLE}, {}", known.join(", ")));
-                }
+            set.0 |= if asked == VEHICLE {
+                Self::VEHICLES.0
+            } else {
+                bit(asked.parse().map_err(|error: UnknownClass| error.to_string())?)
             };
         }
         if set.0 == 0 { Err("no class is named".into()) } else { Ok(set) }
@@ -67,15 +54,7 @@ impl ClassSet {
 }
 
 fn bit(class: ObjectClass) -> u8 {
-    ALL.iter().position(|known| *known == class).map_or(0, |index| 1 << index)
-}
-
-/// The name as it stands in every file of this program.
-fn name(class: ObjectClass) -> String {
-    match serde_json::to_value(class) {
-        Ok(serde_json::Value::String(name)) => name,
-        _ => String::new(),
-    }
+    ObjectClass::ALL.iter().position(|known| *known == class).map_or(0, |index| 1 << index)
 }
 
 impl FromStr for ClassSet {
@@ -131,7 +110,7 @@ mod tests {
     #[test]
     fn an_unknown_class_is_named_with_those_that_are_known() {
         let error = "vehicles".parse::<ClassSet>().unwrap_err();
-        assert!(error.starts_with("class \"vehicles\" is not known; there are vehicle, car,"), "{error}");
+        assert!(error.starts_with("\"vehicles\" is no class: expected vehicle, car,"), "{error}");
         assert!("".parse::<ClassSet>().is_err());
     }
 }

@@ -4,6 +4,7 @@ use std::io::Write;
 use std::path::PathBuf;
 
 use indicatif::{ProgressBar, ProgressStyle};
+use sim_replay::dataset::{IntensityScale, OpenOptions, layouts_text};
 use sim_replay::evaluation_protocol::ProtocolConfig;
 use sim_replay::inspect::{Report, inspect};
 
@@ -11,9 +12,14 @@ use crate::cli::Outcome;
 
 /// Say what a dataset holds (agents, frames, points, rates, boxes, merged ground truth) and what is wrong with it.
 #[derive(Debug, clap::Args)]
+#[command(after_help = format!("Layouts, and the files that decide:\n{}", layouts_text()))]
 pub(crate) struct Args {
     /// Dataset, split, scenario or sequence; the layout is found out.
     dir: PathBuf,
+    /// Number that stored intensities are divided by [default: 255 for bytes and red; of other numbers the range of each
+    /// agent's first sweeps tells: up to 1 as they are, up to 255 by 255].
+    #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
+    intensity_scale: IntensityScale,
     #[command(flatten)]
     protocol: ProtocolConfig,
     /// Print JSON instead of a table.
@@ -41,7 +47,8 @@ fn with_progress(args: &Args) -> Report {
     if let Ok(style) = ProgressStyle::with_template("{bar:40} {pos}/{len} frames, {eta} left") {
         bar.set_style(style);
     }
-    let report = inspect(&args.dir, &args.protocol, &|done, total| {
+    let options = OpenOptions { intensity_scale: args.intensity_scale, ..OpenOptions::default() };
+    let report = inspect(&args.dir, &options, &args.protocol, &|done, total| {
         bar.set_length(total as u64);
         bar.set_position(done as u64);
     });

@@ -28,6 +28,11 @@ pub const PRESETS: [(&str, &str); 14] = [
 pub fn preset_of_layout(layout: Layout) -> &'static str {
     match layout {
         Layout::V2v4Real => "v2v4real",
+        Layout::V2xReal => "v2xreal",
+        Layout::Dair => "dair",
+        Layout::V2xSeq => "v2xseq",
+        Layout::V2xSim => "v2xsim",
+        Layout::Mars => "mars",
         _ => "opv2v",
     }
 }

@@ -2,13 +2,17 @@
 //!
 //! Every frame is read. What cannot be read becomes a [`Problem`] with file, line and field, and the rest goes on.
 
+mod boxes;
+mod cells;
 mod survey;
+mod sweeps;
 mod table;
 
 use protocol::{CavId, Handedness};
 use serde::Serialize;
 
 pub use survey::inspect;
+pub use sweeps::SweepReport;
 
 pub use crate::dataset::Problem;
 use crate::dataset::{Layout, MissingFrame};
@@ -65,7 +69,9 @@ pub struct AgentReport {
     pub frames: usize,
     /// Points of a sweep.
     pub points: Option<Summary>,
-    /// Points left out because a number is not finite, over all sweeps.
+    /// Form and intensities of its sweeps; `None` where none has a point.
+    pub sweeps: Option<SweepReport>,
+    /// Points left out because a number is not finite, over all sweeps. Organised clouds have many.
     pub dropped_points: usize,
     /// Radar points of a frame.
     pub radar_points: Option<Summary>,

@@ -20,12 +20,17 @@ mod binary;
 mod encode;
 mod header;
 mod lzf;
+mod number;
 
 use protocol::PointCloud;
+use serde::Serialize;
 
 pub use encode::{Encoding, IntensityField, encode};
 
 use header::{Data, Header};
+
+/// Red of full intensity.
+const RED_SCALE: f32 = 255.0;
 
 /// What a PCD file holds.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -38,6 +43,33 @@ pub struct PcdCloud {
     pub dropped: usize,
     /// Where the first of these stands.
     pub first_dropped: Option<Place>,
+    /// Where the intensities come from; `None` where the file has none, and 0 stands for all.
+    pub intensity: Option<IntensityOrigin>,
+    /// Form of the file, for example `PCD` or `5 floats per point: x y z intensity ring`; empty where it is not known.
+    pub form: &'static str,
+}
+
+/// Where the intensities of a sweep come from.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct IntensityOrigin {
+    /// Name of the field.
+    pub field: String,
+    /// Number that the field stores, which tells its scale or leaves it open.
+    pub kind: IntensityKind,
+    /// Divisor that made the stored numbers what [`PcdCloud::points`] holds.
+    pub divisor: f32,
+}
+
+/// Number that stores an intensity.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum IntensityKind {
+    /// The red byte of a packed colour, 0..255.
+    RedByte,
+    /// A byte, 0..255.
+    Byte,
+    /// A wider number, whose scale its type does not tell.
+    Number,
 }
 
 /// Where in a file.
@@ -71,55 +103,66 @@ impl PcdError {
     }
 }
 
-/// Reads a PCD file that is in memory.
+/// Reads a PCD file that is in memory. Intensities are as the file stores them; the red byte of a colour is 0 to 1.
 ///
 /// # Errors
 /// [`PcdError`] names line, field and both values of what does not fit. Nothing is allocated on the word of the header
 /// alone.
 pub fn decode(bytes: &[u8]) -> Result<PcdCloud, PcdError> {
+    let mut cloud = decode_stored(bytes)?;
+    if let Some(origin) = cloud.intensity.as_mut().filter(|origin| origin.kind == IntensityKind::RedByte) {
+        origin.divisor = RED_SCALE;
+        cloud.points.xyzi.iter_mut().for_each(|point| point[3] /= RED_SCALE);
+    }
+    Ok(cloud)
+}
+
+/// [`decode`] with the red byte of a colour as it is stored too: 0 to 255.
+///
+/// # Errors
+/// As [`decode`].
+pub fn decode_stored(bytes: &[u8]) -> Result<PcdCloud, PcdError> {
     let (header, body) = Header::parse(bytes)?;
-    match header.data {
+    let cloud = match header.data {
         Data::Ascii => ascii::decode(&header, body),
         Data::Binary => binary::decode(&header, body),
         Data::BinaryCompressed => binary::decode_compressed(&header, body),
+    }?;
+    let intensity = header.intensity_origin().map(|(field, kind)| IntensityOrigin::stored(field, kind));
+    Ok(PcdCloud { intensity, form: header.data.name(), ..cloud })
+}
+
+impl IntensityOrigin {
+    /// A field whose numbers stand as they are stored.
+    pub(crate) fn stored(field: &str, kind: IntensityKind) -> Self {
+        Self { field: field.to_owned(), kind, divisor: 1.0 }
     }
 }
 
-/// Gathers points, leaving out those that are not finite.
-struct Collector {
-    cloud: PcdCloud,
-    labels: Vec<u8>,
-}
-
-impl Collector {
-    fn with_capacity(points: usize, labelled: bool) -> Self {
-        let mut cloud = PcdCloud::default();
-        cloud.points.xyzi.reserve_exact(points);
-        Self { cloud, labels: Vec::with_capacity(if labelled { points } else { 0 }) }
-    }
-
-    fn push(&mut self, point: [f32; 4], label: Option<u8>, place: Place) {
-        if point.iter().all(|value| value.is_finite()) {
-            self.cloud.points.xyzi.push(point);
-            self.labels.extend(label);
-        } else {
-            self.cloud.dropped += 1;
-            self.cloud.first_dropped.get_or_insert(place);
+impl PcdCloud {
+    /// Points without those that are not finite. `labels`: one for each point, or none.
+    pub(crate) fn of_finite(mut points: Vec<[f32; 4]>, mut labels: Vec<u8>) -> Self {
+        let is_finite = |point: &[f32; 4]| point.iter().all(|value| value.is_finite());
+        let (all, first) = (points.len(), points.iter().position(|point| !is_finite(point)));
+        if first.is_some() {
+            let mut kept = points.iter().map(is_finite);
+            labels.retain(|_| kept.next().unwrap_or(false));
+            points.retain(is_finite);
+        }
+        Self {
+            dropped: all - points.len(),
+            first_dropped: first.map(|point| Place::Point(point as u64)),
+            points: PointCloud { xyzi: points },
+            labels: labels.iter().any(|&label| label != 0).then_some(labels),
+            ..Self::default()
         }
     }
-
-    fn finish(mut self) -> PcdCloud {
-        if self.labels.iter().any(|&label| label != 0) {
-            self.cloud.labels = Some(self.labels);
-        }
-        self.cloud
-    }
 }
 
-/// Red and green of a packed `0x00RRGGBB`: intensity 0..1 and label.
+/// Red and green of a packed `0x00RRGGBB`: intensity and label.
 fn unpack_rgb(bits: u32) -> (f32, u8) {
     let [_, red, green, _] = bits.to_be_bytes();
-    (f32::from(red) / 255.0, green)
+    (f32::from(red), green)
 }
 
 #[cfg(test)]

@@ -182,11 +182,11 @@ fn drive(folder: &Path, files: &[(&str, &[u8])], names: &[&'static str]) -> Vec<
     names.iter().enumerate().filter(|(place, name)| !name.is_empty() && *place < files.len()).map(reader).collect()
 }
 
-/// Whether the first sweep of the first scenario can be read.
+/// True where the first sweep of the first scenario can be read, and nothing is left out.
 fn read_first(folder: &Path) -> bool {
-    let Ok(dataset) = dataset::open(folder) else { return false };
+    let Some(dataset) = dataset::open(folder).ok().filter(|dataset| dataset.problems.is_empty()) else { return false };
     let Some(scenario) = dataset.scenarios.first().filter(|scenario| !scenario.ticks.is_empty()) else { return false };
-    scenario.load(0, 0, &LoadOptions::default()).is_ok()
+    scenario.load(0, 0, &LoadOptions::default()).is_ok_and(|frame| frame.problems.is_empty())
 }
 
 fn read_recording(path: &Path, _: &[u8]) -> bool {
