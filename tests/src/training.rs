@@ -9,6 +9,7 @@ use ego_fuser::Method;
 use ego_fuser::loss::LossConfig;
 use ego_fuser::samples::{SampleConfig, SampleKind};
 use ego_fuser::train::{Accuracy, Observer, StepReport, TrainConfig};
+use sim_replay::dataset::OpenOptions;
 
 /// libtorch has one generator of random numbers per process: who begins a training has it alone.
 pub fn alone() -> MutexGuard<'static, ()> {
@@ -60,6 +61,7 @@ pub fn config(data: &Path, out: &Path, method: Method, steps: u64) -> TrainConfi
     TrainConfig {
         data: vec![data.to_owned()],
         validation: vec![],
+        open: OpenOptions::default(),
         method,
         detector: small(),
         init: None,

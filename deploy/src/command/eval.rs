@@ -11,6 +11,7 @@ use agent::pose_source::{
 use agent::rate::RateConfig;
 use clap::ValueEnum;
 use deploy::evaluation::{EvaluationOptions, Part, evaluate, frame_count};
+use deploy::metrics::Metrics;
 use deploy::report;
 use deploy::table::{self, TableObserver, TableSpec};
 use ego_fuser::Method;
@@ -20,6 +21,8 @@ use ego_fuser::pairing::PairingConfig;
 use ego_fuser::trust::TrustConfig;
 use indicatif::{ProgressBar, ProgressStyle};
 use protocol::{CodecConfig, ConfidenceGate, Dtype};
+use sim_replay::dataset::IntensityScale;
+use sim_replay::dataset::LeftOut;
 use sim_replay::link::LinkConfig;
 
 use super::{BadInput, Outcome};
@@ -125,6 +128,9 @@ pub(crate) struct Arguments {
     /// Scenarios to judge at most, evenly spread [default: all].
     #[arg(long, value_parser = clap::value_parser!(u64).range(1..))]
     scenarios: Option<u64>,
+    /// Number that stored intensities are divided by [default: auto; `sim-replay inspect --help` says by what].
+    #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
+    intensity_scale: IntensityScale,
     /// Threads to compute with.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
     threads: u16,
@@ -204,7 +210,7 @@ impl Arguments {
             (true, several) => println!("{}", serde_json::to_string_pretty(several)?),
             (false, several) => print!("{}", report::table(several)),
         }
-        Ok(Outcome::Done)
+        Ok(left_out(&all))
     }
 
     fn options(&self) -> Result<EvaluationOptions, BadInput> {
@@ -248,7 +254,7 @@ impl Arguments {
             }),
             frames: self.frames.map(at_most),
             stepped: self.link.as_deref().map(|link| self.stepped(link)).transpose()?,
-            part: Part { scenarios: self.scenarios.map(at_most), ticks: None },
+            part: Part { scenarios: self.scenarios.map(at_most), ticks: None, intensity_scale: self.intensity_scale },
         })
     }
 
@@ -310,6 +316,19 @@ impl Arguments {
             },
         }
     }
+}
+
+/// Prints what the evaluations left out, each finding once.
+fn left_out(all: &[Metrics]) -> Outcome {
+    let mut sum = LeftOut::default();
+    all.iter().for_each(|metrics| sum.merge(&metrics.left_out));
+    for problem in sum.problems() {
+        eprintln!("left out: {}", problem.message);
+    }
+    if let Some(one) = all.iter().map(|metrics| &metrics.left_out).find(|one| **one != LeftOut::default()) {
+        eprintln!("{one}");
+    }
+    Outcome::of(!sum.is_nothing())
 }
 
 /// Fills tables and prints them.

@@ -174,7 +174,7 @@ impl Run<'_> {
                 limit_bytes: (self.spec.maps_limit_gb.max(0.0) * 1e9) as u64,
             }),
             frames: self.spec.frames,
-            part: Part { scenarios: table.scenarios, ticks: None },
+            part: Part { scenarios: table.scenarios, ..Part::default() },
             ..EvaluationOptions::default()
         };
         let metrics = evaluate(&options, row.method, &mut || observer.frame()).map_err(Box::new)?;

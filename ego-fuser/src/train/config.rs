@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use agent::model_config::DetectorConfig;
 use agent::training::RunConfig;
+use sim_replay::dataset::OpenOptions;
 
 use crate::feature_store::KeptMaps;
 use crate::fusion::FusionConfig;
@@ -18,6 +19,8 @@ pub struct TrainConfig {
     pub data: Vec<PathBuf>,
     /// Datasets to validate on; without any, AP is not measured.
     pub validation: Vec<PathBuf>,
+    /// What these datasets do not say of themselves.
+    pub open: OpenOptions,
     /// The method.
     pub method: Method,
     /// The network, where `init` does not say.

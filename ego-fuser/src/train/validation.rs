@@ -8,6 +8,7 @@ use protocol::Box3d;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
+use sim_replay::dataset::OpenOptions;
 use tch::no_grad;
 
 use super::TrainError;
@@ -41,12 +42,12 @@ impl Validator {
     /// # Errors
     /// [`TrainError::Sample`] when a folder cannot be read.
     pub fn open(
-        folders: &[PathBuf],
+        (folders, options): (&[PathBuf], &OpenOptions),
         samples: &SampleConfig,
         model: &CooperativeModel,
         frames: usize,
     ) -> Result<Self, TrainError> {
-        let scenes = Arc::new(SceneSet::open(folders)?);
+        let scenes = Arc::new(SceneSet::open_with(folders, options)?);
         let all = scenes.ticks();
         let frames = frames.clamp(1, all.len());
         let ticks = (0..frames).map(|frame| all[frame * all.len() / frames]).collect();

@@ -85,6 +85,10 @@ fn survey_tick(scenario: &Scenario, tick: usize) -> TickFindings {
     let mut agents = Vec::with_capacity(scenario.agents.len());
     let mut frames = Vec::with_capacity(scenario.agents.len());
     for agent in 0..scenario.agents.len() {
+        if !scenario.is_present(agent, tick) {
+            agents.push(FrameFindings::default());
+            continue;
+        }
         let (findings, frame) = survey_frame(scenario, agent, tick);
         agents.push(findings);
         frames.extend(frame);
@@ -104,6 +108,7 @@ fn survey_frame(scenario: &Scenario, agent: usize, tick: usize) -> (FrameFinding
         survey_points(scenario, agent, tick, Some(variant), &mut findings);
     }
     if let Some(frame) = &frame {
+        findings.problems.extend(frame.problems.iter().cloned());
         findings.boxes = Some(frame.objects.len());
         findings.world_from_lidar = frame.world_from_lidar;
         if let Some(points) = &plain {
@@ -251,6 +256,7 @@ fn summarize_agent(id: &CavId, frames: &[&FrameFindings]) -> AgentReport {
         sweeps: sweeps::summarize(&frames.iter().filter_map(|frame| frame.sweep.as_ref()).collect::<Vec<_>>()),
         boxes: counts(|frame| frame.boxes),
         boxes_without_points: frames.iter().map(|frame| frame.boxes_without_points).sum(),
+        frames: frames.iter().filter(|frame| frame.points.is_some()).count(),
         // An empty sum is -0.
         distance_m: (!positions.is_empty()).then(|| positions.windows(2).map(step).fold(0.0, |sum, step| sum + step)),
     }
@@ -334,6 +340,62 @@ mod tests {
         let agent = &report.scenarios[0].agents[0];
         assert_eq!((agent.points, agent.dropped_points), (Summary::of(&[1, 0, 2, 2]), 3));
         assert_eq!(report.ticks.len(), 4, "annotations of sound YAML count even where the sweep is broken");
+    }
+
+    /// Messages and table of an agent whose sweeps have these intensities.
+    fn of_intensities(sweeps: &[&[f32]]) -> (Vec<String>, String) {
+        let dir = tempfile::tempdir().unwrap();
+        for (stem, intensities) in sweeps.iter().enumerate() {
+            let points: Vec<[f32; 4]> = intensities.iter().map(|&intensity| [10.0, 0.0, -1.3, intensity]).collect();
+            write(dir.path(), &format!("1/{stem:06}.yaml"), YAML.as_bytes());
+            write(dir.path(), &format!("1/{stem:06}.pcd"), &sweep(&points));
+        }
+        let (report, messages) = survey(dir.path());
+        (messages, report.to_string())
+    }
+
+    #[test]
+    fn intensities_are_told_and_what_is_wrong_with_them_is_a_problem() {
+        let (messages, table) = of_intensities(&[&[0.0, 0.25, 1.0], &[0.5]]);
+        assert!(messages.is_empty(), "{messages:?}");
+        let line = "  sweeps of 1: PCD, ascii; intensity from intensity, divided by 1: 0.000 to 1.000, median 0.500";
+        assert!(table.contains(line), "{table}");
+        let (messages, table) = of_intensities(&[&[0.0, 51.0, 255.0]]);
+        assert!(messages.is_empty() && table.contains("divided by 255: 0.000 to 1.000, median 0.200"), "{table}");
+        let message = |sweeps: &[&[f32]]| of_intensities(sweeps).0.concat();
+        assert_eq!(
+            message(&[&[0.5], &[0.5, 0.5]]),
+            "/1: sweeps of agent 1: all 3 intensities are 0.5 (field intensity divided by 1), expected a sensor's, which \
+             differ"
+        );
+        assert_eq!(
+            message(&[&[0.5], &[1.0], &[0.25], &[200.0, 0.0]]),
+            "/1: sweeps of agent 1: 1 of 5 intensities are above 1, up to 200 (field intensity divided by 1): see \
+             --intensity-scale"
+        );
+        assert!(message(&[&[-0.5, 0.5]]).contains("1 of 2 intensities are below 0, down to -0.5"));
+        assert_eq!(
+            message(&[&[1.0, 700.0]]),
+            "/1: sweeps of agent 1: intensities reach 700, neither 0 to 1 nor 0 to 255 (field intensity divided by \
+             1023): state the scale by --intensity-scale"
+        );
+    }
+
+    #[test]
+    fn a_missing_intensity_and_implausible_points_are_problems() {
+        let dir = tempfile::tempdir().unwrap();
+        write(dir.path(), "1/000010.yaml", YAML.as_bytes());
+        let head = "FIELDS x y z ring\nSIZE 4 4 4 4\nTYPE F F F F\nWIDTH 2\nDATA ascii\n";
+        write(dir.path(), "1/000010.pcd", format!("{head}1 2 3 0\n4000 5 6 1\n").as_bytes());
+        let (_, messages) = survey(dir.path());
+        assert_eq!(
+            messages,
+            [
+                "/1: sweeps of agent 1: no field of intensity (intensity, reflectivity, remission, rgb, ...): it is 0 for \
+                 all points",
+                "/1: sweeps of agent 1: 50.0 % of the points lie within 300 m, usual are 95.0 % or more",
+            ]
+        );
     }
 
     #[test]
