@@ -16,7 +16,7 @@ use ego_fuser::feature_store::{FeatureStore, KeptMaps, MapSource};
 use ego_fuser::trust::TrustConfig;
 use ego_fuser::{Exchange, Method};
 use protocol::{CavId, CodecConfig};
-use sim_replay::dataset::{self, ReadError, Scenario};
+use sim_replay::dataset::{self, IntensityScale, OpenOptions, ReadError, Scenario};
 use sim_replay::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
 
 use crate::metrics::{Messages, Metrics};
@@ -72,6 +72,8 @@ pub struct Part {
     pub scenarios: Option<usize>,
     /// The first so many ticks of each; all where absent.
     pub ticks: Option<usize>,
+    /// Divisor of the intensities of its sweeps.
+    pub intensity_scale: IntensityScale,
 }
 
 impl Part {
@@ -81,7 +83,8 @@ impl Part {
     /// # Errors
     /// [`EvaluationError`] when it cannot be read, or the protocol contradicts itself.
     pub fn open(&self, path: &Path, protocol: &ProtocolConfig) -> Result<OpenedData, EvaluationError> {
-        let dataset = dataset::open(path)?;
+        let options = OpenOptions { intensity_scale: self.intensity_scale, ..OpenOptions::default() };
+        let dataset = dataset::open_with(path, &options)?;
         let protocol = protocol.resolve(dataset.layout).map_err(EvaluationError::Protocol)?;
         let mut scenarios: Vec<Scenario> =
             dataset.scenarios.iter().filter_map(|scenario| protocol.arrange(scenario)).collect();

@@ -21,6 +21,7 @@ use ego_fuser::pairing::PairingConfig;
 use ego_fuser::trust::TrustConfig;
 use indicatif::{ProgressBar, ProgressStyle};
 use protocol::{CodecConfig, ConfidenceGate, Dtype};
+use sim_replay::dataset::IntensityScale;
 use sim_replay::dataset::LeftOut;
 use sim_replay::evaluation_protocol::ProtocolConfig;
 use sim_replay::link::LinkConfig;
@@ -128,6 +129,9 @@ pub(crate) struct Arguments {
     /// Scenarios to judge at most, evenly spread [default: all].
     #[arg(long, value_parser = clap::value_parser!(u64).range(1..))]
     scenarios: Option<u64>,
+    /// Number that stored intensities are divided by [default: auto; `sim-replay inspect --help` says by what].
+    #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
+    intensity_scale: IntensityScale,
     /// Threads to compute with.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
     threads: u16,
@@ -256,7 +260,7 @@ impl Arguments {
             }),
             frames: self.frames.map(at_most),
             stepped: self.link.as_deref().map(|link| self.stepped(link)).transpose()?,
-            part: Part { scenarios: self.scenarios.map(at_most), ticks: None },
+            part: Part { scenarios: self.scenarios.map(at_most), ticks: None, intensity_scale: self.intensity_scale },
             protocol: self.protocol.clone(),
         })
     }

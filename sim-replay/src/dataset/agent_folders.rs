@@ -1,7 +1,7 @@
 //! The folders of the OPV2V family: `<root>/<split>/<scenario>/<agent>/<frame>.yaml` with a sweep beside it, entered at any
 //! level.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::{BTreeMap, BTreeSet, HashSet};
 use std::path::{Path, PathBuf};
 
 use protocol::CavId;
@@ -151,7 +151,12 @@ impl ScenarioFolder {
 
     /// The reader of all agents' sweeps.
     pub(super) fn sweeps(&self, options: &OpenOptions) -> Sweeps {
-        let of_agent = |agent: &CavId| self.stems.iter().map(|stem| self.pcd(agent, stem, None)).collect::<Vec<_>>();
+        let missing: HashSet<(&CavId, &str)> =
+            self.missing.iter().map(|frame| (&frame.agent, frame.stem.as_str())).collect();
+        let of_agent = |agent: &CavId| {
+            let stems = self.stems.iter().filter(|stem| !missing.contains(&(agent, stem.as_str())));
+            stems.map(|stem| self.pcd(agent, stem, None)).take(Sweeps::MOST_TRIED).collect::<Vec<_>>()
+        };
         let sweeps = Sweeps::new(SweepStorage::ByName, options);
         self.agents.iter().fold(sweeps, |sweeps, agent| sweeps.with_agent(agent.clone(), of_agent(agent)))
     }

@@ -25,7 +25,7 @@ const FRAMES_TO_TRY: usize = 5;
 const SHOWN_PROBLEMS: usize = 5;
 
 /// What a dataset does not say of itself.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct OpenOptions {
     /// Time from one stored frame to the next where neither time stamps nor the length of a simulator's tick are
     /// recorded, nanoseconds. The datasets of the OPV2V family store ten frames a second.
@@ -36,7 +36,7 @@ pub struct OpenOptions {
 
 impl Default for OpenOptions {
     fn default() -> Self {
-        Self { period_nanos: 100_000_000, intensity_scale: IntensityScale::Auto }
+        Self { period_nanos: 100_000_000, intensity_scale: IntensityScale::AUTO }
     }
 }
 
