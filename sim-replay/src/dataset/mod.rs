@@ -27,6 +27,7 @@ mod open;
 mod opv2v;
 mod points;
 mod recorded;
+mod unfinished;
 mod v2v4real;
 mod yaml;
 
@@ -39,6 +40,7 @@ use serde::Serialize;
 pub use error::ReadError;
 pub use listing::{content_sha256, listing_sha256};
 pub use open::{OpenOptions, open, open_with};
+pub use unfinished::UNFINISHED;
 
 use crate::frame::Frame;
 use crate::pcd::PcdCloud;

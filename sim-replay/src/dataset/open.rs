@@ -10,6 +10,7 @@ use super::opv2v::{self, Opv2v};
 use super::v2v4real::V2v4Real;
 use super::{
     Dataset, FrameSource, Layout, ReadError, Scenario, files, kitti_object, kitti_odometry, localization, recorded,
+    unfinished,
 };
 
 /// How far below the opened folder sequences of a single vehicle are looked for.
@@ -45,6 +46,12 @@ pub fn open(dir: &Path) -> Result<Dataset, ReadError> {
 /// # Errors
 /// As [`open`].
 pub fn open_with(dir: &Path, options: &OpenOptions) -> Result<Dataset, ReadError> {
+    let mut dataset = open_any(dir, options)?;
+    unfinished::report(dir, &mut dataset);
+    Ok(dataset)
+}
+
+fn open_any(dir: &Path, options: &OpenOptions) -> Result<Dataset, ReadError> {
     if let Some(file) = recorded::file_of(dir) {
         return recorded::open(&file);
     }
