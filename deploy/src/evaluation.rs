@@ -16,7 +16,7 @@ use ego_fuser::feature_store::{FeatureStore, KeptMaps, MapSource};
 use ego_fuser::trust::TrustConfig;
 use ego_fuser::{Exchange, Method};
 use protocol::{CavId, CodecConfig};
-use sim_replay::dataset::{self, ReadError, Scenario};
+use sim_replay::dataset::{self, Dataset, ReadError, Scenario};
 
 use crate::metrics::{Messages, Metrics};
 use crate::score::Board;
@@ -66,10 +66,10 @@ impl Part {
     ///
     /// # Errors
     /// [`ReadError`] when it cannot be read.
-    pub fn open(&self, path: &Path) -> Result<Vec<Scenario>, ReadError> {
-        let mut scenarios = dataset::open(path)?.scenarios;
-        scenarios.iter_mut().for_each(|scenario| scenario.ticks.truncate(self.ticks.unwrap_or(usize::MAX)));
-        Ok(scenarios)
+    pub fn open(&self, path: &Path) -> Result<Dataset, ReadError> {
+        let mut dataset = dataset::open(path)?;
+        dataset.scenarios.iter_mut().for_each(|scenario| scenario.ticks.truncate(self.ticks.unwrap_or(usize::MAX)));
+        Ok(dataset)
     }
 
     /// Those of all scenarios that are asked for.
@@ -101,15 +101,16 @@ pub enum EvaluationError {
 /// # Errors
 /// [`EvaluationError`] when the data set cannot be read.
 pub fn frame_count(options: &EvaluationOptions) -> Result<usize, EvaluationError> {
-    let scenarios = options.part.open(&options.dataset)?;
+    let scenarios = options.part.open(&options.dataset)?.scenarios;
     let ticks = options.part.chosen(&scenarios).map(|scenario| scenario.ticks.len()).sum();
     Ok(options.frames.map_or(ticks, |frames| frames.min(ticks)))
 }
 
-/// Runs one method over all scenarios, the first vehicle of each being the ego; `on_frame` is told of every frame.
+/// Runs one method over all scenarios, the first vehicle of each being the ego; `on_frame` is told of every frame. Frames
+/// and parts that cannot be read are left out and counted in [`Metrics::left_out`].
 ///
 /// # Errors
-/// [`EvaluationError`] at the first frame that cannot be read, and when there is none.
+/// [`EvaluationError`] when the data set cannot be opened, and when no frame can be judged.
 pub fn evaluate(
     options: &EvaluationOptions,
     method: Method,
@@ -129,7 +130,7 @@ pub(crate) fn judged(
     on_frame: &mut dyn FnMut(),
 ) -> Result<(Board, Evaluator, Instant), EvaluationError> {
     let began = Instant::now();
-    let scenarios = options.part.open(&options.dataset)?;
+    let Dataset { scenarios, problems, .. } = options.part.open(&options.dataset)?;
     let weights = weights_of(&options.weights, method)?;
     let mut evaluator = Evaluator::new(EvaluateConfig {
         weights: weights.clone(),
@@ -148,6 +149,7 @@ pub(crate) fn judged(
     if let Some(stepped) = &options.stepped {
         evaluator = evaluator.over_link(stepped.clone());
     }
+    evaluator.add_left_out_files(&problems);
     let grid = evaluator.ego().detector().config().feature_grid();
     let channels = evaluator.ego().detector().config().feature_channels();
     let map_values = u64::from(grid.width) * u64::from(grid.height) * u64::try_from(channels).unwrap_or(0);
@@ -195,5 +197,6 @@ pub(crate) fn metrics(board: &Board, evaluator: &Evaluator, options: &Evaluation
         None => ("offline", began.elapsed().as_secs_f64()),
     };
     let names = [evaluator.ego().method().name(), options.pose_source.name()];
-    Metrics::of(board, clock, names, seconds, Messages::of(&evaluator.ledger().total()))
+    let metrics = Metrics::of(board, clock, names, seconds, Messages::of(&evaluator.ledger().total()));
+    Metrics { left_out: evaluator.left_out().clone(), ..metrics }
 }

@@ -6,6 +6,7 @@ pub use agent::pose_error::PoseError;
 use agent::statistics::{quantile, sorted};
 use protocol::{CavId, Counts, DropReason};
 use serde::{Deserialize, Serialize};
+use sim_replay::dataset::LeftOut;
 
 use crate::score::{Board, NeighbourRecord};
 
@@ -44,6 +45,9 @@ pub struct Metrics {
     pub neighbours: BTreeMap<CavId, NeighbourRecord>,
     /// The ledger's totals.
     pub messages: Messages,
+    /// Data of the scene that could not be used.
+    #[serde(default)]
+    pub left_out: LeftOut,
 }
 
 impl Metrics {
@@ -70,6 +74,7 @@ impl Metrics {
             comm: board.communication(),
             neighbours: board.neighbours().clone(),
             messages,
+            left_out: LeftOut::default(),
         }
     }
 }

@@ -5,6 +5,8 @@
 use protocol::{CavId, Handedness, PointCloud, Pose};
 use serde::{Deserialize, Serialize};
 
+use crate::dataset::Problem;
+
 /// What an annotated object is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -71,6 +73,8 @@ pub struct Frame {
     pub speed_mps: Option<f64>,
     /// What this CAV's annotation lists. A CAV never lists itself.
     pub objects: Vec<Object>,
+    /// Parts of the frame that were left out: an object without a sound box, a field that cannot be read.
+    pub problems: Vec<Problem>,
     /// Which way the axes of the recording turned.
     pub source_handedness: Handedness,
 }
@@ -90,6 +94,7 @@ impl Frame {
             gnss_world_from_vehicle: None,
             speed_mps: None,
             objects: Vec::new(),
+            problems: Vec::new(),
             source_handedness,
         }
     }

@@ -11,6 +11,7 @@ use agent::pose_source::{
 use agent::rate::RateConfig;
 use clap::ValueEnum;
 use deploy::evaluation::{EvaluationOptions, Part, evaluate, frame_count};
+use deploy::metrics::Metrics;
 use deploy::report;
 use deploy::table::{self, TableObserver, TableSpec};
 use ego_fuser::Method;
@@ -20,6 +21,7 @@ use ego_fuser::pairing::PairingConfig;
 use ego_fuser::trust::TrustConfig;
 use indicatif::{ProgressBar, ProgressStyle};
 use protocol::{CodecConfig, ConfidenceGate, Dtype};
+use sim_replay::dataset::LeftOut;
 use sim_replay::link::LinkConfig;
 
 use super::{BadInput, Outcome};
@@ -204,7 +206,7 @@ impl Arguments {
             (true, several) => println!("{}", serde_json::to_string_pretty(several)?),
             (false, several) => print!("{}", report::table(several)),
         }
-        Ok(Outcome::Done)
+        Ok(left_out(&all))
     }
 
     fn options(&self) -> Result<EvaluationOptions, BadInput> {
@@ -310,6 +312,19 @@ impl Arguments {
             },
         }
     }
+}
+
+/// Prints what the evaluations left out, each finding once.
+fn left_out(all: &[Metrics]) -> Outcome {
+    let mut sum = LeftOut::default();
+    all.iter().for_each(|metrics| sum.merge(&metrics.left_out));
+    for problem in sum.problems() {
+        eprintln!("left out: {}", problem.message);
+    }
+    if let Some(one) = all.iter().map(|metrics| &metrics.left_out).find(|one| **one != LeftOut::default()) {
+        eprintln!("{one}");
+    }
+    Outcome::of(!sum.is_nothing())
 }
 
 /// Fills tables and prints them.

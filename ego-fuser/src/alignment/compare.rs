@@ -65,7 +65,7 @@ pub fn run(
 ) -> Result<(), AlignError> {
     approaches.iter_mut().for_each(|approach| approach.begin());
     for tick in ticks {
-        let frames = (0..scenario.agents.len())
+        let frames = (scenario.present_agents(tick))
             .map(|agent| Ok(scenario.load(agent, tick, &LoadOptions::default())?))
             .collect::<Result<Vec<Frame>, AlignError>>()?;
         let truth = (frames.iter().map(|frame| true_pose(frame, scenario, tick))).collect::<Result<Vec<_>, _>>()?;

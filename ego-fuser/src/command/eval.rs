@@ -86,8 +86,7 @@ impl Arguments {
         let mut tally = Tally::default();
         for scenario in scenarios {
             for tick in 0..scenario.ticks.len().min(frames) {
-                let agents = 0..scenario.agents.len();
-                let frames: Vec<Frame> = agents
+                let frames: Vec<Frame> = (scenario.present_agents(tick))
                     .map(|agent| scenario.load(agent, tick, &LoadOptions::default()))
                     .collect::<Result<_, _>>()?;
                 let objects = ground_truth::merge(&frames.iter().collect::<Vec<_>>(), 0, &rule);

@@ -9,7 +9,7 @@ use sim_replay::synth::{ConvertOptions, Converted, SceneLayout, SynthError, conv
 
 use crate::cli::Outcome;
 
-/// Problems that are printed; the others are counted.
+/// Problems that are printed; all are counted, and stand in the JSON summary.
 const SHOWN_PROBLEMS: usize = 10;
 
 /// Write a data set in another layout: sweeps, poses and boxes stay what they are, as far as the layout holds them.
@@ -50,10 +50,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     });
     bar.finish_and_clear();
     match result {
-        Ok(mut converted) => {
-            converted.problems.extend(input.problems);
+        Ok(converted) => {
             print(&converted, args);
-            Ok(if converted.problems.is_empty() { Outcome::Done } else { Outcome::DataLost })
+            Ok(if converted.left_out.is_nothing() { Outcome::Done } else { Outcome::DataLost })
         }
         Err(error @ SynthError::Write { .. }) => Err(error.into()),
         Err(error) => {
@@ -64,18 +63,14 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
 }
 
 fn print(converted: &Converted, args: &Args) {
-    let Converted { scenarios, agent_frames, left_out, problems } = converted;
-    for problem in problems.iter().take(SHOWN_PROBLEMS) {
-        eprintln!("left out: {problem}");
-    }
-    if let Some(more) = problems.len().checked_sub(SHOWN_PROBLEMS).filter(|more| *more > 0) {
-        eprintln!("left out: {more} more");
+    let Converted { scenarios, agent_frames, omitted, left_out } = converted;
+    for problem in left_out.problems().take(SHOWN_PROBLEMS) {
+        eprintln!("left out: {}", problem.message);
     }
     if args.json {
-        let problems: Vec<String> = problems.iter().map(ToString::to_string).collect();
         let report = serde_json::json!({
             "out": args.out, "layout": args.layout.name(), "scenarios": scenarios, "agent_frames": agent_frames,
-            "left_out": left_out, "problems": problems,
+            "omitted": omitted, "left_out": left_out,
         });
         println!("{report}");
         return;
@@ -85,5 +80,9 @@ fn print(converted: &Converted, args: &Args) {
         args.out.display(),
         args.layout.name()
     );
-    super::synth::print_left_out(left_out);
+    super::synth::print_omitted(omitted);
+    let summary = left_out.to_string();
+    if !summary.is_empty() {
+        println!("{summary}");
+    }
 }

@@ -206,6 +206,12 @@ fn print(report: &StreamReport, as_json: bool) -> anyhow::Result<()> {
     if let Some(AirReport { offered, arrived, dropped }) = &report.air {
         println!("{offered} sensor frames crossed a link: {arrived} arrived{}", by_reason(dropped));
     }
+    if report.absent_frames > 0 {
+        println!("{} frames do not exist: their vehicles came later or have left", report.absent_frames);
+    }
+    if report.left_out_parts > 0 {
+        println!("{} objects or other parts of frames were left out, see the log", report.left_out_parts);
+    }
     if report.unreadable_frames > 0 {
         println!("{} frames could not be read", report.unreadable_frames);
     }

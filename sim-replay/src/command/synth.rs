@@ -119,12 +119,12 @@ fn progress_bar(scenarios: usize) -> ProgressBar {
 }
 
 fn print(summary: &Summary, options: &SynthOptions, seconds: f64, json: bool) {
-    let Summary { layout, scenarios, agent_frames, points, annotations, left_out } = summary;
+    let Summary { layout, scenarios, agent_frames, points, annotations, omitted } = summary;
     let per_frame = |count: &usize| *count as f64 / (*agent_frames).max(1) as f64;
     if json {
         let report = serde_json::json!({
             "out": options.out, "layout": layout.name(), "scenarios": scenarios, "agent_frames": agent_frames,
-            "points_per_frame": per_frame(points), "vehicles_per_frame": per_frame(annotations), "left_out": left_out,
+            "points_per_frame": per_frame(points), "vehicles_per_frame": per_frame(annotations), "omitted": omitted,
             "seconds": seconds,
         });
         println!("{report}");
@@ -133,13 +133,13 @@ fn print(summary: &Summary, options: &SynthOptions, seconds: f64, json: bool) {
     println!("{}: {scenarios} scenarios, {agent_frames} agent-frames, layout {}", options.out.display(), layout.name());
     println!("{:.0} points and {:.1} annotated vehicles a frame", per_frame(points), per_frame(annotations));
     println!("{seconds:.1} s, {:.0} agent-frames a second", *agent_frames as f64 / seconds);
-    print_left_out(left_out);
+    print_omitted(omitted);
 }
 
 /// What a layout had no place for.
-pub(super) fn print_left_out(left_out: &BTreeMap<&'static str, u64>) {
-    for (what, count) in left_out {
-        println!("left out: {count} {what}");
+pub(super) fn print_omitted(omitted: &BTreeMap<&'static str, u64>) {
+    for (what, count) in omitted {
+        println!("not in this layout: {count} {what}");
     }
 }
 

@@ -20,7 +20,7 @@ pub(super) struct ScenarioFolder {
     pub(super) dir: PathBuf,
     /// Ego first, roadside units last.
     pub(super) agents: Vec<CavId>,
-    /// Stems that every agent has.
+    /// Stems of the ego, the first of the agents.
     pub(super) stems: Vec<String>,
     /// Stems that some agent has and this one has not.
     pub(super) missing: Vec<MissingFrame>,
@@ -92,15 +92,14 @@ impl ScenarioFolder {
         }
         let agents = in_order(by_agent.keys());
         let all: BTreeSet<&String> = by_agent.values().flat_map(|agent| &agent.stems).collect();
-        let (mut stems, mut missing) = (Vec::new(), Vec::new());
+        let mut missing = Vec::new();
         for stem in all {
             let without = agents.iter().filter(|id| !by_agent[id].stems.contains(stem));
-            let before = missing.len();
             missing.extend(without.map(|id| MissingFrame { agent: id.clone(), stem: stem.clone() }));
-            if missing.len() == before {
-                stems.push(stem.clone());
-            }
         }
+        let ego = agents.first().and_then(|ego| by_agent.get(ego));
+        let mut stems: Vec<String> = ego.map(|ego| ego.stems.iter().cloned().collect()).unwrap_or_default();
+        problems.extend(without_common_frame(dir, &agents, &by_agent));
         if stems.iter().all(|stem| stem.parse::<u64>().is_ok()) {
             stems.sort_by_key(|stem| stem.parse::<u64>().unwrap_or(u64::MAX));
         }
@@ -161,6 +160,32 @@ impl ScenarioFolder {
         }
         Ok(Some((seconds * 1e9).round() as u64))
     }
+}
+
+/// One problem for every agent that never has a frame at the ego's ticks: odd stems beside even ones, for example.
+fn without_common_frame(
+    dir: &Path,
+    agents: &[CavId],
+    by_agent: &BTreeMap<CavId, AgentFolder>,
+) -> impl Iterator<Item = ReadError> {
+    let stems = |id: &CavId| by_agent.get(id).map(|agent| &agent.stems);
+    let first = |id: &CavId| stems(id).and_then(BTreeSet::first).cloned().unwrap_or_default();
+    let ego = agents.first().cloned();
+    let strangers = agents.iter().skip(1).filter(|id| {
+        let ego = ego.as_ref().and_then(stems);
+        ego.zip(stems(id)).is_some_and(|(ego, own)| ego.is_disjoint(own))
+    });
+    let problem = |id: &CavId| {
+        let ego = ego.as_ref().map(|ego| (ego.to_string(), first(ego))).unwrap_or_default();
+        let reason = format!(
+            "no frame of agent {id} (first {}) at a tick of the ego {} (first {}): it takes no part",
+            first(id),
+            ego.0,
+            ego.1
+        );
+        ReadError::malformed(&dir.join(id.as_str()), reason)
+    };
+    strangers.map(problem).collect::<Vec<_>>().into_iter()
 }
 
 /// Text order, as OpenCOOD sorts: `1045` before `650`. Roadside units (negative ids) go last, so that no unit is the ego
@@ -260,13 +285,13 @@ mod tests {
     }
 
     #[test]
-    fn frame_lists_are_intersected_and_what_is_missing_is_said() {
+    fn the_frames_of_the_ego_count_and_missing_ones_are_listed() {
         let dir = tempfile::tempdir().unwrap();
         touch(dir.path(), &["1/000068.yaml", "1/000068.pcd", "1/000070.yaml", "1/000070.pcd"]);
         touch(dir.path(), &["2/000070.yaml", "2/000070.pcd", "2/000072.yaml", "2/000074.pcd", "2/000076_radar.pcd"]);
         touch(dir.path(), &["3/000070.yaml"]);
         let (folder, problems) = scan(dir.path());
-        assert_eq!((ids(&folder), folder.stems.as_slice()), (vec!["1", "2"], ["000070".to_owned()].as_slice()));
+        assert_eq!((ids(&folder), folder.stems.len()), (vec!["1", "2"], 2));
         assert_eq!(folder.missing, [MissingFrame { agent: CavId::new("2").unwrap(), stem: "000068".into() }]);
         assert_eq!(
             problems,
@@ -278,6 +303,17 @@ mod tests {
                 "/3: no frame with both YAML and PCD: the agent is left out",
             ]
         );
+    }
+
+    #[test]
+    fn an_agent_without_a_common_tick_is_named() {
+        let dir = tempfile::tempdir().unwrap();
+        touch(dir.path(), &["1/000068.yaml", "1/000068.pcd", "1/000070.yaml", "1/000070.pcd"]);
+        touch(dir.path(), &["2/000069.yaml", "2/000069.pcd"]);
+        let (folder, problems) = scan(dir.path());
+        assert_eq!((folder.agents.len(), folder.stems.len()), (2, 2));
+        let expected = "/2: no frame of agent 2 (first 000069) at a tick of the ego 1 (first 000068): it takes no part";
+        assert_eq!(problems, [expected]);
     }
 
     #[test]

@@ -19,6 +19,7 @@ mod hdf5_poses;
 mod kitti_object;
 mod kitti_odometry;
 mod kitti_text;
+mod left_out;
 mod listing;
 mod localization;
 mod nclt_ground_truth;
@@ -26,6 +27,8 @@ mod numpy_tags;
 mod open;
 mod opv2v;
 mod points;
+mod presence;
+mod problem;
 mod recorded;
 mod unfinished;
 mod v2v4real;
@@ -38,12 +41,16 @@ use protocol::{CavId, Handedness};
 use serde::Serialize;
 
 pub use error::ReadError;
+pub use left_out::LeftOut;
 pub use listing::{content_sha256, listing_sha256};
 pub use open::{OpenOptions, open, open_with};
+pub use presence::LoadedTick;
+pub use problem::Problem;
 pub use unfinished::UNFINISHED;
 
 use crate::frame::Frame;
 use crate::pcd::PcdCloud;
+use presence::Absences;
 
 /// The layouts that are known here.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
@@ -101,10 +108,12 @@ pub struct Scenario {
     pub name: String,
     /// The agents, ego first: in text order, a roadside unit that would come first last.
     pub agents: Vec<CavId>,
-    /// The moments that every agent has, in order.
+    /// The ego's moments, in order. Other agents take part where they have a frame, see [`Self::is_present`].
     pub ticks: Vec<Tick>,
-    /// Frames that some agents have and others lack; their moments are not among `ticks`.
+    /// Frames that some agents have and others lack. Where the ego lacks one there is no tick.
     pub missing: Vec<MissingFrame>,
+    /// Those of `agents` that stand beside the road.
+    pub roadside_units: Vec<CavId>,
     /// Variants of the LiDAR sweep beside the plain one, for example `fog_0.060`.
     pub lidar_variants: Vec<String>,
     /// Whether there are 4D radar points.
@@ -113,6 +122,7 @@ pub struct Scenario {
     pub layout: Layout,
     /// Which way the axes of the recording turned.
     pub source_handedness: Handedness,
+    absences: Absences,
     source: Arc<dyn FrameSource>,
 }
 
@@ -214,6 +224,13 @@ impl Scenario {
         let agent =
             self.agents.get(agent_index).ok_or_else(|| self.no_such("agent", agent_index, self.agents.len()))?;
         let tick = self.ticks.get(tick_index).ok_or_else(|| self.no_such("tick", tick_index, self.ticks.len()))?;
+        if !self.is_present(agent_index, tick_index) {
+            return Err(ReadError::Absent {
+                scenario: self.name.clone(),
+                agent: agent.to_string(),
+                tick: tick.stem.clone(),
+            });
+        }
         Ok((agent, tick))
     }
 
@@ -230,10 +247,12 @@ fn single_vehicle(name: String, layout: Layout, ticks: Vec<Tick>, source: Arc<dy
         agents: vec![CavId::new("0").expect("a digit is an identifier")],
         ticks,
         missing: Vec::new(),
+        roadside_units: Vec::new(),
         lidar_variants: Vec::new(),
         has_radar: false,
         layout,
         source_handedness: Handedness::Right,
+        absences: Absences::default(),
         source,
     }
 }

@@ -3,10 +3,11 @@
 use std::path::Path;
 use std::sync::Arc;
 
-use protocol::Handedness;
+use protocol::{CavId, Handedness};
 
 use super::agent_folders::{self, ScenarioFolder};
 use super::opv2v::{self, Opv2v};
+use super::presence::Absences;
 use super::v2v4real::V2v4Real;
 use super::{
     Dataset, FrameSource, Layout, ReadError, Scenario, files, kitti_object, kitti_odometry, localization, recorded,
@@ -110,16 +111,19 @@ fn agent_folder_scenario(
     problems: &mut Vec<ReadError>,
 ) -> Scenario {
     if folder.stems.is_empty() {
-        let reason = format!("no frame that all of its {} agents have", folder.agents.len());
-        problems.push(ReadError::malformed(&folder.dir, reason));
+        problems.push(ReadError::malformed(&folder.dir, "no frame of any agent"));
     }
     let layout = if is_v2v4real(&folder) { Layout::V2v4Real } else { Layout::Opv2v };
     let source_handedness = if layout == Layout::Opv2v { Handedness::Left } else { Handedness::Right };
+    let ticks = folder.ticks(options.period_nanos, problems);
+    let is_unit = |id: &&CavId| id.as_str().starts_with('-');
     Scenario {
         name: files::name_below(root, &folder.dir),
         agents: folder.agents.clone(),
-        ticks: folder.ticks(options.period_nanos, problems),
+        absences: Absences::new(&folder.agents, &ticks, &folder.missing),
+        ticks,
         missing: folder.missing.clone(),
+        roadside_units: folder.agents.iter().filter(is_unit).cloned().collect(),
         lidar_variants: folder.variants.clone(),
         has_radar: folder.has_radar,
         layout,

@@ -6,6 +6,7 @@ use std::sync::Arc;
 
 use protocol::{CavId, Gnss, Handedness, Lidar, Limits, Payload, Radar, Stamp, Stream, Topic, Truth, wire};
 
+use super::presence::Absences;
 use super::{Dataset, FrameSource, Layout, MissingFrame, ReadError, Scenario, Tick};
 use crate::frame::{Frame, Object, ObjectClass};
 use crate::pcd::PcdCloud;
@@ -34,6 +35,8 @@ pub(super) fn open(file: &Path) -> Result<Dataset, ReadError> {
     let (ticks, missing) = source.ticks();
     let scenario = Scenario {
         name,
+        absences: Absences::new(&agents, &ticks, &missing),
+        roadside_units: agents.iter().filter(|id| id.as_str().starts_with('-')).cloned().collect(),
         has_radar: source.sensors.keys().any(|(_, _, stream)| *stream == Stream::Radar),
         agents,
         ticks,
@@ -108,7 +111,7 @@ impl Recorded {
         agents
     }
 
-    /// The moments of which everyone's sweep was recorded, and the sweeps that are missing at others.
+    /// The moments of which the ego's sweep was recorded, and the sweeps that are missing at any moment.
     fn ticks(&self) -> (Vec<Tick>, Vec<MissingFrame>) {
         let mut captures: Vec<u64> =
             self.sensors.keys().filter(|(_, _, stream)| *stream == Stream::Lidar).map(|(at, _, _)| *at).collect();
@@ -118,11 +121,10 @@ impl Recorded {
             let stem = capture_nanos.to_string();
             let lacks = |cav: &&CavId| !self.sensors.contains_key(&(capture_nanos, (*cav).clone(), Stream::Lidar));
             let lacking: Vec<&CavId> = self.agents.iter().filter(lacks).collect();
-            if lacking.is_empty() {
+            let frame = |cav: &&CavId| MissingFrame { agent: (*cav).clone(), stem: stem.clone() };
+            missing.extend(lacking.iter().map(frame));
+            if lacking.first() != self.agents.first().as_ref() {
                 ticks.push(Tick { stem, capture_nanos });
-            } else {
-                let frame = |cav: &CavId| MissingFrame { agent: cav.clone(), stem: stem.clone() };
-                missing.extend(lacking.into_iter().map(frame));
             }
         }
         (ticks, missing)

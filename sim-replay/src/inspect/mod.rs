@@ -5,14 +5,13 @@
 mod survey;
 mod table;
 
-use std::path::Path;
-
 use protocol::{CavId, Handedness};
 use serde::Serialize;
 
 pub use survey::inspect;
 
-use crate::dataset::{Layout, MissingFrame, ReadError};
+pub use crate::dataset::Problem;
+use crate::dataset::{Layout, MissingFrame};
 
 /// The findings. Serializes to the JSON of `sim-replay inspect --json`, prints as its table.
 #[derive(Debug, Clone, Serialize)]
@@ -38,7 +37,7 @@ pub struct ScenarioReport {
     pub layout: Layout,
     /// Which way its axes turn on disk.
     pub handedness: Handedness,
-    /// Moments that all agents have.
+    /// Moments of the ego.
     pub frames: usize,
     /// From the first moment to the last, seconds.
     pub seconds: f64,
@@ -59,6 +58,8 @@ pub struct ScenarioReport {
 pub struct AgentReport {
     /// Who.
     pub id: CavId,
+    /// Moments at which it has a sweep that can be read.
+    pub frames: usize,
     /// Points of a sweep.
     pub points: Option<Summary>,
     /// Points left out because a number is not finite, over all sweeps.
@@ -106,28 +107,4 @@ pub struct TickReport {
     pub agents: Vec<CavId>,
     /// How many objects there are.
     pub merged_boxes: usize,
-}
-
-/// Something wrong.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize)]
-pub struct Problem {
-    /// The file or folder.
-    pub path: String,
-    /// The line, from 1, where the file has lines.
-    pub line: Option<u64>,
-    /// The field.
-    pub field: Option<String>,
-    /// What is wrong, with place and both values.
-    pub message: String,
-}
-
-impl From<&ReadError> for Problem {
-    fn from(error: &ReadError) -> Self {
-        Self {
-            path: error.path().unwrap_or(Path::new("")).display().to_string(),
-            line: error.line(),
-            field: error.field().map(str::to_owned),
-            message: error.to_string(),
-        }
-    }
 }

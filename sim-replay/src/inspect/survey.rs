@@ -72,6 +72,10 @@ fn survey_tick(scenario: &Scenario, tick: usize) -> TickFindings {
     let mut agents = Vec::with_capacity(scenario.agents.len());
     let mut frames = Vec::with_capacity(scenario.agents.len());
     for agent in 0..scenario.agents.len() {
+        if !scenario.is_present(agent, tick) {
+            agents.push(FrameFindings::default());
+            continue;
+        }
         let (findings, frame) = survey_frame(scenario, agent, tick);
         agents.push(findings);
         frames.extend(frame);
@@ -91,6 +95,7 @@ fn survey_frame(scenario: &Scenario, agent: usize, tick: usize) -> (FrameFinding
         survey_points(scenario, agent, tick, Some(variant), &mut findings);
     }
     if let Some(frame) = &frame {
+        findings.problems.extend(frame.problems.iter().cloned());
         findings.boxes = Some(frame.objects.len());
         findings.world_from_lidar = frame.world_from_lidar;
         if let Some(points) = &plain {
@@ -222,6 +227,7 @@ fn summarize_agent(id: &CavId, frames: &[&FrameFindings]) -> AgentReport {
         radar_points: counts(|frame| frame.radar_points),
         boxes: counts(|frame| frame.boxes),
         boxes_without_points: frames.iter().map(|frame| frame.boxes_without_points).sum(),
+        frames: frames.iter().filter(|frame| frame.points.is_some()).count(),
         // An empty sum is -0.
         distance_m: (!positions.is_empty()).then(|| positions.windows(2).map(step).fold(0.0, |sum, step| sum + step)),
     }

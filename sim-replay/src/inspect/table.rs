@@ -59,15 +59,7 @@ impl Report {
         if !scenario.lidar_variants.is_empty() {
             writeln!(f, "  LiDAR variants: {}", scenario.lidar_variants.join(", "))?;
         }
-        if !scenario.missing.is_empty() {
-            let first = &scenario.missing[0];
-            let missing = count(scenario.missing.len(), "frame");
-            writeln!(
-                f,
-                "  {missing} left out because an agent lacks it; first: {} of agent {}",
-                first.stem, first.agent
-            )?;
-        }
+        write_missing(f, scenario)?;
         self.write_merged(f, scenario)
     }
 
@@ -88,6 +80,18 @@ impl Report {
         }
         Ok(())
     }
+}
+
+/// A line for every agent that lacks frames which others have; at those that the ego lacks there is no tick.
+fn write_missing(f: &mut fmt::Formatter<'_>, scenario: &ScenarioReport) -> fmt::Result {
+    for (index, AgentReport { id, .. }) in scenario.agents.iter().enumerate() {
+        let lacking: Vec<_> = scenario.missing.iter().filter(|frame| frame.agent == *id).collect();
+        let (Some(first), Some(last)) = (lacking.first(), lacking.last()) else { continue };
+        let frames = count(lacking.len(), "frame");
+        let consequence = if index == 0 { "the frames of others are not used there" } else { "absent there" };
+        writeln!(f, "  agent {id} lacks {frames}, from {} to {}: {consequence}", first.stem, last.stem)?;
+    }
+    Ok(())
 }
 
 fn write_agent(f: &mut fmt::Formatter<'_>, agent: &AgentReport) -> fmt::Result {

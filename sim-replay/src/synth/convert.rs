@@ -5,15 +5,16 @@ use std::path::PathBuf;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
+use protocol::CavId;
 use rayon::prelude::*;
 
 use super::error::SynthError;
 use super::generate::check_folder;
 use super::layout::{
-    AgentFrame, LeftOut, Moment, SceneAgent, SceneHeader, SceneLayout, SceneWriter, SweepVariant, Unfinished,
+    AgentFrame, Moment, Omissions, SceneAgent, SceneHeader, SceneLayout, SceneWriter, SweepVariant, Unfinished, locked,
 };
 use super::protocol_file::converted_yaml;
-use crate::dataset::{Dataset, LoadOptions, ReadError, Scenario};
+use crate::dataset::{Dataset, LeftOut, LoadOptions, LoadedTick, Problem, ReadError, Scenario};
 
 /// Lengths of a tick that are tried, nanoseconds: a simulator's step, and what clocks of sensors are read to.
 const TICKS_NANOS: [u64; 4] = [50_000_000, 10_000_000, 1_000_000, 1_000];
@@ -37,16 +38,16 @@ pub struct Converted {
     /// Frames of all agents together.
     pub agent_frames: usize,
     /// What the layout has no place for, and how often it was left out.
-    pub left_out: BTreeMap<&'static str, u64>,
-    /// Frames that could not be read and are left out.
-    pub problems: Vec<ReadError>,
+    pub omitted: BTreeMap<&'static str, u64>,
+    /// What could not be read.
+    pub left_out: LeftOut,
 }
 
 /// Writes all scenarios of a data set in a layout. `progress` hears how many moments are done and how many there are.
 ///
 /// # Errors
 /// [`SynthError`] where the layout cannot hold a scene or a file cannot be written. A frame that cannot be read is left out
-/// and stands in [`Converted::problems`].
+/// and stands in [`Converted::left_out`].
 pub fn convert(
     dataset: &Dataset,
     options: &ConvertOptions,
@@ -55,13 +56,14 @@ pub fn convert(
     check_folder(&options.out, options.force)?;
     let unfinished = Unfinished::mark(&options.out)?;
     let mut writer = options.layout.writer(&options.out);
-    let (left_out, problems) = (LeftOut::default(), Mutex::new(Vec::new()));
+    let (omitted, left_out) = (Omissions::default(), Mutex::new(LeftOut::default()));
+    locked(&left_out).add_files(&dataset.problems);
     let mut converted = Converted::default();
     let total = dataset.scenarios.iter().map(|scenario| scenario.ticks.len()).sum();
     let done = AtomicUsize::new(0);
     for scenario in &dataset.scenarios {
         writer.begin(&header(scenario, dataset)?)?;
-        let frames = write_moments(scenario, writer.as_ref(), (&left_out, &problems), &|| {
+        let frames = write_moments(scenario, writer.as_ref(), (&omitted, &left_out), &|| {
             progress(done.fetch_add(1, Ordering::Relaxed) + 1, total);
         })?;
         writer.end()?;
@@ -70,9 +72,8 @@ pub fn convert(
     }
     writer.finish()?;
     unfinished.clear()?;
-    converted.left_out = left_out.into_counts();
-    converted.problems = problems.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner);
-    converted.problems.sort_by_key(ToString::to_string);
+    converted.omitted = omitted.into_counts();
+    converted.left_out = std::mem::take(&mut *locked(&left_out));
     Ok(converted)
 }
 
@@ -86,7 +87,8 @@ fn header(scenario: &Scenario, dataset: &Dataset) -> Result<SceneHeader, SynthEr
         return Err(SynthError::Layout { layout: "of the input", reason });
     }
     let from = format!("{:?}", dataset.layout);
-    let agents = scenario.agents.iter().map(|id| SceneAgent { id: id.clone(), is_roadside: is_roadside(id.as_str()) });
+    let is_roadside = |id: &CavId| scenario.roadside_units.contains(id);
+    let agents = scenario.agents.iter().map(|id| SceneAgent { id: id.clone(), is_roadside: is_roadside(id) });
     Ok(SceneHeader {
         name: scenario.name.clone(),
         agents: agents.collect(),
@@ -96,58 +98,53 @@ fn header(scenario: &Scenario, dataset: &Dataset) -> Result<SceneHeader, SynthEr
     })
 }
 
-/// Units at the roadside have negative numbers in the OPV2V family.
-fn is_roadside(id: &str) -> bool {
-    id.starts_with('-')
-}
-
-/// Writes the moments at which the ego is present; returns how many frames.
+/// Writes the moments at which the ego's frame can be read; returns how many frames.
 fn write_moments(
     scenario: &Scenario,
     writer: &dyn SceneWriter,
-    (left_out, problems): (&LeftOut, &Mutex<Vec<ReadError>>),
+    (omitted, left_out): (&Omissions, &Mutex<LeftOut>),
     done: &(dyn Fn() + Sync),
 ) -> Result<usize, SynthError> {
     let moments = (0..scenario.ticks.len()).into_par_iter().map(|index| {
-        let moment = read_moment(scenario, index, problems);
-        let frames = moment.frames.len();
-        if frames > 0 {
-            writer.write(&moment, left_out)?;
-        }
+        let loaded = read(scenario, index);
+        locked(left_out).add_tick(&loaded);
         done();
-        Ok(frames)
+        if loaded.frames.first().is_none_or(|(agent, _)| *agent != 0) {
+            return Ok(0);
+        }
+        let frames = loaded.frames.into_iter().map(|(agent, frame)| {
+            let variants = variants(scenario, agent, index, left_out);
+            AgentFrame { agent, frame, variants, simulated: None }
+        });
+        let moment = Moment { index, frames: frames.collect() };
+        writer.write(&moment, omitted)?;
+        Ok(moment.frames.len())
     });
     moments.sum()
 }
 
-/// Reads all agents' frames of a moment. Without the ego's there is none.
-fn read_moment(scenario: &Scenario, index: usize, problems: &Mutex<Vec<ReadError>>) -> Moment {
-    let mut frames = Vec::with_capacity(scenario.agents.len());
-    for agent in 0..scenario.agents.len() {
-        match read_frame(scenario, agent, index) {
-            Ok(frame) => frames.push(frame),
-            Err(error) => {
-                problems.lock().unwrap_or_else(std::sync::PoisonError::into_inner).push(error);
-                if agent == 0 {
-                    break;
-                }
-            }
-        }
+/// The frames of a moment. No layout has a place for sweeps of which nobody knows where they were taken.
+fn read(scenario: &Scenario, index: usize) -> LoadedTick {
+    let options = LoadOptions { lidar_variant: None, points: true, radar: true };
+    let mut loaded = scenario.load_tick(index, 0..scenario.agents.len(), &options);
+    for (agent, _) in loaded.frames.extract_if(.., |(_, frame)| frame.world_from_lidar.is_none()) {
+        let path = scenario.points_path(agent, index, None).unwrap_or_default();
+        let error = ReadError::malformed(&path, "there is no pose for this sweep");
+        loaded.unreadable.push((agent, Problem::from(&error)));
     }
-    Moment { index, frames }
+    loaded
 }
 
-fn read_frame(scenario: &Scenario, agent: usize, index: usize) -> Result<AgentFrame, ReadError> {
-    let frame = scenario.load(agent, index, &LoadOptions { lidar_variant: None, points: true, radar: true })?;
-    if frame.world_from_lidar.is_none() {
-        let path = scenario.points_path(agent, index, None)?;
-        return Err(ReadError::malformed(&path, "there is no pose for this sweep"));
-    }
-    let variants = scenario.lidar_variants.iter().map(|name| {
-        let cloud = scenario.load_points(agent, index, Some(name))?;
+/// The copies of a sweep that can be read.
+fn variants(scenario: &Scenario, agent: usize, index: usize, left_out: &Mutex<LeftOut>) -> Vec<SweepVariant> {
+    let read = |name: &String| {
+        let cloud = scenario.load_points(agent, index, Some(name)).map_err(|error| {
+            // A copy is a part of its frame, not a frame.
+            locked(left_out).add_files([&error]);
+        });
+        let cloud = cloud.ok()?;
         let labels = cloud.labels.unwrap_or_else(|| vec![0; cloud.points.len()]);
-        Ok(SweepVariant { name: name.clone(), points: cloud.points.xyzi, labels })
-    });
-    let variants = variants.collect::<Result<_, ReadError>>()?;
-    Ok(AgentFrame { agent, frame, variants, simulated: None })
+        Some(SweepVariant { name: name.clone(), points: cloud.points.xyzi, labels })
+    };
+    scenario.lidar_variants.iter().filter_map(read).collect()
 }

@@ -11,8 +11,8 @@ use protocol::{CavId, Handedness, PointCloud, Pose};
 use super::cast::{Body, Placement};
 use super::error::SynthError;
 use super::layout::{
-    AgentFrame, BoxAnchor, LeftOut, Moment, SceneAgent, SceneHeader, SceneLayout, SceneWriter, Simulated, SweepVariant,
-    Unfinished, make_folder,
+    AgentFrame, BoxAnchor, Moment, Omissions, SceneAgent, SceneHeader, SceneLayout, SceneWriter, Simulated,
+    SweepVariant, Unfinished, make_folder,
 };
 use super::lidar::{LIDAR_MOUNT_M, Lidar, lidar_motion};
 use super::options::{Subset, SynthOptions};
@@ -46,7 +46,7 @@ pub struct Summary {
     /// Annotated vehicles of all agent-frames.
     pub annotations: usize,
     /// What the layout has no place for, and how often it was left out.
-    pub left_out: BTreeMap<&'static str, u64>,
+    pub omitted: BTreeMap<&'static str, u64>,
 }
 
 impl Summary {
@@ -68,7 +68,7 @@ pub fn generate(options: &SynthOptions, progress: &(dyn Fn(u64) + Sync)) -> Resu
     check_folder(&options.out, options.force)?;
     let unfinished = Unfinished::mark(&options.out)?;
     let mut writer = options.layout.writer(&options.out);
-    let left_out = LeftOut::default();
+    let omitted = Omissions::default();
     let mut total = Summary { layout: options.layout, ..Summary::default() };
     for (place, source) in sources(options).iter().enumerate() {
         let town = town::build(source, options.town_seed)?;
@@ -79,12 +79,12 @@ pub fn generate(options: &SynthOptions, progress: &(dyn Fn(u64) + Sync)) -> Resu
             let spec = spec(options, &town, number);
             let scene = Scene { options, world: &world, spec };
             let progress = |thousandths| progress(before + thousandths);
-            total.add(&scene.write(writer.as_mut(), &left_out, &progress)?);
+            total.add(&scene.write(writer.as_mut(), &omitted, &progress)?);
         }
     }
     writer.finish()?;
     unfinished.clear()?;
-    total.left_out = left_out.into_counts();
+    total.omitted = omitted.into_counts();
     Ok(total)
 }
 
@@ -160,13 +160,13 @@ impl Scene<'_, '_> {
     fn write(
         &self,
         writer: &mut dyn SceneWriter,
-        left_out: &LeftOut,
+        omitted: &Omissions,
         progress: &(dyn Fn(u64) + Sync),
     ) -> Result<Summary, SynthError> {
         let recording = record(self.world, &self.spec)?;
         let agents = self.agents(&recording)?;
         writer.begin(&self.header(&recording, &agents))?;
-        let mut summary = self.write_moments(&recording, &agents, (writer, left_out), progress)?;
+        let mut summary = self.write_moments(&recording, &agents, (writer, omitted), progress)?;
         writer.end()?;
         summary.scenarios = 1;
         Ok(summary)
@@ -206,7 +206,7 @@ impl Scene<'_, '_> {
         &self,
         recording: &Recording,
         agents: &[Agent],
-        (writer, left_out): (&dyn SceneWriter, &LeftOut),
+        (writer, omitted): (&dyn SceneWriter, &Omissions),
         progress: &(dyn Fn(u64) + Sync),
     ) -> Result<Summary, SynthError> {
         let moments = recording.frames.len();
@@ -220,7 +220,7 @@ impl Scene<'_, '_> {
                     return;
                 }
                 let moment = self.moment(recording, agents, index, &mut bench);
-                let result = writer.write(&moment, left_out).map(|()| counts(&moment));
+                let result = writer.write(&moment, omitted).map(|()| counts(&moment));
                 let mut total = total.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
                 match (&mut *total, result) {
                     (Ok(total), Ok(summary)) => total.add(&summary),

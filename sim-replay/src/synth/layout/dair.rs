@@ -14,7 +14,7 @@ use serde_json::{Value, json};
 use super::boxes::{upright_in, with_byte_intensities};
 use super::dair_json::{cooperative_type, side_type, transform, upright_label, world_label};
 use super::disk::{make_folder, make_fresh_folder, write_file, write_origin};
-use super::{AgentFrame, LeftOut, Moment, SceneHeader, SceneWriter, locked};
+use super::{AgentFrame, Moment, Omissions, SceneHeader, SceneWriter, locked};
 use crate::frame::Object;
 use crate::ground_truth::upright_box;
 use crate::pcd::{self, Encoding, IntensityField};
@@ -119,7 +119,7 @@ impl Dair {
     }
 
     /// The sweep and the labels of one side.
-    fn write_side(&self, side: &Side, id: &str, frame: &AgentFrame, left_out: &LeftOut) -> Result<(), SynthError> {
+    fn write_side(&self, side: &Side, id: &str, frame: &AgentFrame, omitted: &Omissions) -> Result<(), SynthError> {
         let points = with_byte_intensities(&frame.frame.points);
         let cloud = pcd::encode(&points, Encoding::Binary, IntensityField::Intensity);
         write_file(&self.root.join(format!("{}/velodyne/{id}.pcd", side.folder)), cloud)?;
@@ -127,7 +127,7 @@ impl Dair {
         for object in &frame.frame.objects {
             match side_type(object.class) {
                 Some(kind) => labels.push(upright_label(kind, object.id, &upright_in(frame, object))),
-                None => left_out.add("objects of a class without a name in the labels", 1),
+                None => omitted.add("objects of a class without a name in the labels", 1),
             }
         }
         self.write_json(&format!("{}/label/{}/{id}.json", side.folder, side.labels), &Value::Array(labels))
@@ -185,24 +185,24 @@ impl SceneWriter for Dair {
         Ok(())
     }
 
-    fn write(&self, moment: &Moment, left_out: &LeftOut) -> Result<(), SynthError> {
+    fn write(&self, moment: &Moment, omitted: &Omissions) -> Result<(), SynthError> {
         let Some(batch) = &self.scene else { return Ok(()) };
         let (Some(vehicle), Some(unit)) = (moment.of(0), moment.of(batch.unit)) else {
-            left_out.add("frames of moments without vehicle or roadside unit", moment.frames.len());
+            omitted.add("frames of moments without vehicle or roadside unit", moment.frames.len());
             return Ok(());
         };
-        left_out.add("frames of agents beyond one vehicle and one roadside unit", moment.frames.len() - 2);
+        omitted.add("frames of agents beyond one vehicle and one roadside unit", moment.frames.len() - 2);
         let number = batch.first_frame + moment.index;
         let [id, unit_id] = [number, FIRST_UNIT_FRAME + number].map(|number| format!("{number:06}"));
-        self.write_side(&VEHICLE, &id, vehicle, left_out)?;
-        self.write_side(&UNIT, &unit_id, unit, left_out)?;
+        self.write_side(&VEHICLE, &id, vehicle, omitted)?;
+        self.write_side(&UNIT, &unit_id, unit, omitted)?;
         self.write_vehicle_pose(&id, vehicle)?;
         self.write_unit_pose(&unit_id, unit)?;
         let mut labels = Vec::new();
         for object in Moment::union([vehicle, unit]) {
             match cooperative_type(object.class) {
                 Some(kind) => labels.push(self.cooperative_label(kind, object, vehicle)),
-                None => left_out.add("objects that are no vehicles, in the labels of both sides", 1),
+                None => omitted.add("objects that are no vehicles, in the labels of both sides", 1),
             }
         }
         let path = format!("cooperative/{}/{id}.json", self.cooperative_labels());

@@ -11,7 +11,7 @@ use protocol::Box3d;
 use super::boxes::{float_bytes, upright_in};
 use super::disk::{make_folder, make_fresh_folder, write_file, write_origin};
 use super::kitti_odometry::camera_from_lidar;
-use super::{AgentFrame, LeftOut, Moment, SceneHeader, SceneWriter};
+use super::{AgentFrame, Moment, Omissions, SceneHeader, SceneWriter};
 use crate::frame::ObjectClass;
 use crate::synth::error::SynthError;
 
@@ -62,7 +62,7 @@ impl SceneWriter for KittiObject {
         Ok(())
     }
 
-    fn write(&self, moment: &Moment, _: &LeftOut) -> Result<(), SynthError> {
+    fn write(&self, moment: &Moment, _: &Omissions) -> Result<(), SynthError> {
         for frame in &moment.frames {
             let number = self.first_frame + frame.agent * self.moments + moment.index;
             let points = float_bytes(frame.frame.points.xyzi.iter().copied());

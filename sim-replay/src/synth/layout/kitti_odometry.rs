@@ -7,7 +7,7 @@ use std::path::Path;
 
 use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion};
 
-use super::LeftOut;
+use super::Omissions;
 use super::boxes::float_bytes;
 use super::disk::{make_folder, write_file};
 use super::sequences::{Sequence, Style};
@@ -50,7 +50,7 @@ impl Style for KittiOdometry {
         format!("{moment:06}.bin")
     }
 
-    fn points(&self, points: &[[f32; 4]], _: &LeftOut) -> Vec<u8> {
+    fn points(&self, points: &[[f32; 4]], _: &Omissions) -> Vec<u8> {
         float_bytes(points.iter().copied())
     }
 

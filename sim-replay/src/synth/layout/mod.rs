@@ -123,8 +123,8 @@ pub(crate) trait SceneWriter: Send + Sync {
     fn begin(&mut self, scene: &SceneHeader) -> Result<(), SynthError>;
 
     /// Writes one moment of the scene: from any thread, in any order, each moment once. What the layout has no place for is
-    /// counted in `left_out`.
-    fn write(&self, moment: &Moment, left_out: &LeftOut) -> Result<(), SynthError>;
+    /// counted in `omitted`.
+    fn write(&self, moment: &Moment, omitted: &Omissions) -> Result<(), SynthError>;
 
     /// Ends the scene: writes what several of its moments share.
     fn end(&mut self) -> Result<(), SynthError> {
@@ -232,9 +232,9 @@ impl Moment {
 
 /// What a layout had no place for: counts by what it is.
 #[derive(Debug, Default)]
-pub(crate) struct LeftOut(Mutex<BTreeMap<&'static str, u64>>);
+pub(crate) struct Omissions(Mutex<BTreeMap<&'static str, u64>>);
 
-impl LeftOut {
+impl Omissions {
     /// Counts `count` more of `what`.
     pub(crate) fn add(&self, what: &'static str, count: usize) {
         if count > 0 {
@@ -249,6 +249,6 @@ impl LeftOut {
 }
 
 /// The content of a lock: a thread that panicked while it held it ends the program anyway.
-fn locked<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
+pub(crate) fn locked<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
     mutex.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
 }

@@ -5,7 +5,7 @@
 use std::fmt::Write as _;
 use std::path::Path;
 
-use super::LeftOut;
+use super::Omissions;
 use super::boxes::{byte, ring};
 use super::disk::{make_folder, write_file};
 use super::sequences::{Sequence, Style, date, pose_z_down, z_down};
@@ -43,7 +43,7 @@ impl Style for Nclt {
         format!("{micros}.bin")
     }
 
-    fn points(&self, points: &[[f32; 4]], left_out: &LeftOut) -> Vec<u8> {
+    fn points(&self, points: &[[f32; 4]], omitted: &Omissions) -> Vec<u8> {
         let mut bytes = Vec::with_capacity(8 * points.len());
         let mut outside = 0;
         for &point in points {
@@ -55,7 +55,7 @@ impl Style for Nclt {
             bytes.extend([x, y, z].into_iter().flat_map(u16::to_le_bytes));
             bytes.extend([byte(intensity), ring(point)]);
         }
-        left_out.add("points beyond the coordinates that can be written (-100 m to 227 m)", outside);
+        omitted.add("points beyond the coordinates that can be written (-100 m to 227 m)", outside);
         bytes
     }
 
@@ -86,10 +86,10 @@ mod tests {
 
     #[test]
     fn points_are_rounded_and_those_outside_are_counted() {
-        let left_out = LeftOut::default();
-        let bytes = Nclt.points(&[[1.0024, -2.0026, 0.5, 0.2], [-100.5, 0.0, 0.0, 0.5]], &left_out);
+        let omitted = Omissions::default();
+        let bytes = Nclt.points(&[[1.0024, -2.0026, 0.5, 0.2], [-100.5, 0.0, 0.0, 0.5]], &omitted);
         let numbers: Vec<u16> = bytes[..6].as_chunks::<2>().0.iter().map(|pair| u16::from_le_bytes(*pair)).collect();
         assert_eq!((numbers, bytes[6], bytes.len()), (vec![20_200, 20_401, 19_900], 51, 8));
-        assert_eq!(left_out.into_counts().into_values().collect::<Vec<_>>(), [1]);
+        assert_eq!(omitted.into_counts().into_values().collect::<Vec<_>>(), [1]);
     }
 }

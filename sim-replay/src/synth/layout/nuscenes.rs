@@ -11,7 +11,7 @@ use serde_json::{Map, Value};
 use super::boxes::{float_bytes, points_in, ring};
 use super::disk::{make_folder, make_fresh_folder, write_file, write_origin};
 use super::nuscenes_tables::{AnnotationRecord, Sample, SceneTables, SweepRecord, Tables};
-use super::{AgentFrame, LeftOut, Moment, SceneHeader, SceneWriter, locked};
+use super::{AgentFrame, Moment, Omissions, SceneHeader, SceneWriter, locked};
 use crate::synth::error::SynthError;
 
 /// Time stamps of a scene count from here on, microseconds, with a day between two scenes.
@@ -86,7 +86,7 @@ impl SceneWriter for NuScenes {
         Ok(())
     }
 
-    fn write(&self, moment: &Moment, _: &LeftOut) -> Result<(), SynthError> {
+    fn write(&self, moment: &Moment, _: &Omissions) -> Result<(), SynthError> {
         let Some(scene) = &self.scene else { return Ok(()) };
         let offset = EPOCH_MICROS + scene.number as u64 * DAY_MICROS;
         let micros = offset + scene.header.capture_nanos[moment.index] / 1000;

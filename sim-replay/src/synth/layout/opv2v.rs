@@ -9,7 +9,7 @@ use protocol::{PointCloud, Pose};
 
 use super::disk::{Unfinished, make_folder, make_fresh_folder, scene_path, write_file};
 use super::yaml_text::{KMH_PER_MPS, ObjectEntry, agent_folders, anchors, write_list};
-use super::{AgentFrame, LeftOut, Moment, SceneHeader, SceneWriter, SweepVariant};
+use super::{AgentFrame, Moment, Omissions, SceneHeader, SceneWriter, SweepVariant};
 use crate::carla_pose::{CarlaPose, mirrored_point};
 use crate::frame::ObjectClass;
 use crate::pcd::{self, Encoding, IntensityField};
@@ -76,7 +76,7 @@ impl SceneWriter for Opv2v {
         Ok(())
     }
 
-    fn write(&self, moment: &Moment, _: &LeftOut) -> Result<(), SynthError> {
+    fn write(&self, moment: &Moment, _: &Omissions) -> Result<(), SynthError> {
         let Some(folders) = &self.folders else { return Ok(()) };
         for frame in &moment.frames {
             let points = pcd_of(&frame.frame.points.xyzi, IntensityField::Intensity);

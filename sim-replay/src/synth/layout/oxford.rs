@@ -3,7 +3,7 @@
 
 use std::path::Path;
 
-use super::LeftOut;
+use super::Omissions;
 use super::boxes::of_255;
 use super::disk::write_file;
 use super::hdf5_file::poses_file;
@@ -35,7 +35,7 @@ impl Style for Oxford {
         format!("{micros}.bin")
     }
 
-    fn points(&self, points: &[[f32; 4]], _: &LeftOut) -> Vec<u8> {
+    fn points(&self, points: &[[f32; 4]], _: &Omissions) -> Vec<u8> {
         let component = |index: usize| {
             points.iter().map(move |&point| {
                 let [x, y, z, intensity] = z_down(point);

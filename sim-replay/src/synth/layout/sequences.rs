@@ -7,7 +7,7 @@ use std::sync::Mutex;
 use protocol::Pose;
 
 use super::disk::{Unfinished, make_folder, make_fresh_folder, write_file, write_origin};
-use super::{LeftOut, Moment, SceneHeader, SceneWriter, locked};
+use super::{Moment, Omissions, SceneHeader, SceneWriter, locked};
 use crate::synth::error::SynthError;
 
 /// Between the clocks of two scenes, microseconds: a day.
@@ -28,7 +28,7 @@ pub(super) trait Style: Debug + Send + Sync {
     fn file_name(&self, moment: usize, micros: u64) -> String;
 
     /// The bytes of a sweep.
-    fn points(&self, points: &[[f32; 4]], left_out: &LeftOut) -> Vec<u8>;
+    fn points(&self, points: &[[f32; 4]], omitted: &Omissions) -> Vec<u8>;
 
     /// Writes what belongs to all sweeps of a sequence.
     fn write_poses(&self, root: &Path, sequence: &Sequence<'_>) -> Result<(), SynthError>;
@@ -101,14 +101,14 @@ impl SceneWriter for Sequences {
         Ok(())
     }
 
-    fn write(&self, moment: &Moment, left_out: &LeftOut) -> Result<(), SynthError> {
+    fn write(&self, moment: &Moment, omitted: &Omissions) -> Result<(), SynthError> {
         let Some(scene) = &self.scene else { return Ok(()) };
         let micros = scene.offset_micros + scene.capture_nanos[moment.index] / 1000;
         for frame in &moment.frames {
             let folder = self.root.join(self.style.folder(scene.first_sequence + frame.agent));
             let file = folder.join(self.style.sweeps_folder()).join(self.style.file_name(moment.index, micros));
-            write_file(&file, self.style.points(&frame.frame.points.xyzi, left_out))?;
-            left_out.add("boxes, which the layout does not have", frame.frame.objects.len());
+            write_file(&file, self.style.points(&frame.frame.points.xyzi, omitted))?;
+            omitted.add("boxes, which the layout does not have", frame.frame.objects.len());
             let world_from_lidar = frame.world_from_lidar().into();
             let sweep = SweepPose { moment: moment.index, micros, world_from_lidar };
             locked(&self.sweeps).push((frame.agent, sweep));

@@ -12,7 +12,7 @@ use super::boxes::real_type;
 use super::disk::write_file;
 use super::opv2v::AgentFolders;
 use super::yaml_text::{KMH_PER_MPS, ObjectEntry};
-use super::{AgentFrame, LeftOut, Moment, SceneHeader, SceneWriter};
+use super::{AgentFrame, Moment, Omissions, SceneHeader, SceneWriter};
 use crate::carla_pose::CarlaPose;
 use crate::frame::Object;
 use crate::pcd::{self, Encoding, IntensityField};
@@ -70,7 +70,7 @@ impl SceneWriter for V2v4real {
         Ok(())
     }
 
-    fn write(&self, moment: &Moment, _: &LeftOut) -> Result<(), SynthError> {
+    fn write(&self, moment: &Moment, _: &Omissions) -> Result<(), SynthError> {
         let Some(folders) = &self.folders else { return Ok(()) };
         for frame in &moment.frames {
             let points = pcd::encode(&frame.frame.points, Encoding::Binary, IntensityField::Intensity);

@@ -9,7 +9,7 @@ use super::boxes::{float_bytes, real_type};
 use super::disk::write_file;
 use super::opv2v::AgentFolders;
 use super::yaml_text::{KMH_PER_MPS, ObjectEntry, anchors, write_list};
-use super::{AgentFrame, LeftOut, Moment, SceneHeader, SceneWriter};
+use super::{AgentFrame, Moment, Omissions, SceneHeader, SceneWriter};
 use crate::carla_pose::CarlaPose;
 use crate::synth::error::SynthError;
 
@@ -32,7 +32,7 @@ impl SceneWriter for V2xreal {
         Ok(())
     }
 
-    fn write(&self, moment: &Moment, _: &LeftOut) -> Result<(), SynthError> {
+    fn write(&self, moment: &Moment, _: &Omissions) -> Result<(), SynthError> {
         let Some(folders) = &self.folders else { return Ok(()) };
         for frame in &moment.frames {
             let points = float_bytes(frame.frame.points.xyzi.iter().copied());

@@ -65,7 +65,7 @@ fn upright(label: &Value) -> Box3d {
 fn dair_keeps_poses_points_and_boxes() {
     let folder = tempfile::tempdir().unwrap();
     let root = folder.path();
-    assert!(write(SceneLayout::Dair, root).left_out.is_empty());
+    assert!(write(SceneLayout::Dair, root).omitted.is_empty());
     let pairs = json(&root.join("cooperative/data_info.json"));
     let stem = |path: &Value| path.as_str().unwrap().rsplit_once('/').unwrap().1[..6].to_owned();
     let ticks: Vec<Tick> = pairs
@@ -146,11 +146,11 @@ fn both_sides_have_labels_of_their_own() {
 }
 
 #[test]
-fn agents_beyond_two_are_left_out_and_one_is_refused() {
+fn agents_beyond_two_are_omitted_and_one_is_refused() {
     let folder = tempfile::tempdir().unwrap();
     let three = SynthOptions { agents: 3..=3, scenes: 1, ..options(SceneLayout::Dair, folder.path()) };
-    let left_out = generate(&three, &|_| {}).unwrap().left_out;
-    assert_eq!(left_out["frames of agents beyond one vehicle and one roadside unit"], 2);
+    let omitted = generate(&three, &|_| {}).unwrap().omitted;
+    assert_eq!(omitted["frames of agents beyond one vehicle and one roadside unit"], 2);
     let one = SynthOptions { agents: 1..=2, ..options(SceneLayout::Dair, &folder.path().join("one")) };
     let refused = generate(&one, &|_| {}).unwrap_err().to_string();
     assert!(refused.contains("--agents is 1-2; expected 2 or more"), "{refused}");

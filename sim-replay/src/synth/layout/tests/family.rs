@@ -7,7 +7,7 @@ use crate::dataset::Layout;
 use crate::frame::{Frame, Object, ObjectClass};
 use crate::synth::cast::Placement;
 use crate::synth::layout::{
-    AgentFrame, BoxAnchor, LeftOut, Moment, SceneAgent, SceneHeader, SceneLayout, Simulated, SweepVariant,
+    AgentFrame, BoxAnchor, Moment, Omissions, SceneAgent, SceneHeader, SceneLayout, Simulated, SweepVariant,
 };
 use crate::synth::positioning::Fix;
 use crate::synth::{ConvertOptions, SynthOptions, Weather, convert, generate};
@@ -22,7 +22,7 @@ fn a_scene_is_the_same_in_every_layout_that_is_read() {
         let folder = tempfile::tempdir().unwrap();
         let summary = write(layout, folder.path());
         assert_eq!((summary.layout, summary.scenarios, summary.agent_frames), (layout, 2, 8));
-        assert!(summary.left_out.is_empty(), "{:?}", summary.left_out);
+        assert!(summary.omitted.is_empty(), "{:?}", summary.omitted);
         let dataset = open(folder.path());
         assert_eq!(dataset.layout, found);
         assert_same(&ticks(&dataset), &expected, layout);
@@ -36,7 +36,7 @@ fn a_converted_data_set_is_the_same_as_a_generated_one() {
     write(SceneLayout::Opv2v, first.path());
     let into = |layout, out: &std::path::Path| ConvertOptions { out: out.to_owned(), layout, force: false };
     let there = convert(&open(first.path()), &into(SceneLayout::V2v4real, second.path()), &|_, _| {}).unwrap();
-    assert_eq!((there.scenarios, there.agent_frames, there.problems.len()), (2, 8, 0));
+    assert_eq!((there.scenarios, there.agent_frames, there.left_out.is_nothing()), (2, 8, true));
     assert_same(&ticks(&open(second.path())), &expected, SceneLayout::V2v4real);
     convert(&open(second.path()), &into(SceneLayout::Opv2v, third.path()), &|_, _| {}).unwrap();
     let back = open(third.path());
@@ -114,7 +114,7 @@ fn files_of_opv2v_have_this_text() {
     };
     let mut writer = SceneLayout::Opv2v.writer(folder.path());
     writer.begin(&header).unwrap();
-    writer.write(&Moment { index: 0, frames: vec![frame()] }, &LeftOut::default()).unwrap();
+    writer.write(&Moment { index: 0, frames: vec![frame()] }, &Omissions::default()).unwrap();
     writer.end().unwrap();
     let file = |name: &str| std::fs::read(folder.path().join("test/a").join(name)).unwrap();
     assert_eq!(file("data_protocol.yaml"), b"world: {}\n");

@@ -89,7 +89,7 @@ fn tick(tables: &Tables, root: &Path, sample: &Value, channels: &[String], scale
 #[test]
 fn v2xsim_keeps_poses_points_and_boxes() {
     let folder = tempfile::tempdir().unwrap();
-    assert!(write(SceneLayout::V2xsim, folder.path()).left_out.is_empty());
+    assert!(write(SceneLayout::V2xsim, folder.path()).omitted.is_empty());
     assert!(folder.path().join("sweeps/LIDAR_TOP_id_2/scene_1_000001.pcd.bin").is_file());
     let channels = |_: &Value| vec!["LIDAR_TOP_id_1".to_owned(), "LIDAR_TOP_id_2".to_owned()];
     assert_same(&ticks(folder.path(), "v1.0-mini", channels, 1.0), &expected(), SceneLayout::V2xsim);

@@ -26,8 +26,8 @@ fn sequences(layout: SceneLayout, found: Layout) -> (Vec<Vec<Tick>>, Vec<u64>) {
         assert_eq!(scenario.ticks[1].capture_nanos - scenario.ticks[0].capture_nanos, 100_000_000);
     }
     let boxes = summary.annotations as u64;
-    assert_eq!(summary.left_out["boxes, which the layout does not have"], boxes);
-    let others = summary.left_out.into_iter().filter(|(what, _)| !what.starts_with("boxes")).map(|(_, count)| count);
+    assert_eq!(summary.omitted["boxes, which the layout does not have"], boxes);
+    let others = summary.omitted.into_iter().filter(|(what, _)| !what.starts_with("boxes")).map(|(_, count)| count);
     (ticks(&dataset).chunks(2).map(<[Tick]>::to_vec).collect(), others.collect())
 }
 

@@ -47,7 +47,7 @@ fn tick(yamls: &[PathBuf]) -> Tick {
 #[test]
 fn v2xreal_keeps_poses_points_and_boxes() {
     let folder = tempfile::tempdir().unwrap();
-    assert!(write(SceneLayout::V2xreal, folder.path()).left_out.is_empty());
+    assert!(write(SceneLayout::V2xreal, folder.path()).omitted.is_empty());
     let mut ticks = Vec::new();
     for scenario in sorted(folder.path()) {
         let agents: Vec<PathBuf> = sorted(&scenario).into_iter().filter(|path| path.is_dir()).collect();
