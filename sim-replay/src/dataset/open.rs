@@ -14,7 +14,7 @@ use super::written_pose::WrittenPose;
 use super::yaml::{self, Field};
 use super::{
     Dataset, FrameSource, Layout, ReadError, Scenario, Tick, files, kitti_object, kitti_odometry, layouts_text,
-    localization, recorded,
+    localization, recorded, unfinished,
 };
 
 /// How far below the opened folder sequences of a single vehicle are looked for.
@@ -54,6 +54,12 @@ pub fn open(dir: &Path) -> Result<Dataset, ReadError> {
 /// # Errors
 /// As [`open`].
 pub fn open_with(dir: &Path, options: &OpenOptions) -> Result<Dataset, ReadError> {
+    let mut dataset = open_any(dir, options)?;
+    unfinished::report(dir, &mut dataset);
+    Ok(dataset)
+}
+
+fn open_any(dir: &Path, options: &OpenOptions) -> Result<Dataset, ReadError> {
     if let Some(file) = recorded::file_of(dir) {
         return recorded::open(&file);
     }

@@ -1,5 +1,6 @@
 //! `data_protocol.yaml`: how a scenario was made.
 
+use super::layout::SceneLayout;
 use super::options::SynthOptions;
 use super::recording::SceneSpec;
 use super::traffic::STEP_S;
@@ -8,11 +9,34 @@ use crate::town::Town;
 /// The file's name, in the folder of its scenario.
 pub(super) const FILE_NAME: &str = "data_protocol.yaml";
 
+/// The text of the file for a scene that was converted: from which layout, and what it was called there.
+pub(crate) fn converted_yaml(from: &str, scenario: &str, tick_nanos: u64) -> String {
+    let (version, tick_s) = (env!("CARGO_PKG_VERSION"), tick_nanos as f64 / 1e9);
+    let scenario = scenario.replace('\'', "''");
+    format!(
+        "\
+description: converted scene
+converter:
+  name: sim-replay convert
+  version: {version}
+  from: {from}
+  scenario: '{scenario}'
+world:
+  fixed_delta_seconds: {tick_s}
+"
+    )
+}
+
 /// The text of the file. It names what decides the bytes of the scenario, and the sensors in the words of OpenCDA.
 pub(crate) fn protocol_yaml(options: &SynthOptions, spec: &SceneSpec, town: &Town) -> String {
     let SynthOptions { subset, seed, town_seed, weather, frames, period_s, .. } = options;
     let (name, town_name, scene_seed, agents) = (&spec.name, &town.name, spec.seed, spec.agents);
     let (subset, weather, version) = (subset.name(), weather.name(), env!("CARGO_PKG_VERSION"));
+    // Without a word of it the layout is OPV2V's.
+    let layout = match options.layout {
+        SceneLayout::Opv2v => String::new(),
+        layout => format!("  layout: {}\n", layout.name()),
+    };
     format!(
         "\
 description: generated scene, no recording
@@ -29,7 +53,7 @@ generator:
   frames: {frames}
   period_seconds: {period_s}
   weather: {weather}
-vehicle_base:
+{layout}vehicle_base:
   sensing:
     localization:
       gnss:
