@@ -1,17 +1,17 @@
 //! `sim-replay inspect`: what is in a dataset, and what is wrong with it.
 
 use std::io::Write;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use indicatif::{ProgressBar, ProgressStyle};
-use sim_replay::inspect::{Report, inspect};
+use sim_replay::inspect::{Report, inspect, inspect_map};
 
 use crate::cli::Outcome;
 
 /// Say what a dataset holds (agents, frames, points, rates, boxes, merged ground truth) and what is wrong with it.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// Dataset, split, scenario or sequence; the layout is found out.
+    /// Dataset, split, scenario or sequence, whose layout is found out; or an OpenDRIVE map (.xodr).
     dir: PathBuf,
     /// Print JSON instead of a table.
     #[arg(long)]
@@ -20,6 +20,9 @@ pub(crate) struct Args {
 
 /// Prints the findings to standard output.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
+    if args.dir.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("xodr")) && args.dir.is_file() {
+        return run_map(&args.dir, args.json);
+    }
     let report = with_progress(args);
     let mut out = std::io::stdout().lock();
     if args.json {
@@ -29,6 +32,25 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
         writeln!(out, "{report}")?;
     }
     Ok(if report.problems.is_empty() { Outcome::Done } else { Outcome::BadInput })
+}
+
+/// Prints what a map holds to standard output.
+fn run_map(path: &Path, json: bool) -> anyhow::Result<Outcome> {
+    let report = match inspect_map(path) {
+        Ok(report) => report,
+        Err(error) => {
+            eprintln!("error: {error}");
+            return Ok(Outcome::BadInput);
+        }
+    };
+    let mut out = std::io::stdout().lock();
+    if json {
+        serde_json::to_writer_pretty(&mut out, &report)?;
+        writeln!(out)?;
+    } else {
+        writeln!(out, "{report}")?;
+    }
+    Ok(Outcome::Done)
 }
 
 /// Reads everything; a bar on a terminal says how far.

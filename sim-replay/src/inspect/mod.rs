@@ -2,6 +2,7 @@
 //!
 //! Every frame is read. What cannot be read becomes a [`Problem`] with file, line and field, and the rest goes on.
 
+mod map;
 mod survey;
 mod table;
 
@@ -10,6 +11,7 @@ use std::path::Path;
 use protocol::{CavId, Handedness};
 use serde::Serialize;
 
+pub use map::{MapReport, inspect_map};
 pub use survey::inspect;
 
 use crate::dataset::{Layout, MissingFrame, ReadError};

@@ -18,13 +18,13 @@ use super::vehicle::Vehicle;
 use super::world::World;
 use super::writer::{AgentFolder, Annotation, FrameFacts, make_folder, write_file};
 use crate::random::derive_seed;
-use crate::town::{self, Town, TownSource};
+use crate::town::{self, Finding, Town, TownSource};
 
 /// The farthest that any sensor looks, metres.
 const SIGHT_M: f64 = 152.0;
 
 /// What was generated.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Summary {
     /// Scenario folders.
     pub scenarios: usize,
@@ -34,6 +34,8 @@ pub struct Summary {
     pub points: usize,
     /// Annotated vehicles of all agent-frames.
     pub annotations: usize,
+    /// Parts of the map that were not built as its file gives them.
+    pub findings: Vec<Finding>,
 }
 
 impl Summary {
@@ -56,6 +58,7 @@ pub fn generate(options: &SynthOptions, progress: &(dyn Fn(u64) + Sync)) -> Resu
     let mut total = Summary::default();
     for (place, source) in sources(options).iter().enumerate() {
         let town = town::build(source, options.town_seed)?;
+        total.findings.extend(town.findings.iter().cloned());
         let world = World::new(&town);
         let places = sources(options).len();
         for number in (place..options.scenarios()).step_by(places) {
@@ -224,7 +227,7 @@ impl Scene<'_, '_> {
         let mut annotations: Vec<Annotation<'_>> =
             seen.into_iter().zip(&hits).filter(is_hit).map(|(annotation, _)| annotation).collect();
         annotations.sort_unstable_by_key(|annotation| annotation.id);
-        let summary = Summary { scenarios: 0, agent_frames: 1, points, annotations: annotations.len() };
+        let summary = Summary { agent_frames: 1, points, annotations: annotations.len(), ..Summary::default() };
         let facts =
             FrameFacts { vehicle: own.motion.end, speed_mps: own.speed_mps, fix: agent.fixes[number], annotations };
         agent.folder.write_facts(frame.tick, &facts)?;
