@@ -6,6 +6,7 @@ use agent::process;
 use anyhow::Context;
 use clap::{Parser, Subcommand};
 use sim_replay::bus::BusError;
+use sim_replay::output;
 
 use crate::command;
 
@@ -42,7 +43,7 @@ pub(crate) fn run(cli: Cli) -> ExitCode {
     match outcome {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("error: {error:#}");
+            output::note(format_args!("error: {error:#}"));
             let is_bad_input = error.is::<BadInput>() || BusError::is_behind(error.as_ref());
             if is_bad_input { ExitCode::from(2) } else { ExitCode::FAILURE }
         }

@@ -5,6 +5,7 @@ use std::process::ExitCode;
 use clap::{Parser, Subcommand};
 
 use sim_replay::bus::BusError;
+use sim_replay::output;
 
 use crate::command;
 
@@ -56,7 +57,7 @@ pub(crate) fn run(cli: Cli) -> ExitCode {
         Ok(Outcome::BadInput) => ExitCode::from(2),
         Ok(Outcome::DataLost) => ExitCode::from(3),
         Err(error) => {
-            eprintln!("error: {error:#}");
+            output::note(format_args!("error: {error:#}"));
             if BusError::is_behind(error.as_ref()) { ExitCode::from(2) } else { ExitCode::FAILURE }
         }
     }

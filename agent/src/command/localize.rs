@@ -7,6 +7,7 @@ use agent::pose_source::{LocalizedPose, PgcConfig, PoseInput, PoseRow, PoseSourc
 use indicatif::{ProgressBar, ProgressStyle};
 use protocol::PoseEstimate;
 use sim_replay::dataset::{self, LoadOptions, Scenario};
+use sim_replay::output;
 
 use super::town_heads::{TownHead, head_of};
 use crate::cli::BadInput;
@@ -52,7 +53,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         found += args.localize(scenario, head, &bar)?;
     }
     bar.finish_and_clear();
-    println!("{sweeps} sweeps, {found} with a pose; {} were there before: {}", done.len(), args.out.display());
+    output::line(format_args!(
+        "{sweeps} sweeps, {found} with a pose; {} were there before: {}",
+        done.len(),
+        args.out.display()
+    ))?;
     Ok(())
 }
 

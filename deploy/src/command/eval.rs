@@ -21,6 +21,7 @@ use ego_fuser::trust::TrustConfig;
 use indicatif::{ProgressBar, ProgressStyle};
 use protocol::{CodecConfig, ConfidenceGate, Dtype};
 use sim_replay::link::LinkConfig;
+use sim_replay::output;
 
 use super::{BadInput, Outcome};
 
@@ -200,9 +201,9 @@ impl Arguments {
         }
         bar.finish_and_clear();
         match (self.json, &all[..]) {
-            (true, [one]) => println!("{}", serde_json::to_string_pretty(one)?),
-            (true, several) => println!("{}", serde_json::to_string_pretty(several)?),
-            (false, several) => print!("{}", report::table(several)),
+            (true, [one]) => output::line(serde_json::to_string_pretty(one)?)?,
+            (true, several) => output::line(serde_json::to_string_pretty(several)?)?,
+            (false, several) => output::text(report::table(several))?,
         }
         Ok(Outcome::Done)
     }
@@ -317,7 +318,7 @@ fn tables(spec: &Path, out: &Path) -> anyhow::Result<Outcome> {
     let mut progress = TableProgress(ProgressBar::new_spinner());
     let filled = table::run(&TableSpec::read(spec)?, out, &mut progress)?;
     progress.0.finish_and_clear();
-    filled.iter().for_each(|table| println!("{}", table::markdown(table)));
+    filled.iter().try_for_each(|table| output::line(table::markdown(table)))?;
     Ok(Outcome::Done)
 }
 
@@ -328,7 +329,7 @@ impl TableObserver for TableProgress {
     fn cell(&mut self, table: &str, row: &str, column: &str, known: bool) {
         let text = format!("{table}: {row}, {column}{}", if known { ", known" } else { "" });
         if self.0.is_hidden() {
-            eprintln!("{text}");
+            output::note(&text);
         }
         self.0.set_message(text);
     }

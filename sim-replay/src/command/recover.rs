@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use sim_replay::bus::log_to_stderr;
+use sim_replay::output;
 use sim_replay::recording::{RecordingOptions, recover};
 
 use crate::cli::Outcome;
@@ -31,16 +32,19 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     let report = match recover(&args.from, &args.to, options) {
         Ok(report) => report,
         Err(error) => {
-            eprintln!("error: {error}");
+            output::note(format_args!("error: {error}"));
             return Ok(Outcome::BadInput);
         }
     };
     if args.json {
-        println!("{}", serde_json::to_string(&report)?);
+        output::line(serde_json::to_string(&report)?)?;
     } else {
-        println!("{} messages in {}", report.messages, args.to.display());
+        output::line(format_args!("{} messages in {}", report.messages, args.to.display()))?;
         if let Some(damage) = &report.damage {
-            println!("{} bytes behind byte {} are lost: {}", damage.lost_bytes, damage.whole_bytes, damage.reason);
+            output::line(format_args!(
+                "{} bytes behind byte {} are lost: {}",
+                damage.lost_bytes, damage.whole_bytes, damage.reason
+            ))?;
         }
     }
     Ok(if report.damage.is_some() { Outcome::DataLost } else { Outcome::Done })

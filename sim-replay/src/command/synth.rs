@@ -1,11 +1,12 @@
 //! `sim-replay synth`: generate scenes.
 
-use std::io::IsTerminal;
+use std::io::{self, IsTerminal};
 use std::ops::RangeInclusive;
 use std::path::PathBuf;
 use std::time::Instant;
 
 use indicatif::{ProgressBar, ProgressStyle};
+use sim_replay::output;
 use sim_replay::synth::{self, Subset, Summary, SynthError, SynthOptions, Weather};
 use sim_replay::town::TownSource;
 
@@ -74,12 +75,12 @@ pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
     bar.finish_and_clear();
     match result {
         Ok(summary) => {
-            print(&summary, &options, start.elapsed().as_secs_f64(), json);
+            print(&summary, &options, start.elapsed().as_secs_f64(), json)?;
             Ok(Outcome::Done)
         }
         Err(error @ (SynthError::Write { .. } | SynthError::Alone { .. })) => Err(error.into()),
         Err(error) => {
-            eprintln!("error: {error}");
+            output::note(format_args!("error: {error}"));
             Ok(Outcome::BadInput)
         }
     }
@@ -112,7 +113,7 @@ fn progress_bar(scenarios: usize) -> ProgressBar {
     bar.with_style(ProgressStyle::with_template(&template).unwrap_or_else(|_| ProgressStyle::default_bar()))
 }
 
-fn print(summary: &Summary, options: &SynthOptions, seconds: f64, json: bool) {
+fn print(summary: &Summary, options: &SynthOptions, seconds: f64, json: bool) -> io::Result<()> {
     let Summary { scenarios, agent_frames, points, annotations } = *summary;
     let per_frame = |count: usize| count as f64 / agent_frames.max(1) as f64;
     if json {
@@ -120,12 +121,15 @@ fn print(summary: &Summary, options: &SynthOptions, seconds: f64, json: bool) {
             "out": options.out, "scenarios": scenarios, "agent_frames": agent_frames,
             "points_per_frame": per_frame(points), "vehicles_per_frame": per_frame(annotations), "seconds": seconds,
         });
-        println!("{report}");
-        return;
+        return output::line(report);
     }
-    println!("{}: {scenarios} scenarios, {agent_frames} agent-frames", options.out.display());
-    println!("{:.0} points and {:.1} annotated vehicles a frame", per_frame(points), per_frame(annotations));
-    println!("{seconds:.1} s, {:.0} agent-frames a second", agent_frames as f64 / seconds);
+    output::line(format_args!("{}: {scenarios} scenarios, {agent_frames} agent-frames", options.out.display()))?;
+    output::line(format_args!(
+        "{:.0} points and {:.1} annotated vehicles a frame",
+        per_frame(points),
+        per_frame(annotations)
+    ))?;
+    output::line(format_args!("{seconds:.1} s, {:.0} agent-frames a second", agent_frames as f64 / seconds))
 }
 
 fn parse_town(text: &str) -> Result<TownSource, String> {
