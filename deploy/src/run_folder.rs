@@ -59,6 +59,13 @@ impl RunFolder {
         Ok(Self { path })
     }
 
+    /// Removes it with all that is in it: of a run that was refused before it began, so that its name is free again.
+    pub fn remove(self) {
+        if let Err(error) = fs::remove_dir_all(&self.path) {
+            tracing::warn!("cannot remove {}, the folder of a run that did not begin: {error}", self.path.display());
+        }
+    }
+
     /// Where it is.
     #[must_use]
     pub fn path(&self) -> &Path {
@@ -222,7 +229,7 @@ mod tests {
         let lines: Vec<&str> = text.lines().collect();
         assert_eq!(
             lines[1],
-            "3,300000000,81.2500,20,22,18,1,0,100.0000,1,1000,1300,0.2500,,2.5000,40.5000,,,,,81.2500"
+            "3,2,300000000,81.2500,20,22,18,1,0,100.0000,1,1000,1300,0.2500,,2.5000,40.5000,,,,,81.2500"
         );
         assert_eq!(lines[0].matches(',').count(), lines[1].matches(',').count());
     }

@@ -158,7 +158,8 @@ fn play(fleet: &Fleet, recorded: &Recorded, evaluator: &mut Evaluator, folder: &
     let mut written = Ok(());
     let _ = evaluator.run(recorded, &mut |frame: EvaluatedFrame| {
         bar.inc(1);
-        written = writeln!(file, "{}", DetectionsReport::new(&frame.stamp, frame.result.clone()).to_json());
+        let report = DetectionsReport::new(&frame.stamp, Some(frame.tick as u64), frame.result.clone());
+        written = writeln!(file, "{}", report.to_json());
         judge(&mut board, frame, true);
         if written.is_ok() { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
     })?;

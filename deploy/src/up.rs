@@ -129,6 +129,15 @@ impl UpError {
             _ => false,
         }
     }
+
+    /// Whether the run was refused before anything of it began, so that nothing in its folder is of use.
+    pub(crate) fn is_refusal(&self) -> bool {
+        match self {
+            Self::Process { .. } | Self::Folder(_) => false,
+            Self::Evaluate(_) => self.is_bad_input(),
+            _ => true,
+        }
+    }
 }
 
 /// Runs a scenario to its end, or until Ctrl-C.
@@ -142,22 +151,31 @@ pub fn up(scenario: &Scenario, options: &UpOptions) -> Result<RunResult, UpError
     let fleet = Fleet::plan(scenario)?;
     let run = fleet.scenario.run.clone().unwrap_or_else(|| name_of_now(options.prefix));
     let folder = RunFolder::create(&options.runs, &run)?;
+    let result = go(&fleet, options, &run, &folder);
+    if result.as_ref().is_err_and(UpError::is_refusal) {
+        folder.remove();
+    }
+    result
+}
+
+/// Runs a fleet, as the run of that name in that folder.
+fn go(fleet: &Fleet, options: &UpOptions, run: &RunId, folder: &RunFolder) -> Result<RunResult, UpError> {
     let stop = Stop::new();
     stop.on_signals().map_err(UpError::Signals)?;
-    let fingerprint = fingerprint(&fleet, &options.programs);
+    let fingerprint = fingerprint(fleet, &options.programs);
 
-    let keys = fleet.keys(&folder)?;
-    let place = MeetingPlace::open(&fleet.scenario.network, &run, keys.as_ref())?;
+    let keys = fleet.keys(folder)?;
+    let place = MeetingPlace::open(&fleet.scenario.network, run, keys.as_ref())?;
     let refused = RefusalWatch::over(&place)?;
     let board = Board::new(fleet.ego.clone(), fleet.ground_truth_rule(), fleet.map_values());
     let detections = folder.file("detections.jsonl");
-    let mut scorer = ScorerNode::start(place.session.clone(), &run, &fleet.agents, &fleet.ego, board, detections)?;
+    let mut scorer = ScorerNode::start(place.session.clone(), run, &fleet.agents, &fleet.ego, board, detections)?;
     if let Some(address) = fleet.scenario.network.metrics {
         scorer.serve_metrics(address)?;
     }
     let (endpoint, programs) = (place.endpoint.as_str(), options.programs.as_path());
-    let meeting = Meeting { run: &run, endpoint, keys: keys.as_ref(), programs, folder: &folder };
-    let watched = watch(&fleet, &meeting, &place.endpoint, &scorer, &stop);
+    let meeting = Meeting { run, endpoint, keys: keys.as_ref(), programs, folder };
+    let watched = watch(fleet, &meeting, &place.endpoint, &scorer, &stop);
     // Before the scorer closes the session.
     let refused = refused.finish();
     let scored = scorer.finish();
@@ -166,7 +184,7 @@ pub fn up(scenario: &Scenario, options: &UpOptions) -> Result<RunResult, UpError
     }
     let watched = watched?;
 
-    let result = write(&fleet, &run, folder, (scored, &refused), &watched, fingerprint);
+    let result = write(fleet, run, folder.clone(), (scored, &refused), &watched, fingerprint);
     match watched.ending {
         Ending::Over | Ending::Asked => Ok(result),
         Ending::Failed { process, how } => {
