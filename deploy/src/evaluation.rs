@@ -181,12 +181,12 @@ fn maps(kept: &KeptMaps, weights: &Path, scenarios: &[Scenario]) -> Result<MapSo
 
 /// Judges a frame; in virtual time its stamp says when it was published.
 pub(crate) fn judge(board: &mut Board, frame: EvaluatedFrame, is_stepped: bool) {
-    let EvaluatedFrame { stamp, result, frames, poses, objects } = frame;
+    let EvaluatedFrame { tick, stamp, result, frames, poses, objects } = frame;
     let poses: Vec<_> = frames.iter().map(|frame| frame.cav.clone()).zip(poses).collect();
     let truth: Vec<(CavId, _)> =
         frames.iter().filter_map(|frame| Some((frame.cav.clone(), frame.world_from_lidar?))).collect();
     let latency_ms = is_stepped.then(|| (stamp.publish_nanos - stamp.capture_nanos) as f64 / 1e6);
-    board.judge_whole(stamp.capture_nanos, latency_ms, result, objects, &poses, truth);
+    board.judge_whole((tick as u64, stamp.capture_nanos), latency_ms, result, objects, &poses, truth);
 }
 
 pub(crate) fn metrics(board: &Board, evaluator: &Evaluator, options: &EvaluationOptions, began: Instant) -> Metrics {

@@ -119,14 +119,15 @@ impl RunFolder {
 /// The table of a run's frames: a header line, then a line per frame.
 fn frames_csv(records: &[FrameRecord], swept: &BTreeMap<u64, u64>) -> String {
     let mut text = String::from(
-        "frame_index,capture_nanos,latency_ms,detected,truth,found,fused,skipped,oldest_ms,stale,payload_bytes,wire_bytes,ego_error_m,\
+        "tick,agent_frame,capture_nanos,latency_ms,detected,truth,found,fused,skipped,oldest_ms,stale,payload_bytes,wire_bytes,ego_error_m,\
          ego_error_deg,swept_ms,posed_ms,published_ms,arrived_ms,decided_ms,fused_ms,detected_ms\n",
     );
     let optional = |number: &Option<f64>| number.map_or(String::new(), |number| format!("{number:.4}"));
     for record in records {
         // Destructured in full, so that a new column stops the build here.
         let FrameRecord {
-            frame_index,
+            tick,
+            agent_frame,
             capture_nanos,
             latency_ms,
             stamps,
@@ -152,7 +153,7 @@ fn frames_csv(records: &[FrameRecord], swept: &BTreeMap<u64, u64>) -> String {
         // Writing to a string cannot fail.
         let _ = writeln!(
             text,
-            "{frame_index},{capture_nanos},{latency_ms},{detected},{truth},{found},{fused},{skipped},\
+            "{tick},{agent_frame},{capture_nanos},{latency_ms},{detected},{truth},{found},{fused},{skipped},\
              {oldest_ms},{stale},{payload_bytes},{wire_bytes},{error_m},{error_deg},{stamps}"
         );
     }
@@ -199,12 +200,15 @@ mod tests {
         assert!(folder.log_dir().is_dir() && folder.path().is_absolute());
         let error = RunFolder::create(&runs.path().join("deeper"), &name).unwrap_err().to_string();
         assert!(error.contains("r1 exists already"), "{error}");
+        folder.remove();
+        RunFolder::create(&runs.path().join("deeper"), &name).unwrap();
     }
 
     #[test]
     fn every_line_of_the_table_has_every_column() {
         let record = FrameRecord {
-            frame_index: 3,
+            tick: 3,
+            agent_frame: 2,
             capture_nanos: 300_000_000,
             latency_ms: Some(81.25),
             stamps: StageStamps {

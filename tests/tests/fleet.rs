@@ -290,7 +290,7 @@ fn live_in_lockstep_equals_offline_bit_by_bit_and_the_books_balance() {
         assert!(offline.iter().any(|(_, detections)| !detections.is_empty()), "{method}: nothing to compare");
         assert_eq!(live.len(), offline.len(), "{method}");
         for (tick, ((live_capture, live), (capture, offline))) in live.iter().zip(&offline).enumerate() {
-            assert_eq!(live.frame_index, tick as u64, "{method}");
+            assert_eq!(live.agent_frame, tick as u64, "{method}");
             assert_eq!((live_capture, live.detections.len()), (capture, offline.len()), "{method}");
             for (live, offline) in live.detections.iter().zip(offline) {
                 assert_eq!(live, offline, "{method} at {capture}");

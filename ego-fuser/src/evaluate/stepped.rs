@@ -271,7 +271,7 @@ impl<'a> Run<'a> {
         let objects = ground_truth::merge(&frames.iter().collect::<Vec<_>>(), 0, &self.evaluator.rule);
         let objects = objects.into_iter().map(|(_, object)| object).collect();
         let stamp = protocol::Stamp { publish_nanos: done_nanos, ..stamp(&own.cav, capture_nanos) };
-        Ok(EvaluatedFrame { stamp, result, frames, poses, objects })
+        Ok(EvaluatedFrame { tick, stamp, result, frames, poses, objects })
     }
 
     /// Lays a message where it waits for its tick.
@@ -322,7 +322,7 @@ impl<'a> Run<'a> {
                 Some((_, Skipped::NotNeeded)) | None => self.courier.received(&view.cav),
             }
         }
-        let mut result = self.evaluator.report(tick, own, &views, &bytes, output);
+        let mut result = self.evaluator.report(tick - self.config.ticks.start, own, &views, &bytes, output);
         if self.evaluator.ego.method() != Method::None {
             let silent = self.crew[1..].iter().map(|member| &member.cav);
             for cav in silent.filter(|cav| views.iter().all(|view| view.cav != **cav)) {

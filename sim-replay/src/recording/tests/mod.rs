@@ -44,7 +44,7 @@ fn truth(tick: u64) -> Truth {
         world_from_lidar: pose(tick),
         objects: vec![object.clone()],
     };
-    Truth { frame_index: tick, agents: AGENTS.map(agent).into() }
+    Truth { tick, agents: AGENTS.map(agent).into() }
 }
 
 /// The messages of one tick, as they come from the network.
@@ -259,7 +259,7 @@ fn json_stands_beside_our_own_messages() {
     let disk = Disk::new(usize::MAX);
     let mut writer = RecordingWriter::over(disk.clone(), Path::new("t"), RecordingOptions::default()).unwrap();
     let key: Key = "v2v/test/4279/detections/json".parse().unwrap();
-    let text = br#"{"frame_index": 0}"#;
+    let text = br#"{"tick": 0}"#;
     assert!(serde_json::from_slice::<DetectionsReport>(text).is_err(), "any JSON will do");
     writer.write(&key, 5, text).unwrap();
     for (key, payload) in tick_messages(0, 1) {
@@ -294,7 +294,7 @@ fn the_first_of_two_replays_of_one_moment_is_taken_with_its_own_truth() {
         writer.write(&key, 5, &payload).unwrap();
         if key.topic == protocol::Topic::Truth {
             let second = Stamp { epoch: 2, ..stamp("replay", 0) };
-            let nothing = Truth { frame_index: 0, agents: Vec::new() };
+            let nothing = Truth { tick: 0, agents: Vec::new() };
             // The same once more is no news.
             for stamp in [stamp("replay", 0), second] {
                 writer.write(&key, 6, &wire::encode(&stamp, nothing.clone()).unwrap().to_vec()).unwrap();
