@@ -47,7 +47,7 @@ fn every_program_comes_to_its_quiet_end() {
 #[test]
 fn an_error_that_nobody_reads_keeps_its_exit_code() {
     for (program, arguments, code) in [
-        ("sim-replay", ["recover", "/no/recording.mcap", "/no/whole.mcap"], 2),
+        ("sim-replay", ["recover", "/no/recording.mcap", "--out=/no/whole.mcap"], 2),
         ("ego-fuser", ["eval", "--weights=/no/weights.safetensors", "--data=/no/scene"], 2),
         ("v2vloc", ["status", "/no/run", "--json"], 2),
     ] {

@@ -45,7 +45,7 @@ fn a_fleet_plays_its_scene_and_accounts_for_every_message() {
     assert_eq!(of_table, results.iter().map(of_results).collect::<Vec<_>>(), "both files count alike");
     assert!(fs::metadata(run.join("frame.png")).unwrap().len() > 1_000);
     let recording = Recording::open(&run.join("recording.mcap")).unwrap();
-    assert_eq!(recording.damage(), None);
+    assert_eq!(recording.damage(), []);
     let told = |stream| {
         let is_it = |topic: &Topic| matches!(topic, Topic::Stream { stream: known, .. } if *known == stream);
         recording.entries().iter().filter(|entry| is_it(&entry.key.topic)).count()
