@@ -63,7 +63,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     if let Err(overdue) = bus.leave(STOP_LIMIT) {
         tracing::warn!("{overdue}");
     }
-    Ok(Outcome::Done)
+    Ok(if report.is_complete() { Outcome::Done } else { Outcome::DataLost })
 }
 
 fn print(report: &LinkReport, as_json: bool) -> anyhow::Result<()> {
@@ -71,12 +71,19 @@ fn print(report: &LinkReport, as_json: bool) -> anyhow::Result<()> {
         output::line(serde_json::to_string(report)?)?;
         return Ok(());
     }
-    let LinkReport { offered, arrived, copies, under_way, dropped } = report;
+    let LinkReport { offered, arrived, copies, under_way, longest_ms, dropped } = report;
     output::line(format_args!(
         "{offered} messages: {arrived} arrived, {copies} of them twice, {under_way} still under way"
     ))?;
     for (reason, count) in dropped {
         output::line(format_args!("{count} dropped: {reason}"))?;
+    }
+    // What the run lost stands last.
+    if !report.is_complete() {
+        let seconds = *longest_ms as f64 * 1e-3;
+        output::line(format_args!(
+            "{under_way} of {offered} messages were still under way at the end, the oldest for {seconds:.1} s"
+        ))?;
     }
     Ok(())
 }
