@@ -82,6 +82,14 @@ impl Part {
 /// Why an evaluation came to nothing.
 #[derive(Debug, thiserror::Error)]
 pub enum EvaluationError {
+    /// There is no truth to judge by.
+    #[error("scenario {scenario} has no true poses of the ego {ego}: there is nothing to judge its results by")]
+    NoPoses {
+        /// The scenario.
+        scenario: String,
+        /// Its ego.
+        ego: CavId,
+    },
     /// The data set cannot be read.
     #[error(transparent)]
     Dataset(#[from] ReadError),
@@ -156,6 +164,9 @@ pub(crate) fn judged(
     let mut board: Option<Board> = None;
     for scenario in options.part.chosen(&scenarios) {
         let Some(ego) = scenario.agents.first() else { continue };
+        if !scenario.has_poses(0, 0) {
+            return Err(EvaluationError::NoPoses { scenario: scenario.name.clone(), ego: ego.clone() });
+        }
         let board = board.get_or_insert_with(|| Board::new(ego.clone(), *evaluator.rule(), map_values));
         board.change_ego(ego);
         let judged = evaluator.run(scenario, &mut |frame| {

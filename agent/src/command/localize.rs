@@ -46,6 +46,10 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     // Which head each needs is known before any is computed with.
     let heads: Vec<&Path> = scenarios.iter().map(|scenario| head_of(&args.head, scenario)).collect::<Result<_, _>>()?;
     let sweeps: usize = scenarios.iter().map(|scenario| scenario.agents.len() * scenario.ticks.len()).sum();
+    if sweeps == 0 && done.is_empty() {
+        let scenes: Vec<String> = args.scene.iter().map(|scene| scene.display().to_string()).collect();
+        return Err(bad(anyhow::anyhow!("there is no sweep in {}", scenes.join(", "))));
+    }
     let bar = ProgressBar::new(sweeps as u64)
         .with_style(ProgressStyle::with_template("{bar:30} {pos}/{len} sweeps  {eta} left")?);
     let mut found = 0;

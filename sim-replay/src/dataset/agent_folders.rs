@@ -27,13 +27,16 @@ pub(super) struct ScenarioFolder {
     /// Suffixes of point files beside the plain one and the radar's.
     pub(super) variants: Vec<String>,
     pub(super) has_radar: bool,
+    /// Agents that have sweeps and nothing else.
+    pub(super) without_yaml: BTreeSet<CavId>,
 }
 
 /// What lies in an agent's folder.
 #[derive(Debug, Default)]
 struct AgentFolder {
-    /// Stems with both YAML and PCD.
+    /// Stems with both YAML and PCD; with PCD alone where there is no YAML at all.
     stems: BTreeSet<String>,
+    is_without_yaml: bool,
     variants: BTreeSet<String>,
     has_radar: bool,
 }
@@ -106,7 +109,10 @@ impl ScenarioFolder {
         }
         let variants: BTreeSet<String> = by_agent.values().flat_map(|agent| agent.variants.iter().cloned()).collect();
         let has_radar = by_agent.values().any(|agent| agent.has_radar);
-        Ok(Self { dir: dir.to_owned(), agents, stems, missing, variants: variants.into_iter().collect(), has_radar })
+        let without_yaml =
+            by_agent.iter().filter(|(_, agent)| agent.is_without_yaml).map(|(id, _)| id.clone()).collect();
+        let variants = variants.into_iter().collect();
+        Ok(Self { dir: dir.to_owned(), agents, stems, missing, variants, has_radar, without_yaml })
     }
 
     /// The metadata file of a frame.
@@ -175,8 +181,12 @@ impl AgentFolder {
     fn scan(dir: &Path, problems: &mut Vec<ReadError>) -> Result<Self, ReadError> {
         let listing = files::list(dir)?;
         let is_frame = |stem: &&str| !NOT_FRAMES.iter().any(|text| stem.contains(text));
-        let yamls: BTreeSet<&str> = files::stems(&listing.files, ".yaml").into_iter().filter(is_frame).collect();
-        let mut agent = Self::default();
+        let mut yamls: BTreeSet<&str> = files::stems(&listing.files, ".yaml").into_iter().filter(is_frame).collect();
+        let mut agent = Self { is_without_yaml: yamls.is_empty(), ..Self::default() };
+        if agent.is_without_yaml {
+            // Sweeps alone are frames without poses and boxes.
+            yamls.extend(files::stems(&listing.files, ".pcd").into_iter().filter(|stem| !stem.contains('_')));
+        }
         let mut without_yaml = BTreeSet::new();
         for name in files::stems(&listing.files, ".pcd") {
             if yamls.contains(name) {

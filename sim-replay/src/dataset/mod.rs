@@ -26,6 +26,7 @@ mod numpy_tags;
 mod open;
 mod opv2v;
 mod points;
+mod poses;
 mod recorded;
 mod v2v4real;
 mod yaml;

@@ -22,6 +22,9 @@ pub(super) struct Opv2v(pub(super) ScenarioFolder);
 
 impl FrameSource for Opv2v {
     fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame, ReadError> {
+        if self.0.without_yaml.contains(agent) {
+            return Ok(Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Left));
+        }
         let path = self.0.yaml(agent, &tick.stem);
         let node = yaml::read(&path)?;
         frame_without_points(agent, tick, &Field::root(&path, &node))
@@ -36,7 +39,7 @@ impl FrameSource for Opv2v {
     }
 
     fn annotation_path(&self, agent: &CavId, tick: &Tick) -> Option<PathBuf> {
-        Some(self.0.yaml(agent, &tick.stem))
+        Some(self.0.yaml(agent, &tick.stem)).filter(|_| !self.0.without_yaml.contains(agent))
     }
 
     fn points_path(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> PathBuf {
@@ -54,7 +57,7 @@ fn mirrored(path: &Path) -> Result<PcdCloud, ReadError> {
 fn frame_without_points(agent: &CavId, tick: &Tick, root: &Field<'_>) -> Result<Frame, ReadError> {
     let optional_pose = |key| root.optional(key)?.map(|field| six_numbers(&field)).transpose();
     Ok(Frame {
-        world_from_lidar: Some(six_numbers(&root.required("lidar_pose")?)?),
+        world_from_lidar: optional_pose("lidar_pose")?,
         world_from_vehicle: optional_pose("true_ego_pos")?,
         gnss_world_from_vehicle: optional_pose("predicted_ego_pos")?,
         speed_mps: root.optional("ego_speed")?.map(|speed| speed_mps(&speed)).transpose()?,
@@ -102,9 +105,8 @@ pub(super) fn object_entries<'a>(root: &Field<'a>) -> Result<Vec<(&'a str, Field
     let key = if !has("vehicles") && has("objects") { "objects" } else { "vehicles" };
     match root.optional(key)? {
         Some(field) => field.entries(),
-        // An empty map may be written as nothing; a key that is not there is an error.
-        None if has(key) => Ok(Vec::new()),
-        None => root.required(key).map(|_| Vec::new()),
+        // An empty map may be written as nothing, or left out where nobody has annotated anything.
+        None => Ok(Vec::new()),
     }
 }
 
@@ -251,7 +253,6 @@ vehicles:
                 "lidar_pose: [10, 20, 2]",
                 ":3: lidar_pose: a list of 3, expected 6 numbers",
             ),
-            ("lidar_pose: [10, 20, 2, 0, 90, 1e-06]\n", "", ":1: lidar_pose: missing"),
             ("lidar_pose: [10,", "lidar_pose: [.inf,", ":3: lidar_pose.0: inf, expected a finite number"),
             (
                 "extent: [2, 1, 0.75]",
@@ -260,7 +261,6 @@ vehicles:
             ),
             ("    location: [10, 30, 0]\n", "", ":10: vehicles.4335.location: missing"),
             ("  4335:", "  car:", ":10: vehicles.car: \"car\" is no object id: expected an integer"),
-            ("vehicles:", "cars:", ":1: vehicles: missing"),
         ];
         for (from, to, expected) in cases {
             assert_eq!(message_with(from, to), format!("/1/000070.yaml{expected}"));
