@@ -13,6 +13,7 @@
 pub mod absences;
 mod crew_processes;
 pub mod evaluation;
+mod failures;
 pub mod fingerprint;
 pub mod fleet;
 pub mod health;

@@ -207,8 +207,8 @@ fn write(
     let resolved = Scenario { provenance, ..fleet.scenario.clone() };
     folder.write("scenario.yaml", &resolved.to_yaml())?;
     let picture = crate::showcase::draw(fleet, board, &folder.file("frame.png"));
-    let (killed, unwritten) = (Vec::new(), Vec::new());
-    Ok(RunResult { folder, metrics, balance, missed: 0, interrupted: false, killed, unwritten, picture })
+    let (killed, unwritten, failures) = (Vec::new(), Vec::new(), Vec::new());
+    Ok(RunResult { folder, metrics, balance, missed: 0, interrupted: false, killed, unwritten, failures, picture })
 }
 
 impl From<EvaluateError> for UpError {

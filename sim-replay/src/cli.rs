@@ -14,7 +14,8 @@ use crate::command;
 #[command(
     version,
     after_help = "Exit codes: 0 done, 1 failed, 2 bad usage or input, 3 finished but data was lost (stream: frames that \
-                  cannot be read, ticks that are not answered)."
+                  cannot be read, ticks that are not answered; record and recover: messages that are missing; link: \
+                  messages that never arrive)."
 )]
 pub(crate) struct Cli {
     #[command(subcommand)]

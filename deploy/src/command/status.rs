@@ -34,7 +34,8 @@ impl Arguments {
         } else {
             output::text(status.table())?;
         }
-        anyhow::ensure!(status.is_well(), "run {} is not well", status.run);
+        let troubles = status.troubles();
+        anyhow::ensure!(troubles.is_empty(), "run {} is not well: {}", status.run, troubles.join("; "));
         Ok(Outcome::Done)
     }
 }

@@ -48,7 +48,13 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
         without: args.without.clone(),
         keeps_running: args.keep_running || args.bus.supervised,
     };
-    let report = match recording::record(&bus, &options, &stop) {
+    // Who waits for the report is told at once of a failure; the last line counts.
+    let mut on_failure = |report: &RecordReport| {
+        if args.json && serde_json::to_string(report).map_err(Into::into).and_then(output::line).is_err() {
+            tracing::error!("the failure cannot be printed");
+        }
+    };
+    let report = match recording::record(&bus, &options, &stop, &mut on_failure) {
         Ok(report) => report,
         Err(RecorderError::Recording(error)) => {
             output::note(format_args!("error: {error}"));
@@ -74,11 +80,5 @@ fn print(report: &RecordReport, as_json: bool) -> anyhow::Result<()> {
         report.bytes as f64 / 1e6,
         report.file.display()
     ))?;
-    if report.overwritten > 0 {
-        output::line(format_args!("{} came faster than the disk takes them", report.overwritten))?;
-    }
-    if let Some(failure) = &report.failure {
-        output::line(format_args!("{} not written: {failure}", report.not_written))?;
-    }
-    Ok(())
+    report.loss_in_words().map_or(Ok(()), |words| Ok(output::line(words)?))
 }

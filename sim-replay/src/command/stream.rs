@@ -207,15 +207,16 @@ fn print(report: &StreamReport, as_json: bool) -> anyhow::Result<()> {
     if let Some(AirReport { offered, arrived, dropped }) = &report.air {
         output::line(format_args!("{offered} sensor frames crossed a link: {arrived} arrived{}", by_reason(dropped)))?;
     }
+    if !report.unsent.is_empty() {
+        let unsent: u64 = report.unsent.values().sum();
+        output::line(format_args!("{unsent} of the messages were not sent{}", by_reason(&report.unsent)))?;
+    }
+    // What the run lost stands last.
     if report.unreadable_frames > 0 {
         output::line(format_args!("{} frames could not be read", report.unreadable_frames))?;
     }
     if report.unanswered > 0 {
         output::line(format_args!("{} ticks were not answered", report.unanswered))?;
-    }
-    if !report.unsent.is_empty() {
-        let unsent: u64 = report.unsent.values().sum();
-        output::line(format_args!("{unsent} of the messages were not sent{}", by_reason(&report.unsent)))?;
     }
     Ok(())
 }

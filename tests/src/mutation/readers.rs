@@ -75,7 +75,7 @@ pub fn all(root: &Path) -> Vec<Reader> {
         on_disk("link", text(seeds::LINK), file("link", "a.yaml"), |path, _| {
             LinkConfig::open(&path.to_string_lossy()).is_ok()
         }),
-        on_disk("link trace", text(seeds::TRACE), file("trace", "a.csv"), |path, _| Trace::read_csv(path).is_ok()),
+        on_disk("link trace", text(seeds::TRACE), file("trace", "a.csv"), |path, _| Trace::read_csv(path, 0).is_ok()),
         on_disk("mahimahi trace", text(seeds::MAHIMAHI), file("mahimahi", "a.txt"), |path, _| {
             Trace::read_mahimahi(path).is_ok()
         }),
