@@ -102,6 +102,14 @@ impl Part {
 /// Why an evaluation came to nothing.
 #[derive(Debug, thiserror::Error)]
 pub enum EvaluationError {
+    /// There is no truth to judge by.
+    #[error("scenario {scenario} has no true poses of the ego {ego}: there is nothing to judge its results by")]
+    NoPoses {
+        /// The scenario.
+        scenario: String,
+        /// Its ego.
+        ego: CavId,
+    },
     /// The data set cannot be read.
     #[error(transparent)]
     Dataset(#[from] ReadError),
@@ -181,6 +189,9 @@ pub(crate) fn judged(
     let mut board: Option<Board> = None;
     for scenario in options.part.chosen(&scenarios) {
         let Some(ego) = scenario.agents.first() else { continue };
+        if !scenario.has_poses(0, 0) {
+            return Err(EvaluationError::NoPoses { scenario: scenario.name.clone(), ego: ego.clone() });
+        }
         let board = board.get_or_insert_with(|| Board::new(ego.clone(), *evaluator.rule(), map_values));
         board.change_ego(ego);
         let judged = evaluator.run(scenario, &mut |frame| {
@@ -206,12 +217,12 @@ fn maps(kept: &KeptMaps, weights: &Path, scenarios: &[Scenario]) -> Result<MapSo
 
 /// Judges a frame; in virtual time its stamp says when it was published.
 pub(crate) fn judge(board: &mut Board, frame: EvaluatedFrame, is_stepped: bool) {
-    let EvaluatedFrame { stamp, result, frames, poses, objects } = frame;
+    let EvaluatedFrame { tick, stamp, result, frames, poses, objects } = frame;
     let poses: Vec<_> = frames.iter().map(|frame| frame.cav.clone()).zip(poses).collect();
     let truth: Vec<(CavId, _)> =
         frames.iter().filter_map(|frame| Some((frame.cav.clone(), frame.world_from_lidar?))).collect();
     let latency_ms = is_stepped.then(|| (stamp.publish_nanos - stamp.capture_nanos) as f64 / 1e6);
-    board.judge_whole(stamp.capture_nanos, latency_ms, result, objects, &poses, truth);
+    board.judge_whole((tick as u64, stamp.capture_nanos), latency_ms, result, objects, &poses, truth);
 }
 
 pub(crate) fn metrics(board: &Board, evaluator: &Evaluator, options: &EvaluationOptions, began: Instant) -> Metrics {

@@ -5,6 +5,7 @@ use std::process::ExitCode;
 use clap::{Parser, Subcommand};
 
 use sim_replay::bus::BusError;
+use sim_replay::output;
 
 use crate::command;
 
@@ -12,8 +13,9 @@ use crate::command;
 #[derive(Debug, Parser)]
 #[command(
     version,
-    after_help = "Exit codes: 0 done, 1 failed, 2 bad usage or input, 3 finished but data was lost (convert, \
-                  stream: frames that cannot be read; stream: ticks that are not answered)."
+    after_help = "Exit codes: 0 done, 1 failed, 2 bad usage or input, 3 finished but data was lost (convert, stream: frames \
+                  that cannot be read; stream: ticks that are not answered; record and recover: messages that are \
+                  missing; link: messages that never arrive)."
 )]
 pub(crate) struct Cli {
     #[command(subcommand)]
@@ -58,7 +60,7 @@ pub(crate) fn run(cli: Cli) -> ExitCode {
         Ok(Outcome::BadInput) => ExitCode::from(2),
         Ok(Outcome::DataLost) => ExitCode::from(3),
         Err(error) => {
-            eprintln!("error: {error:#}");
+            output::note(format_args!("error: {error:#}"));
             if BusError::is_behind(error.as_ref()) { ExitCode::from(2) } else { ExitCode::FAILURE }
         }
     }

@@ -15,6 +15,7 @@ use ego_fuser::alignment::table::{Row, Tally, markdown};
 use ego_fuser::alignment::{Approach, BoxIcp, CloudIcp, FreeAlign, Measured, Poses};
 use protocol::CavId;
 use sim_replay::dataset::{IntensityScale, Scenario};
+use sim_replay::output;
 
 use super::{BadInput, progress, scenarios};
 
@@ -117,9 +118,9 @@ impl Arguments {
         let mut boxes = self.box_source(&approaches)?;
         let rows = self.compare(&mut approaches, &mut boxes, &scenarios)?;
         if self.json {
-            println!("{}", serde_json::to_string_pretty(&rows)?);
+            output::line(serde_json::to_string_pretty(&rows)?)?;
         } else {
-            print!("{}", markdown(&rows));
+            output::text(markdown(&rows))?;
         }
         Ok(())
     }

@@ -16,6 +16,7 @@ use serde_json::json;
 use sim_replay::dataset::{IntensityScale, LoadOptions, Scenario};
 use sim_replay::frame::Frame;
 use sim_replay::ground_truth;
+use sim_replay::output;
 
 use super::{BadInput, progress, scenarios};
 
@@ -71,7 +72,7 @@ impl Arguments {
             rows.push(evaluate(config, &scenarios, self.frames.unwrap_or(usize::MAX), self.json)?);
         }
         if self.json {
-            println!("{}", serde_json::to_string_pretty(&rows)?);
+            output::line(serde_json::to_string_pretty(&rows)?)?;
         }
         Ok(())
     }
@@ -100,9 +101,9 @@ impl Arguments {
         }
         let row = tally.row("multi_scale");
         if self.json {
-            println!("{}", serde_json::to_string_pretty(&[row])?);
+            output::line(serde_json::to_string_pretty(&[row])?)?;
         } else {
-            print_row(&row);
+            print_row(&row)?;
         }
         Ok(())
     }
@@ -132,20 +133,20 @@ fn evaluate(config: EvaluateConfig, scenarios: &[Scenario], frames: usize, json:
     bar.finish_and_clear();
     let row = tally.row(method.name());
     if !json {
-        print_row(&row);
+        print_row(&row)?;
     }
     Ok(row)
 }
 
-fn print_row(row: &serde_json::Value) {
+fn print_row(row: &serde_json::Value) -> std::io::Result<()> {
     let ap = |name: &str| THRESHOLDS.map(|iou| format!("{:.4}", row[name][format!("{iou}")].as_f64().unwrap_or(0.0)));
     let (global, frame) = (ap("ap_global").join(" "), ap("ap_frame_order").join(" "));
-    println!(
+    output::line(format_args!(
         "{:<10} AP@0.3/0.5/0.7 global {global}, frame order {frame}, {} frames, {} bytes a neighbour",
         row["method"].as_str().unwrap_or_default(),
         row["frames"],
         row["payload_bytes_mean"]
-    );
+    ))
 }
 
 /// What the frames of one method add up to.

@@ -6,6 +6,7 @@ use agent::weights::Weights;
 use anyhow::Result;
 use ego_fuser::residual::{Offset, ResidualMeter};
 use sim_replay::dataset::IntensityScale;
+use sim_replay::output;
 
 use super::{BadInput, scenarios};
 
@@ -53,19 +54,19 @@ impl Arguments {
         let mut meter = ResidualMeter::load(&weights).map_err(|error| BadInput(error.to_string()))?;
         let found = meter.measure(&scenarios(&self.data, self.intensity_scale)?, self.every, &offsets, self.seed)?;
         if self.json {
-            println!("{}", serde_json::to_string_pretty(&found)?);
+            output::line(serde_json::to_string_pretty(&found)?)?;
             return Ok(());
         }
-        println!("offset        pairs  mean m before/after  median m before/after  mean degrees before/after");
+        output::line("offset        pairs  mean m before/after  median m before/after  mean degrees before/after")?;
         for residual in found {
             let Offset { shift_m, turn_deg } = residual.offset;
             let [mean, median, angle] = [residual.mean_m, residual.p50_m, residual.mean_deg]
                 .map(|[before, after]| format!("{before:.3} / {after:.3}"));
-            println!(
+            output::line(format_args!(
                 "{:<13} {:>5}  {mean:>19}  {median:>21}  {angle:>25}",
                 format!("{shift_m} m {turn_deg} deg"),
                 residual.pairs
-            );
+            ))?;
         }
         Ok(())
     }

@@ -134,7 +134,7 @@ impl Arguments {
         let mut bar = Progress::default();
         let summary = train::run(&config, &mut bar).map_err(blamed)?;
         bar.0.finish();
-        self.options.print(&summary.trained, &serde_json::json!({"accuracy": summary.accuracy}));
+        self.options.print(&summary.trained, &serde_json::json!({"accuracy": summary.accuracy}))?;
         Ok(())
     }
 

@@ -5,6 +5,7 @@ use std::path::PathBuf;
 
 use indicatif::ProgressBar;
 use sim_replay::dataset;
+use sim_replay::output;
 use sim_replay::synth::{ConvertOptions, Converted, SceneLayout, SynthError, convert};
 
 use crate::cli::Outcome;
@@ -38,7 +39,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     let input = match dataset::open(&args.from) {
         Ok(input) => input,
         Err(error) => {
-            eprintln!("error: {error}");
+            output::note(format_args!("error: {error}"));
             return Ok(Outcome::BadInput);
         }
     };
@@ -51,38 +52,35 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     bar.finish_and_clear();
     match result {
         Ok(converted) => {
-            print(&converted, args);
+            print(&converted, args)?;
             Ok(if converted.left_out.is_nothing() { Outcome::Done } else { Outcome::DataLost })
         }
         Err(error @ SynthError::Write { .. }) => Err(error.into()),
         Err(error) => {
-            eprintln!("error: {error}");
+            output::note(format_args!("error: {error}"));
             Ok(Outcome::BadInput)
         }
     }
 }
 
-fn print(converted: &Converted, args: &Args) {
+fn print(converted: &Converted, args: &Args) -> std::io::Result<()> {
     let Converted { scenarios, agent_frames, omitted, left_out } = converted;
     for problem in left_out.problems().take(SHOWN_PROBLEMS) {
-        eprintln!("left out: {}", problem.message);
+        output::note(format_args!("left out: {}", problem.message));
     }
     if args.json {
         let report = serde_json::json!({
             "out": args.out, "layout": args.layout.name(), "scenarios": scenarios, "agent_frames": agent_frames,
             "omitted": omitted, "left_out": left_out,
         });
-        println!("{report}");
-        return;
+        return output::line(report);
     }
-    println!(
+    output::line(format_args!(
         "{}: {scenarios} scenarios, {agent_frames} agent-frames, layout {}",
         args.out.display(),
         args.layout.name()
-    );
-    super::synth::print_omitted(omitted);
+    ))?;
+    super::synth::print_omitted(omitted)?;
     let summary = left_out.to_string();
-    if !summary.is_empty() {
-        println!("{summary}");
-    }
+    if summary.is_empty() { Ok(()) } else { output::line(summary) }
 }

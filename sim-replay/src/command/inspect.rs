@@ -7,6 +7,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use sim_replay::dataset::{IntensityScale, OpenOptions, layouts_text};
 use sim_replay::evaluation_protocol::ProtocolConfig;
 use sim_replay::inspect::{Report, inspect, inspect_map};
+use sim_replay::output;
 
 use crate::cli::Outcome;
 
@@ -48,7 +49,7 @@ fn run_map(path: &Path, json: bool) -> anyhow::Result<Outcome> {
     let report = match inspect_map(path) {
         Ok(report) => report,
         Err(error) => {
-            eprintln!("error: {error}");
+            output::note(format_args!("error: {error}"));
             return Ok(Outcome::BadInput);
         }
     };

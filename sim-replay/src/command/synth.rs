@@ -1,12 +1,13 @@
 //! `sim-replay synth`: generate scenes.
 
 use std::collections::BTreeMap;
-use std::io::IsTerminal;
+use std::io::{self, IsTerminal};
 use std::ops::RangeInclusive;
 use std::path::PathBuf;
 use std::time::Instant;
 
 use indicatif::{ProgressBar, ProgressStyle};
+use sim_replay::output;
 use sim_replay::synth::{self, SceneLayout, Subset, Summary, SynthError, SynthOptions, Weather};
 use sim_replay::town::TownSource;
 
@@ -83,12 +84,12 @@ pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
     match result {
         Ok(summary) => {
             print_findings(&summary);
-            print(&summary, &options, start.elapsed().as_secs_f64(), json);
+            print(&summary, &options, start.elapsed().as_secs_f64(), json)?;
             Ok(Outcome::Done)
         }
         Err(error @ (SynthError::Write { .. } | SynthError::Alone { .. })) => Err(error.into()),
         Err(error) => {
-            eprintln!("error: {error}");
+            output::note(format_args!("error: {error}"));
             Ok(Outcome::BadInput)
         }
     }
@@ -125,14 +126,14 @@ fn progress_bar(scenarios: usize) -> ProgressBar {
 /// Names on standard error what was not built as the map gives it.
 fn print_findings(summary: &Summary) {
     for finding in summary.findings.iter().take(PRINTED_FINDINGS) {
-        eprintln!("map: {finding}");
+        output::note(format_args!("map: {finding}"));
     }
     if let Some(further) = summary.findings.len().checked_sub(PRINTED_FINDINGS).filter(|&further| further > 0) {
-        eprintln!("map: {further} further findings; all are in data_protocol.yaml of each scenario");
+        output::note(format_args!("map: {further} further findings; all are in data_protocol.yaml of each scenario"));
     }
 }
 
-fn print(summary: &Summary, options: &SynthOptions, seconds: f64, json: bool) {
+fn print(summary: &Summary, options: &SynthOptions, seconds: f64, json: bool) -> io::Result<()> {
     let Summary { layout, scenarios, agent_frames, points, annotations, omitted, findings } = summary;
     let per_frame = |count: &usize| *count as f64 / (*agent_frames).max(1) as f64;
     if json {
@@ -141,20 +142,22 @@ fn print(summary: &Summary, options: &SynthOptions, seconds: f64, json: bool) {
             "points_per_frame": per_frame(points), "vehicles_per_frame": per_frame(annotations), "omitted": omitted,
             "seconds": seconds, "map_findings": findings,
         });
-        println!("{report}");
-        return;
+        return output::line(report);
     }
-    println!("{}: {scenarios} scenarios, {agent_frames} agent-frames, layout {}", options.out.display(), layout.name());
-    println!("{:.0} points and {:.1} annotated vehicles a frame", per_frame(points), per_frame(annotations));
-    println!("{seconds:.1} s, {:.0} agent-frames a second", *agent_frames as f64 / seconds);
-    print_omitted(omitted);
+    let out = options.out.display();
+    output::line(format_args!("{out}: {scenarios} scenarios, {agent_frames} agent-frames, layout {}", layout.name()))?;
+    output::line(format_args!(
+        "{:.0} points and {:.1} annotated vehicles a frame",
+        per_frame(points),
+        per_frame(annotations)
+    ))?;
+    output::line(format_args!("{seconds:.1} s, {:.0} agent-frames a second", *agent_frames as f64 / seconds))?;
+    print_omitted(omitted)
 }
 
 /// What a layout had no place for.
-pub(super) fn print_omitted(omitted: &BTreeMap<&'static str, u64>) {
-    for (what, count) in omitted {
-        println!("not in this layout: {count} {what}");
-    }
+pub(super) fn print_omitted(omitted: &BTreeMap<&'static str, u64>) -> io::Result<()> {
+    omitted.iter().try_for_each(|(what, count)| output::line(format_args!("not in this layout: {count} {what}")))
 }
 
 fn parse_town(text: &str) -> Result<TownSource, String> {

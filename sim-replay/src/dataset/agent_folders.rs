@@ -30,6 +30,8 @@ pub(super) struct ScenarioFolder {
     pub(super) has_radar: bool,
     /// Suffix of the sweeps.
     pub(super) suffix: &'static str,
+    /// Agents that have sweeps and nothing else.
+    pub(super) without_yaml: BTreeSet<CavId>,
 }
 
 /// Folders of scenarios at or below `dir`. Folders below that cannot be listed are left out.
@@ -130,7 +132,9 @@ impl ScenarioFolder {
         let variants: BTreeSet<String> = by_agent.values().flat_map(|agent| agent.variants.iter().cloned()).collect();
         let has_radar = by_agent.values().any(|agent| agent.has_radar);
         let variants = variants.into_iter().collect();
-        Ok(Self { dir: dir.to_owned(), agents, stems, missing, variants, has_radar, suffix })
+        let bare = by_agent.iter().filter(|(_, agent)| agent.is_without_yaml);
+        let without_yaml = bare.map(|(id, _)| id.clone()).collect();
+        Ok(Self { dir: dir.to_owned(), agents, stems, missing, variants, has_radar, suffix, without_yaml })
     }
 
     /// The metadata file of a frame.

@@ -16,8 +16,9 @@ pub(super) const BIN: &str = ".bin";
 /// What lies in an agent's folder.
 #[derive(Debug, Default)]
 pub(super) struct AgentFolder {
-    /// Stems with both YAML and sweep.
+    /// Stems with both YAML and sweep; with a sweep alone where there is no YAML at all.
     pub(super) stems: BTreeSet<String>,
+    pub(super) is_without_yaml: bool,
     pub(super) variants: BTreeSet<String>,
     pub(super) has_radar: bool,
 }
@@ -41,7 +42,13 @@ fn is_number(stem: &str) -> bool {
 impl AgentFolder {
     /// Sorts the files of `dir`. What has to be left out goes to `problems`.
     pub(super) fn new(dir: &Path, listing: &Listing, suffix: &str, problems: &mut Vec<ReadError>) -> Self {
-        let all: BTreeSet<&str> = yaml_stems(listing).collect();
+        let mut all: BTreeSet<&str> = yaml_stems(listing).collect();
+        let is_without_yaml = all.is_empty();
+        if is_without_yaml {
+            // Sweeps alone are frames without poses and boxes.
+            let sweeps = files::stems(&listing.files, suffix).into_iter();
+            all.extend(sweeps.filter(|stem| !stem.contains('_')));
+        }
         let numbered: BTreeSet<&str> = all.iter().copied().filter(|stem| is_number(stem)).collect();
         // Copies such as `000070 (1)` beside numbers are no moments. Frames may have other names where most have.
         let is_copy = |stem: &&&str| {
@@ -51,12 +58,13 @@ impl AgentFolder {
         let others = all.iter().filter(|stem| !is_copy(stem)).count();
         let are_numbers = !numbered.is_empty() && numbered.len() >= others;
         let (yamls, mut strays) = if are_numbers {
-            let strays = all.difference(&numbered).map(|stem| format!("{stem}.yaml")).collect();
+            let ending = if is_without_yaml { suffix } else { ".yaml" };
+            let strays = all.difference(&numbered).map(|stem| format!("{stem}{ending}")).collect();
             (numbered, strays)
         } else {
             (all, Vec::new())
         };
-        let mut agent = Self::default();
+        let mut agent = Self { is_without_yaml, ..Self::default() };
         let mut without_yaml = BTreeSet::new();
         for name in files::stems(&listing.files, suffix) {
             match Sweep::of(name, &yamls) {

@@ -32,6 +32,7 @@ mod numpy_tags;
 mod open;
 mod opv2v;
 mod points;
+mod poses;
 mod presence;
 mod problem;
 mod recorded;

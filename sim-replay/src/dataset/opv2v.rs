@@ -27,6 +27,9 @@ pub(super) struct Opv2v {
 
 impl FrameSource for Opv2v {
     fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame, ReadError> {
+        if self.folder.without_yaml.contains(agent) {
+            return Ok(Frame::empty(agent.clone(), tick.capture_nanos, self.handedness));
+        }
         let path = self.folder.yaml(agent, &tick.stem);
         let node = yaml::read(&path)?;
         self.frame_without_points(agent, tick, Field::root(&path, &node))
@@ -41,7 +44,8 @@ impl FrameSource for Opv2v {
     }
 
     fn annotation_path(&self, agent: &CavId, tick: &Tick) -> Option<PathBuf> {
-        Some(self.folder.yaml(agent, &tick.stem))
+        let has_yaml = !self.folder.without_yaml.contains(agent);
+        has_yaml.then(|| self.folder.yaml(agent, &tick.stem))
     }
 
     fn points_path(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> PathBuf {
@@ -52,10 +56,10 @@ impl FrameSource for Opv2v {
 impl Opv2v {
     fn frame_without_points(&self, agent: &CavId, tick: &Tick, root: Field<'_>) -> Result<Frame, ReadError> {
         let pose = |field: &Field<'_>| self.six_numbers(field);
-        let world_from_lidar = pose(&root.required("lidar_pose")?)?;
+        let world_from_lidar = root.optional("lidar_pose")?.map(|field| pose(&field)).transpose()?;
         let mut annotations = Annotations::new(root);
         Ok(Frame {
-            world_from_lidar: Some(world_from_lidar),
+            world_from_lidar,
             world_from_vehicle: annotations.optional(&["true_ego_pos", "true_ego_pose"], pose),
             gnss_world_from_vehicle: annotations.optional(&["predicted_ego_pos", "predicted_ego_pose"], pose),
             speed_mps: annotations.optional(&["ego_speed"], speed_mps),
@@ -199,11 +203,10 @@ vehicles:
     }
 
     #[test]
-    fn without_a_pose_of_the_lidar_there_is_no_frame() {
+    fn a_pose_of_the_lidar_that_cannot_be_right_leaves_no_frame() {
         let pose = "lidar_pose: [10, 20, 2, 0, 90, 1e-06]";
         for (to, expected) in [
             ("lidar_pose: [10, 20, 2]", ":3: lidar_pose: a list of 3, expected 6 numbers or a 4x4 matrix"),
-            ("", ":1: lidar_pose: missing"),
             ("lidar_pose: [.inf, 20, 2, 0, 90, 0]", ":3: lidar_pose.0: inf, expected a finite number"),
             (
                 "lidar_pose: [1e8, 20, 2, 0, 90, 0]",

@@ -73,7 +73,7 @@ pub fn all(root: &Path) -> Vec<Reader> {
         on_disk("link", text(seeds::LINK), file("link", "a.yaml"), |path, _| {
             LinkConfig::open(&path.to_string_lossy()).is_ok()
         }),
-        on_disk("link trace", text(seeds::TRACE), file("trace", "a.csv"), |path, _| Trace::read_csv(path).is_ok()),
+        on_disk("link trace", text(seeds::TRACE), file("trace", "a.csv"), |path, _| Trace::read_csv(path, 0).is_ok()),
         on_disk("mahimahi trace", text(seeds::MAHIMAHI), file("mahimahi", "a.txt"), |path, _| {
             Trace::read_mahimahi(path).is_ok()
         }),
@@ -194,7 +194,7 @@ fn read_recording(path: &Path, _: &[u8]) -> bool {
             let _ = wire::decode_any([&bytes[..]], &Limits::DEFAULT);
         }
     }
-    recording.damage().is_none()
+    recording.damage().is_empty()
 }
 
 fn weights() -> Vec<u8> {
