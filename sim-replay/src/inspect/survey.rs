@@ -363,7 +363,7 @@ mod tests {
             [
                 "/1/000010.pcd:13: intensity: \"5e\" is no number: the file is cut off here, after 1 of 2 POINTS",
                 "/1/000013.pcd: 2 of 2 points are not finite and are left out, the first in line 12",
-                "/1/000014.yaml:1: lidar_pose: a list of 3, expected 6 numbers",
+                "/1/000014.yaml:1: lidar_pose: a list of 3, expected 6 numbers or a 4x4 matrix",
                 "/1/000016.yaml: does not exist beside 000016.pcd: the frame is left out",
             ]
         );
