@@ -12,8 +12,8 @@ use crate::command;
 #[derive(Debug, Parser)]
 #[command(
     version,
-    after_help = "Exit codes: 0 done, 1 failed, 2 bad usage or input, 3 finished but data was lost (stream: frames that \
-                  cannot be read, ticks that are not answered)."
+    after_help = "Exit codes: 0 done, 1 failed, 2 bad usage or input, 3 finished but data was lost (convert, \
+                  stream: frames that cannot be read; stream: ticks that are not answered)."
 )]
 pub(crate) struct Cli {
     #[command(subcommand)]
@@ -22,6 +22,7 @@ pub(crate) struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
+    Convert(command::convert::Args),
     Inspect(command::inspect::Args),
     Link(command::link::Args),
     Record(command::record::Args),
@@ -44,6 +45,7 @@ pub(crate) enum Outcome {
 /// Runs what was asked for and prints the chain of causes where it failed.
 pub(crate) fn run(cli: Cli) -> ExitCode {
     let outcome = match cli.command {
+        Command::Convert(args) => command::convert::run(&args),
         Command::Inspect(args) => command::inspect::run(&args),
         Command::Link(args) => command::link::run(&args),
         Command::Record(args) => command::record::run(&args),

@@ -42,12 +42,6 @@ impl ObjectClass {
         Self::VEHICLES.contains(&self)
     }
 
-    /// True where detection counts the object by default: vehicles.
-    #[must_use]
-    pub fn is_detection_target(self) -> bool {
-        self.is_vehicle()
-    }
-
     /// Its name in files and options: `car`, `two_wheeler`.
     #[must_use]
     pub fn name(self) -> &'static str {
@@ -76,22 +70,6 @@ impl FromStr for ObjectClass {
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
 #[error("{0:?} is no class: expected vehicle, car, van, truck, bus, two_wheeler, pedestrian or other")]
 pub struct UnknownClass(String);
-
-/// Reads a list such as `vehicle,pedestrian`; `vehicle` stands for [`ObjectClass::VEHICLES`]. In the order of
-/// [`ObjectClass::ALL`], each class once.
-///
-/// # Errors
-/// [`UnknownClass`] for the first name that is none.
-pub fn classes_from_str(text: &str) -> Result<Vec<ObjectClass>, UnknownClass> {
-    let mut named = Vec::new();
-    for word in text.split(',').map(str::trim) {
-        match word {
-            "vehicle" | "vehicles" => named.extend(ObjectClass::VEHICLES),
-            word => named.push(word.parse()?),
-        }
-    }
-    Ok(ObjectClass::ALL.into_iter().filter(|class| named.contains(class)).collect())
-}
 
 /// An annotated object.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -176,15 +154,6 @@ mod tests {
             assert_eq!(class.name().parse(), Ok(class));
             assert_eq!(serde_json::to_value(class).unwrap(), class.name());
         }
-        assert!(!ObjectClass::Other.is_vehicle() && !ObjectClass::TwoWheeler.is_detection_target());
-    }
-
-    #[test]
-    fn lists_of_classes_know_vehicles() {
-        assert_eq!(classes_from_str("vehicle").unwrap(), ObjectClass::VEHICLES);
-        let listed = classes_from_str("pedestrian, bus,vehicle").unwrap();
-        assert_eq!(listed.len(), 5);
-        assert_eq!(listed.last(), Some(&ObjectClass::Pedestrian));
-        assert!(classes_from_str("vehicle,cat").unwrap_err().to_string().starts_with("\"cat\" is no class"));
+        assert!(!ObjectClass::Other.is_vehicle() && !ObjectClass::TwoWheeler.is_vehicle());
     }
 }

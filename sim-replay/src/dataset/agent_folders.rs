@@ -1,7 +1,7 @@
 //! The folders of the OPV2V family: `<root>/<split>/<scenario>/<agent>/<frame>.yaml` with a sweep beside it, entered at any
 //! level.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::{BTreeMap, BTreeSet, HashSet};
 use std::path::{Path, PathBuf};
 
 use protocol::CavId;
@@ -21,7 +21,7 @@ pub(super) struct ScenarioFolder {
     pub(super) dir: PathBuf,
     /// Ego first, roadside units last.
     pub(super) agents: Vec<CavId>,
-    /// Stems of the ego, the first of the agents.
+    /// Stems that any agent has.
     pub(super) stems: Vec<String>,
     /// Stems that some agent has and this one has not.
     pub(super) missing: Vec<MissingFrame>,
@@ -118,12 +118,11 @@ impl ScenarioFolder {
         let agents = in_order(by_agent.keys());
         let all: BTreeSet<&String> = by_agent.values().flat_map(|agent| &agent.stems).collect();
         let mut missing = Vec::new();
-        for stem in all {
-            let without = agents.iter().filter(|id| !by_agent[id].stems.contains(stem));
-            missing.extend(without.map(|id| MissingFrame { agent: id.clone(), stem: stem.clone() }));
+        for stem in &all {
+            let without = agents.iter().filter(|id| !by_agent[id].stems.contains(*stem));
+            missing.extend(without.map(|id| MissingFrame { agent: id.clone(), stem: (*stem).clone() }));
         }
-        let ego = agents.first().and_then(|ego| by_agent.get(ego));
-        let mut stems: Vec<String> = ego.map(|ego| ego.stems.iter().cloned().collect()).unwrap_or_default();
+        let mut stems: Vec<String> = all.into_iter().cloned().collect();
         problems.extend(without_common_frame(dir, &agents, &by_agent));
         if stems.iter().all(|stem| stem.parse::<u64>().is_ok()) {
             stems.sort_by_key(|stem| stem.parse::<u64>().unwrap_or(u64::MAX));
@@ -152,7 +151,12 @@ impl ScenarioFolder {
 
     /// The reader of all agents' sweeps.
     pub(super) fn sweeps(&self, options: &OpenOptions) -> Sweeps {
-        let of_agent = |agent: &CavId| self.stems.iter().map(|stem| self.pcd(agent, stem, None)).collect::<Vec<_>>();
+        let missing: HashSet<(&CavId, &str)> =
+            self.missing.iter().map(|frame| (&frame.agent, frame.stem.as_str())).collect();
+        let of_agent = |agent: &CavId| {
+            let stems = self.stems.iter().filter(|stem| !missing.contains(&(agent, stem.as_str())));
+            stems.map(|stem| self.pcd(agent, stem, None)).take(Sweeps::MOST_TRIED).collect::<Vec<_>>()
+        };
         let sweeps = Sweeps::new(SweepStorage::ByName, options);
         self.agents.iter().fold(sweeps, |sweeps, agent| sweeps.with_agent(agent.clone(), of_agent(agent)))
     }
@@ -162,7 +166,7 @@ impl ScenarioFolder {
         self.pcd(agent, stem, Some(RADAR))
     }
 
-    /// Capture times. Stems count simulator ticks, they are no clock: where `data_protocol.yaml` gives the length of a
+    /// Capture times of all stems. Stems count simulator ticks, they are no clock: where `data_protocol.yaml` gives the length of a
     /// tick, time is tick times length; else the smallest step between stems is one `period_nanos`, from 0 on.
     pub(super) fn ticks(&self, period_nanos: u64, problems: &mut Vec<ReadError>) -> Vec<Tick> {
         let tick_nanos = self.tick_nanos().unwrap_or_else(|error| {
@@ -284,7 +288,7 @@ mod tests {
     }
 
     #[test]
-    fn the_frames_of_the_ego_count_and_missing_ones_are_listed() {
+    fn frames_are_listed_and_so_are_missing_ones() {
         let dir = tempfile::tempdir().unwrap();
         touch(dir.path(), &["1/000068.yaml", "1/000068.pcd", "1/000070.yaml", "1/000070.pcd"]);
         touch(dir.path(), &["2/000070.yaml", "2/000070.pcd", "2/000072.yaml", "2/000074.pcd", "2/000076_radar.pcd"]);
@@ -310,7 +314,7 @@ mod tests {
         touch(dir.path(), &["1/000068.yaml", "1/000068.pcd", "1/000070.yaml", "1/000070.pcd"]);
         touch(dir.path(), &["2/000069.yaml", "2/000069.pcd"]);
         let (folder, problems) = scan(dir.path());
-        assert_eq!((folder.agents.len(), folder.stems.len()), (2, 2));
+        assert_eq!((folder.agents.len(), folder.stems.len()), (2, 3));
         let expected = "/2: no frame of agent 2 (first 000069) at a tick of the ego 1 (first 000068): it takes no part";
         assert_eq!(problems, [expected]);
     }

@@ -35,6 +35,7 @@ mod points;
 mod presence;
 mod problem;
 mod recorded;
+mod unfinished;
 mod v2v4real;
 mod written_pose;
 mod yaml;
@@ -54,6 +55,7 @@ pub(crate) use points::Plausibility;
 pub use points::{IntensityScale, IntensityScaleError};
 pub use presence::LoadedTick;
 pub use problem::Problem;
+pub use unfinished::UNFINISHED;
 
 use crate::frame::Frame;
 use crate::pcd::PcdCloud;

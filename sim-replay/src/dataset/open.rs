@@ -13,8 +13,8 @@ use super::v2v4real::V2v4Real;
 use super::written_pose::WrittenPose;
 use super::yaml::{self, Field};
 use super::{
-    Dataset, FrameSource, Layout, ReadError, Scenario, files, kitti_object, kitti_odometry, layouts_text, localization,
-    recorded,
+    Dataset, FrameSource, Layout, ReadError, Scenario, Tick, files, kitti_object, kitti_odometry, layouts_text,
+    localization, recorded, unfinished,
 };
 
 /// How far below the opened folder sequences of a single vehicle are looked for.
@@ -25,7 +25,7 @@ const FRAMES_TO_TRY: usize = 5;
 const SHOWN_PROBLEMS: usize = 5;
 
 /// What a dataset does not say of itself.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct OpenOptions {
     /// Time from one stored frame to the next where neither time stamps nor the length of a simulator's tick are
     /// recorded, nanoseconds. The datasets of the OPV2V family store ten frames a second.
@@ -36,7 +36,7 @@ pub struct OpenOptions {
 
 impl Default for OpenOptions {
     fn default() -> Self {
-        Self { period_nanos: 100_000_000, intensity_scale: IntensityScale::Auto }
+        Self { period_nanos: 100_000_000, intensity_scale: IntensityScale::AUTO }
     }
 }
 
@@ -54,6 +54,12 @@ pub fn open(dir: &Path) -> Result<Dataset, ReadError> {
 /// # Errors
 /// As [`open`].
 pub fn open_with(dir: &Path, options: &OpenOptions) -> Result<Dataset, ReadError> {
+    let mut dataset = open_any(dir, options)?;
+    unfinished::report(dir, &mut dataset);
+    Ok(dataset)
+}
+
+fn open_any(dir: &Path, options: &OpenOptions) -> Result<Dataset, ReadError> {
     if let Some(file) = recorded::file_of(dir) {
         return recorded::open(&file);
     }
@@ -136,12 +142,16 @@ fn agent_folder_scenario(
     let layout = family_layout(&folder);
     let sweeps = folder.sweeps(options);
     let source_handedness = if layout == Layout::Opv2v { Handedness::Left } else { Handedness::Right };
-    let ticks = folder.ticks(options.period_nanos, problems);
+    let moments = folder.ticks(options.period_nanos, problems);
+    let ego_lacks = |tick: &Tick| {
+        folder.missing.iter().any(|frame| Some(&frame.agent) == folder.agents.first() && frame.stem == tick.stem)
+    };
+    let ticks: Vec<Tick> = moments.iter().filter(|tick| !ego_lacks(tick)).cloned().collect();
     let is_unit = |id: &&CavId| id.as_str().starts_with('-');
     Scenario {
         name: files::name_below(root, &folder.dir),
         agents: folder.agents.clone(),
-        absences: Absences::new(&folder.agents, &ticks, &folder.missing),
+        absences: Absences::new(&folder.agents, &ticks, &folder.missing).among(moments),
         ticks,
         missing: folder.missing.clone(),
         roadside_units: folder.agents.iter().filter(is_unit).cloned().collect(),

@@ -4,6 +4,7 @@
 
 mod boxes;
 mod cells;
+mod map;
 mod survey;
 mod sweeps;
 mod table;
@@ -11,11 +12,13 @@ mod table;
 use protocol::{CavId, Handedness};
 use serde::Serialize;
 
-pub use survey::{inspect, inspect_with};
+pub use map::{MapReport, inspect_map};
+pub use survey::inspect;
 pub use sweeps::SweepReport;
 
 pub use crate::dataset::Problem;
 use crate::dataset::{Layout, MissingFrame};
+use crate::evaluation_protocol::EvaluationProtocol;
 
 /// The findings. Serializes to the JSON of `sim-replay inspect --json`, prints as its table.
 #[derive(Debug, Clone, Serialize)]
@@ -24,6 +27,8 @@ pub struct Report {
     pub path: String,
     /// Its layout, where it has one that is known.
     pub layout: Option<Layout>,
+    /// The protocol that ground truth was merged by: the one of the layout, unless another was asked for.
+    pub protocol: Option<EvaluationProtocol>,
     /// What was found in each scenario.
     pub scenarios: Vec<ScenarioReport>,
     /// Merged ground truth by tick, ego and set of agents: the ego alone, and with all in range.

@@ -11,7 +11,8 @@ use super::boxes;
 use super::cells::Cells;
 use super::sweeps::{self, SweepFindings};
 use super::{AgentReport, Problem, Report, ScenarioReport, Summary, TickReport};
-use crate::dataset::{self, Layout, OpenOptions, Scenario};
+use crate::dataset::{self, OpenOptions, ReadError, Scenario};
+use crate::evaluation_protocol::ProtocolConfig;
 use crate::frame::{Frame, Object};
 use crate::ground_truth::{self, GroundTruthRule};
 use crate::pcd::{PcdCloud, Place};
@@ -42,18 +43,24 @@ struct TickFindings {
     merged: Vec<TickReport>,
 }
 
-/// Reads all of the dataset in `dir`. `progress` is told how many ticks are done and how many there are.
+/// Reads all of the data set in `dir`, its ground truth by the protocol. `progress` is told how many ticks are done and how
+/// many there are.
 #[must_use]
-pub fn inspect(dir: &Path, progress: &(dyn Fn(usize, usize) + Sync)) -> Report {
-    inspect_with(dir, &OpenOptions::default(), progress)
-}
-
-/// [`inspect`] with what the dataset does not say of itself.
-#[must_use]
-pub fn inspect_with(dir: &Path, options: &OpenOptions, progress: &(dyn Fn(usize, usize) + Sync)) -> Report {
-    let mut report =
-        Report { path: dir.display().to_string(), layout: None, scenarios: vec![], ticks: vec![], problems: vec![] };
-    let dataset = match dataset::open_with(dir, options) {
+pub fn inspect(
+    dir: &Path,
+    open: &OpenOptions,
+    protocol: &ProtocolConfig,
+    progress: &(dyn Fn(usize, usize) + Sync),
+) -> Report {
+    let mut report = Report {
+        path: dir.display().to_string(),
+        layout: None,
+        protocol: None,
+        scenarios: vec![],
+        ticks: vec![],
+        problems: vec![],
+    };
+    let dataset = match dataset::open_with(dir, open) {
         Ok(dataset) => dataset,
         Err(error) => {
             report.problems.push(Problem::from(&error));
@@ -61,6 +68,14 @@ pub fn inspect_with(dir: &Path, options: &OpenOptions, progress: &(dyn Fn(usize,
         }
     };
     report.layout = Some(dataset.layout);
+    let protocol = match protocol.resolve(dataset.layout) {
+        Ok(protocol) => protocol,
+        Err(reason) => {
+            report.problems.push(Problem::from(&ReadError::Layout { path: dir.to_owned(), reason }));
+            return report;
+        }
+    };
+    report.protocol = Some(protocol.clone());
     report.problems.extend(dataset.problems.iter().map(Problem::from));
     let total = dataset.scenarios.iter().map(|scenario| scenario.ticks.len()).sum();
     let done = AtomicUsize::new(0);
@@ -68,7 +83,7 @@ pub fn inspect_with(dir: &Path, options: &OpenOptions, progress: &(dyn Fn(usize,
         let findings: Vec<TickFindings> = (0..scenario.ticks.len())
             .into_par_iter()
             .map(|tick| {
-                let findings = survey_tick(scenario, tick);
+                let findings = survey_tick(scenario, tick, &protocol.ground_truth);
                 progress(done.fetch_add(1, Ordering::Relaxed) + 1, total);
                 findings
             })
@@ -76,7 +91,7 @@ pub fn inspect_with(dir: &Path, options: &OpenOptions, progress: &(dyn Fn(usize,
         let summary = summarize(scenario, &findings);
         report.problems.extend(box_problems(&summary, &findings));
         report.scenarios.push(summary);
-        report.problems.extend(sweep_problems(scenario, &findings, options));
+        report.problems.extend(sweep_problems(scenario, &findings, open));
         for tick in findings {
             report.ticks.extend(tick.merged);
             report.problems.extend(tick.agents.into_iter().flat_map(|agent| agent.problems));
@@ -113,7 +128,7 @@ fn box_problems(scenario: &ScenarioReport, findings: &[TickFindings]) -> Vec<Pro
     problems
 }
 
-fn survey_tick(scenario: &Scenario, tick: usize) -> TickFindings {
+fn survey_tick(scenario: &Scenario, tick: usize, rule: &GroundTruthRule) -> TickFindings {
     let mut agents = Vec::with_capacity(scenario.agents.len());
     let mut frames = Vec::with_capacity(scenario.agents.len());
     for agent in 0..scenario.agents.len() {
@@ -126,7 +141,7 @@ fn survey_tick(scenario: &Scenario, tick: usize) -> TickFindings {
         frames.extend(frame);
     }
     let frames: Vec<&Frame> = frames.iter().collect();
-    let merged = merged_counts(scenario, tick, &frames);
+    let merged = merged_counts(scenario, tick, &frames, rule);
     TickFindings { agents, merged }
 }
 
@@ -222,11 +237,7 @@ fn sweeps_of(findings: &[TickFindings], agent: usize) -> Vec<&SweepFindings> {
 }
 
 /// One entry for every ego alone, and one with all in range of it, where there is anyone.
-fn merged_counts(scenario: &Scenario, tick: usize, frames: &[&Frame]) -> Vec<TickReport> {
-    let rule = match scenario.layout {
-        Layout::V2v4Real => GroundTruthRule::V2V4REAL,
-        _ => GroundTruthRule::OPV2V,
-    };
+fn merged_counts(scenario: &Scenario, tick: usize, frames: &[&Frame], rule: &GroundTruthRule) -> Vec<TickReport> {
     let report = |ego: &CavId, agents: Vec<CavId>, merged_boxes: usize| TickReport {
         scenario: scenario.name.clone(),
         tick: scenario.ticks[tick].stem.clone(),
@@ -236,12 +247,12 @@ fn merged_counts(scenario: &Scenario, tick: usize, frames: &[&Frame]) -> Vec<Tic
     };
     let mut merged = Vec::new();
     for (index, ego) in frames.iter().enumerate() {
-        let alone = ground_truth::merge(&[ego], 0, &rule).len();
+        let alone = ground_truth::merge(&[ego], 0, rule).len();
         merged.push(report(&ego.cav, vec![ego.cav.clone()], alone));
         let contributors = ground_truth::contributors(frames, index, rule.comm_range_m);
         if contributors.len() > 1 {
             let agents = contributors.iter().map(|&other| frames[other].cav.clone()).collect();
-            merged.push(report(&ego.cav, agents, ground_truth::merge(frames, index, &rule).len()));
+            merged.push(report(&ego.cav, agents, ground_truth::merge(frames, index, rule).len()));
         }
     }
     merged
@@ -316,7 +327,7 @@ mod tests {
     }
 
     fn survey(root: &Path) -> (Report, Vec<String>) {
-        let report = inspect(root, &|_, _| {});
+        let report = inspect(root, &OpenOptions::default(), &ProtocolConfig::default(), &|_, _| {});
         let root = root.to_string_lossy();
         let messages = report.problems.iter().map(|problem| problem.message.replace(&*root, "")).collect();
         (report, messages)
@@ -371,6 +382,62 @@ mod tests {
         let agent = &report.scenarios[0].agents[0];
         assert_eq!((agent.points, agent.dropped_points), (Summary::of(&[1, 0, 2, 2]), 3));
         assert_eq!(report.ticks.len(), 4, "annotations of sound YAML count even where the sweep is broken");
+    }
+
+    /// Messages and table of an agent whose sweeps have these intensities.
+    fn of_intensities(sweeps: &[&[f32]]) -> (Vec<String>, String) {
+        let dir = tempfile::tempdir().unwrap();
+        for (stem, intensities) in sweeps.iter().enumerate() {
+            let points: Vec<[f32; 4]> = intensities.iter().map(|&intensity| [10.0, 0.0, -1.3, intensity]).collect();
+            write(dir.path(), &format!("1/{stem:06}.yaml"), YAML.as_bytes());
+            write(dir.path(), &format!("1/{stem:06}.pcd"), &sweep(&points));
+        }
+        let (report, messages) = survey(dir.path());
+        (messages, report.to_string())
+    }
+
+    #[test]
+    fn intensities_are_told_and_what_is_wrong_with_them_is_a_problem() {
+        let (messages, table) = of_intensities(&[&[0.0, 0.25, 1.0], &[0.5]]);
+        assert!(messages.is_empty(), "{messages:?}");
+        let line = "  sweeps of 1: PCD, ascii; intensity from intensity, divided by 1: 0.000 to 1.000, median 0.500";
+        assert!(table.contains(line), "{table}");
+        let (messages, table) = of_intensities(&[&[0.0, 51.0, 255.0]]);
+        assert!(messages.is_empty() && table.contains("divided by 255: 0.000 to 1.000, median 0.200"), "{table}");
+        let message = |sweeps: &[&[f32]]| of_intensities(sweeps).0.concat();
+        assert_eq!(
+            message(&[&[0.5], &[0.5, 0.5]]),
+            "/1: sweeps of agent 1: all 3 intensities are 0.5 (field intensity divided by 1), expected a sensor's, which \
+             differ"
+        );
+        assert_eq!(
+            message(&[&[0.5], &[1.0], &[0.25], &[200.0, 0.0]]),
+            "/1: sweeps of agent 1: 1 of 5 intensities are above 1, up to 200 (field intensity divided by 1): see \
+             --intensity-scale"
+        );
+        assert!(message(&[&[-0.5, 0.5]]).contains("1 of 2 intensities are below 0, down to -0.5"));
+        assert_eq!(
+            message(&[&[1.0, 700.0]]),
+            "/1: sweeps of agent 1: intensities reach 700, neither 0 to 1 nor 0 to 255 (field intensity divided by \
+             1023): state the scale by --intensity-scale"
+        );
+    }
+
+    #[test]
+    fn a_missing_intensity_and_implausible_points_are_problems() {
+        let dir = tempfile::tempdir().unwrap();
+        write(dir.path(), "1/000010.yaml", YAML.as_bytes());
+        let head = "FIELDS x y z ring\nSIZE 4 4 4 4\nTYPE F F F F\nWIDTH 2\nDATA ascii\n";
+        write(dir.path(), "1/000010.pcd", format!("{head}1 2 3 0\n4000 5 6 1\n").as_bytes());
+        let (_, messages) = survey(dir.path());
+        assert_eq!(
+            messages,
+            [
+                "/1: sweeps of agent 1: no field of intensity (intensity, reflectivity, remission, rgb, ...): it is 0 for \
+                 all points",
+                "/1: sweeps of agent 1: 50.0 % of the points lie within 300 m, usual are 95.0 % or more",
+            ]
+        );
     }
 
     #[test]

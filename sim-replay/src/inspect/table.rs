@@ -22,6 +22,9 @@ impl fmt::Display for Report {
             count(self.scenarios.len(), "scenario"),
             count(frames, "frame")
         )?;
+        if let Some(protocol) = &self.protocol {
+            writeln!(f, "{protocol}")?;
+        }
         for scenario in &self.scenarios {
             self.write_scenario(f, scenario)?;
         }
