@@ -87,7 +87,7 @@ fn open_single_vehicles(
     problems: &mut Vec<ReadError>,
 ) -> Result<(), ReadError> {
     let opened = if kitti_object::is_split(dir) {
-        kitti_object::open(root, dir, options)
+        kitti_object::open(root, dir, options, problems)
     } else if kitti_odometry::is_sequence(dir) {
         kitti_odometry::open(root, dir, options, problems)
     } else if localization::is_sequence(dir) {
