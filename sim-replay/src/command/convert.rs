@@ -1,7 +1,7 @@
 //! `sim-replay convert`: write a data set in another layout.
 
 use std::io::IsTerminal;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use indicatif::ProgressBar;
 use sim_replay::dataset;
@@ -42,6 +42,10 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
             return Ok(Outcome::BadInput);
         }
     };
+    if overlap(&args.from, &args.out) {
+        eprintln!("error: {}: the input lies there; take another folder for --out", args.out.display());
+        return Ok(Outcome::BadInput);
+    }
     let bar = if std::io::stderr().is_terminal() { ProgressBar::new(0) } else { ProgressBar::hidden() };
     let options = ConvertOptions { out: args.out.clone(), layout: args.layout, force: args.force };
     let result = convert(&input, &options, &|done, total| {
@@ -60,6 +64,12 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
             Ok(Outcome::BadInput)
         }
     }
+}
+
+/// Whether one of the two lies in the other: what is read would be replaced.
+fn overlap(from: &Path, out: &Path) -> bool {
+    let real = |path: &Path| path.canonicalize().ok();
+    real(from).zip(real(out)).is_some_and(|(from, out)| from.starts_with(&out) || out.starts_with(&from))
 }
 
 fn print(converted: &Converted, args: &Args) {
@@ -84,5 +94,22 @@ fn print(converted: &Converted, args: &Args) {
     let summary = left_out.to_string();
     if !summary.is_empty() {
         println!("{summary}");
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_input_is_not_written_over() {
+        let folder = tempfile::tempdir().unwrap();
+        let [from, out, inside] = ["a", "b", "a/c"].map(|name| folder.path().join(name));
+        std::fs::create_dir_all(&inside).unwrap();
+        assert!(!overlap(&from, &out), "a folder that is not there yet");
+        std::fs::create_dir(&out).unwrap();
+        assert!(!overlap(&from, &out));
+        assert!(overlap(&from, &from) && overlap(&from, &inside) && overlap(&inside, &from));
+        assert!(overlap(&from, &inside.join("..")));
     }
 }

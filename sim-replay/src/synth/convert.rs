@@ -1,4 +1,4 @@
-//! Data sets that were opened, written in another layout.
+//! Conversion: a data set that was opened, written in another layout.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -43,7 +43,8 @@ pub struct Converted {
     pub left_out: LeftOut,
 }
 
-/// Writes all scenarios of a data set in a layout. `progress` hears how many moments are done and how many there are.
+/// Writes all scenarios of a data set in a layout. `progress` is called with the number of moments
+/// that are done and their total, from any thread.
 ///
 /// # Errors
 /// [`SynthError`] where the layout cannot hold a scene or a file cannot be written. A frame that cannot be read is left out
