@@ -16,7 +16,8 @@ use ego_fuser::feature_store::{FeatureStore, KeptMaps, MapSource};
 use ego_fuser::trust::TrustConfig;
 use ego_fuser::{Exchange, Method};
 use protocol::{CavId, CodecConfig};
-use sim_replay::dataset::{self, Dataset, ReadError, Scenario};
+use sim_replay::dataset::{self, IntensityScale, OpenOptions, ReadError, Scenario};
+use sim_replay::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
 
 use crate::metrics::{Messages, Metrics};
 use crate::score::Board;
@@ -49,6 +50,19 @@ pub struct EvaluationOptions {
     pub stepped: Option<SteppedConfig>,
     /// The part of the data set that is judged.
     pub part: Part,
+    /// Whose messages and annotations count, and which objects.
+    pub protocol: ProtocolConfig,
+}
+
+/// A data set, opened to be judged by a protocol.
+#[derive(Debug)]
+pub struct OpenedData {
+    /// The scenarios, with the agents that take part.
+    pub scenarios: Vec<Scenario>,
+    /// The protocol.
+    pub protocol: EvaluationProtocol,
+    /// Parts of the data set that are not used.
+    pub problems: Vec<ReadError>,
 }
 
 /// A part of a data set.
@@ -58,18 +72,24 @@ pub struct Part {
     pub scenarios: Option<usize>,
     /// The first so many ticks of each; all where absent.
     pub ticks: Option<usize>,
+    /// Divisor of the intensities of its sweeps.
+    pub intensity_scale: IntensityScale,
 }
 
 impl Part {
-    /// Opens a data set: all its scenarios, each with the ticks that are asked for. Maps are kept of these, so that another
-    /// choice among them needs no others.
+    /// Opens a data set: all its scenarios, each with the agents of the protocol and the ticks that are asked for. Maps are
+    /// kept of these, so that another choice among them needs no others.
     ///
     /// # Errors
-    /// [`ReadError`] when it cannot be read.
-    pub fn open(&self, path: &Path) -> Result<Dataset, ReadError> {
-        let mut dataset = dataset::open(path)?;
-        dataset.scenarios.iter_mut().for_each(|scenario| scenario.ticks.truncate(self.ticks.unwrap_or(usize::MAX)));
-        Ok(dataset)
+    /// [`EvaluationError`] when it cannot be read, or the protocol contradicts itself.
+    pub fn open(&self, path: &Path, protocol: &ProtocolConfig) -> Result<OpenedData, EvaluationError> {
+        let options = OpenOptions { intensity_scale: self.intensity_scale, ..OpenOptions::default() };
+        let dataset = dataset::open_with(path, &options)?;
+        let protocol = protocol.resolve(dataset.layout).map_err(EvaluationError::Protocol)?;
+        let mut scenarios: Vec<Scenario> =
+            dataset.scenarios.iter().filter_map(|scenario| protocol.arrange(scenario)).collect();
+        scenarios.iter_mut().for_each(|scenario| scenario.ticks.truncate(self.ticks.unwrap_or(usize::MAX)));
+        Ok(OpenedData { scenarios, protocol, problems: dataset.problems })
     }
 
     /// Those of all scenarios that are asked for.
@@ -85,6 +105,9 @@ pub enum EvaluationError {
     /// The data set cannot be read.
     #[error(transparent)]
     Dataset(#[from] ReadError),
+    /// The protocol is not known or contradicts itself.
+    #[error("evaluation protocol: {0}")]
+    Protocol(String),
     /// The data set has no frame to judge.
     #[error("{}: there is no frame in it", .0.display())]
     Empty(PathBuf),
@@ -101,7 +124,7 @@ pub enum EvaluationError {
 /// # Errors
 /// [`EvaluationError`] when the data set cannot be read.
 pub fn frame_count(options: &EvaluationOptions) -> Result<usize, EvaluationError> {
-    let scenarios = options.part.open(&options.dataset)?.scenarios;
+    let scenarios = options.part.open(&options.dataset, &options.protocol)?.scenarios;
     let ticks = options.part.chosen(&scenarios).map(|scenario| scenario.ticks.len()).sum();
     Ok(options.frames.map_or(ticks, |frames| frames.min(ticks)))
 }
@@ -130,7 +153,7 @@ pub(crate) fn judged(
     on_frame: &mut dyn FnMut(),
 ) -> Result<(Board, Evaluator, Instant), EvaluationError> {
     let began = Instant::now();
-    let Dataset { scenarios, problems, .. } = options.part.open(&options.dataset)?;
+    let OpenedData { scenarios, protocol, problems } = options.part.open(&options.dataset, &options.protocol)?;
     let weights = weights_of(&options.weights, method)?;
     let mut evaluator = Evaluator::new(EvaluateConfig {
         weights: weights.clone(),
@@ -138,7 +161,7 @@ pub(crate) fn judged(
         pose_source: options.pose_source.clone(),
         codec: options.codec,
         rate: options.rate,
-        rule: None,
+        protocol: Some(protocol.clone()),
         delay_nanos: options.delay_nanos,
         attack: options.attack,
         trust: options.trust,
@@ -198,5 +221,5 @@ pub(crate) fn metrics(board: &Board, evaluator: &Evaluator, options: &Evaluation
     };
     let names = [evaluator.ego().method().name(), options.pose_source.name()];
     let metrics = Metrics::of(board, clock, names, seconds, Messages::of(&evaluator.ledger().total()));
-    Metrics { left_out: evaluator.left_out().clone(), ..metrics }
+    Metrics { left_out: evaluator.left_out().clone(), protocol: evaluator.protocol(), ..metrics }
 }

@@ -7,6 +7,7 @@ use agent::statistics::{quantile, sorted};
 use protocol::{CavId, Counts, DropReason};
 use serde::{Deserialize, Serialize};
 use sim_replay::dataset::LeftOut;
+use sim_replay::evaluation_protocol::EvaluationProtocol;
 
 use crate::score::{Board, NeighbourRecord};
 
@@ -45,6 +46,9 @@ pub struct Metrics {
     pub neighbours: BTreeMap<CavId, NeighbourRecord>,
     /// The ledger's totals.
     pub messages: Messages,
+    /// The evaluation protocol, with the ground-truth range as it was applied.
+    #[serde(default)]
+    pub protocol: Option<EvaluationProtocol>,
     /// Data of the scene that could not be used.
     #[serde(default)]
     pub left_out: LeftOut,
@@ -74,6 +78,7 @@ impl Metrics {
             comm: board.communication(),
             neighbours: board.neighbours().clone(),
             messages,
+            protocol: None,
             left_out: LeftOut::default(),
         }
     }

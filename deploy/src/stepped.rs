@@ -78,7 +78,7 @@ fn evaluate_config(fleet: &Fleet) -> EvaluateConfig {
         pose_source: pose_source(scenario, &scenario.agents.pose),
         codec: scenario.agents.codec,
         rate: scenario.agents.rate,
-        rule: Some(fleet.ground_truth_rule()),
+        protocol: Some(fleet.protocol.clone()),
         delay_nanos: 0,
         attack: None,
         trust: scenario.ego.trust.then(TrustConfig::default),

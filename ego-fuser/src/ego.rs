@@ -63,10 +63,11 @@ pub struct Ego {
     history: History,
     trust: Option<Trust>,
     limits: PostprocessConfig,
+    comm_range_m: f64,
 }
 
 impl Ego {
-    /// The communication range of OPV2V and its relatives, metres.
+    /// The communication range of OPV2V and its relatives, metres: what holds unless another is asked for.
     pub const COMM_RANGE_M: f64 = 70.0;
 
     /// Reads the weights; `method` overrides the one that the file names.
@@ -98,7 +99,13 @@ impl Ego {
         let limits = PostprocessConfig::for_detector(detector.config());
         let limits = PostprocessConfig { score_threshold: SCORE_THRESHOLD, ..limits };
         let history = History::new(fusion.frames());
-        Self { method, detector, fusion, history, trust: None, limits }
+        Self { method, detector, fusion, history, trust: None, limits, comm_range_m: Self::COMM_RANGE_M }
+    }
+
+    /// The same with another communication range: neighbours farther away, metres in the plane, have no part.
+    #[must_use]
+    pub fn with_comm_range(self, comm_range_m: f64) -> Self {
+        Self { comm_range_m, ..self }
     }
 
     /// The same leaving out neighbours whose words do not fit what the ego sees itself.
@@ -187,7 +194,7 @@ impl Ego {
         let world_from_ego = own.pose.world_from_cav().ok_or(no_pose)?;
         let world_from_cav = view.pose.world_from_cav().ok_or(no_pose)?;
         let [dx, dy] = [0, 1].map(|axis| world_from_cav.translation_m[axis] - world_from_ego.translation_m[axis]);
-        if dx.hypot(dy) > Self::COMM_RANGE_M {
+        if dx.hypot(dy) > self.comm_range_m {
             return Err(Skipped::Unusable(DropReason::OutOfRange));
         }
         let fits = match &view.content {

@@ -22,7 +22,9 @@ use agent::rate::RateConfig;
 use agent::weights::Weights;
 use protocol::message::{Detections, FusedNeighbour, SkippedNeighbour};
 use protocol::{Box3d, CavId, CodecConfig, Ledger, PoseEstimate, Stamp};
+use sim_replay::class_set::ClassSet;
 use sim_replay::dataset::{LeftOut, LoadOptions, Scenario};
+use sim_replay::evaluation_protocol::EvaluationProtocol;
 use sim_replay::frame::Frame;
 use sim_replay::ground_truth::{self, GroundTruthRule};
 
@@ -49,8 +51,9 @@ pub struct EvaluateConfig {
     pub codec: CodecConfig,
     /// What neighbours fit theirs to. There is no queue to watch here.
     pub rate: RateConfig,
-    /// Which objects count; absent: those wholly over the area of the network, of all vehicles within 70 m.
-    pub rule: Option<GroundTruthRule>,
+    /// Whose messages and annotations count, and which objects; absent: vehicles wholly over the area of the network,
+    /// of all agents within 70 m.
+    pub protocol: Option<EvaluationProtocol>,
     /// How long messages of neighbours are under way, nanoseconds: the ego fuses the newest that are at least so old.
     pub delay_nanos: u64,
     /// Neighbours that lie; absent: none.
@@ -107,7 +110,12 @@ impl Evaluator {
     /// [`EvaluateError`] names the file and what is wrong with it.
     pub fn new(config: EvaluateConfig) -> Result<Self, EvaluateError> {
         let ego = Ego::load(&config.weights, config.method)?.with_trust(config.trust)?;
-        let rule = config.rule.unwrap_or_else(|| rule_of(ego.detector()));
+        let area = ego.detector().config();
+        let rule = config
+            .protocol
+            .as_ref()
+            .map_or_else(|| rule_for(area), |protocol| protocol.rule_within(area.lidar_range_m));
+        let ego = ego.with_comm_range(rule.comm_range_m);
         let codec = CodecConfig { gate: config.codec.gate.or(ego.method().gate()), ..config.codec };
         let config = EvaluateConfig { codec, ..config };
         let weights = Weights::load(&config.weights)?;
@@ -156,6 +164,13 @@ impl Evaluator {
     #[must_use]
     pub fn ego(&self) -> &Ego {
         &self.ego
+    }
+
+    /// The protocol with the ground-truth rule as it is applied to this network; absent where none was asked for.
+    #[must_use]
+    pub fn protocol(&self) -> Option<EvaluationProtocol> {
+        let protocol = self.config.protocol.clone()?;
+        Some(EvaluationProtocol { ground_truth: self.rule, ..protocol })
     }
 
     /// Which objects count.
@@ -311,13 +326,7 @@ impl Evaluator {
     }
 }
 
-/// The objects of all vehicles within 70 m that lie wholly over the area of a detector.
-#[must_use]
-pub fn rule_of(detector: &Detector) -> GroundTruthRule {
-    rule_for(detector.config())
-}
-
-/// The same by its numbers.
+/// The vehicles that lie wholly over the area of a detector, as annotated by all agents within 70 m.
 #[must_use]
 pub fn rule_for(config: &DetectorConfig) -> GroundTruthRule {
     let [x_low, y_low, z_low, x_high, y_high, z_high] = config.lidar_range_m;
@@ -327,6 +336,7 @@ pub fn rule_for(config: &DetectorConfig) -> GroundTruthRule {
         z_m: [z_low, z_high],
         comm_range_m: Ego::COMM_RANGE_M,
         min_corners: 8,
+        classes: ClassSet::VEHICLES,
     }
 }
 

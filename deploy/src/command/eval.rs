@@ -21,7 +21,9 @@ use ego_fuser::pairing::PairingConfig;
 use ego_fuser::trust::TrustConfig;
 use indicatif::{ProgressBar, ProgressStyle};
 use protocol::{CodecConfig, ConfidenceGate, Dtype};
+use sim_replay::dataset::IntensityScale;
 use sim_replay::dataset::LeftOut;
+use sim_replay::evaluation_protocol::ProtocolConfig;
 use sim_replay::link::LinkConfig;
 
 use super::{BadInput, Outcome};
@@ -127,9 +129,14 @@ pub(crate) struct Arguments {
     /// Scenarios to judge at most, evenly spread [default: all].
     #[arg(long, value_parser = clap::value_parser!(u64).range(1..))]
     scenarios: Option<u64>,
+    /// Number that stored intensities are divided by [default: auto; `sim-replay inspect --help` says by what].
+    #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
+    intensity_scale: IntensityScale,
     /// Threads to compute with.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
     threads: u16,
+    #[command(flatten)]
+    protocol: ProtocolConfig,
     /// Print JSON in the shape of metrics.json (a list of them for several methods) instead of a table.
     #[arg(long)]
     json: bool,
@@ -204,7 +211,10 @@ impl Arguments {
         match (self.json, &all[..]) {
             (true, [one]) => println!("{}", serde_json::to_string_pretty(one)?),
             (true, several) => println!("{}", serde_json::to_string_pretty(several)?),
-            (false, several) => print!("{}", report::table(several)),
+            (false, several) => {
+                print!("{}", report::table(several));
+                several.iter().take(1).filter_map(|metrics| metrics.protocol.as_ref()).for_each(|it| println!("{it}"));
+            }
         }
         Ok(left_out(&all))
     }
@@ -250,7 +260,8 @@ impl Arguments {
             }),
             frames: self.frames.map(at_most),
             stepped: self.link.as_deref().map(|link| self.stepped(link)).transpose()?,
-            part: Part { scenarios: self.scenarios.map(at_most), ticks: None },
+            part: Part { scenarios: self.scenarios.map(at_most), ticks: None, intensity_scale: self.intensity_scale },
+            protocol: self.protocol.clone(),
         })
     }
 

@@ -152,6 +152,7 @@ impl Run<'_> {
             scenarios: table.scenarios,
             attack: column.attack,
             trust: column.trust.then(TrustConfig::default),
+            protocol: self.spec.protocol.clone(),
             version: env!("CARGO_PKG_VERSION").to_owned(),
         };
         let known = Cell::read(&key, &self.cells)?;
@@ -174,7 +175,8 @@ impl Run<'_> {
                 limit_bytes: (self.spec.maps_limit_gb.max(0.0) * 1e9) as u64,
             }),
             frames: self.spec.frames,
-            part: Part { scenarios: table.scenarios, ticks: None },
+            part: Part { scenarios: table.scenarios, ..Part::default() },
+            protocol: self.spec.protocol.clone(),
             ..EvaluationOptions::default()
         };
         let metrics = evaluate(&options, row.method, &mut || observer.frame()).map_err(Box::new)?;

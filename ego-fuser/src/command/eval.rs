@@ -13,7 +13,7 @@ use ego_fuser::evaluate::{EvaluateConfig, EvaluatedFrame, Evaluator};
 use ego_fuser::multi_scale::{MULTI_SCALE_KIND, OfflineDetector};
 use protocol::CodecConfig;
 use serde_json::json;
-use sim_replay::dataset::{LoadOptions, Scenario};
+use sim_replay::dataset::{IntensityScale, LoadOptions, Scenario};
 use sim_replay::frame::Frame;
 use sim_replay::ground_truth;
 
@@ -25,6 +25,9 @@ pub(crate) struct Arguments {
     /// Datasets, splits or scenarios.
     #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
     data: Vec<PathBuf>,
+    /// Number that stored intensities are divided by [default: auto; `sim-replay inspect --help` says by what].
+    #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
+    intensity_scale: IntensityScale,
     /// Weights of encoder and head.
     #[arg(long, value_name = "FILE")]
     weights: PathBuf,
@@ -46,7 +49,7 @@ impl Arguments {
     /// Evaluates and prints a line per method.
     pub(crate) fn run(self) -> Result<()> {
         tch::set_num_threads(i32::from(self.threads.max(1)));
-        let scenarios = scenarios(&self.data)?;
+        let scenarios = scenarios(&self.data, self.intensity_scale)?;
         if kind_of(&self.weights)?.as_deref() == Some(MULTI_SCALE_KIND) {
             return self.run_multi_scale(&scenarios);
         }
@@ -60,7 +63,7 @@ impl Arguments {
                 pose_source: PoseSourceConfig::Recorded,
                 codec: CodecConfig::default(),
                 rate: RateConfig::default(),
-                rule: None,
+                protocol: None,
                 delay_nanos: 0,
                 attack: None,
                 trust: None,

@@ -8,6 +8,7 @@ use agent::pillars::{Pillars, Voxeliser};
 use nalgebra::Point3;
 use protocol::{Box3d, NoPoseReason, PointCloud, Pose, PoseEstimate};
 use rand::Rng;
+use sim_replay::class_set::ClassSet;
 use sim_replay::frame::Frame;
 use sim_replay::ground_truth::{self, GroundTruthRule};
 use tch::Tensor;
@@ -49,6 +50,8 @@ pub struct SampleConfig {
     pub max_agents: usize,
     /// Vehicles farther away do not take part, metres in the plane.
     pub comm_range_m: f64,
+    /// Classes of the objects that are to be found.
+    pub classes: ClassSet,
     /// Whether a single vehicle is also to find what only its neighbours have annotated: the rule of the evaluation. A
     /// training by it is of single vehicles, whatever their method shares; a neighbour that is dropped has annotated nothing.
     pub merged_truth: bool,
@@ -66,6 +69,7 @@ impl SampleConfig {
             moments: Moments::default(),
             max_agents: 5,
             comm_range_m: 70.0,
+            classes: ClassSet::VEHICLES,
             merged_truth: false,
         }
     }
@@ -306,6 +310,7 @@ impl SampleBuilder {
             z_m: [range[2], range[5]],
             comm_range_m: self.config.comm_range_m,
             min_corners: 8,
+            classes: self.config.classes,
         };
         let views: Vec<&Frame> = annotators.iter().filter_map(|&agent| frames[agent].as_ref()).collect();
         let on_lattice =

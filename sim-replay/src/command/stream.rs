@@ -7,7 +7,7 @@ use std::time::Duration;
 use anyhow::Context;
 use protocol::{CavId, DropReason, Role};
 use sim_replay::bus::{BusArgs, Route, STOP_LIMIT, log_to_stderr};
-use sim_replay::dataset::{self, LoadOptions, Scenario};
+use sim_replay::dataset::{self, IntensityScale, LoadOptions, OpenOptions, Scenario};
 use sim_replay::link::{CapacityConfig, DelayLaw, LinkConfig, LossLaw};
 use sim_replay::stream::{AirReport, Replay, StreamError, StreamOptions, StreamReport};
 
@@ -47,6 +47,9 @@ pub(crate) struct Args {
     /// Variant of the sweeps, for example fog_0.060 [default: the plain ones].
     #[arg(long)]
     variant: Option<String>,
+    /// Number that stored intensities are divided by [default: auto; `sim-replay inspect --help` says by what].
+    #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
+    intensity_scale: IntensityScale,
     /// Publish radar sweeps too.
     #[arg(long)]
     radar: bool,
@@ -171,7 +174,8 @@ impl Args {
 }
 
 fn open(args: &Args) -> anyhow::Result<Scenario> {
-    let dataset = dataset::open(&args.dir)?;
+    let options = OpenOptions { intensity_scale: args.intensity_scale, ..OpenOptions::default() };
+    let dataset = dataset::open_with(&args.dir, &options)?;
     for problem in &dataset.problems {
         tracing::warn!("{problem}");
     }

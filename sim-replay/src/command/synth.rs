@@ -12,6 +12,9 @@ use sim_replay::town::TownSource;
 
 use crate::cli::Outcome;
 
+/// Findings of a map that are printed one by one.
+const PRINTED_FINDINGS: usize = 20;
+
 /// Generate scenes, in the layout of OPV2V or another: the same arguments give the same files, byte for byte.
 ///
 /// Seeds 0 to 999 are for training and validation, seeds from 1000 on for measuring only.
@@ -79,6 +82,7 @@ pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
     bar.finish_and_clear();
     match result {
         Ok(summary) => {
+            print_findings(&summary);
             print(&summary, &options, start.elapsed().as_secs_f64(), json);
             Ok(Outcome::Done)
         }
@@ -118,14 +122,24 @@ fn progress_bar(scenarios: usize) -> ProgressBar {
     bar.with_style(ProgressStyle::with_template(&template).unwrap_or_else(|_| ProgressStyle::default_bar()))
 }
 
+/// Names on standard error what was not built as the map gives it.
+fn print_findings(summary: &Summary) {
+    for finding in summary.findings.iter().take(PRINTED_FINDINGS) {
+        eprintln!("map: {finding}");
+    }
+    if let Some(further) = summary.findings.len().checked_sub(PRINTED_FINDINGS).filter(|&further| further > 0) {
+        eprintln!("map: {further} further findings; all are in data_protocol.yaml of each scenario");
+    }
+}
+
 fn print(summary: &Summary, options: &SynthOptions, seconds: f64, json: bool) {
-    let Summary { layout, scenarios, agent_frames, points, annotations, omitted } = summary;
+    let Summary { layout, scenarios, agent_frames, points, annotations, omitted, findings } = summary;
     let per_frame = |count: &usize| *count as f64 / (*agent_frames).max(1) as f64;
     if json {
         let report = serde_json::json!({
             "out": options.out, "layout": layout.name(), "scenarios": scenarios, "agent_frames": agent_frames,
             "points_per_frame": per_frame(points), "vehicles_per_frame": per_frame(annotations), "omitted": omitted,
-            "seconds": seconds,
+            "seconds": seconds, "map_findings": findings,
         });
         println!("{report}");
         return;

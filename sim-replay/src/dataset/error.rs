@@ -69,6 +69,15 @@ impl ReadError {
         Self::Io { path: path.to_owned(), source }
     }
 
+    /// The same with what follows from it at the end of the reason.
+    #[must_use]
+    pub fn with_consequence(mut self, consequence: &str) -> Self {
+        if let Self::Malformed { reason, .. } | Self::Layout { reason, .. } = &mut self {
+            *reason = format!("{reason}: {consequence}");
+        }
+        self
+    }
+
     /// The file or folder at fault, if the error is about one.
     #[must_use]
     pub fn path(&self) -> Option<&Path> {

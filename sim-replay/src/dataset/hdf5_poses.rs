@@ -10,6 +10,7 @@ use hdf5_reader::{Dataset, Datatype, Hdf5File, OpenOptions};
 use nalgebra::Matrix4;
 use protocol::Pose;
 
+use super::faults::Faults;
 use super::{ReadError, files};
 
 /// Largest HDF5 file, and largest dataset in it, that is read, bytes: a million poses.
@@ -26,13 +27,22 @@ pub(super) enum RowOrder {
     RotationFirst,
 }
 
-/// Poses by time stamp in microseconds, in the axes of the file.
-pub(super) fn read(path: &Path, order: RowOrder) -> Result<BTreeMap<u64, Pose>, ReadError> {
+/// Poses by time stamp in microseconds, in the axes of the file. Entries that cannot be right are left out and named.
+pub(super) fn read(
+    path: &Path,
+    order: RowOrder,
+    problems: &mut Vec<ReadError>,
+) -> Result<BTreeMap<u64, Pose>, ReadError> {
     let bytes = files::read_limited(path, MAX_BYTES as u64)?;
-    parse(path, bytes, order)
+    parse(path, bytes, order, problems)
 }
 
-fn parse(path: &Path, bytes: Vec<u8>, order: RowOrder) -> Result<BTreeMap<u64, Pose>, ReadError> {
+fn parse(
+    path: &Path,
+    bytes: Vec<u8>,
+    order: RowOrder,
+    problems: &mut Vec<ReadError>,
+) -> Result<BTreeMap<u64, Pose>, ReadError> {
     let options = OpenOptions::default().with_max_read_bytes(MAX_BYTES).with_max_chunk_bytes(MAX_BYTES);
     let file = Hdf5File::from_vec_with_options(bytes, options)
         .map_err(|error| ReadError::malformed(path, format!("no sound HDF5: {error}")))?;
@@ -46,14 +56,17 @@ fn parse(path: &Path, bytes: Vec<u8>, order: RowOrder) -> Result<BTreeMap<u64, P
     }
     let (rows, _) = poses.as_chunks::<12>();
     let kept = TRIMMED..stamps.len().saturating_sub(TRIMMED);
+    let mut faults = Faults::default();
     let mut by_time = BTreeMap::new();
     for (index, (stamp, row)) in stamps.iter().zip(rows).enumerate().filter(|(index, _)| kept.contains(index)) {
         if !(0.0..=1e18).contains(stamp) {
-            return Err(wrong(path, "valid_timestamps", format!("entry {index}: {stamp} are no microseconds")));
+            faults.push(wrong(path, "valid_timestamps", format!("entry {index}: {stamp} are no microseconds")));
+            continue;
         }
-        let pose = pose(row, order).map_err(|error| wrong(path, "poses", format!("entry {index}: {error}")))?;
-        by_time.insert(*stamp as u64, pose);
+        let pose = pose(row, order).map_err(|error| wrong(path, "poses", format!("entry {index}: {error}")));
+        by_time.extend(faults.take(pose).map(|pose| (*stamp as u64, pose)));
     }
+    faults.report("row", problems);
     Ok(by_time)
 }
 
@@ -105,7 +118,10 @@ pub(super) mod tests {
     pub(in crate::dataset) use crate::synth::layout::poses_file as file;
 
     fn parse(bytes: Vec<u8>, order: RowOrder) -> Result<BTreeMap<u64, Pose>, ReadError> {
-        super::parse(Path::new("a.h5"), bytes, order)
+        let mut problems = Vec::new();
+        let poses = super::parse(Path::new("a.h5"), bytes, order, &mut problems);
+        assert!(problems.is_empty(), "{problems:?}");
+        poses
     }
 
     const MATRIX: [f64; 12] = [0.0, -1.0, 0.0, 4.0, 1.0, 0.0, 0.0, 5.0, 0.0, 0.0, 1.0, 6.0];
@@ -127,10 +143,26 @@ pub(super) mod tests {
     fn what_is_wrong_is_named() {
         let message = |bytes, order| parse(bytes, order).unwrap_err().to_string();
         let stamps: Vec<i64> = (0..11).collect();
-        let scaled = file(&stamps, &[MATRIX.map(|value| 2.0 * value); 11]);
-        assert!(message(scaled, RowOrder::Matrix).starts_with("a.h5: poses: entry 5: pose matrix is not a rotation"));
         assert!(message(file(&stamps, &[MATRIX; 10]), RowOrder::Matrix).contains("shape [10, 12], expected [11, 12]"));
         assert!(message(b"no".to_vec(), RowOrder::Matrix).starts_with("a.h5: no sound HDF5"));
+    }
+
+    #[test]
+    fn a_bad_entry_is_left_out_and_named() {
+        let stamps: Vec<i64> = (0..13).collect();
+        for (value, expected) in [
+            (7.0, "a.h5: poses: entry 6: pose matrix is not a rotation"),
+            (f64::NAN, "a.h5: poses: entry 6: pose component NaN"),
+        ] {
+            let mut rows = [MATRIX; 13];
+            rows[6][0] = value;
+            let mut problems = Vec::new();
+            let poses = super::parse(Path::new("a.h5"), file(&stamps, &rows), RowOrder::Matrix, &mut problems).unwrap();
+            assert_eq!(poses.keys().copied().collect::<Vec<_>>(), [5, 7]);
+            let message = problems[0].to_string();
+            assert!(message.starts_with(expected) && message.ends_with("the row is left out"), "{message}");
+            assert_eq!(problems.len(), 1);
+        }
     }
 
     #[test]
@@ -148,7 +180,7 @@ pub(super) mod tests {
             let mut bytes = file(&(0..12).collect::<Vec<i64>>(), &[MATRIX; 12]);
             let at = at.index(bytes.len());
             bytes[at] = byte;
-            let _ = parse(bytes, RowOrder::Matrix);
+            let _ = super::parse(Path::new("a.h5"), bytes, RowOrder::Matrix, &mut Vec::new());
         }
     }
 }

@@ -13,12 +13,17 @@
 //! ```
 
 mod agent_folders;
+mod annotations;
+mod classes;
 mod error;
+mod faults;
 mod files;
+mod frame_files;
 mod hdf5_poses;
 mod kitti_object;
 mod kitti_odometry;
 mod kitti_text;
+mod layouts;
 mod left_out;
 mod listing;
 mod localization;
@@ -32,6 +37,7 @@ mod problem;
 mod recorded;
 mod unfinished;
 mod v2v4real;
+mod written_pose;
 mod yaml;
 
 use std::path::PathBuf;
@@ -41,9 +47,12 @@ use protocol::{CavId, Handedness};
 use serde::Serialize;
 
 pub use error::ReadError;
+pub use layouts::{LAYOUTS, Layout, LayoutDescription, layouts_text};
 pub use left_out::LeftOut;
 pub use listing::{content_sha256, listing_sha256};
 pub use open::{OpenOptions, open, open_with};
+pub(crate) use points::Plausibility;
+pub use points::{IntensityScale, IntensityScaleError};
 pub use presence::LoadedTick;
 pub use problem::Problem;
 pub use unfinished::UNFINISHED;
@@ -51,26 +60,6 @@ pub use unfinished::UNFINISHED;
 use crate::frame::Frame;
 use crate::pcd::PcdCloud;
 use presence::Absences;
-
-/// The layouts that are known here.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Layout {
-    /// OPV2V, V2XSet, V2X-R, V2VDet and generated scenes: a folder per agent, YAML and PCD per frame, left-handed.
-    Opv2v,
-    /// V2V4Real: the same folders, with pose matrices and objects in the LiDAR frame, right-handed.
-    V2v4Real,
-    /// Localization sequences of NCLT, as recorded or as converted by LightLoc.
-    Nclt,
-    /// Localization sequences of Oxford and QEOxford, as converted by LightLoc.
-    Oxford,
-    /// KITTI odometry.
-    KittiOdometry,
-    /// KITTI object detection.
-    KittiObject,
-    /// A recording of a live run ([`crate::recording`]).
-    Recording,
-}
 
 /// A dataset, or the part of one that was opened.
 #[derive(Debug)]
@@ -179,9 +168,18 @@ impl Scenario {
             (frame.points, frame.dropped_points) = (cloud.points, cloud.dropped);
         }
         if options.radar && self.has_radar {
-            frame.radar = Some(self.source.radar(agent, tick)?.points);
+            frame.radar = Some(self.load_radar(agent_index, tick_index)?.points);
         }
         Ok(frame)
+    }
+
+    /// Reads the radar's points alone.
+    ///
+    /// # Errors
+    /// As [`Self::load`].
+    pub fn load_radar(&self, agent_index: usize, tick_index: usize) -> Result<PcdCloud, ReadError> {
+        let (agent, tick) = self.frame_of(agent_index, tick_index)?;
+        self.source.radar(agent, tick)
     }
 
     /// Reads the LiDAR's points alone: the plain sweep, or a variant of [`Self::lidar_variants`].
@@ -240,11 +238,16 @@ impl Scenario {
     }
 }
 
+/// The vehicle of a layout that does not name it.
+fn single_vehicle_id() -> CavId {
+    CavId::new("0").expect("a digit is an identifier")
+}
+
 /// A scenario of a layout that knows one vehicle and does not name it.
 fn single_vehicle(name: String, layout: Layout, ticks: Vec<Tick>, source: Arc<dyn FrameSource>) -> Scenario {
     Scenario {
         name,
-        agents: vec![CavId::new("0").expect("a digit is an identifier")],
+        agents: vec![single_vehicle_id()],
         ticks,
         missing: Vec::new(),
         roadside_units: Vec::new(),

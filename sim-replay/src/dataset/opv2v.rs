@@ -1,156 +1,108 @@
-//! Frames of OPV2V, V2XSet, V2X-R, V2VDet and generated scenes.
+//! Frames of OPV2V, V2XSet, V2X-R, V2VDet and generated scenes, and of V2X-Real and V2XPnP.
 //!
-//! The files are left-handed: points, poses and boxes are mirrored here, all together.
+//! OPV2V's files are left-handed: points, poses and boxes are mirrored here, all together. V2X-Real comes from real sensors
+//! in the same format: the formula of its matrices is the same, and nothing is mirrored.
 
-use std::path::{Path, PathBuf};
+use std::path::PathBuf;
 
-use protocol::{CavId, Handedness, Pose};
+use protocol::{CavId, Handedness, Pose, PoseError};
 
 use super::agent_folders::ScenarioFolder;
+use super::annotations::{Annotations, speed_mps};
+use super::points::Sweeps;
+use super::written_pose::WrittenPose;
 use super::yaml::{self, Field};
 use super::{FrameSource, ReadError, Tick, points};
 use crate::carla_pose::CarlaPose;
-use crate::frame::{Frame, Object, ObjectClass};
+use crate::frame::Frame;
 use crate::pcd::PcdCloud;
-
-/// Kilometres per hour in a metre per second.
-const KMH_PER_MPS: f64 = 3.6;
 
 /// A scenario of the family.
 #[derive(Debug)]
-pub(super) struct Opv2v(pub(super) ScenarioFolder);
+pub(super) struct Opv2v {
+    pub(super) folder: ScenarioFolder,
+    pub(super) sweeps: Sweeps,
+    pub(super) handedness: Handedness,
+}
 
 impl FrameSource for Opv2v {
     fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame, ReadError> {
-        let path = self.0.yaml(agent, &tick.stem);
+        let path = self.folder.yaml(agent, &tick.stem);
         let node = yaml::read(&path)?;
-        frame_without_points(agent, tick, &Field::root(&path, &node))
+        self.frame_without_points(agent, tick, Field::root(&path, &node))
     }
 
     fn points(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> Result<PcdCloud, ReadError> {
-        mirrored(&self.points_path(agent, tick, variant))
+        self.sweeps.read(agent, &self.points_path(agent, tick, variant)).map(|cloud| self.right_handed(cloud))
     }
 
     fn radar(&self, agent: &CavId, tick: &Tick) -> Result<PcdCloud, ReadError> {
-        mirrored(&self.0.radar(agent, &tick.stem))
+        points::read_pcd(&self.folder.radar(agent, &tick.stem)).map(|cloud| self.right_handed(cloud))
     }
 
     fn annotation_path(&self, agent: &CavId, tick: &Tick) -> Option<PathBuf> {
-        Some(self.0.yaml(agent, &tick.stem))
+        Some(self.folder.yaml(agent, &tick.stem))
     }
 
     fn points_path(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> PathBuf {
-        self.0.pcd(agent, &tick.stem, variant)
+        self.folder.pcd(agent, &tick.stem, variant)
     }
 }
 
-/// Reads left-handed points and makes them right-handed.
-fn mirrored(path: &Path) -> Result<PcdCloud, ReadError> {
-    let mut cloud = points::read_pcd(path)?;
-    points::mirror_y(&mut cloud.points);
-    Ok(cloud)
-}
-
-fn frame_without_points(agent: &CavId, tick: &Tick, root: &Field<'_>) -> Result<Frame, ReadError> {
-    let optional_pose = |key| root.optional(key)?.map(|field| six_numbers(&field)).transpose();
-    Ok(Frame {
-        world_from_lidar: Some(six_numbers(&root.required("lidar_pose")?)?),
-        world_from_vehicle: optional_pose("true_ego_pos")?,
-        gnss_world_from_vehicle: optional_pose("predicted_ego_pos")?,
-        speed_mps: root.optional("ego_speed")?.map(|speed| speed_mps(&speed)).transpose()?,
-        objects: objects(root)?,
-        ..Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Left)
-    })
-}
-
-/// x, y, z, roll, yaw, pitch in metres and degrees.
-fn six_numbers(field: &Field<'_>) -> Result<Pose, ReadError> {
-    let pose = CarlaPose::from(field.numbers::<6>()?).to_pose();
-    pose.validate().map_err(|error| field.error(error.to_string()))?;
-    Ok(pose)
-}
-
-/// km/h to m/s. Relatives of the format write a vector; its length is the speed.
-pub(super) fn speed_mps(field: &Field<'_>) -> Result<f64, ReadError> {
-    let kmh = match field.items() {
-        Ok(_) => field.numbers::<3>()?.iter().map(|component| component * component).sum::<f64>().sqrt(),
-        Err(_) => field.number()?,
-    };
-    Ok(kmh / KMH_PER_MPS)
-}
-
-fn objects(root: &Field<'_>) -> Result<Vec<Object>, ReadError> {
-    object_entries(root)?
-        .into_iter()
-        .map(|(key, field)| {
-            let pose = object_pose(&field)?.to_pose();
-            pose.validate().map_err(|error| field.error(error.to_string()))?;
-            Ok(Object {
-                id: object_id(key, &field)?,
-                class: ObjectClass::Car,
-                world_from_object: pose,
-                size_m: object_size(&field)?,
-                speed_mps: field.optional("speed")?.map(|speed| speed_mps(&speed)).transpose()?,
-            })
+impl Opv2v {
+    fn frame_without_points(&self, agent: &CavId, tick: &Tick, root: Field<'_>) -> Result<Frame, ReadError> {
+        let pose = |field: &Field<'_>| self.six_numbers(field);
+        let world_from_lidar = pose(&root.required("lidar_pose")?)?;
+        let mut annotations = Annotations::new(root);
+        Ok(Frame {
+            world_from_lidar: Some(world_from_lidar),
+            world_from_vehicle: annotations.optional(&["true_ego_pos", "true_ego_pose"], pose),
+            gnss_world_from_vehicle: annotations.optional(&["predicted_ego_pos", "predicted_ego_pose"], pose),
+            speed_mps: annotations.optional(&["ego_speed"], speed_mps),
+            objects: annotations.objects(|id, _| Ok(id), |place| self.world_from(place)),
+            problems: annotations.into_problems(),
+            ..Frame::empty(agent.clone(), tick.capture_nanos, self.handedness)
         })
-        .collect()
-}
-
-/// The map of annotated objects: `vehicles`, or `objects` in relatives of the format.
-pub(super) fn object_entries<'a>(root: &Field<'a>) -> Result<Vec<(&'a str, Field<'a>)>, ReadError> {
-    let has = |key: &str| root.entries().is_ok_and(|entries| entries.iter().any(|(found, _)| *found == key));
-    let key = if !has("vehicles") && has("objects") { "objects" } else { "vehicles" };
-    match root.optional(key)? {
-        Some(field) => field.entries(),
-        // An empty map may be written as nothing; a key that is not there is an error.
-        None if has(key) => Ok(Vec::new()),
-        None => root.required(key).map(|_| Vec::new()),
     }
-}
 
-pub(super) fn object_id(key: &str, field: &Field<'_>) -> Result<i64, ReadError> {
-    key.parse().map_err(|_| field.error(format!("{key:?} is no object id: expected an integer")))
-}
-
-/// Where the box's centre is and how it is turned, in the numbers of the file.
-pub(super) fn object_pose(field: &Field<'_>) -> Result<CarlaPose, ReadError> {
-    let center = field.optional("center")?.map_or(Ok([0.0; 3]), |center| center.numbers::<3>())?;
-    let (location, angle) = (field.required("location")?.numbers()?, field.required("angle")?.numbers()?);
-    Ok(CarlaPose::of_box(location, angle, center))
-}
-
-/// `extent` holds half sizes.
-pub(super) fn object_size(field: &Field<'_>) -> Result<[f64; 3], ReadError> {
-    let extent = field.required("extent")?;
-    let half = extent.numbers::<3>()?;
-    if half.iter().any(|half| !(0.0..=100.0).contains(half)) {
-        return Err(extent.error(format!("{half:?} are no half sizes in metres")));
+    /// x, y, z, roll, yaw, pitch in metres and degrees.
+    fn six_numbers(&self, field: &Field<'_>) -> Result<Pose, ReadError> {
+        match WrittenPose::read(field)? {
+            WrittenPose::SixNumbers(place) => self.world_from(&place).map_err(|error| field.error(error.to_string())),
+            WrittenPose::Matrix(_) => Err(field.error(
+                "a 4x4 matrix as in V2V4Real, but the scenario's first frame has a lidar_pose of 6 numbers as in OPV2V",
+            )),
+        }
     }
-    Ok(half.map(|half| 2.0 * half))
-}
 
-/// What tells a scenario's layouts apart: the first of its frames that can be read.
-pub(super) fn is_v2v4real(path: &Path) -> Result<bool, ReadError> {
-    let node = yaml::read(path)?;
-    let root = Field::root(path, &node);
-    let is_matrix = root.required("lidar_pose")?.numbers::<6>().is_err() && !is_flat_list(&root);
-    let has_association = object_entries(&root)
-        .is_ok_and(|objects| objects.iter().any(|(_, object)| matches!(object.optional("ass_id"), Ok(Some(_)))));
-    Ok(is_matrix || has_association)
-}
+    fn world_from(&self, place: &CarlaPose) -> Result<Pose, PoseError> {
+        match self.handedness {
+            Handedness::Left => {
+                let pose = place.to_pose();
+                pose.validate().map(|()| pose)
+            }
+            Handedness::Right => Pose::from_matrix(&place.left_handed_matrix()),
+        }
+    }
 
-/// A list of scalars of whatever length is a pose of OPV2V, if a wrong one.
-fn is_flat_list(root: &Field<'_>) -> bool {
-    let items = root.required("lidar_pose").and_then(|pose| pose.items());
-    items.is_ok_and(|items| items.iter().all(|item| item.items().is_err()))
+    fn right_handed(&self, mut cloud: PcdCloud) -> PcdCloud {
+        if self.handedness == Handedness::Left {
+            points::mirror_y(&mut cloud.points);
+        }
+        cloud
+    }
 }
 
 #[cfg(test)]
 pub(super) mod tests {
     use std::fs;
 
+    use std::path::Path;
+
+    use super::super::numpy_tags::tests::{pickled_array, pickled_scalar};
     use super::*;
     use crate::dataset::{self, Layout, LoadOptions, Scenario};
+    use crate::frame::ObjectClass;
     use crate::pcd::{self, Encoding, IntensityField};
 
     const YAML: &str = "RSU: false
@@ -191,13 +143,16 @@ vehicles:
         dataset.scenarios.swap_remove(0)
     }
 
-    fn message_with(from: &str, to: &str) -> String {
+    fn load_with(from: &str, to: &str) -> Result<Frame, String> {
         let dir = tempfile::tempdir().unwrap();
         let yaml = YAML.replace(from, to);
         assert_ne!(yaml, YAML);
-        write_frame(dir.path(), "1/000070", &yaml, &[]);
-        let error = opened(dir.path()).load(0, 0, &LoadOptions::default()).unwrap_err();
-        error.to_string().replace(&*dir.path().to_string_lossy(), "")
+        write_frame(dir.path(), "1/000070", &yaml, &[[1.0, 2.0, 3.0, 0.5]]);
+        let root = dir.path().to_string_lossy();
+        let loaded = opened(dir.path()).load(0, 0, &LoadOptions::default());
+        let mut frame = loaded.map_err(|error| error.to_string().replace(&*root, ""))?;
+        frame.problems.iter_mut().for_each(|problem| problem.message = problem.message.replace(&*root, ""));
+        Ok(frame)
     }
 
     #[test]
@@ -244,27 +199,239 @@ vehicles:
     }
 
     #[test]
-    fn what_is_wrong_names_file_line_and_field() {
-        let cases = [
+    fn without_a_pose_of_the_lidar_there_is_no_frame() {
+        let pose = "lidar_pose: [10, 20, 2, 0, 90, 1e-06]";
+        for (to, expected) in [
+            ("lidar_pose: [10, 20, 2]", ":3: lidar_pose: a list of 3, expected 6 numbers or a 4x4 matrix"),
+            ("", ":1: lidar_pose: missing"),
+            ("lidar_pose: [.inf, 20, 2, 0, 90, 0]", ":3: lidar_pose.0: inf, expected a finite number"),
             (
-                "lidar_pose: [10, 20, 2, 0, 90, 1e-06]",
-                "lidar_pose: [10, 20, 2]",
-                ":3: lidar_pose: a list of 3, expected 6 numbers",
+                "lidar_pose: [1e8, 20, 2, 0, 90, 0]",
+                ":3: lidar_pose: pose component 100000000 is not a finite number within 1e7",
             ),
-            ("lidar_pose: [10, 20, 2, 0, 90, 1e-06]\n", "", ":1: lidar_pose: missing"),
-            ("lidar_pose: [10,", "lidar_pose: [.inf,", ":3: lidar_pose.0: inf, expected a finite number"),
+        ] {
+            assert_eq!(load_with(pose, to).unwrap_err(), format!("/1/000070.yaml{expected}"));
+        }
+    }
+
+    #[test]
+    fn a_part_that_cannot_be_right_is_left_out_and_named() {
+        let left_out = ": the object is left out";
+        for (from, to, expected) in [
             (
                 "extent: [2, 1, 0.75]",
                 "extent: [2, -1, 0.75]",
-                ":12: vehicles.4335.extent: [2.0, -1.0, 0.75] are no half sizes in metres",
+                ":12: vehicles.4335.extent: [2.0, -1.0, 0.75] m, expected half sizes above 0 and up to 50 m",
             ),
+            (
+                "extent: [2, 1, 0.75]",
+                "extent: [2, 0.3, 250]",
+                ":12: vehicles.4335.extent: [2.0, 0.3, 250.0] m, expected half sizes above 0 and up to 50 m",
+            ),
+            (
+                "extent: [2, 1, 0.75]",
+                "extent: [0, 0, 0]",
+                ":12: vehicles.4335.extent: [0.0, 0.0, 0.0] m, expected half sizes above 0 and up to 50 m",
+            ),
+            (
+                "extent: [2, 1, 0.75]",
+                "extent: [2, .inf, 1]",
+                ":12: vehicles.4335.extent.1: inf, expected a finite number",
+            ),
+            (
+                "extent: [2, 1, 0.75]",
+                "extent: [2, 1, .nan]",
+                ":12: vehicles.4335.extent.2: NaN, expected a finite number",
+            ),
+            ("extent: [2, 1, 0.75]", "extent: 2", ":12: vehicles.4335.extent: 2, expected a list of 3 numbers"),
+            ("    extent: [2, 1, 0.75]\n", "", ":10: vehicles.4335.extent: missing"),
             ("    location: [10, 30, 0]\n", "", ":10: vehicles.4335.location: missing"),
-            ("  4335:", "  car:", ":10: vehicles.car: \"car\" is no object id: expected an integer"),
-            ("vehicles:", "cars:", ":1: vehicles: missing"),
-        ];
-        for (from, to, expected) in cases {
-            assert_eq!(message_with(from, to), format!("/1/000070.yaml{expected}"));
+            ("    angle: [0, 90, 0]\n", "", ":10: vehicles.4335.angle: missing"),
+            (
+                "angle: [0, 90, 0]",
+                "angle: [0, 1e300, 0]",
+                ":10: vehicles.4335.angle: [0.0, 1e300, 0.0], expected angles in degrees",
+            ),
+            ("location: [10, 30, 0]", "location: [1e30, 30, 0]", ":10: vehicles.4335: pose component"),
+            (
+                "center: [0.5, 0, 0.7]",
+                "center: here",
+                ":11: vehicles.4335.center: the text \"here\", expected a list of 3 numbers",
+            ),
+            ("  4335:\n", "  car:\n", ":10: vehicles.car: \"car\" is no object id, expected an integer"),
+            ("  4335:\n", "  7.5:\n", ":10: vehicles.7.5: \"7.5\" is no object id, expected an integer"),
+            ("  4335:\n", "  7: [1, 2]\n  8: ~\n  4335:\n", ":9: vehicles.7: a list of 2, expected a map"),
+            ("  4335:\n", "  4335: {}\n  4335:\n", ":9: vehicles.4335: listed again below"),
+        ] {
+            let frame = load_with(from, to).unwrap();
+            let first = &frame.problems[0];
+            assert!(first.message.starts_with(&format!("/1/000070.yaml{expected}")), "{}", first.message);
+            assert!(first.message.ends_with(left_out) && first.line.is_some() && first.field.is_some(), "{first:?}");
+            // Points and the other objects stay.
+            let others = usize::from(to.contains("\n  4335:"));
+            assert_eq!((frame.points.len(), frame.objects.len()), (1, others), "{to}");
         }
+    }
+
+    #[test]
+    fn what_is_no_list_of_objects_is_left_out_as_a_whole() {
+        for (to, expected) in [
+            ("cars:", ":1: vehicles: missing: the list of objects is left out"),
+            (
+                "vehicles: [{location: [1, 2, 3]}]\nrest:",
+                ":8: vehicles: a list of 1, expected a map of objects by id: the list of objects is left out",
+            ),
+            ("vehicles: 7\nrest:", ":8: vehicles: 7, expected a map of objects by id: the list of objects is left out"),
+        ] {
+            let frame = load_with("vehicles:", to).unwrap();
+            assert_eq!(frame.problems[0].message, format!("/1/000070.yaml{expected}"));
+            assert_eq!((frame.points.len(), frame.objects.len(), frame.problems.len()), (1, 0, 1));
+        }
+        let frame = load_with("vehicles:", "vehicles: []\nrest:").unwrap();
+        assert!(frame.objects.is_empty() && frame.problems.is_empty());
+    }
+
+    #[test]
+    fn other_fields_are_left_out_one_by_one() {
+        let frame = load_with("true_ego_pos: [10,", "true_ego_pos: [x,").unwrap();
+        assert_eq!((frame.world_from_vehicle, frame.objects.len(), frame.problems.len()), (None, 1, 1));
+        assert!(frame.problems[0].message.ends_with("the field is left out"));
+        for (from, to) in [("speed: 18", "speed: .nan"), ("speed: 18", "speed: 1e9"), ("speed: 18", "speed: [1, x]")] {
+            let frame = load_with(from, to).unwrap();
+            assert_eq!((frame.objects.len(), frame.objects[0].speed_mps, frame.problems.len()), (1, None, 1), "{to}");
+            assert_eq!(frame.problems[0].field.as_deref(), Some("vehicles.4335.speed"));
+        }
+    }
+
+    #[test]
+    fn types_are_read_by_whatever_key() {
+        for key in ["obj_type", "object_type", "class", "type"] {
+            let frame = load_with("speed: 18", &format!("speed: 18\n    {key}: Pedestrian")).unwrap();
+            assert_eq!((frame.objects[0].class, frame.problems.len()), (ObjectClass::Pedestrian, 0), "{key}");
+        }
+        for (kind, found) in [("Ufo", "class: the text \"Ufo\" is no known type"), ("5", "class: 5 is no known type")] {
+            let frame = load_with("speed: 18", &format!("speed: 18\n    class: {kind}")).unwrap();
+            assert_eq!(frame.objects[0].class, ObjectClass::Other);
+            let message = &frame.problems[0].message;
+            assert!(message.contains(found) && !message.contains(".yaml"), "{message}");
+        }
+    }
+
+    #[test]
+    fn coordinates_of_utm_are_places_like_others() {
+        let frame = load_with("[10, 20, 2, 0, 90, 1e-06]", "[692000.5, 9999999, 2, 0, 90, 0]").unwrap();
+        assert_eq!(frame.world_from_lidar.unwrap().translation_m, [692_000.5, -9_999_999.0, 2.0]);
+        let frame = load_with("location: [10, 30, 0]", "location: [692000, 5335000, 500]").unwrap();
+        assert_eq!((frame.objects.len(), frame.problems.len()), (1, 0));
+    }
+
+    #[test]
+    fn a_pickled_pose_of_six_numbers_is_opv2v() {
+        let pickled = pickled_array(&[6], &[10.0, 20.0, 2.0, 0.0, 90.0, 1e-6], "  ");
+        let three = |values: [f64; 3]| pickled_array(&[3], &values, "      ");
+        let id = pickled_scalar("i8", "<", &4335i64.to_le_bytes());
+        let plain = load_with("RSU: false", "RSU: true").unwrap();
+        for (from, to) in [
+            ("lidar_pose: [10, 20, 2, 0, 90, 1e-06]\n", format!("lidar_pose: {pickled}")),
+            ("angle: [0, 90, 0]\n", format!("angle: {}", three([0.0, 90.0, 0.0]))),
+            ("location: [10, 30, 0]\n", format!("location: {}", three([10.0, 30.0, 0.0]))),
+            ("extent: [2, 1, 0.75]\n", format!("extent: {}", three([2.0, 1.0, 0.75]))),
+            ("speed: 18\n", format!("speed: {}\n", pickled_scalar("f4", ">", &18f32.to_be_bytes()))),
+            ("  4335:\n", format!("  ? {id}\n  :\n")),
+            ("true_ego_pos:", "true_ego_pose:".into()),
+        ] {
+            let frame = load_with(from, &to).unwrap();
+            assert_eq!(frame, plain, "{to}");
+        }
+    }
+
+    #[test]
+    fn a_matrix_beside_six_numbers_is_named() {
+        let dir = tempfile::tempdir().unwrap();
+        write_frame(dir.path(), "1/000070", YAML, &[]);
+        let matrix = "lidar_pose: [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]";
+        let other = YAML.replace("lidar_pose: [10, 20, 2, 0, 90, 1e-06]", matrix);
+        write_frame(dir.path(), "2/000070", &other, &[]);
+        let scenario = opened(dir.path());
+        assert_eq!(scenario.layout, Layout::Opv2v);
+        let error = scenario.load(1, 0, &LoadOptions::default()).unwrap_err().to_string();
+        assert!(error.contains("2/000070.yaml:3: lidar_pose: a 4x4 matrix as in V2V4Real"), "{error}");
+    }
+
+    #[test]
+    fn agents_may_have_names() {
+        let dir = tempfile::tempdir().unwrap();
+        for agent in ["car1", "car2", "Car 3"] {
+            write_frame(dir.path(), &format!("scene/{agent}/000070"), YAML, &[]);
+        }
+        let dataset = dataset::open(dir.path()).unwrap();
+        let agents: Vec<&str> = dataset.scenarios[0].agents.iter().map(CavId::as_str).collect();
+        assert_eq!((agents, dataset.problems.len()), (vec!["car1", "car2"], 1));
+        let problem = dataset.problems[0].to_string();
+        assert!(problem.contains("Car 3: it holds frames, but its name is no agent's: CAV id \"Car 3\""), "{problem}");
+        let dir = tempfile::tempdir().unwrap();
+        write_frame(dir.path(), "scene/Car 3/000070", YAML, &[]);
+        let error = dataset::open(dir.path()).unwrap_err().to_string();
+        assert!(error.contains("its name is no agent's"), "{error}");
+    }
+
+    #[test]
+    fn copies_of_agents_and_loose_frames_are_no_agents() {
+        let dir = tempfile::tempdir().unwrap();
+        for frame in ["scene/650/000070", "scene/650_old/000070", "scene/000070"] {
+            write_frame(dir.path(), frame, YAML, &[]);
+        }
+        let dataset = dataset::open(dir.path()).unwrap();
+        assert_eq!((dataset.scenarios[0].name.as_str(), dataset.scenarios[0].agents.len()), ("scene", 1));
+        let problem = dataset.problems[0].to_string();
+        assert!(problem.contains("650_old: it holds frames, but its name is no agent's: no number"), "{problem}");
+    }
+
+    #[test]
+    fn links_to_nothing_cost_what_they_stand_for() {
+        let dir = tempfile::tempdir().unwrap();
+        let link = |name: &str| std::os::unix::fs::symlink("/nowhere", dir.path().join(name)).unwrap();
+        write_frame(dir.path(), "scene/1/000070", YAML, &[]);
+        write_frame(dir.path(), "scene/1/000072", YAML, &[]);
+        link("scene/1/000070_camera0.png");
+        link("beside");
+        assert_eq!(opened(dir.path()).ticks.len(), 2);
+        fs::remove_file(dir.path().join("scene/1/000072.pcd")).unwrap();
+        link("scene/1/000072.pcd");
+        let dataset = dataset::open(dir.path()).unwrap();
+        assert_eq!((dataset.scenarios[0].ticks.len(), dataset.problems.len()), (1, 1));
+        assert!(
+            dataset.problems[0]
+                .to_string()
+                .ends_with("000072.pcd: does not exist beside 000072.yaml: the frame is left out")
+        );
+    }
+
+    #[test]
+    fn bare_floats_beside_yaml_are_v2x_real_and_nothing_is_mirrored() {
+        let dir = tempfile::tempdir().unwrap();
+        for agent in ["1", "2", "-1"] {
+            fs::create_dir_all(dir.path().join(agent)).unwrap();
+            for stem in ["000000", "000001"] {
+                fs::write(dir.path().join(format!("{agent}/{stem}.yaml")), YAML).unwrap();
+                let points = [[1.0f32, 2.0, 3.0, 0.5], [4.0, 5.0, 6.0, 0.25]].concat();
+                let bytes: Vec<u8> = points.iter().flat_map(|value| value.to_le_bytes()).collect();
+                fs::write(dir.path().join(format!("{agent}/{stem}.bin")), bytes).unwrap();
+            }
+        }
+        let scenario = opened(dir.path());
+        assert_eq!((scenario.layout, scenario.source_handedness), (Layout::V2xReal, Handedness::Right));
+        assert_eq!((scenario.ticks.len(), scenario.agents.last().unwrap().as_str()), (2, "-1"));
+        let frame = scenario.load(2, 1, &LoadOptions::default()).unwrap();
+        assert_eq!(frame.points.xyzi, [[1.0, 2.0, 3.0, 0.5], [4.0, 5.0, 6.0, 0.25]]);
+        let lidar = frame.world_from_lidar.unwrap();
+        assert_eq!(lidar.translation_m, [10.0, 20.0, 2.0]);
+        assert!((lidar.yaw_rad().to_degrees() - 90.0).abs() < 1e-9);
+        assert_eq!(
+            frame.objects[0].world_from_object.translation_m,
+            [10.5, 30.0, 0.7],
+            "in the world, not in the LiDAR"
+        );
     }
 
     #[test]

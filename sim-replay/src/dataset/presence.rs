@@ -8,9 +8,14 @@ use protocol::CavId;
 use super::{LoadOptions, MissingFrame, Problem, Scenario, Tick};
 use crate::frame::Frame;
 
-/// Pairs of agent and tick, by their indices, that have no frame.
+/// Who is absent when, and the moments of all agents.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Absences(Arc<HashSet<(usize, usize)>>);
+pub(super) struct Absences {
+    /// Pairs of agent and tick, by their indices, that have no frame.
+    pairs: Arc<HashSet<(usize, usize)>>,
+    /// Moments at which any agent has a frame, in order; none where they are the ticks.
+    moments: Option<Arc<Vec<Tick>>>,
+}
 
 impl Absences {
     /// The missing frames of `agents` at `ticks`; others do not concern them.
@@ -19,7 +24,12 @@ impl Absences {
         let ticks: HashMap<&str, usize> =
             ticks.iter().enumerate().map(|(index, tick)| (tick.stem.as_str(), index)).collect();
         let place = |frame: &MissingFrame| Some((*agents.get(&frame.agent)?, *ticks.get(frame.stem.as_str())?));
-        Self(Arc::new(missing.iter().filter_map(place).collect()))
+        Self { pairs: Arc::new(missing.iter().filter_map(place).collect()), moments: None }
+    }
+
+    /// The same where agents have frames at further moments; `moments` are all of them.
+    pub(super) fn among(self, moments: Vec<Tick>) -> Self {
+        Self { moments: Some(Arc::new(moments)), ..self }
     }
 }
 
@@ -39,7 +49,7 @@ impl Scenario {
     /// Whether an agent has a frame at a tick, by their indices in [`Self::agents`] and [`Self::ticks`].
     #[must_use]
     pub fn is_present(&self, agent_index: usize, tick_index: usize) -> bool {
-        !self.absences.0.contains(&(agent_index, tick_index))
+        !self.absences.pairs.contains(&(agent_index, tick_index))
     }
 
     /// Indices of the agents that have a frame at a tick, the ego first.
@@ -47,10 +57,29 @@ impl Scenario {
         (0..self.agents.len()).filter(move |&agent| self.is_present(agent, tick_index))
     }
 
+    /// The scenario with some of its agents (indices), the first as the ego: its ticks are those at which that one has a
+    /// frame.
+    #[must_use]
+    pub fn arranged(&self, order: &[usize]) -> Self {
+        let agents: Vec<CavId> = order.iter().filter_map(|&index| self.agents.get(index).cloned()).collect();
+        let is_kept = |frame: &&MissingFrame| agents.contains(&frame.agent);
+        let missing: Vec<MissingFrame> = self.missing.iter().filter(is_kept).cloned().collect();
+        let lacking: HashSet<&str> = (missing.iter())
+            .filter(|frame| Some(&frame.agent) == agents.first())
+            .map(|frame| frame.stem.as_str())
+            .collect();
+        let moments = self.absences.moments.as_deref().unwrap_or(&self.ticks);
+        let is_tick = |tick: &&Tick| !lacking.contains(tick.stem.as_str());
+        let ticks: Vec<Tick> = moments.iter().filter(is_tick).cloned().collect();
+        let absences = Absences { moments: self.absences.moments.clone(), ..Absences::new(&agents, &ticks, &missing) };
+        let roadside_units = self.roadside_units.iter().filter(|unit| agents.contains(unit)).cloned().collect();
+        Self { agents, ticks, missing, absences, roadside_units, ..self.clone() }
+    }
+
     /// How many frames of agents other than the ego are missing at its ticks.
     #[must_use]
     pub fn absent_frames(&self) -> usize {
-        self.absences.0.iter().filter(|(_, tick)| *tick < self.ticks.len()).count()
+        self.absences.pairs.iter().filter(|(_, tick)| *tick < self.ticks.len()).count()
     }
 
     /// Reads the frames of `agents` (indices) at a tick: whoever is present and readable.

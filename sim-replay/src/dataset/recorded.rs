@@ -9,7 +9,7 @@ use protocol::{CavId, Gnss, Handedness, Lidar, Limits, Payload, Radar, Stamp, St
 use super::presence::Absences;
 use super::{Dataset, FrameSource, Layout, MissingFrame, ReadError, Scenario, Tick};
 use crate::frame::{Frame, Object, ObjectClass};
-use crate::pcd::PcdCloud;
+use crate::pcd::{IntensityKind, IntensityOrigin, PcdCloud};
 use crate::recording::{Entry, Recording, RecordingError};
 
 /// Name of the recording in a run folder.
@@ -154,12 +154,13 @@ impl FrameSource for Recorded {
 
     fn points(&self, agent: &CavId, tick: &Tick, _: Option<&str>) -> Result<PcdCloud, ReadError> {
         let Lidar { points } = self.sensor(agent, tick, Stream::Lidar)?;
-        Ok(PcdCloud { points, labels: None, dropped: 0, first_dropped: None })
+        let intensity = Some(IntensityOrigin::stored("intensity", IntensityKind::Number));
+        Ok(PcdCloud { points, intensity, form: "recorded message", ..PcdCloud::default() })
     }
 
     fn radar(&self, agent: &CavId, tick: &Tick) -> Result<PcdCloud, ReadError> {
         let Radar { points } = self.sensor(agent, tick, Stream::Radar)?;
-        Ok(PcdCloud { points, labels: None, dropped: 0, first_dropped: None })
+        Ok(PcdCloud { points, ..PcdCloud::default() })
     }
 
     fn points_path(&self, _: &CavId, _: &Tick, _: Option<&str>) -> PathBuf {

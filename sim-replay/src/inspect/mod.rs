@@ -2,16 +2,23 @@
 //!
 //! Every frame is read. What cannot be read becomes a [`Problem`] with file, line and field, and the rest goes on.
 
+mod boxes;
+mod cells;
+mod map;
 mod survey;
+mod sweeps;
 mod table;
 
 use protocol::{CavId, Handedness};
 use serde::Serialize;
 
+pub use map::{MapReport, inspect_map};
 pub use survey::inspect;
+pub use sweeps::SweepReport;
 
 pub use crate::dataset::Problem;
 use crate::dataset::{Layout, MissingFrame};
+use crate::evaluation_protocol::EvaluationProtocol;
 
 /// The findings. Serializes to the JSON of `sim-replay inspect --json`, prints as its table.
 #[derive(Debug, Clone, Serialize)]
@@ -20,6 +27,8 @@ pub struct Report {
     pub path: String,
     /// Its layout, where it has one that is known.
     pub layout: Option<Layout>,
+    /// The protocol that ground truth was merged by: the one of the layout, unless another was asked for.
+    pub protocol: Option<EvaluationProtocol>,
     /// What was found in each scenario.
     pub scenarios: Vec<ScenarioReport>,
     /// Merged ground truth by tick, ego and set of agents: the ego alone, and with all in range.
@@ -62,7 +71,9 @@ pub struct AgentReport {
     pub frames: usize,
     /// Points of a sweep.
     pub points: Option<Summary>,
-    /// Points left out because a number is not finite, over all sweeps.
+    /// Form and intensities of its sweeps; `None` where none has a point.
+    pub sweeps: Option<SweepReport>,
+    /// Points left out because a number is not finite, over all sweeps. Organised clouds have many.
     pub dropped_points: usize,
     /// Radar points of a frame.
     pub radar_points: Option<Summary>,

@@ -18,7 +18,7 @@ use super::traffic::STEP_S;
 use super::world::World;
 use crate::frame::Frame;
 use crate::random::derive_seed;
-use crate::town::{self, Town, TownSource};
+use crate::town::{self, Finding, Town, TownSource};
 
 /// Length of a step of the simulation, nanoseconds.
 const STEP_NANOS: u64 = (STEP_S * 1e9) as u64;
@@ -38,6 +38,8 @@ pub struct Summary {
     pub annotations: usize,
     /// What the layout has no place for, and how often it was left out.
     pub omitted: BTreeMap<&'static str, u64>,
+    /// Parts of the map that were not built as its file gives them.
+    pub findings: Vec<Finding>,
 }
 
 impl Summary {
@@ -63,6 +65,7 @@ pub fn generate(options: &SynthOptions, progress: &(dyn Fn(u64) + Sync)) -> Resu
     let mut total = Summary { layout: options.layout, ..Summary::default() };
     for (place, source) in sources(options).iter().enumerate() {
         let town = town::build(source, options.town_seed)?;
+        total.findings.extend(town.findings.iter().cloned());
         let world = World::new(&town);
         let places = sources(options).len();
         for number in (place..options.scenarios()).step_by(places) {
