@@ -4,7 +4,7 @@ use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 
 use indicatif::ProgressBar;
-use sim_replay::dataset;
+use sim_replay::dataset::{self, IntensityScale, OpenOptions};
 use sim_replay::synth::{ConvertOptions, Converted, SceneLayout, SynthError, convert};
 
 use crate::cli::Outcome;
@@ -25,6 +25,9 @@ pub(crate) struct Args {
     /// Layout of the files.
     #[arg(long, value_enum)]
     layout: SceneLayout,
+    /// Number that stored intensities are divided by [default: by the type and the range of the numbers, as inspect shows].
+    #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
+    intensity_scale: IntensityScale,
     /// Write into a folder that is not empty; what the layout writes there is replaced.
     #[arg(long)]
     force: bool,
@@ -35,7 +38,8 @@ pub(crate) struct Args {
 
 /// Converts and prints a summary to standard output.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
-    let input = match dataset::open(&args.from) {
+    let open = OpenOptions { intensity_scale: args.intensity_scale, ..OpenOptions::default() };
+    let input = match dataset::open_with(&args.from, &open) {
         Ok(input) => input,
         Err(error) => {
             eprintln!("error: {error}");

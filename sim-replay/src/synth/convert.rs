@@ -87,13 +87,12 @@ fn header(scenario: &Scenario, dataset: &Dataset) -> Result<SceneHeader, SynthEr
             format!("scenario {}: two moments at {} and {} ns: times do not rise", scenario.name, pair[0], pair[1]);
         return Err(SynthError::Layout { layout: "of the input", reason });
     }
-    let from = format!("{:?}", dataset.layout);
     let is_roadside = |id: &CavId| scenario.roadside_units.contains(id);
     let agents = scenario.agents.iter().map(|id| SceneAgent { id: id.clone(), is_roadside: is_roadside(id) });
     Ok(SceneHeader {
         name: scenario.name.clone(),
         agents: agents.collect(),
-        origin: converted_yaml(&from, &scenario.name, tick_nanos),
+        origin: converted_yaml(dataset.layout.name(), &scenario.name, tick_nanos),
         capture_nanos,
         tick_nanos,
     })
