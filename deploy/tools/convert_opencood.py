@@ -46,11 +46,13 @@ import sys
 from pathlib import Path
 
 import opencood_names
-from opencood_checkpoint import FLOATS, Refused, read_checkpoint, write_safetensors
+from opencood_checkpoint import read_checkpoint
 from opencood_config import read_config
 from opencood_models import (
     MULTI_SCALE_KIND, check_understood, dataset_method, detector_config, feature_channels, fusion_part,
 )  # fmt: skip
+from opencood_refused import FLOATS, Refused
+from safetensors_file import write_safetensors
 
 # What a network of v2vloc has no use for, by the end or the beginning of its name.
 UNUSED_ENDS = ("num_batches_tracked", "relative_position_index", "relative_indices")

@@ -2,7 +2,7 @@
 
 import json
 
-from opencood_checkpoint import Refused
+from opencood_refused import Refused
 
 EXPECTED = "expected is the config.yaml that lies beside a checkpoint of OpenCOOD, or the same as JSON"
 REQUIRED = object()

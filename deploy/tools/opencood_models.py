@@ -1,6 +1,6 @@
 """The models of the public code bases: their sizes, their fusion, the names of their tensors."""
 
-from opencood_checkpoint import Refused
+from opencood_refused import Refused
 
 MULTI_SCALE_KIND = "multi_scale_detector"
 UNDERSTOOD = (

@@ -22,7 +22,8 @@ from pathlib import Path
 
 import convert_opencood
 import opencood_names
-from opencood_checkpoint import LEGACY_MAGIC, read_checkpoint
+from opencood_checkpoint import read_checkpoint
+from torch_file import LEGACY_MAGIC
 
 HAS_YAML = importlib.util.find_spec("yaml") is not None
 
@@ -241,6 +242,8 @@ class Containers(Conversions):
             (b"\x89HDF\r\n\x1a\nrest", "HDF"),
             (archive({"epoch": 3}), "without tensors (its keys: 'epoch')"),
             (archive([1, 2]), "type list"),
+            (archive(LINEAR()), "type torch.nn.modules.linear.Linear"),
+            (archive({"model": LINEAR()}), "without tensors (its keys: 'model')"),
             (archive(OrderedDict()), "no key at all"),
             (archive({"one": state(), "two": state()}), "2 state dictionaries"),
             (archive(state() | {"cls_head.bias": "text"}), "cls_head.bias"),
