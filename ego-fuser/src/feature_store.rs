@@ -153,7 +153,7 @@ impl FeatureStore {
                 let frame =
                     scenario.load(sweep / self.ticks[index], sweep % self.ticks[index], &LoadOptions::default())?;
                 let map = detector.encode(&frame.points)?.features;
-                let message = self.packed(detector.to_message(&map)?)?;
+                let message = self.packed(detector.to_kept(&map)?)?;
                 let length = u32::try_from(message.len()).map_err(|_| self.io(io::ErrorKind::FileTooLarge.into()))?;
                 let record = [&length.to_le_bytes()[..], &message].concat();
                 self.file.write_all(&record).map_err(|source| self.io(source))?;

@@ -6,7 +6,7 @@ use protocol::{HEADER_LEN, Message, Packing, wire};
 
 /// Kind, length and FNV-1a of each sample in turn. Maps packed by zstd are left out: their bytes are zstd's affair. (A CRC
 /// would not do here: over data that end in their own CRC it is constant.)
-const PINNED: [(&str, usize, u64); 28] = [
+const PINNED: [(&str, usize, u64); 29] = [
     ("lidar", 1693, 0x7925_3f96_ce9b_c855),
     ("lidar", 93, 0x90ae_9b22_d69b_63ad),
     ("radar", 1693, 0x3042_4228_2935_b456),
@@ -26,6 +26,7 @@ const PINNED: [(&str, usize, u64); 28] = [
     ("bev", 772, 0x6269_99c8_0726_2f78),
     ("bev", 584, 0x554b_f1ad_4e15_df6c),
     ("bev", 531, 0x04cb_5d96_2cf7_4e33),
+    ("bev", 2489, 0),
     ("control", 101, 0x9890_f0ab_7c91_454e),
     ("control", 93, 0x35b1_e919_8218_3083),
     ("control", 93, 0xcf32_7f35_0a3b_ba6a),
