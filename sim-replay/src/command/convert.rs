@@ -48,7 +48,10 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
         }
     };
     if overlap(&args.from, &args.out) {
-        eprintln!("error: {}: the input lies there; take another folder for --out", args.out.display());
+        output::note(format_args!(
+            "error: {}: the input lies there; take another folder for --out",
+            args.out.display()
+        ));
         return Ok(Outcome::BadInput);
     }
     let bar = if std::io::stderr().is_terminal() { ProgressBar::new(0) } else { ProgressBar::hidden() };
