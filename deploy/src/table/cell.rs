@@ -43,6 +43,8 @@ pub struct CellKey {
     /// When the ego leaves out neighbours that it does not trust.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub trust: Option<TrustConfig>,
+    /// Boxes at or below this score are not judged.
+    pub score_threshold: f32,
     /// Version of the program.
     pub version: String,
 }
