@@ -88,6 +88,8 @@ pub struct Evaluator {
     /// Who computes what the vehicles see; absent: this process.
     remote: Option<RemoteCrew>,
     ledger: Ledger,
+    /// Bytes of all that neighbours handed to the air.
+    sent_bytes: u64,
 }
 
 impl Evaluator {
@@ -101,8 +103,18 @@ impl Evaluator {
         let codec = CodecConfig { gate: config.codec.gate.or(ego.method().gate()), ..config.codec };
         let config = EvaluateConfig { codec, ..config };
         let weights = Weights::load(&config.weights)?;
-        let (under_way, ledger) = (VecDeque::new(), Ledger::default());
-        Ok(Self { weights, ego, rule, config, under_way, maps: None, stepped: None, remote: None, ledger })
+        Ok(Self {
+            weights,
+            ego,
+            rule,
+            config,
+            under_way: VecDeque::new(),
+            maps: None,
+            stepped: None,
+            remote: None,
+            ledger: Ledger::default(),
+            sent_bytes: 0,
+        })
     }
 
     /// The same with messages that cross the emulated air, in virtual time.
@@ -123,6 +135,12 @@ impl Evaluator {
     #[must_use]
     pub fn ledger(&self) -> &Ledger {
         &self.ledger
+    }
+
+    /// Bytes of all that neighbours handed to the air so far, poses and headers included; 0 without one.
+    #[must_use]
+    pub fn sent_bytes(&self) -> u64 {
+        self.sent_bytes
     }
 
     /// The same with maps that its encoder made before, kept as exactly as messages say them or more: those say the same
