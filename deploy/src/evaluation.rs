@@ -10,7 +10,7 @@ use agent::attack::AttackConfig;
 use agent::pose_source::PoseSourceConfig;
 use agent::rate::RateConfig;
 use agent::weights::Weights;
-use ego_fuser::evaluate::stepped::SteppedConfig;
+use ego_fuser::evaluate::stepped::{ComputeTimes, SteppedConfig};
 use ego_fuser::evaluate::{EvaluateConfig, EvaluateError, EvaluatedFrame, Evaluator};
 use ego_fuser::feature_store::{FeatureStore, KeptMaps, MapSource};
 use ego_fuser::trust::TrustConfig;
@@ -19,7 +19,7 @@ use protocol::{CavId, CodecConfig};
 use sim_replay::dataset::{self, IntensityScale, OpenOptions, ReadError, Scenario};
 use sim_replay::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
 
-use crate::metrics::{Messages, Metrics};
+use crate::metrics::Metrics;
 use crate::score::Board;
 use crate::weights_choice::{WeightsChoiceError, weights_of};
 
@@ -185,7 +185,8 @@ pub(crate) fn judged(
     let channels = evaluator.ego().detector().config().sent_channels();
     let map_values = u64::from(grid.width) * u64::from(grid.height) * u64::try_from(channels).unwrap_or(0);
     let left = options.frames.unwrap_or(usize::MAX);
-    let is_stepped = options.stepped.is_some();
+    // Without a time to compute, a result is as old as its sweep by definition: that is no latency.
+    let is_timed = options.stepped.as_ref().is_some_and(|stepped| stepped.compute != ComputeTimes::NONE);
     let mut board: Option<Board> = None;
     for scenario in options.part.chosen(&scenarios) {
         let Some(ego) = scenario.agents.first() else { continue };
@@ -195,7 +196,7 @@ pub(crate) fn judged(
         let board = board.get_or_insert_with(|| Board::new(ego.clone(), *evaluator.rule(), map_values));
         board.change_ego(ego);
         let judged = evaluator.run(scenario, &mut |frame| {
-            judge(board, frame, is_stepped);
+            judge(board, frame, is_timed);
             on_frame();
             if board.records().len() >= left { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
         })?;
@@ -215,13 +216,13 @@ fn maps(kept: &KeptMaps, weights: &Path, scenarios: &[Scenario]) -> Result<MapSo
     Ok(MapSource::new(Arc::new(store.map_err(|error| EvaluateError::from(Box::new(error)))?), weights))
 }
 
-/// Judges a frame; in virtual time its stamp says when it was published.
-pub(crate) fn judge(board: &mut Board, frame: EvaluatedFrame, is_stepped: bool) {
+/// Judges a frame; where computers take a time its stamp says when it was published.
+pub(crate) fn judge(board: &mut Board, frame: EvaluatedFrame, is_timed: bool) {
     let EvaluatedFrame { tick, stamp, result, frames, poses, objects } = frame;
     let poses: Vec<_> = frames.iter().map(|frame| frame.cav.clone()).zip(poses).collect();
     let truth: Vec<(CavId, _)> =
         frames.iter().filter_map(|frame| Some((frame.cav.clone(), frame.world_from_lidar?))).collect();
-    let latency_ms = is_stepped.then(|| (stamp.publish_nanos - stamp.capture_nanos) as f64 / 1e6);
+    let latency_ms = is_timed.then(|| (stamp.publish_nanos - stamp.capture_nanos) as f64 / 1e6);
     board.judge_whole((tick as u64, stamp.capture_nanos), latency_ms, result, objects, &poses, truth);
 }
 
@@ -231,6 +232,6 @@ pub(crate) fn metrics(board: &Board, evaluator: &Evaluator, options: &Evaluation
         None => ("offline", began.elapsed().as_secs_f64()),
     };
     let names = [evaluator.ego().method().name(), options.pose_source.name()];
-    let metrics = Metrics::of(board, clock, names, seconds, Messages::of(&evaluator.ledger().total()));
+    let metrics = Metrics::of(board, clock, names, seconds, evaluator.ledger(), Some(evaluator.sent_bytes()));
     Metrics { left_out: evaluator.left_out().clone(), protocol: evaluator.protocol(), ..metrics }
 }

@@ -21,7 +21,7 @@ use tch::{Kind, TchError, Tensor, no_grad};
 use crate::fusion::{AlignedMaps, EarlierMaps, FusionStage, SentMaps, StageError, ViewFacts};
 use crate::history::{History, KeptMap};
 use crate::method::{Exchange, Method};
-use crate::model::{METHOD_KEY, SCORE_THRESHOLD};
+use crate::model::METHOD_KEY;
 use crate::numbers;
 use crate::samples::merge_points;
 use crate::trust::{Belief, Trust, TrustConfig};
@@ -97,7 +97,6 @@ impl Ego {
 
     fn assembled(detector: Detector, method: Method, fusion: FusionStage) -> Self {
         let limits = PostprocessConfig::for_detector(detector.config());
-        let limits = PostprocessConfig { score_threshold: SCORE_THRESHOLD, ..limits };
         let history = History::new(fusion.frames());
         Self { method, detector, fusion, history, trust: None, limits, comm_range_m: Self::COMM_RANGE_M }
     }

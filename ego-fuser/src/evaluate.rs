@@ -103,6 +103,8 @@ pub struct Evaluator {
     ledger: Ledger,
     /// Data that could not be used.
     left_out: LeftOut,
+    /// Bytes of all that neighbours handed to the air.
+    sent_bytes: u64,
 }
 
 impl Evaluator {
@@ -132,6 +134,7 @@ impl Evaluator {
             remote: None,
             ledger: Ledger::default(),
             left_out: LeftOut::default(),
+            sent_bytes: 0,
         })
     }
 
@@ -153,6 +156,12 @@ impl Evaluator {
     #[must_use]
     pub fn ledger(&self) -> &Ledger {
         &self.ledger
+    }
+
+    /// Bytes of all that neighbours handed to the air so far, poses and headers included; 0 without one.
+    #[must_use]
+    pub fn sent_bytes(&self) -> u64 {
+        self.sent_bytes
     }
 
     /// The same with maps that its encoder made before, kept as exactly as messages say them or more: those say the same

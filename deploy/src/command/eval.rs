@@ -37,7 +37,8 @@ pub(crate) struct Arguments {
     /// Fusion methods, as `ego-fuser methods` lists them; several give one table.
     #[arg(long, value_name = "NAME", value_delimiter = ',', required_unless_present = "table")]
     method: Vec<Method>,
-    /// Weights of the detector, or a folder with a file *-METHOD.safetensors for each method.
+    /// Weights of the detector; or a folder with *-METHOD.safetensors or METHOD/weights.safetensors for each method; or the
+    /// folder of a training.
     #[arg(long, value_name = "FILE", required_unless_present = "table")]
     weights: Option<PathBuf>,
     /// Instead: a file of tables, rows of methods and columns of conditions; cells that are done are kept in --out.
@@ -88,7 +89,7 @@ pub(crate) struct Arguments {
     /// Oldest map that is still fused, by capture time, milliseconds (--link).
     #[arg(long, value_name = "MS", default_value_t = 300, requires = "link")]
     max_age: u64,
-    /// Compute time of pose, map and fusion, milliseconds, for example 20,60,30 (--link).
+    /// Compute time of pose, map and fusion, milliseconds, for example 20,60,30; without it no latency is told (--link).
     #[arg(long, value_name = "MS,MS,MS", value_delimiter = ',', num_args = 1, default_values_t = [0.0; 3], requires = "link")]
     compute: Vec<f64>,
     /// Lets neighbours lie: to see what that does to the ego.

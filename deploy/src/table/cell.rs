@@ -47,6 +47,8 @@ pub struct CellKey {
     /// The protocol that was asked for.
     #[serde(default, skip_serializing_if = "is_default")]
     pub protocol: ProtocolConfig,
+    /// Boxes at or below this score are not judged.
+    pub score_threshold: f32,
     /// Version of the program.
     pub version: String,
 }

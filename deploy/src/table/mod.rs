@@ -12,6 +12,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use agent::postprocess::SCORE_THRESHOLD;
 use agent::rate::RateConfig;
 use sim_replay::dataset::{self, ReadError};
 
@@ -153,6 +154,7 @@ impl Run<'_> {
             attack: column.attack,
             trust: column.trust.then(TrustConfig::default),
             protocol: self.spec.protocol.clone(),
+            score_threshold: SCORE_THRESHOLD,
             version: env!("CARGO_PKG_VERSION").to_owned(),
         };
         let known = Cell::read(&key, &self.cells)?;

@@ -131,11 +131,23 @@ impl Arguments {
     /// Trains and says what came of it.
     pub(crate) fn run(&self) -> Result<()> {
         let config = self.config()?;
-        let mut bar = Progress::default();
+        let mut bar = Progress(TrainingBar::of(config.run.length));
+        if let Some(hint) = self.hint() {
+            bar.0.say(hint);
+        }
         let summary = train::run(&config, &mut bar).map_err(blamed)?;
         bar.0.finish();
         self.options.print(&summary.trained, &serde_json::json!({"accuracy": summary.accuracy}))?;
         Ok(())
+    }
+
+    /// What is faster where a training from scratch was not meant.
+    fn hint(&self) -> Option<&'static str> {
+        // Merged points are encoded together, by an encoder that learns with the rest.
+        (self.init.is_none() && self.method != Method::Early).then_some(
+            "training from scratch, encoder and all; --init deploy/weights/lean-max.safetensors --freeze-encoder learns \
+             fusion and head alone, several times faster",
+        )
     }
 
     fn config(&self) -> Result<TrainConfig> {
@@ -256,7 +268,6 @@ enum Mode {
 }
 
 /// Shows on standard error how it goes.
-#[derive(Default)]
 struct Progress(TrainingBar);
 
 impl Observer for Progress {
@@ -272,7 +283,7 @@ impl Observer for Progress {
 
     fn stepped(&mut self, report: &StepReport) {
         let text = format!(
-            "step {} epoch {:.2} loss {:.3} = {:.3} + {:.3} lr {:.1e} {:.1} samples/s, {:.0} % waiting",
+            "step {} epoch {:.2} loss {:.3} = scores {:.3} + boxes {:.3} lr {:.1e} {:.1} samples/s, {:.0} % waiting",
             report.step,
             report.epoch,
             report.score_loss + report.box_loss,

@@ -355,6 +355,7 @@ impl<'a> Run<'a> {
             self.courier.close(cav, waiting);
         }
         self.evaluator.ledger.merge(self.courier.ledger());
+        self.evaluator.sent_bytes += self.courier.sent_bytes();
     }
 }
 

@@ -18,7 +18,7 @@ use tch::{Device, no_grad};
 use super::{MultiScaleNetwork, MultiScaleOutput, Placement};
 use crate::ego::Ego;
 use crate::evaluate::rule_for;
-use crate::model::{ModelError, SCORE_THRESHOLD, flat};
+use crate::model::{ModelError, flat};
 use crate::samples::merge_points;
 
 /// Detects in the recorded sweeps of several vehicles, by their recorded poses.
@@ -39,12 +39,11 @@ impl OfflineDetector {
     pub fn load(path: &Path) -> Result<Self, ModelError> {
         let network = MultiScaleNetwork::load(path, Device::Cpu)?;
         let config = &network.network().config;
-        let limits = PostprocessConfig { score_threshold: SCORE_THRESHOLD, ..PostprocessConfig::for_detector(config) };
         Ok(Self {
             crop: Crop::for_detector(config),
             voxeliser: Voxeliser::for_detector(config),
             anchors: Anchors::for_detector(config),
-            limits,
+            limits: PostprocessConfig::for_detector(config),
             network,
         })
     }

@@ -11,6 +11,9 @@ use crate::ego::Content;
 
 /// Boxes below this score say nothing about who sent them.
 const SURE: f32 = 0.3;
+/// Boxes at or below this score are no evidence for or against who sent them. It has nothing to do with which boxes are
+/// judged.
+const EVIDENT: f32 = 0.2;
 /// Values of a map that are compared to tell copies, spread over it.
 const PRINT_VALUES: usize = 4096;
 /// How far a detector looks, where there is no map to say so, metres.
@@ -42,8 +45,8 @@ impl Seen {
             Content::Features(map) => Self::in_map(&detector.received(map)?, map.sent.as_deref(), detector, empty),
             Content::Boxes(found) => {
                 let at = |[x, y, _]: [f64; 3]| [x, y];
-                let all: Vec<_> = found.iter().map(|found| (at(found.box3d.center_m), found.score)).collect();
-                Ok(Self::of_boxes(all))
+                let evident = found.iter().filter(|found| found.score > EVIDENT);
+                Ok(Self::of_boxes(evident.map(|found| (at(found.box3d.center_m), found.score)).collect()))
             }
             Content::Points(points) => {
                 let encoded = detector.encode(points)?.features;
@@ -136,6 +139,11 @@ pub(super) fn likeness(one: &[f32], other: &[f32]) -> f64 {
 
 #[cfg(test)]
 mod tests {
+    use agent::model_config::DetectorConfig;
+    use agent::point_pillars::PointPillars;
+    use protocol::{Box3d, Detection};
+    use tch::nn::VarStore;
+
     use super::*;
 
     #[test]
@@ -151,6 +159,22 @@ mod tests {
         assert_eq!(seen.sure_at([1.0, 0.5], 1.0), Some(0.8));
         assert_eq!(seen.sure_at([-2.0, 0.5], 1.0), Some(0.0));
         assert_eq!(seen.sure_at([20.0, 0.5], 1.0), None);
+    }
+
+    #[test]
+    fn boxes_that_are_judged_but_hardly_seen_are_no_evidence() {
+        let network = VarStore::new(tch::Device::Cpu);
+        let config = DetectorConfig { lidar_range_m: [-12.8, -6.4, -3.0, 12.8, 6.4, 1.0], ..DetectorConfig::lean() };
+        let mut detector = Detector::from_network(PointPillars::new(&network.root(), &config).unwrap());
+        let found = [(4.0, 0.7), (8.0, 0.25), (12.0, 0.15)].map(|(x, score)| Detection {
+            box3d: Box3d { center_m: [x, 0.0, -1.0], size_m: [4.4, 1.9, 1.6], heading_rad: 0.0 },
+            score,
+            source: None,
+        });
+        let seen = Seen::in_message(&Content::Boxes(found.to_vec()), &mut detector, &[]).unwrap();
+        assert_eq!(seen.vehicles, [[4.0, 0.0]]);
+        assert_eq!((seen.sure_at([8.0, 0.0], 1.0), seen.sure_at([12.0, 0.0], 1.0)), (Some(0.25), Some(0.0)));
+        assert_eq!(seen.print.len(), 2 * 3);
     }
 
     #[test]
