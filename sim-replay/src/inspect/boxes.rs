@@ -8,10 +8,11 @@ const ENOUGH_BOXES: usize = 20;
 const MAX_EMPTY_SHARE: f64 = 0.5;
 const HINT: &str = "frames (axes, order of the pose's numbers) or units of the boxes may be wrong";
 
-/// The finding that agents list vehicles, and none is ground truth of any ego.
-pub(super) fn without_ground_truth(scenario: &str, vehicles: usize, merged: usize) -> Option<Problem> {
-    let reason = format!("ground truth 0 for every ego and tick, though agents list {vehicles} vehicles: {HINT}");
-    (vehicles > 0 && merged == 0).then(|| problem(scenario, "ground truth", &reason))
+/// The finding that agents list `targets` objects of the classes that count, and none is ground truth of any ego.
+pub(super) fn without_ground_truth(scenario: &str, targets: usize, merged: usize) -> Option<Problem> {
+    let reason =
+        format!("ground truth 0 for every ego and tick, though agents list {targets} objects of its classes: {HINT}");
+    (targets > 0 && merged == 0).then(|| problem(scenario, "ground truth", &reason))
 }
 
 /// The finding that most boxes of an agent are empty. `boxes` are those of frames whose points were read.

@@ -28,7 +28,6 @@ struct FrameFindings {
     dropped: usize,
     radar_points: Option<usize>,
     boxes: Option<usize>,
-    vehicles: usize,
     /// Boxes of a frame whose points were read.
     boxes_with_sweep: usize,
     boxes_without_points: usize,
@@ -40,6 +39,8 @@ struct FrameFindings {
 #[derive(Debug)]
 struct TickFindings {
     agents: Vec<FrameFindings>,
+    /// Objects of all agents that are of the protocol's classes.
+    targets: usize,
     merged: Vec<TickReport>,
 }
 
@@ -116,11 +117,9 @@ fn counted(problems: Vec<Problem>) -> Vec<Problem> {
 
 /// Doubts about the boxes of a scenario as a whole.
 fn box_problems(scenario: &ScenarioReport, findings: &[TickFindings]) -> Vec<Problem> {
-    let frames = || findings.iter().flat_map(|tick| &tick.agents);
-    let vehicles = frames().map(|frame| frame.vehicles).sum();
+    let targets = findings.iter().map(|tick| tick.targets).sum();
     let merged = findings.iter().flat_map(|tick| &tick.merged).map(|tick| tick.merged_boxes).sum();
-    let mut problems: Vec<Problem> =
-        boxes::without_ground_truth(&scenario.name, vehicles, merged).into_iter().collect();
+    let mut problems: Vec<Problem> = boxes::without_ground_truth(&scenario.name, targets, merged).into_iter().collect();
     for (index, agent) in scenario.agents.iter().enumerate() {
         let boxes = findings.iter().map(|tick| tick.agents[index].boxes_with_sweep).sum();
         problems.extend(boxes::mostly_empty(&scenario.name, agent, boxes));
@@ -141,8 +140,10 @@ fn survey_tick(scenario: &Scenario, tick: usize, rule: &GroundTruthRule) -> Tick
         frames.extend(frame);
     }
     let frames: Vec<&Frame> = frames.iter().collect();
+    let objects = frames.iter().flat_map(|frame| &frame.objects);
+    let targets = objects.filter(|object| rule.classes.contains(object.class)).count();
     let merged = merged_counts(scenario, tick, &frames, rule);
-    TickFindings { agents, merged }
+    TickFindings { agents, targets, merged }
 }
 
 fn survey_frame(scenario: &Scenario, agent: usize, tick: usize) -> (FrameFindings, Option<Frame>) {
@@ -157,7 +158,6 @@ fn survey_frame(scenario: &Scenario, agent: usize, tick: usize) -> (FrameFinding
     if let Some(frame) = &frame {
         findings.problems.extend(frame.problems.iter().cloned());
         findings.boxes = Some(frame.objects.len());
-        findings.vehicles = frame.objects.iter().filter(|object| object.class.is_vehicle()).count();
         findings.world_from_lidar = frame.world_from_lidar;
         if let Some(points) = &plain {
             let cells = Cells::new(points);
@@ -454,7 +454,7 @@ mod tests {
             [
                 "scene: agent 1: 20 of 20 boxes (100 %) hold none of its points: frames (axes, order of the pose's \
                  numbers) or units of the boxes may be wrong",
-                "scene: ground truth 0 for every ego and tick, though agents list 20 vehicles: frames (axes, order of \
+                "scene: ground truth 0 for every ego and tick, though agents list 20 objects of its classes: frames (axes, order of \
                  the pose's numbers) or units of the boxes may be wrong",
             ]
         );
