@@ -224,6 +224,29 @@ mod tests {
         }
     }
 
+    /// Scenes of a seed are the same from one version to the next only in the same towns.
+    #[test]
+    fn our_own_towns_stay_what_they_are() {
+        for (source, counts, sums) in [
+            (TownSource::Town1, [168, 4221, 445, 0], [4735203.0653, 2410977.6519, 244239.8916]),
+            (TownSource::Town4, [172, 11365, 286, 192], [2554837.7919, 1465742.7106, 139175.4820]),
+        ] {
+            let town = build(&source, 0).unwrap();
+            let sum = |values: &mut dyn Iterator<Item = [f64; 3]>| -> f64 {
+                values.map(|[x, y, z]| x + 2.0 * y + 3.0 * z).sum()
+            };
+            let found = [
+                sum(&mut town.lanes.lanes.iter().flat_map(|lane| &lane.centerline).copied()),
+                sum(&mut town.solids.iter().map(|solid| solid.center_m)),
+                sum(&mut town.parking.iter().map(|spot| [spot.center_m[0], spot.center_m[1], spot.yaw_rad])),
+            ];
+            let counted = [town.lanes.lanes.len(), town.solids.len(), town.parking.len(), town.ground.decks.len()];
+            assert_eq!(counted, counts, "{source:?}");
+            assert!(found.iter().zip(sums).all(|(found, sum): (&f64, f64)| (found - sum).abs() < 0.01), "{found:?}");
+            assert!(town.findings.is_empty() && town.lanes.lanes.iter().all(|lane| lane.banks_rad.is_empty()));
+        }
+    }
+
     #[test]
     fn unusable_maps_are_refused_with_their_path() {
         let folder = tempfile::tempdir().unwrap();
