@@ -405,9 +405,10 @@ mod tests {
         let (messages, table) = of_intensities(&[&[0.0, 51.0, 255.0]]);
         assert!(messages.is_empty() && table.contains("divided by 255: 0.000 to 1.000, median 0.200"), "{table}");
         let message = |sweeps: &[&[f32]]| of_intensities(sweeps).0.concat();
+        assert_eq!(message(&[&[0.5; 19]]), "", "few points tell nothing");
         assert_eq!(
-            message(&[&[0.5], &[0.5, 0.5]]),
-            "/1: sweeps of agent 1: all 3 intensities are 0.5 (field intensity divided by 1), expected a sensor's, which \
+            message(&[&[0.5; 19], &[0.5]]),
+            "/1: sweeps of agent 1: all 20 intensities are 0.5 (field intensity divided by 1), expected a sensor's, which \
              differ"
         );
         assert_eq!(

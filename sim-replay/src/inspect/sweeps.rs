@@ -11,6 +11,8 @@ use crate::pcd::{IntensityKind, IntensityOrigin, PcdCloud};
 
 /// Points of a sweep that its median is taken of at most.
 const MEDIAN_OF: usize = 4096;
+/// Fewer points than this may all have the same intensity.
+const LEAST_POINTS: usize = 20;
 /// Divisors that need no explanation: 0 to 1, and a byte.
 const USUAL_DIVISORS: [f32; 2] = [1.0, 255.0];
 
@@ -124,7 +126,7 @@ fn intensity_fault(report: &SweepReport, sweeps: &[&SweepFindings], scale: Inten
     if below > 0 {
         return Some(format!("{below} of {points} intensities are below 0, down to {min} ({from})"));
     }
-    if points > 1 && min.total_cmp(&max).is_eq() {
+    if points >= LEAST_POINTS && min.total_cmp(&max).is_eq() {
         return Some(format!("all {points} intensities are {min} ({from}), expected a sensor's, which differ"));
     }
     let is_unusual = scale == IntensityScale::AUTO && !USUAL_DIVISORS.contains(&origin.divisor);

@@ -111,11 +111,13 @@ fn what_is_neither_is_refused_with_the_figure() {
     for bytes in [doubles, integers] {
         let (dir, sweeps) = agent(SweepStorage::ByName, &[("0.bin", bytes)]);
         let message = sweeps.read(&id(), &dir.path().join("0.bin")).unwrap_err().to_string();
-        assert!(message.contains("no sweep of x y z intensity or x y z intensity ring as f32: with"), "{message}");
-        assert!(
-            message.contains("% of the points have a number beyond 1e7 or below 1e-30, usual is none"),
-            "{message}"
-        );
+        assert!(message.contains("no sweep of x y z intensity or x y z intensity ring as f32: "), "{message}");
+        assert!(message.contains("% of the numbers are beyond 1e7 or below 1e-30, usual is none"), "{message}");
+    }
+    for (count, behind) in [(3, vec![]), (6, vec![0.5, 3.0, 0.01]), (7, vec![0.5, 3.0, 0.01, 9.0])] {
+        let (dir, sweeps) = agent(SweepStorage::ByName, &[("0.bin", turn(400, |_| behind.clone()))]);
+        let message = sweeps.read(&id(), &dir.path().join("0.bin")).unwrap_err().to_string();
+        assert!(message.contains(&format!("it looks like {count} floats per point, expected 4")), "{message}");
     }
 }
 

@@ -3,13 +3,15 @@
 mod file;
 mod writers;
 
+use std::sync::LazyLock;
+
 use proptest::prelude::*;
 
 use super::*;
 use file::{File, Number};
 
 /// A file of each kind to damage: our own, and those of PCL and Open3D with what they leave behind.
-pub(super) fn samples() -> Vec<Vec<u8>> {
+static SAMPLES: LazyLock<Vec<Vec<u8>>> = LazyLock::new(|| {
     let cloud = PointCloud { xyzi: (0..20).map(|i| [i as f32, -1.5, 0.25, 1.0 - i as f32 / 64.0]).collect() };
     let ours = [Encoding::Ascii, Encoding::Binary]
         .into_iter()
@@ -18,12 +20,12 @@ pub(super) fn samples() -> Vec<Vec<u8>> {
     ours.chain([binary::tests::compressed(&cloud)])
         .chain(writers::all().into_iter().map(|variant| variant.bytes))
         .collect()
-}
+});
 
 #[test]
 fn every_truncation_is_an_error_or_cuts_what_is_not_needed() {
-    for file in samples() {
-        let whole = decode(&file).unwrap();
+    for file in SAMPLES.iter() {
+        let whole = decode(file).unwrap();
         let is_text = file.windows(10).any(|window| window == b"DATA ascii");
         for length in 0..file.len() {
             let Ok(cloud) = decode(&file[..length]) else { continue };
@@ -58,8 +60,7 @@ proptest! {
         cut in any::<prop::sample::Index>(),
         (at, inserted) in (any::<prop::sample::Index>(), prop::collection::vec(any::<u8>(), 0..9)),
     ) {
-        let mut files = samples();
-        let mut file = files.swap_remove(which.index(files.len()));
+        let mut file = which.get(&SAMPLES).clone();
         for (at, value) in flips {
             let at = at.index(file.len());
             file[at] = value;
