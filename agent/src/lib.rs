@@ -29,7 +29,6 @@ pub mod process;
 pub mod rate;
 pub mod registration;
 pub mod residual;
-pub mod rotated_iou;
 pub mod shrink;
 pub mod sparse;
 pub mod statistics;

@@ -3,11 +3,11 @@
 use nalgebra::{Isometry3, Point3};
 use protocol::{Box3d, CavId, Detection};
 use serde::{Deserialize, Serialize};
+use sim_replay::rotated_iou::Polygon;
 
 use crate::decode::Decoded;
 use crate::model_config::DetectorConfig;
 use crate::nms::rotated_nms;
-use crate::rotated_iou::Polygon;
 
 /// Limits of the clean-up, with the reference's numbers as defaults.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

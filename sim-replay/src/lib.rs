@@ -17,6 +17,7 @@ pub mod link;
 pub mod pcd;
 pub mod random;
 pub mod recording;
+pub mod rotated_iou;
 pub mod stream;
 pub mod synth;
 pub mod town;
