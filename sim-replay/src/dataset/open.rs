@@ -13,7 +13,7 @@ use super::v2v4real::V2v4Real;
 use super::written_pose::WrittenPose;
 use super::yaml::{self, Field};
 use super::{
-    Dataset, FrameSource, Layout, ReadError, Scenario, Tick, files, kitti_object, kitti_odometry, layouts_text,
+    Dataset, FrameSource, Layout, ReadError, Scenario, Tick, dair, files, kitti_object, kitti_odometry, layouts_text,
     localization, recorded,
 };
 
@@ -56,6 +56,9 @@ pub fn open(dir: &Path) -> Result<Dataset, ReadError> {
 pub fn open_with(dir: &Path, options: &OpenOptions) -> Result<Dataset, ReadError> {
     if let Some(file) = recorded::file_of(dir) {
         return recorded::open(&file);
+    }
+    if let Some(dataset) = dair::open(dir, options)? {
+        return Ok(dataset);
     }
     let mut problems = Vec::new();
     let folders = agent_folders::find(dir, &mut problems)?;
