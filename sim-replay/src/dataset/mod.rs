@@ -32,6 +32,7 @@ mod listing;
 mod localization;
 mod nclt_ground_truth;
 mod numpy_tags;
+mod nuscenes;
 mod open;
 mod opv2v;
 mod points;

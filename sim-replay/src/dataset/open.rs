@@ -14,7 +14,7 @@ use super::written_pose::WrittenPose;
 use super::yaml::{self, Field};
 use super::{
     Dataset, FrameSource, Layout, ReadError, Scenario, Tick, dair, files, kitti_object, kitti_odometry, layouts_text,
-    localization, recorded,
+    localization, nuscenes, recorded,
 };
 
 /// How far below the opened folder sequences of a single vehicle are looked for.
@@ -57,8 +57,10 @@ pub fn open_with(dir: &Path, options: &OpenOptions) -> Result<Dataset, ReadError
     if let Some(file) = recorded::file_of(dir) {
         return recorded::open(&file);
     }
-    if let Some(dataset) = dair::open(dir, options)? {
-        return Ok(dataset);
+    for reader in [dair::open, nuscenes::open] {
+        if let Some(dataset) = reader(dir, options)? {
+            return Ok(dataset);
+        }
     }
     let mut problems = Vec::new();
     let folders = agent_folders::find(dir, &mut problems)?;
