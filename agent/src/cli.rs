@@ -7,6 +7,7 @@ use anyhow::Context;
 use clap::{Parser, Subcommand};
 use sim_replay::bus::BusError;
 use sim_replay::dataset::LeftOut;
+use sim_replay::output;
 
 use crate::command;
 
@@ -47,7 +48,7 @@ impl Outcome {
     /// Prints what was left out, if anything was.
     pub(crate) fn of(left_out: &LeftOut) -> Self {
         for problem in left_out.problems() {
-            eprintln!("left out: {}", problem.message);
+            output::note(format_args!("left out: {}", problem.message));
         }
         if left_out.is_nothing() { Self::Done } else { Self::DataLost }
     }
@@ -66,7 +67,7 @@ pub(crate) fn run(cli: Cli) -> ExitCode {
         Ok(Outcome::Done) => ExitCode::SUCCESS,
         Ok(Outcome::DataLost) => ExitCode::from(3),
         Err(error) => {
-            eprintln!("error: {error:#}");
+            output::note(format_args!("error: {error:#}"));
             let is_bad_input = error.is::<BadInput>() || BusError::is_behind(error.as_ref());
             if is_bad_input { ExitCode::from(2) } else { ExitCode::FAILURE }
         }

@@ -1,5 +1,7 @@
 //! What one connected vehicle does with its sweep: where am I, what do I see, what do I tell the others.
 
+#![warn(clippy::print_stdout, clippy::print_stderr)]
+
 pub mod agent;
 pub mod agent_attention;
 pub mod anchors;

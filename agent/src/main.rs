@@ -1,5 +1,7 @@
 //! Command line of `agent`.
 
+#![warn(clippy::print_stdout, clippy::print_stderr)]
+
 mod cli;
 mod command;
 

@@ -4,8 +4,9 @@
     pip install eclipse-zenoh
     read_detections.py --connect tcp/127.0.0.1:7447 [--run RUN] [--count FRAMES]
 
-Boxes are in the frame of the ego's LiDAR: x forward, y left, z up; metres and radians. `frame_index` counts the frames
-of the ego's own agent; a number left out is a frame that was never decided.
+Boxes are in the frame of the ego's LiDAR: x forward, y left, z up; metres and radians. `agent_frame` counts the
+frames of the ego's own agent; a number left out is a frame that was never decided. `tick`, of the scene, is known to
+the scorer alone, which writes it to detections.jsonl; capture times are the same everywhere.
 """
 import argparse
 import json
@@ -27,7 +28,7 @@ with zenoh.open(config) as session:
     for number, sample in enumerate(subscriber, start=1):
         frame = json.loads(sample.payload.to_string())
         ages = ", ".join(f"{one['cav']} ({one['age_nanos'] / 1e6:.0f} ms old)" for one in frame["fused"])
-        print(f"ego {frame['ego']} frame {frame['frame_index']} at {frame['capture_nanos'] / 1e9:.1f} s,"
+        print(f"ego {frame['ego']} frame {frame['agent_frame']} at {frame['capture_nanos'] / 1e9:.1f} s,"
               f" {frame['method']}, with {ages or 'nobody'}:")
         for found in frame["detections"]:
             (x, y, z), (l, w, h) = found["box"]["center_m"], found["box"]["size_m"]

@@ -48,6 +48,7 @@ impl CrewProcesses {
         let endpoint = place.endpoint.as_str();
         let mut specs = fleet.processes(&Meeting { run, endpoint, keys: keys.as_ref(), programs, folder });
         specs.retain(|spec| spec.program.ends_with("agent"));
+        place.check_free(&fleet.scenario.network, run, &specs)?;
         let identity = Identity {
             run: run.clone(),
             process: ProcessId::new(NAME).expect("lower-case letters"),

@@ -16,7 +16,7 @@ use ego_fuser::feature_store::{FeatureStore, KeptMaps, MapSource};
 use ego_fuser::trust::TrustConfig;
 use ego_fuser::{Exchange, Method};
 use protocol::{CavId, CodecConfig};
-use sim_replay::dataset::{self, ReadError, Scenario};
+use sim_replay::dataset::{self, IntensityScale, OpenOptions, ReadError, Scenario};
 use sim_replay::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
 
 use crate::metrics::{Messages, Metrics};
@@ -72,6 +72,8 @@ pub struct Part {
     pub scenarios: Option<usize>,
     /// The first so many ticks of each; all where absent.
     pub ticks: Option<usize>,
+    /// Divisor of the intensities of its sweeps.
+    pub intensity_scale: IntensityScale,
 }
 
 impl Part {
@@ -81,7 +83,8 @@ impl Part {
     /// # Errors
     /// [`EvaluationError`] when it cannot be read, or the protocol contradicts itself.
     pub fn open(&self, path: &Path, protocol: &ProtocolConfig) -> Result<OpenedData, EvaluationError> {
-        let dataset = dataset::open(path)?;
+        let options = OpenOptions { intensity_scale: self.intensity_scale, ..OpenOptions::default() };
+        let dataset = dataset::open_with(path, &options)?;
         let protocol = protocol.resolve(dataset.layout).map_err(EvaluationError::Protocol)?;
         let mut scenarios: Vec<Scenario> =
             dataset.scenarios.iter().filter_map(|scenario| protocol.arrange(scenario)).collect();
@@ -99,6 +102,14 @@ impl Part {
 /// Why an evaluation came to nothing.
 #[derive(Debug, thiserror::Error)]
 pub enum EvaluationError {
+    /// There is no truth to judge by.
+    #[error("scenario {scenario} has no true poses of the ego {ego}: there is nothing to judge its results by")]
+    NoPoses {
+        /// The scenario.
+        scenario: String,
+        /// Its ego.
+        ego: CavId,
+    },
     /// The data set cannot be read.
     #[error(transparent)]
     Dataset(#[from] ReadError),
@@ -178,6 +189,9 @@ pub(crate) fn judged(
     let mut board: Option<Board> = None;
     for scenario in options.part.chosen(&scenarios) {
         let Some(ego) = scenario.agents.first() else { continue };
+        if !scenario.has_poses(0, 0) {
+            return Err(EvaluationError::NoPoses { scenario: scenario.name.clone(), ego: ego.clone() });
+        }
         let board = board.get_or_insert_with(|| Board::new(ego.clone(), *evaluator.rule(), map_values));
         board.change_ego(ego);
         let judged = evaluator.run(scenario, &mut |frame| {
@@ -203,12 +217,12 @@ fn maps(kept: &KeptMaps, weights: &Path, scenarios: &[Scenario]) -> Result<MapSo
 
 /// Judges a frame; in virtual time its stamp says when it was published.
 pub(crate) fn judge(board: &mut Board, frame: EvaluatedFrame, is_stepped: bool) {
-    let EvaluatedFrame { stamp, result, frames, poses, objects } = frame;
+    let EvaluatedFrame { tick, stamp, result, frames, poses, objects } = frame;
     let poses: Vec<_> = frames.iter().map(|frame| frame.cav.clone()).zip(poses).collect();
     let truth: Vec<(CavId, _)> =
         frames.iter().filter_map(|frame| Some((frame.cav.clone(), frame.world_from_lidar?))).collect();
     let latency_ms = is_stepped.then(|| (stamp.publish_nanos - stamp.capture_nanos) as f64 / 1e6);
-    board.judge_whole(stamp.capture_nanos, latency_ms, result, objects, &poses, truth);
+    board.judge_whole((tick as u64, stamp.capture_nanos), latency_ms, result, objects, &poses, truth);
 }
 
 pub(crate) fn metrics(board: &Board, evaluator: &Evaluator, options: &EvaluationOptions, began: Instant) -> Metrics {

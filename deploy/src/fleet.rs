@@ -104,6 +104,15 @@ impl Fleet {
         let chosen = |cav: &&CavId| scene.agents.is_empty() || scene.agents.contains(cav);
         let agents: Vec<CavId> = recorded.agents.iter().filter(chosen).cloned().collect();
         let ego = scenario.ego.id.clone().unwrap_or_else(|| agents[0].clone());
+        for cav in &agents {
+            let pose = scenario.settings_of(cav).pose;
+            let needs_poses = matches!(pose, PoseSource::Recorded | PoseSource::Noisy(_));
+            let place = recorded.agents.iter().position(|known| known == cav);
+            if needs_poses && place.is_some_and(|place| !recorded.has_poses(place, scenario.scene.seek)) {
+                return Err(FleetError::NoPoses { cav: cav.clone(), source_name: pose.name(), name });
+            }
+        }
+        let scene = &mut scenario.scene;
         let left = recorded.ticks.len() - scene.seek;
         let ticks =
             if scene.repeat { scene.frames } else { Some(scene.frames.map_or(left, |frames| frames.min(left))) };

@@ -24,6 +24,8 @@ pub enum State {
     Starting,
     /// It has joined the run and goes on telling about itself.
     Ready,
+    /// It goes on telling about itself, but has failed in what it was to do.
+    Failing,
     /// It runs but has said nothing for a while.
     Silent,
     /// It has fallen and will be started again.
@@ -49,6 +51,9 @@ pub struct ProcessStatus {
     pub restarts: u32,
     /// How it fell last, in words.
     pub last_fall: Option<String>,
+    /// What it has failed in, in words.
+    #[serde(default)]
+    pub failure: Option<String>,
     /// Since it said something, seconds.
     pub silent_s: Option<f64>,
     /// Resident memory, MiB.
@@ -69,6 +74,7 @@ struct Noted {
     heard: Option<Instant>,
     restarts: u32,
     last_fall: Option<String>,
+    failure: Option<String>,
 }
 
 /// Keeps watch over the processes of a run.
@@ -98,6 +104,7 @@ impl Health {
             heard: None,
             restarts: 0,
             last_fall: None,
+            failure: None,
         });
         match &event.what {
             Happening::Started { pid } => {
@@ -108,17 +115,26 @@ impl Health {
                     heard: None,
                     restarts: noted.restarts,
                     last_fall: noted.last_fall.take(),
+                    failure: noted.failure.take(),
                 };
             }
             Happening::Fell { how, restart, .. } => {
                 (noted.state, noted.pid, noted.restarts) = (State::Fallen, None, *restart);
                 noted.last_fall = Some(how.clone());
             }
-            Happening::GaveUp { how, .. } => {
+            Happening::Said { .. } => {}
+            Happening::GaveUp { how, .. } | Happening::Failed { how } => {
                 (noted.state, noted.pid) = (State::Down, None);
                 noted.last_fall = Some(how.clone());
             }
             Happening::Done { .. } => (noted.state, noted.pid) = (State::Ended, None),
+        }
+    }
+
+    /// Takes note of what a process has failed in.
+    pub fn fails(&mut self, name: &str, words: &str) {
+        if let Some(noted) = self.processes.get_mut(name) {
+            noted.failure = Some(words.to_owned());
         }
     }
 
@@ -148,6 +164,7 @@ impl Health {
             noted.state = match noted.heard {
                 None => State::Starting,
                 Some(_) if since > SILENT => State::Silent,
+                Some(_) if noted.failure.is_some() => State::Failing,
                 Some(_) => State::Ready,
             };
             if since > patience && hears {
@@ -170,6 +187,7 @@ impl Health {
                 up_s: if noted.pid.is_some() { seconds(noted.started) } else { 0.0 },
                 restarts: noted.restarts,
                 last_fall: noted.last_fall.clone(),
+                failure: noted.failure.clone(),
                 silent_s: noted.heard.filter(|_| noted.pid.is_some()).map(seconds),
                 resident_mib: usage.resident_mib,
                 threads: usage.threads,

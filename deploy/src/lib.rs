@@ -8,9 +8,12 @@
 //! - [`view`]: a page to look at a run, live or recorded.
 //! - [`run_folder`], [`metrics`], [`ledger_report`], [`picture`]: what is kept of it.
 
+#![warn(clippy::print_stdout, clippy::print_stderr)]
+
 pub mod absences;
 mod crew_processes;
 pub mod evaluation;
+mod failures;
 pub mod fingerprint;
 pub mod fleet;
 pub mod health;

@@ -1,10 +1,13 @@
 //! Command line of `v2vloc`.
 
+#![warn(clippy::print_stdout, clippy::print_stderr)]
+
 mod command;
 
 use std::process::ExitCode;
 
 use clap::Parser;
+use sim_replay::output;
 
 /// Collaborative perception without GNSS as a distributed system: run it, judge it, look at it.
 #[derive(Debug, Parser)]
@@ -25,7 +28,7 @@ fn main() -> ExitCode {
     match CommandLine::parse().command.run() {
         Ok(outcome) => outcome.into(),
         Err(error) => {
-            eprintln!("v2vloc: {}", in_words(&error));
+            output::note(format_args!("v2vloc: {}", in_words(&error)));
             command::exit_code(&error)
         }
     }

@@ -146,6 +146,9 @@ pub struct Communication {
     pub nominal_fp32_log2: f64,
 }
 
+/// So many messages may be under way at the end of any run.
+const FEW: u64 = 20;
+
 /// Messages of all processes.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
 pub struct Messages {
@@ -174,6 +177,12 @@ impl Messages {
     pub fn of(total: &Counts) -> Self {
         let Counts { sent, received, in_flight, dropped, adapted: _ } = total.clone();
         Self { sent, received, in_flight, dropped }
+    }
+
+    /// Whether most of what was sent never arrived and was not lost either: then the link carries next to nothing.
+    #[must_use]
+    pub fn are_stuck(&self) -> bool {
+        self.in_flight >= FEW && self.in_flight > self.sent / 2
     }
 }
 

@@ -4,13 +4,16 @@ use std::net::{SocketAddr, TcpListener, UdpSocket};
 use std::time::Duration;
 
 use sim_replay::bus::shutdown::{self, Overdue};
-use sim_replay::bus::{BusError, BusOptions, Endpoint, open};
+use sim_replay::bus::{BusError, BusOptions, Endpoint, open, present, process_id};
 use zenoh::{Session, Wait};
 
-use protocol::{Party, Role, RunId};
+use protocol::{Party, ProcessId, Role, RunId};
 
 use crate::scenario::Network;
+use crate::score::scorer_cav;
 use crate::security::RunKeys;
+use crate::supervise::ProcessSpec;
+use crate::up::UpError;
 
 /// How long closing the session may take.
 const CLOSE_LIMIT: Duration = Duration::from_millis(500);
@@ -46,6 +49,24 @@ impl MeetingPlace {
         }?;
         let session = open(&options)?;
         Ok(Self { session, endpoint: from_here(options.endpoint())?, is_guarded: options.guard.is_some() })
+    }
+
+    /// Checks that none of the processes to start, nor a scorer, is there already, on a router that others use too.
+    ///
+    /// # Errors
+    /// [`UpError::Live`] names those that are; [`UpError::Network`] when the router does not say.
+    pub fn check_free(&self, network: &Network, run: &RunId, specs: &[ProcessSpec]) -> Result<(), UpError> {
+        if network.connect.is_none() {
+            return Ok(());
+        }
+        let scorer = process_id(Role::Scorer, &scorer_cav());
+        let is_ours =
+            |process: &ProcessId| *process == scorer || specs.iter().any(|spec| spec.name == process.as_str());
+        let processes: Vec<ProcessId> = present(&self.session, run)?.into_iter().filter(is_ours).collect();
+        if processes.is_empty() {
+            return Ok(());
+        }
+        Err(UpError::Live { run: run.clone(), router: self.endpoint.to_string(), processes })
     }
 
     /// Closes the session.

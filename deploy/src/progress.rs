@@ -4,6 +4,7 @@ use std::io::IsTerminal;
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
+use sim_replay::output;
 
 use crate::score::Progress;
 
@@ -44,7 +45,7 @@ impl Display {
             None if self.last_line.elapsed() >= LINE_PERIOD && progress.frames != self.shown_frames => {
                 self.last_line = Instant::now();
                 self.shown_frames = progress.frames;
-                eprintln!("{} frames  {}", progress.frames, summary(progress));
+                output::note(format_args!("{} frames  {}", progress.frames, summary(progress)));
             }
             None => {}
         }
@@ -53,8 +54,8 @@ impl Display {
     /// Says something that happened, above the live line.
     pub fn say(&self, text: &str) {
         match &self.bar {
-            Some(bar) => bar.suspend(|| eprintln!("{text}")),
-            None => eprintln!("{text}"),
+            Some(bar) => bar.suspend(|| output::note(text)),
+            None => output::note(text),
         }
     }
 

@@ -23,6 +23,10 @@ pub fn run_notes(result: &RunResult) -> String {
         "\nmessages  {} sent, {} received, {} in flight",
         messages.sent, messages.received, messages.in_flight
     );
+    if messages.are_stuck() {
+        let _ =
+            writeln!(text, "stuck     most messages were still in flight at the end: the link carries next to nothing");
+    }
     let dropped: Vec<String> = messages.dropped.iter().map(|(reason, count)| format!("{count} {reason}")).collect();
     let _ = writeln!(text, "dropped   {}", if dropped.is_empty() { "none".into() } else { dropped.join(", ") });
     let verdict = if result.balance.is_exact() {
@@ -36,6 +40,9 @@ pub fn run_notes(result: &RunResult) -> String {
     }
     for process in &result.killed {
         let _ = writeln!(text, "killed    {process} did not end in time");
+    }
+    for failure in &result.failures {
+        let _ = writeln!(text, "failed    {failure}");
     }
     for what in &result.unwritten {
         let _ = writeln!(text, "unwritten {what}");

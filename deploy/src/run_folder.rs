@@ -59,6 +59,13 @@ impl RunFolder {
         Ok(Self { path })
     }
 
+    /// Removes it with all that is in it: of a run that was refused before it began, so that its name is free again.
+    pub fn remove(self) {
+        if let Err(error) = fs::remove_dir_all(&self.path) {
+            tracing::warn!("cannot remove {}, the folder of a run that did not begin: {error}", self.path.display());
+        }
+    }
+
     /// Where it is.
     #[must_use]
     pub fn path(&self) -> &Path {
@@ -112,14 +119,15 @@ impl RunFolder {
 /// The table of a run's frames: a header line, then a line per frame.
 fn frames_csv(records: &[FrameRecord], swept: &BTreeMap<u64, u64>) -> String {
     let mut text = String::from(
-        "frame_index,capture_nanos,latency_ms,detected,truth,found,fused,skipped,oldest_ms,stale,payload_bytes,wire_bytes,ego_error_m,\
+        "tick,agent_frame,capture_nanos,latency_ms,detected,truth,found,fused,skipped,oldest_ms,stale,payload_bytes,wire_bytes,ego_error_m,\
          ego_error_deg,swept_ms,posed_ms,published_ms,arrived_ms,decided_ms,fused_ms,detected_ms\n",
     );
     let optional = |number: &Option<f64>| number.map_or(String::new(), |number| format!("{number:.4}"));
     for record in records {
         // Destructured in full, so that a new column stops the build here.
         let FrameRecord {
-            frame_index,
+            tick,
+            agent_frame,
             capture_nanos,
             latency_ms,
             stamps,
@@ -145,7 +153,7 @@ fn frames_csv(records: &[FrameRecord], swept: &BTreeMap<u64, u64>) -> String {
         // Writing to a string cannot fail.
         let _ = writeln!(
             text,
-            "{frame_index},{capture_nanos},{latency_ms},{detected},{truth},{found},{fused},{skipped},\
+            "{tick},{agent_frame},{capture_nanos},{latency_ms},{detected},{truth},{found},{fused},{skipped},\
              {oldest_ms},{stale},{payload_bytes},{wire_bytes},{error_m},{error_deg},{stamps}"
         );
     }
@@ -192,12 +200,15 @@ mod tests {
         assert!(folder.log_dir().is_dir() && folder.path().is_absolute());
         let error = RunFolder::create(&runs.path().join("deeper"), &name).unwrap_err().to_string();
         assert!(error.contains("r1 exists already"), "{error}");
+        folder.remove();
+        RunFolder::create(&runs.path().join("deeper"), &name).unwrap();
     }
 
     #[test]
     fn every_line_of_the_table_has_every_column() {
         let record = FrameRecord {
-            frame_index: 3,
+            tick: 3,
+            agent_frame: 2,
             capture_nanos: 300_000_000,
             latency_ms: Some(81.25),
             stamps: StageStamps {
@@ -222,7 +233,7 @@ mod tests {
         let lines: Vec<&str> = text.lines().collect();
         assert_eq!(
             lines[1],
-            "3,300000000,81.2500,20,22,18,1,0,100.0000,1,1000,1300,0.2500,,2.5000,40.5000,,,,,81.2500"
+            "3,2,300000000,81.2500,20,22,18,1,0,100.0000,1,1000,1300,0.2500,,2.5000,40.5000,,,,,81.2500"
         );
         assert_eq!(lines[0].matches(',').count(), lines[1].matches(',').count());
     }

@@ -36,13 +36,13 @@ fn try_draw(fleet: &Fleet, frame: &JudgedFrame, path: &Path) -> Result<(), Box<d
         else {
             continue;
         };
-        let recorded = scenario.load(index, usize::try_from(frame.frame_index)?, &options)?;
+        let recorded = scenario.load(index, usize::try_from(frame.tick)?, &options)?;
         loaded.push((cav.to_string(), world_from_ego.from_world(&world_from_cav), recorded.points.xyzi));
     }
     let rule = fleet.ground_truth_rule();
     let detections = frame.result.detections.iter().map(|detection| (detection.box3d, detection.score)).collect();
     Picture {
-        title: format!("{}  frame {}  {}", fleet.scenario.method, frame.frame_index, scenario.name),
+        title: format!("{}  tick {}  {}", fleet.scenario.method, frame.tick, scenario.name),
         x_m: rule.x_m,
         y_m: rule.y_m,
         views: loaded

@@ -114,15 +114,28 @@ impl RunStatus {
         newest.ok_or_else(|| StatusError::NoRun(runs.to_owned()))
     }
 
-    /// Whether nothing is wrong: every process is ready, or the run is over and none stays down.
+    /// What is wrong, in words: with whom while it goes on, who failed or stays down when it is over.
     #[must_use]
-    pub fn is_well(&self) -> bool {
-        let is_well = |process: &ProcessStatus| match self.phase {
+    pub fn troubles(&self) -> Vec<String> {
+        let is_well = |process: &&ProcessStatus| match self.phase {
             Phase::Running => matches!(process.state, State::Ready | State::Ended),
             Phase::Ending | Phase::Over => process.state != State::Down,
-            Phase::Lost => false,
+            Phase::Lost => true,
         };
-        self.phase != Phase::Lost && self.processes.iter().all(is_well)
+        let sick = self.processes.iter().filter(|process| !is_well(process) || process.failure.is_some());
+        let in_words = |process: &ProcessStatus| {
+            let why = process.failure.as_ref().or(process.last_fall.as_ref());
+            let state = name_of(&process.state);
+            format!("{} is {state}{}", process.name, why.map_or(String::new(), |why| format!(" ({why})")))
+        };
+        let lost = (self.phase == Phase::Lost).then(|| "whoever watched over it is gone".to_owned());
+        lost.into_iter().chain(sick.map(in_words)).collect()
+    }
+
+    /// Whether nothing is wrong.
+    #[must_use]
+    pub fn is_well(&self) -> bool {
+        self.troubles().is_empty()
     }
 
     /// Since it was written.
@@ -148,7 +161,7 @@ impl RunStatus {
         );
         let _ = writeln!(
             text,
-            "{:20} {:9} {:>8} {:>8} {:>9} {:>9} {:>8} {:>5}  last fall",
+            "{:20} {:9} {:>8} {:>8} {:>9} {:>9} {:>8} {:>5}  last fall or failure",
             "process", "state", "pid", "up s", "restarts", "silent s", "MiB", "fds"
         );
         for process in &self.processes {
@@ -163,7 +176,7 @@ impl RunStatus {
                 optional(process.silent_s, 1),
                 optional(process.resident_mib, 0),
                 process.descriptors.map_or("-".into(), |count| count.to_string()),
-                process.last_fall.as_deref().unwrap_or("")
+                process.failure.as_deref().or(process.last_fall.as_deref()).unwrap_or("")
             );
         }
         for neighbour in &self.neighbours {
@@ -261,6 +274,7 @@ mod tests {
             up_s: 12.3,
             restarts: 2,
             last_fall: Some("was ended by signal 9".into()),
+            failure: (state == State::Failing).then(|| "recording cut".into()),
             silent_s: Some(0.2),
             resident_mib: Some(150.0),
             threads: Some(20),
@@ -309,6 +323,7 @@ mod tests {
             (State::Ready, true),
             (State::Ended, true),
             (State::Starting, false),
+            (State::Failing, false),
             (State::Silent, false),
             (State::Fallen, false),
             (State::Down, false),

@@ -16,7 +16,7 @@ use ego_fuser::evaluate::{EvaluateConfig, EvaluateError, EvaluatedFrame, Evaluat
 use ego_fuser::pairing::PairingConfig;
 use ego_fuser::trust::TrustConfig;
 use indicatif::{ProgressBar, ProgressStyle};
-use protocol::{CavId, DetectionsReport};
+use protocol::{CavId, DetectionsReport, RunId};
 use sim_replay::dataset::{self, Scenario as Recorded};
 use sim_replay::link::LinkConfig;
 
@@ -48,17 +48,33 @@ pub fn up(scenario: &Scenario, options: &UpOptions) -> Result<RunResult, UpError
     let processes = fleet.scenario.stepped.is_some_and(|stepped| stepped.processes);
     fleet.scenario.stepped = Some(Stepped { compute: Some(compute), processes });
     let run = fleet.scenario.run.clone().unwrap_or_else(|| name_of_now(options.prefix));
-    let folder = RunFolder::create(&options.runs, &run)?;
     let mut evaluator = evaluator.over_link(stepped_config(&fleet, compute)?);
-    let crew = processes.then(|| CrewProcesses::start(&fleet, &run, &folder, &options.programs)).transpose()?;
+    let folder = RunFolder::create(&options.runs, &run)?;
+    let result = go(&fleet, &recorded, &mut evaluator, (&run, &folder), options);
+    if result.as_ref().is_err_and(UpError::is_refusal) {
+        folder.remove();
+    }
+    result
+}
+
+/// Runs a fleet, as the run of that name in that folder.
+fn go(
+    fleet: &Fleet,
+    recorded: &Recorded,
+    evaluator: &mut Evaluator,
+    (run, folder): (&RunId, &RunFolder),
+    options: &UpOptions,
+) -> Result<RunResult, UpError> {
+    let processes = fleet.scenario.stepped.is_some_and(|stepped| stepped.processes);
+    let crew = processes.then(|| CrewProcesses::start(fleet, run, folder, &options.programs)).transpose()?;
     let processes = crew.map(|(processes, remote)| {
         evaluator.set_processes(Some(remote));
         processes
     });
-    let board = play(&fleet, &recorded, &mut evaluator, &folder)?;
+    let board = play(fleet, recorded, evaluator, folder)?;
     evaluator.set_processes(None);
     let killed = processes.map(CrewProcesses::end).unwrap_or_default();
-    let result = write(&fleet, &evaluator, &board, folder, options)?;
+    let result = write(fleet, evaluator, &board, folder.clone(), options)?;
     Ok(RunResult { killed, ..result })
 }
 
@@ -158,7 +174,8 @@ fn play(fleet: &Fleet, recorded: &Recorded, evaluator: &mut Evaluator, folder: &
     let mut written = Ok(());
     let _ = evaluator.run(recorded, &mut |frame: EvaluatedFrame| {
         bar.inc(1);
-        written = writeln!(file, "{}", DetectionsReport::new(&frame.stamp, frame.result.clone()).to_json());
+        let report = DetectionsReport::new(&frame.stamp, Some(frame.tick as u64), frame.result.clone());
+        written = writeln!(file, "{}", report.to_json());
         judge(&mut board, frame, true);
         if written.is_ok() { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
     })?;
@@ -190,8 +207,8 @@ fn write(
     let resolved = Scenario { provenance, ..fleet.scenario.clone() };
     folder.write("scenario.yaml", &resolved.to_yaml())?;
     let picture = crate::showcase::draw(fleet, board, &folder.file("frame.png"));
-    let (killed, unwritten) = (Vec::new(), Vec::new());
-    Ok(RunResult { folder, metrics, balance, missed: 0, interrupted: false, killed, unwritten, picture })
+    let (killed, unwritten, failures) = (Vec::new(), Vec::new(), Vec::new());
+    Ok(RunResult { folder, metrics, balance, missed: 0, interrupted: false, killed, unwritten, failures, picture })
 }
 
 impl From<EvaluateError> for UpError {

@@ -8,7 +8,7 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use ego_fuser::evaluate::EvaluateError;
-use protocol::{Balance, Ledger, RunId};
+use protocol::{Balance, Ledger, ProcessId, RunId};
 use sim_replay::bus::shutdown::Stop;
 use sim_replay::bus::{BusError, Endpoint, Refusal};
 
@@ -25,7 +25,7 @@ use crate::scenario::{Clock, Scenario};
 use crate::score::{Board, Progress, Scored, ScorerError, ScorerNode};
 use crate::security::RefusalWatch;
 use crate::status::Phase;
-use crate::supervise::{SuperviseError, Supervisor};
+use crate::supervise::{ProcessSpec, SuperviseError, Supervisor};
 use crate::watch::{Ending, Watch};
 
 /// How often the display is brought up to date.
@@ -66,6 +66,8 @@ pub struct RunResult {
     pub killed: Vec<String>,
     /// What could not be written of the run, in words: the disk is full, perhaps.
     pub unwritten: Vec<String>,
+    /// Processes that failed in what they were to do, in words.
+    pub failures: Vec<String>,
     /// The picture of one fused frame, where there was one to draw.
     pub picture: Option<PathBuf>,
 }
@@ -75,7 +77,13 @@ impl RunResult {
     #[must_use]
     pub fn lost_data(&self) -> bool {
         let dropped = self.metrics.messages.dropped.iter().any(|(reason, count)| reason.is_loss() && *count > 0);
-        dropped || self.missed > 0 || !self.balance.is_exact() || !self.unwritten.is_empty()
+        dropped
+            || self.missed > 0
+            || !self.balance.is_exact()
+            || !self.unwritten.is_empty()
+            || !self.failures.is_empty()
+            || !self.killed.is_empty()
+            || self.metrics.messages.are_stuck()
     }
 }
 
@@ -91,6 +99,19 @@ pub enum UpError {
     /// The processes cannot meet.
     #[error(transparent)]
     Network(#[from] BusError),
+    /// Another fleet of that name is there; both would fall silent.
+    #[error(
+        "run {run} is already live on {router}: {}; choose another --name, or end it first",
+        processes.iter().map(ToString::to_string).collect::<Vec<_>>().join(", ")
+    )]
+    Live {
+        /// Its name.
+        run: RunId,
+        /// Where.
+        router: String,
+        /// Which of the processes that would be started are there.
+        processes: Vec<ProcessId>,
+    },
     /// There are no keys for the processes.
     #[error("security: {0}")]
     Keys(#[from] KeyError),
@@ -124,9 +145,18 @@ impl UpError {
     pub fn is_bad_input(&self) -> bool {
         match self {
             Self::Network(error) => error.is_bad_input(),
-            Self::Fleet(_) | Self::Folder(RunFolderError::Taken(_)) => true,
+            Self::Fleet(_) | Self::Folder(RunFolderError::Taken(_)) | Self::Live { .. } => true,
             Self::Evaluate(error) => matches!(**error, EvaluateError::TooSlow { .. } | EvaluateError::Link(_)),
             _ => false,
+        }
+    }
+
+    /// Whether the run was refused before anything of it began, so that nothing in its folder is of use.
+    pub(crate) fn is_refusal(&self) -> bool {
+        match self {
+            Self::Process { .. } | Self::Folder(_) => false,
+            Self::Evaluate(_) => self.is_bad_input(),
+            _ => true,
         }
     }
 }
@@ -142,22 +172,33 @@ pub fn up(scenario: &Scenario, options: &UpOptions) -> Result<RunResult, UpError
     let fleet = Fleet::plan(scenario)?;
     let run = fleet.scenario.run.clone().unwrap_or_else(|| name_of_now(options.prefix));
     let folder = RunFolder::create(&options.runs, &run)?;
+    let result = go(&fleet, options, &run, &folder);
+    if result.as_ref().is_err_and(UpError::is_refusal) {
+        folder.remove();
+    }
+    result
+}
+
+/// Runs a fleet, as the run of that name in that folder.
+fn go(fleet: &Fleet, options: &UpOptions, run: &RunId, folder: &RunFolder) -> Result<RunResult, UpError> {
     let stop = Stop::new();
     stop.on_signals().map_err(UpError::Signals)?;
-    let fingerprint = fingerprint(&fleet, &options.programs);
+    let fingerprint = fingerprint(fleet, &options.programs);
 
-    let keys = fleet.keys(&folder)?;
-    let place = MeetingPlace::open(&fleet.scenario.network, &run, keys.as_ref())?;
+    let keys = fleet.keys(folder)?;
+    let place = MeetingPlace::open(&fleet.scenario.network, run, keys.as_ref())?;
+    let (endpoint, programs) = (place.endpoint.as_str(), options.programs.as_path());
+    let meeting = Meeting { run, endpoint, keys: keys.as_ref(), programs, folder };
+    let specs = fleet.processes(&meeting);
+    place.check_free(&fleet.scenario.network, run, &specs)?;
     let refused = RefusalWatch::over(&place)?;
     let board = Board::new(fleet.ego.clone(), fleet.ground_truth_rule(), fleet.map_values());
     let detections = folder.file("detections.jsonl");
-    let mut scorer = ScorerNode::start(place.session.clone(), &run, &fleet.agents, &fleet.ego, board, detections)?;
+    let mut scorer = ScorerNode::start(place.session.clone(), run, &fleet.agents, &fleet.ego, board, detections)?;
     if let Some(address) = fleet.scenario.network.metrics {
         scorer.serve_metrics(address)?;
     }
-    let (endpoint, programs) = (place.endpoint.as_str(), options.programs.as_path());
-    let meeting = Meeting { run: &run, endpoint, keys: keys.as_ref(), programs, folder: &folder };
-    let watched = watch(&fleet, &meeting, &place.endpoint, &scorer, &stop);
+    let watched = watch(fleet, &meeting, specs, &place.endpoint, &scorer, &stop);
     // Before the scorer closes the session.
     let refused = refused.finish();
     let scored = scorer.finish();
@@ -166,7 +207,7 @@ pub fn up(scenario: &Scenario, options: &UpOptions) -> Result<RunResult, UpError
     }
     let watched = watched?;
 
-    let result = write(&fleet, &run, folder, (scored, &refused), &watched, fingerprint);
+    let result = write(fleet, run, folder.clone(), (scored, &refused), &watched, fingerprint);
     match watched.ending {
         Ending::Over | Ending::Asked => Ok(result),
         Ending::Failed { process, how } => {
@@ -183,6 +224,8 @@ struct Watched {
     killed: Vec<String>,
     /// Who was away for a while.
     away: BTreeSet<String>,
+    /// Who failed in what they were to do, in words.
+    failures: Vec<String>,
 }
 
 /// When each sweep came to the ego's agent. One on another host notes nothing here.
@@ -199,13 +242,13 @@ fn swept(log: &Path) -> BTreeMap<u64, u64> {
 fn watch(
     fleet: &Fleet,
     meeting: &Meeting<'_>,
+    mut specs: Vec<ProcessSpec>,
     endpoint: &Endpoint,
     scorer: &ScorerNode,
     stop: &Stop,
 ) -> Result<Watched, UpError> {
     let Meeting { run, folder, .. } = *meeting;
     let (events, happened) = channel();
-    let mut specs = fleet.processes(meeting);
     let mut display = Display::new(fleet.ticks);
     if let Some(first) = fleet.scenario.network.metrics {
         for (spec, address) in specs.iter_mut().zip(ports_behind(first)) {
@@ -234,7 +277,8 @@ fn watch(
     }
     watch.tell(Phase::Over, &scorer.progress());
     away.extend(killed.iter().cloned());
-    Ok(Watched { ending, killed, away })
+    let failures = watch.failures();
+    Ok(Watched { ending, killed, away, failures })
 }
 
 /// The ports behind that of `first`, on the same address.
@@ -335,9 +379,9 @@ fn write(
     note(folder.write("scenario.yaml", &resolved.to_yaml()));
     let picture = crate::showcase::draw(fleet, &board, &folder.file("frame.png"));
     let interrupted = matches!(watched.ending, Ending::Asked);
-    let killed = watched.killed.clone();
+    let (killed, failures) = (watched.killed.clone(), watched.failures.clone());
     let missed = missed(fleet, &board, &watched.ending);
-    RunResult { folder, metrics, balance, missed, interrupted, killed, unwritten, picture }
+    RunResult { folder, metrics, balance, missed, interrupted, killed, unwritten, failures, picture }
 }
 
 /// Ticks without a result. Those that nobody told of at all, as the replay fell with them on its way, are known by their

@@ -7,6 +7,7 @@ use protocol::RunId;
 use sim_replay::bus::Endpoint;
 use sim_replay::bus::shutdown::Stop;
 
+use crate::failures::Failures;
 use crate::fleet::{Fleet, REPLAY};
 use crate::health::Health;
 use crate::progress::Display;
@@ -31,6 +32,7 @@ pub(crate) enum Ending {
 /// The watch over a run while it goes.
 pub(crate) struct Watch {
     health: Health,
+    failures: Failures,
     status: StatusWriter,
 }
 
@@ -40,13 +42,22 @@ impl Watch {
         let [hang, start] = [timeouts.hang_s, timeouts.ready_s.max(timeouts.hang_s)].map(Duration::from_secs_f64);
         Self {
             health: Health::new(hang, start),
+            failures: Failures::default(),
             status: StatusWriter::new(folder.path(), run.as_str(), endpoint.as_str()),
         }
     }
 
-    /// Takes note of what happened.
-    pub(crate) fn note(&mut self, event: &ProcessEvent) {
+    /// Takes note of what happened; what is wrong with the process from now on, in words.
+    pub(crate) fn note(&mut self, event: &ProcessEvent) -> Option<String> {
         self.health.note(event, Instant::now());
+        let words = self.failures.note(event)?;
+        self.health.fails(&event.name, words);
+        Some(words.to_owned())
+    }
+
+    /// What the run had to go on without, in words.
+    pub(crate) fn failures(&self) -> Vec<String> {
+        self.failures.in_words()
     }
 
     /// Who has fallen, at least once.
@@ -87,7 +98,9 @@ impl Watch {
                 // Not before the supervisor is gone, which outlives this.
                 Err(RecvTimeoutError::Disconnected) => return Ending::Asked,
             };
-            self.note(&event);
+            if let Some(words) = self.note(&event) {
+                display.say(&format!("{}: {words}", event.name));
+            }
             if let Some(ending) = show(event, display) {
                 return ending;
             }
@@ -101,19 +114,11 @@ fn show(ProcessEvent { name, what }: ProcessEvent, display: &Display) -> Option<
         Happening::Started { pid } => display.say(&format!("{name} runs (pid {pid})")),
         Happening::Fell { how, again_after, restart } => display
             .say(&format!("{name} {how}; starting it again in {:.1} s (restart {restart})", again_after.as_secs_f64())),
-        Happening::GaveUp { how, is_optional: true } => {
-            display.say(&format!("{name} {how}; the run goes on without it"));
-        }
         Happening::GaveUp { how, is_optional: false } => return Some(Ending::Failed { process: name, how }),
-        Happening::Done { data_lost } => {
-            if data_lost {
-                display.say(&format!("{name} says that data were lost; see its log"));
-            }
-            // The replay is the clock of the run; the others follow it.
-            if name == REPLAY {
-                return Some(Ending::Over);
-            }
-        }
+        // The replay is the clock of the run; the others follow it.
+        Happening::Done { .. } if name == REPLAY => return Some(Ending::Over),
+        // Told as failures, where they are some.
+        Happening::Said { .. } | Happening::GaveUp { .. } | Happening::Failed { .. } | Happening::Done { .. } => {}
     }
     None
 }

@@ -65,6 +65,8 @@ pub struct EvaluateConfig {
 /// One frame of the ego with everything it can be judged by.
 #[derive(Debug, Clone)]
 pub struct EvaluatedFrame {
+    /// Tick of the scenario.
+    pub tick: usize,
     /// Who spoke for the result, and for which capture time.
     pub stamp: Stamp,
     /// What the ego would have published.
@@ -274,13 +276,14 @@ impl Evaluator {
         let objects = ground_truth::merge(&frames.iter().collect::<Vec<_>>(), 0, &self.rule);
         let objects = objects.into_iter().map(|(_, object)| object).collect();
         let stamp = stamp(&own.cav, frames[0].capture_nanos);
-        Ok(EvaluatedFrame { stamp, result, frames, poses, objects })
+        Ok(EvaluatedFrame { tick, stamp, result, frames, poses, objects })
     }
 
-    /// What the ego would publish; `bytes` are payload and wire bytes of each neighbour's message.
+    /// What the ego would publish as its agent's frame of that number; `bytes` are payload and wire bytes of each
+    /// neighbour's message.
     fn report(
         &self,
-        tick: usize,
+        agent_frame: usize,
         own: &View,
         neighbours: &[View],
         bytes: &[(u64, u64)],
@@ -304,7 +307,7 @@ impl Evaluator {
         });
         Detections {
             ego: own.cav.clone(),
-            frame_index: tick as u64,
+            agent_frame: agent_frame as u64,
             method: self.ego.method().name().to_owned(),
             pose: own.pose,
             detections: output.detections,

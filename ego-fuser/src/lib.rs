@@ -8,6 +8,8 @@
 //!
 //! Conventions of axes, units and boxes are those of [`protocol`].
 
+#![warn(clippy::print_stdout, clippy::print_stderr)]
+
 pub mod alignment;
 pub mod average_precision;
 pub mod ego;

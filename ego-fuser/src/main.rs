@@ -1,10 +1,13 @@
 //! Command line of `ego-fuser`.
 
+#![warn(clippy::print_stdout, clippy::print_stderr)]
+
 mod command;
 
 use std::process::ExitCode;
 
 use clap::Parser;
+use sim_replay::output;
 
 /// Fuses the views of connected vehicles into boxes around the ego.
 #[derive(Debug, Parser)]
@@ -19,7 +22,7 @@ fn main() -> ExitCode {
     match command_line.command.run() {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
-            eprintln!("ego-fuser: {error:#}");
+            output::note(format_args!("ego-fuser: {error:#}"));
             command::exit_code(&error)
         }
     }

@@ -212,6 +212,12 @@ impl Selector {
         Self(format!("{KEY_ROOT}/{run}/alive/{role}/*"))
     }
 
+    /// The liveliness tokens of all processes.
+    #[must_use]
+    pub fn everyone_alive(run: &RunId) -> Self {
+        Self(format!("{KEY_ROOT}/{run}/alive/*/*"))
+    }
+
     /// The key expression.
     #[must_use]
     pub fn as_str(&self) -> &str {
@@ -319,6 +325,7 @@ mod tests {
         assert_eq!(Selector::received_by_anyone(&run, Stream::Pose).as_str(), "v2v/r1/rx/*/*/pose");
         assert_eq!(Selector::truth(&run).as_str(), "v2v/r1/truth");
         assert_eq!(Selector::alive(&run, Role::Agent).as_str(), "v2v/r1/alive/agent/*");
+        assert_eq!(Selector::everyone_alive(&run).as_str(), "v2v/r1/alive/*/*");
         assert_eq!(Selector::control(&run).as_str(), "v2v/r1/control/*");
         assert_eq!(Selector::ready(&run).as_str(), "v2v/r1/ready/*");
         assert_eq!(Selector::stats(&run).as_str(), "v2v/r1/stats/*");

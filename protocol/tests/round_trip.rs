@@ -55,8 +55,9 @@ fn a_message_of_another_kind_is_refused() {
 
 #[test]
 fn detections_json_is_what_scripts_read() {
-    let json = DetectionsReport::new(&sample::stamp(), sample::detections()).to_json();
+    let json = DetectionsReport::new(&sample::stamp(), Some(7), sample::detections()).to_json();
     let value: serde_json::Value = serde_json::from_str(&json).unwrap();
+    assert_eq!((&value["tick"], &value["agent_frame"]), (&7.into(), &3.into()));
     assert_eq!(value["ego"], "4279");
     assert_eq!(value["capture_nanos"], 1_500_000_000u64);
     assert_eq!(value["detections"][1]["score"], 1.0);
@@ -66,7 +67,7 @@ fn detections_json_is_what_scripts_read() {
     assert_eq!(value["skipped"][1]["reason"], "stale");
     assert_eq!(value["pose"]["pose"]["confidence"], 0.875);
     let back: DetectionsReport = serde_json::from_str(&json).unwrap();
-    assert_eq!(back.result, sample::detections());
+    assert_eq!((back.tick, back.result), (Some(7), sample::detections()));
 }
 
 /// Largest error of a value that was sent, given the largest value of its channel among those sent.

@@ -4,6 +4,8 @@
 //! Recorded datasets differ in axes, units, pose formats and file layouts. All of that ends at this crate's readers:
 //! behind [`dataset::open`] there is one [`frame::Frame`], in the conventions of [`protocol`].
 
+#![warn(clippy::print_stdout, clippy::print_stderr)]
+
 pub mod bounded;
 pub mod bus;
 pub mod carla_pose;
@@ -14,6 +16,7 @@ pub mod frame;
 pub mod ground_truth;
 pub mod inspect;
 pub mod link;
+pub mod output;
 pub mod pcd;
 pub mod random;
 pub mod recording;

@@ -1,7 +1,10 @@
-//! A small web server for what a process has to show: pages, numbers, streams. GET only, HTTP/1.1.
+//! A small web server for what a process has to show: pages, numbers, streams. GET and HEAD only, HTTP/1.1; over the loopback
+//! under the names of the loopback alone.
 //!
 //! It stands beside work that must not wait for it, and faces browsers that never read: it has a thread of its own, nothing
 //! is kept for a reader, every wait has a limit, and who exceeds it is dropped and counted.
+
+mod host;
 
 use std::convert::Infallible;
 use std::error::Error;
@@ -17,7 +20,7 @@ use futures_util::stream::BoxStream;
 use http_body_util::combinators::UnsyncBoxBody;
 use http_body_util::{BodyExt, Full, StreamBody};
 use hyper::body::{Frame, Incoming};
-use hyper::header::{CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, HeaderValue, X_CONTENT_TYPE_OPTIONS};
+use hyper::header::{ALLOW, CACHE_CONTROL, CONTENT_SECURITY_POLICY, CONTENT_TYPE, HeaderValue, X_CONTENT_TYPE_OPTIONS};
 use hyper::server::conn::http1;
 use hyper::service::service_fn;
 use hyper::{Method, Response, StatusCode};
@@ -174,9 +177,10 @@ async fn accept(listener: TcpListener, handler: Arc<Handler>, readers: Arc<Reade
 async fn serve(connection: TcpStream, handler: Arc<Handler>) -> hyper::Result<()> {
     // What is late for want of it is late, and no more.
     let _ = connection.set_nodelay(true);
+    let local = connection.local_addr();
     let mut connection = TimeoutStream::new(connection);
     connection.set_write_timeout(Some(WRITE_LIMIT));
-    let service = service_fn(move |request| answer(Arc::clone(&handler), request));
+    let service = service_fn(move |request| answer(Arc::clone(&handler), local.as_ref().ok().copied(), request));
     http1::Builder::new()
         .timer(TokioTimer::new())
         .header_read_timeout(READ_LIMIT)
@@ -192,9 +196,22 @@ fn was_not_read(error: &hyper::Error) -> bool {
     cause.is_some_and(|cause| cause.kind() == io::ErrorKind::TimedOut)
 }
 
-async fn answer(handler: Arc<Handler>, request: hyper::Request<Incoming>) -> Result<Response<Body>, Infallible> {
-    if request.method() != Method::GET {
-        return Ok(respond(StatusCode::METHOD_NOT_ALLOWED, TEXT, whole("GET only".into())));
+/// What is answered at `local`, this end of the connection. The body of an answer to HEAD is left out on its way.
+async fn answer(
+    handler: Arc<Handler>,
+    local: Option<SocketAddr>,
+    request: hyper::Request<Incoming>,
+) -> Result<Response<Body>, Infallible> {
+    if !matches!(*request.method(), Method::GET | Method::HEAD) {
+        let mut refusal = respond(StatusCode::METHOD_NOT_ALLOWED, TEXT, whole("GET and HEAD only".into()));
+        refusal.headers_mut().insert(ALLOW, HeaderValue::from_static("GET, HEAD"));
+        return Ok(refusal);
+    }
+    if let Some(local) = local
+        && let Err(name) = host::check(local, request.uri(), request.headers())
+    {
+        let words = format!("this server is called localhost, not {name:?}");
+        return Ok(respond(StatusCode::FORBIDDEN, TEXT, whole(words.into())));
     }
     let (path, query) = (request.uri().path().to_owned(), request.uri().query().unwrap_or_default().to_owned());
     let answer = tokio::task::spawn_blocking(move || handler(&Request { path, query })).await;
@@ -274,14 +291,47 @@ mod tests {
         assert_eq!((status.as_str(), body.as_slice()), ("HTTP/1.0 404 Not Found", b"no /../etc".as_slice()));
     }
 
-    #[test]
-    fn anything_but_a_get_is_refused() {
-        let server = server(|_| Answer::NotFound(String::new()));
+    /// What is answered to a request without a body.
+    fn asked(server: &WebServer, request: &str) -> String {
         let mut connection = TcpStream::connect(server.address()).unwrap();
-        connection.write_all(b"POST / HTTP/1.1\r\nHost: x\r\n\r\n").unwrap();
+        write!(connection, "{request}\r\n\r\n").unwrap();
         let mut answer = String::new();
         connection.read_to_string(&mut answer).unwrap();
-        assert!(answer.starts_with("HTTP/1.1 405"), "{answer}");
+        answer
+    }
+
+    #[test]
+    fn anything_but_get_and_head_is_refused() {
+        let server = server(|_| Answer::NotFound(String::new()));
+        let answer = asked(&server, "POST / HTTP/1.1\r\nHost: localhost");
+        assert!(answer.starts_with("HTTP/1.1 405") && answer.contains("allow: GET, HEAD"), "{answer}");
+    }
+
+    #[test]
+    fn head_is_answered_as_get_without_the_body() {
+        let server = server(|request| match request.path.as_str() {
+            "/page" => Answer::Page { content_type: TEXT, body: "twelve bytes".into() },
+            "/stream" => {
+                let pieces = futures_util::stream::repeat(Bytes::from_static(&[0; 1 << 16])).boxed();
+                Answer::Stream { content_type: TEXT, pieces }
+            }
+            other => Answer::NotFound(other.to_owned()),
+        });
+        let head = asked(&server, "HEAD /page HTTP/1.1\r\nHost: localhost");
+        assert!(head.starts_with("HTTP/1.1 200") && head.contains("content-length: 12\r\n"), "{head}");
+        assert!(head.ends_with("\r\n\r\n"), "{head}");
+        assert!(asked(&server, "HEAD /stream HTTP/1.1\r\nHost: localhost").ends_with("\r\n\r\n"));
+        assert!(asked(&server, "HEAD /none HTTP/1.1\r\nHost: localhost").starts_with("HTTP/1.1 404"));
+    }
+
+    #[test]
+    fn a_page_of_another_name_is_told_nothing() {
+        let server = server(|_| Answer::Page { content_type: TEXT, body: "secret".into() });
+        let answer = asked(&server, &format!("GET / HTTP/1.1\r\nHost: evil.example:{}", server.address().port()));
+        assert!(answer.starts_with("HTTP/1.1 403") && !answer.contains("secret"), "{answer}");
+        assert!(answer.contains("evil.example"), "{answer}");
+        let answer = asked(&server, &format!("GET / HTTP/1.1\r\nHost: {}", server.address()));
+        assert!(answer.starts_with("HTTP/1.1 200") && answer.contains("secret"), "{answer}");
     }
 
     #[test]

@@ -9,6 +9,7 @@ use ego_fuser::Method;
 use ego_fuser::loss::LossConfig;
 use ego_fuser::samples::{SampleConfig, SampleKind};
 use ego_fuser::train::{Accuracy, Observer, StepReport, TrainConfig};
+use sim_replay::dataset::OpenOptions;
 use sim_replay::evaluation_protocol::ProtocolConfig;
 
 /// libtorch has one generator of random numbers per process: who begins a training has it alone.
@@ -61,6 +62,7 @@ pub fn config(data: &Path, out: &Path, method: Method, steps: u64) -> TrainConfi
     TrainConfig {
         data: vec![data.to_owned()],
         validation: vec![],
+        open: OpenOptions::default(),
         method,
         detector: small(),
         init: None,

@@ -159,7 +159,7 @@ fn record<'scope>(
         let bus = router.join("recorder", "recorder");
         let recording = RecordingOptions::default();
         let options = RecorderOptions { out, recording, without: Vec::new(), keeps_running: true };
-        let report = recording::record(&bus, &options, &stop).unwrap();
+        let report = recording::record(&bus, &options, &stop, &mut |_| {}).unwrap();
         bus.leave(PATIENCE).unwrap();
         report
     })
@@ -235,7 +235,7 @@ fn a_recorded_run_replayed_gives_the_same_detections() {
         let (live, ledger) = play_and_record(folder.path(), method, RateConfig::default(), Some(&file));
         assert!(ledger.balance().is_exact(), "{method}: a recorder is in nobody's books");
         let recording = Recording::open(&file).unwrap();
-        assert_eq!(recording.damage(), None);
+        assert_eq!(recording.damage(), []);
         let told = |stream| recording.entries().iter().filter(|entry| entry.key.topic == topic("10", stream)).count();
         assert_eq!([Stream::Lidar, Stream::Pose, Stream::Detections].map(told), [TICKS; 3], "{method}");
         let (again, _) = play_in_lockstep(&file, method, RateConfig::default());
@@ -290,7 +290,7 @@ fn live_in_lockstep_equals_offline_bit_by_bit_and_the_books_balance() {
         assert!(offline.iter().any(|(_, detections)| !detections.is_empty()), "{method}: nothing to compare");
         assert_eq!(live.len(), offline.len(), "{method}");
         for (tick, ((live_capture, live), (capture, offline))) in live.iter().zip(&offline).enumerate() {
-            assert_eq!(live.frame_index, tick as u64, "{method}");
+            assert_eq!(live.agent_frame, tick as u64, "{method}");
             assert_eq!((live_capture, live.detections.len()), (capture, offline.len()), "{method}");
             for (live, offline) in live.detections.iter().zip(offline) {
                 assert_eq!(live, offline, "{method} at {capture}");

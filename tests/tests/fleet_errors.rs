@@ -81,6 +81,7 @@ fn a_port_in_use_is_named() {
     let (code, said) = refused(folder.path(), &scenario);
     assert_eq!(code, Some(1), "{said}");
     assert!(said.contains(&endpoint) && said.contains("in use"), "{said}");
+    assert!(!folder.path().join("runs/test").exists(), "the name is free for the next attempt");
 }
 
 #[test]

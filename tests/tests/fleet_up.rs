@@ -17,7 +17,7 @@ fn json(path: &std::path::Path) -> Value {
 fn a_fleet_plays_its_scene_and_accounts_for_every_message() {
     let _alone = alone();
     let folder = tempfile::tempdir().unwrap();
-    let scenario = write_scenario(folder.path(), 6, "lockstep: true", "record: {without: [bev]}");
+    let scenario = write_scenario(folder.path(), 8, "lockstep: true, seek: 2", "record: {without: [bev]}");
     let mut up = Up::start(folder.path(), &scenario);
     let status = up.wait();
     let run = &up.folder;
@@ -36,10 +36,16 @@ fn a_fleet_plays_its_scene_and_accounts_for_every_message() {
     let results = results(run);
     assert_eq!(results.len(), 6);
     assert!(results.iter().all(|result| fused(result) == 1), "in lockstep nobody is late");
-    assert_eq!(fs::read_to_string(run.join("frames.csv")).unwrap().lines().count(), 7);
+    let ticks: Vec<_> =
+        results.iter().map(|result| (result["tick"].as_u64(), result["agent_frame"].as_u64())).collect();
+    assert_eq!(ticks, (0..6).map(|frame| (Some(frame + 2), Some(frame))).collect::<Vec<_>>());
+    let frames = fs::read_to_string(run.join("frames.csv")).unwrap();
+    let of_table: Vec<_> = frames.lines().skip(1).map(|line| line.split(',').take(3).collect::<Vec<_>>()).collect();
+    let of_results = |result: &Value| ["tick", "agent_frame", "capture_nanos"].map(|name| result[name].to_string());
+    assert_eq!(of_table, results.iter().map(of_results).collect::<Vec<_>>(), "both files count alike");
     assert!(fs::metadata(run.join("frame.png")).unwrap().len() > 1_000);
     let recording = Recording::open(&run.join("recording.mcap")).unwrap();
-    assert_eq!(recording.damage(), None);
+    assert_eq!(recording.damage(), []);
     let told = |stream| {
         let is_it = |topic: &Topic| matches!(topic, Topic::Stream { stream: known, .. } if *known == stream);
         recording.entries().iter().filter(|entry| is_it(&entry.key.topic)).count()
@@ -50,7 +56,7 @@ fn a_fleet_plays_its_scene_and_accounts_for_every_message() {
     }
     let resolved = Scenario::load(&run.join("scenario.yaml")).unwrap();
     assert_eq!(resolved.scene.agents.len(), 2);
-    assert_eq!(resolved.provenance.unwrap().scene_files, 24);
+    assert_eq!(resolved.provenance.unwrap().scene_files, 32);
 }
 
 #[test]
@@ -131,7 +137,7 @@ fn a_killed_replay_goes_on_where_it_was() {
     let results = results(&up.folder);
     let capture = |result: &Value| result["capture_nanos"].as_u64().unwrap();
     assert!(results.len() > heard && results.windows(2).all(|pair| capture(&pair[0]) < capture(&pair[1])));
-    assert_eq!(results.last().unwrap()["frame_index"], 39, "to the end of the scene, which is the run's");
+    assert_eq!(results.last().unwrap()["tick"], 39, "to the end of the scene, which is the run's");
     let ledger = json(&up.folder.join("ledger.json"));
     assert_eq!(ledger["balances"], true, "{}", ledger["balance"]);
 }

@@ -8,7 +8,7 @@ use protocol::{CavId, DropReason, Ledger, Limits, PointCloud, Pose, PoseEstimate
 use sim_replay::bus::shutdown::Stop;
 use sim_replay::bus::{Barrier, Bus, Event, InboxLimits, PublisherOptions, Route};
 use sim_replay::link::node::{self, LinkReport, NodeOptions};
-use sim_replay::link::{Air, CapacityConfig, DelayLaw, DeviceClock, LinkConfig, LossLaw};
+use sim_replay::link::{Air, CapacityConfig, DelayLaw, DeviceClock, LinkConfig, LossLaw, TraceConfig};
 use tests::bus::{PATIENCE, TestRouter, next_event, wait_for};
 
 /// Sweeps that are sent, and their points: 16 kB each.
@@ -127,6 +127,32 @@ fn a_long_delay_keeps_no_more_than_it_may() {
     assert_eq!((report.offered, report.arrived), (COUNT, 2));
     assert_eq!(report.dropped, [(DropReason::LinkQueue, COUNT - 2)].into());
     assert_eq!(ledger.total().dropped[&DropReason::LinkQueue], COUNT - 2);
+}
+
+#[test]
+fn a_link_that_carries_nothing_says_so() {
+    let router = TestRouter::open();
+    let [agent, link] = [("agent-7", "7"), ("link-9", "9")].map(|(name, id)| router.join(name, id));
+    let folder = tempfile::tempdir().unwrap();
+    std::fs::write(folder.path().join("rates.csv"), "time_s,rate_mbps,delay_ms,loss\n0,27,0,0\n60,0,0,0\n").unwrap();
+    let trace = TraceConfig { offset_s: 60.0, ..TraceConfig::new(Path::new("rates.csv")) };
+    let config = LinkConfig { capacity: CapacityConfig::Trace(trace), ..LinkConfig::default() };
+    let air = Air::new(config, folder.path(), 1).unwrap();
+    let (sent, stop, options) = (Topic::Stream { cav: cav("7"), stream: Stream::Points }, Stop::new(), options());
+    let report = std::thread::scope(|scope| {
+        let carrying = scope.spawn(|| node::run(&link, air, &options, &stop).unwrap());
+        let _presence = agent.announce(Role::Agent).unwrap();
+        let publisher = agent.publisher(sent.clone(), PublisherOptions::FEATURES.lossless(16)).unwrap();
+        wait_for_route(&agent, &sent, "link-9");
+        (0..COUNT).for_each(|tick| publisher.offer(tick, points(tick)));
+        publisher.finish();
+        // Longer than any message of use is under way.
+        std::thread::sleep(Duration::from_millis(5_500));
+        stop.request();
+        carrying.join().unwrap()
+    });
+    assert_eq!((report.offered, report.arrived, report.under_way), (COUNT, 0, COUNT), "{report:?}");
+    assert!(report.longest_ms > 5_000 && !report.is_complete(), "{report:?}");
 }
 
 #[test]

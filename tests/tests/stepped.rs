@@ -240,7 +240,7 @@ fn a_stepped_run_is_the_same_bytes_every_time() {
     assert_eq!((latency.p50, latency.p99), (Some(120.0), Some(120.0)), "the deadline, and the fusion");
     assert!(one.metrics.age_ms.p50.unwrap() >= 100.0 && one.metrics.pose.mean_m.unwrap() > 0.05);
     let frames = fs::read_to_string(one.folder.file("frames.csv")).unwrap();
-    assert!(frames.starts_with("frame_index,") && frames.lines().nth(1).unwrap().starts_with("1,"), "{frames}");
+    assert!(frames.starts_with("tick,agent_frame,") && frames.lines().nth(1).unwrap().starts_with("1,0,"), "{frames}");
     assert_eq!(results(one.folder.path()).len(), TICKS - 1);
 }
 

@@ -177,7 +177,7 @@ fn pause_step_seek_and_resume_steer_the_clock() {
     let next_truth = || loop {
         if let (Topic::Truth, Event::Message(arrival)) = next_event(&listener.inbox) {
             let truth: Truth = listener.inbox.decode(&arrival, &Limits::DEFAULT).unwrap();
-            return (truth.frame_index, arrival.header.stamp.capture_nanos);
+            return (truth.tick, arrival.header.stamp.capture_nanos);
         }
     };
     let recorded: Vec<u64> = scenario.ticks.iter().map(|tick| tick.capture_nanos).collect();
@@ -189,7 +189,7 @@ fn pause_step_seek_and_resume_steer_the_clock() {
         // While ticks come, the replay listens: its subscriptions have gone the same way before them.
         while next_truth().0 < 2 {}
         operator.say(Control::Pause, 0);
-        operator.say(Control::Seek { frame_index: 6 }, 0);
+        operator.say(Control::Seek { tick: 6 }, 0);
         operator.say(Control::Step { ticks: 1 }, 0);
         // Anything before tick 6 was out before the pause arrived.
         let capture = loop {
@@ -202,8 +202,8 @@ fn pause_step_seek_and_resume_steer_the_clock() {
         assert_eq!(capture, recorded[6]);
         operator.say(Control::Step { ticks: 2 }, 0);
         assert_eq!([next_truth().0, next_truth().0], [7, 0]);
-        operator.say(Control::Seek { frame_index: 99 }, 0);
-        operator.say(Control::Seek { frame_index: 4 }, 0);
+        operator.say(Control::Seek { tick: 99 }, 0);
+        operator.say(Control::Seek { tick: 4 }, 0);
         operator.say(Control::Resume, 0);
         let (index, capture) = next_truth();
         assert_eq!(index, 4);

@@ -21,6 +21,7 @@ use anyhow::Context;
 use clap::ValueEnum;
 use indicatif::{ProgressBar, ProgressStyle};
 use sim_replay::dataset::LeftOut;
+use sim_replay::output;
 use tch::Device;
 
 use super::town_heads::{TownHead, by_head};
@@ -143,14 +144,14 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     }
     if let ([(head, _)], true) = (&groups[..], args.fit_confidence) {
         let report = args.fit(head, &mut sweeps)?;
-        eprintln!("{}", report_line(&report));
+        output::note(report_line(&report));
     }
     args.write(&sweeps)?;
     let summary = LocalizationSummary::of(&sweeps);
     if args.json {
-        println!("{}", serde_json::to_string_pretty(&summary)?);
+        output::line(serde_json::to_string_pretty(&summary)?)?;
     } else {
-        print!("{}", table(&summary));
+        output::text(table(&summary))?;
     }
     Ok(Outcome::of(&left_out))
 }
@@ -224,7 +225,7 @@ impl Args {
         let (model, report) =
             ConfidenceModel::fit(&labelled, self.good_loss).map_err(|error| BadInput(error.into()))?;
         let sha256 = annotate(head, CONFIDENCE_KEY, &serde_json::to_string(&model)?)?;
-        eprintln!("{}: confidence written, SHA-256 is now {sha256}", head.display());
+        output::note(format_args!("{}: confidence written, SHA-256 is now {sha256}", head.display()));
         let confidence = Confidence::Calibrated(model);
         sweeps.iter_mut().for_each(|sweep| sweep.judge_again(&confidence));
         Ok(report)

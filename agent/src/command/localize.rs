@@ -7,6 +7,7 @@ use agent::pose_source::{LocalizedPose, PgcConfig, PoseInput, PoseRow, PoseSourc
 use indicatif::{ProgressBar, ProgressStyle};
 use protocol::PoseEstimate;
 use sim_replay::dataset::{self, LeftOut, LoadOptions, Problem, Scenario};
+use sim_replay::output;
 
 use super::town_heads::{TownHead, head_of};
 use crate::cli::{BadInput, Outcome};
@@ -45,6 +46,10 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     // Which head each needs is known before any is computed with.
     let heads: Vec<&Path> = scenarios.iter().map(|scenario| head_of(&args.head, scenario)).collect::<Result<_, _>>()?;
     let sweeps: usize = scenarios.iter().map(frames).sum();
+    if sweeps == 0 && done.is_empty() {
+        let scenes: Vec<String> = args.scene.iter().map(|scene| scene.display().to_string()).collect();
+        return Err(bad(anyhow::anyhow!("there is no sweep in {}", scenes.join(", "))));
+    }
     let bar = ProgressBar::new(sweeps as u64)
         .with_style(ProgressStyle::with_template("{bar:30} {pos}/{len} sweeps  {eta} left")?);
     let mut found = 0;
@@ -53,7 +58,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
         found += args.localize(scenario, head, &mut left_out, &bar)?;
     }
     bar.finish_and_clear();
-    println!("{sweeps} sweeps, {found} with a pose; {} were there before: {}", done.len(), args.out.display());
+    output::line(format_args!(
+        "{sweeps} sweeps, {found} with a pose; {} were there before: {}",
+        done.len(),
+        args.out.display()
+    ))?;
     Ok(Outcome::of(&left_out))
 }
 

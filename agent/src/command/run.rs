@@ -14,6 +14,7 @@ use anyhow::Context;
 use clap::ValueEnum;
 use protocol::{CavId, CodecConfig, ConfidenceGate, Dtype, Role, Smoothing, Stream};
 use sim_replay::bus::{BusArgs, STOP_LIMIT, log_to_stderr};
+use sim_replay::output;
 
 use crate::cli::BadInput;
 
@@ -220,9 +221,12 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         tracing::warn!("{overdue}");
     }
     if args.json {
-        println!("{}", serde_json::to_string(&report)?);
+        output::line(serde_json::to_string(&report)?)?;
     } else {
-        println!("{} sweeps, {} without a pose, {} failed", report.sweeps, report.no_pose, report.failed);
+        output::line(format_args!(
+            "{} sweeps, {} without a pose, {} failed",
+            report.sweeps, report.no_pose, report.failed
+        ))?;
     }
     Ok(())
 }

@@ -5,6 +5,7 @@ use std::io::IsTerminal;
 use std::time::{Duration, Instant};
 
 use indicatif::{ProgressBar, ProgressStyle};
+use sim_replay::output;
 
 /// Plain lines come no more often than this.
 const LINE_EVERY: Duration = Duration::from_secs(10);
@@ -62,14 +63,14 @@ impl TrainingBar {
             self.bar.set_message(text.to_owned());
         } else if self.last_line.get().is_none_or(|last| last.elapsed() >= LINE_EVERY) {
             let to_go = remaining_s.map(|seconds| format!(", {seconds:.0} s to go")).unwrap_or_default();
-            eprintln!("{text}, {:.1} % done{to_go}", 100.0 * share_done);
+            output::note(format_args!("{text}, {:.1} % done{to_go}", 100.0 * share_done));
             self.last_line.set(Some(Instant::now()));
         }
     }
 
     /// A line that stays.
     pub fn say(&self, text: &str) {
-        if self.is_watched { self.bar.println(text) } else { eprintln!("{text}") }
+        if self.is_watched { self.bar.println(text) } else { output::note(text) }
     }
 
     /// Takes the bar away.

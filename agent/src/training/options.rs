@@ -1,9 +1,11 @@
 //! The part of the command line that all trainings share.
 
+use std::io;
 use std::path::PathBuf;
 use std::time::Duration;
 
 use clap::ValueEnum;
+use sim_replay::output;
 use tch::{Cuda, Device};
 
 use super::run_config::{ComputePrecision, Length, RunConfig};
@@ -93,7 +95,10 @@ impl TrainingOptions {
     }
 
     /// Prints how a training ended; `more` is an object of what JSON has beside steps, time and weights.
-    pub fn print(&self, trained: &Trained, more: &serde_json::Value) {
+    ///
+    /// # Errors
+    /// As [`output::line`].
+    pub fn print(&self, trained: &Trained, more: &serde_json::Value) -> io::Result<()> {
         let Trained { steps, seconds, weights, sha256, .. } = trained;
         if self.json {
             let mut report =
@@ -101,9 +106,9 @@ impl TrainingOptions {
             if let (Some(report), Some(more)) = (report.as_object_mut(), more.as_object()) {
                 report.extend(more.clone());
             }
-            println!("{report}");
+            output::line(report)
         } else {
-            println!("{steps} steps in {seconds:.0} s: {}", weights.display());
+            output::line(format_args!("{steps} steps in {seconds:.0} s: {}", weights.display()))
         }
     }
 

@@ -10,6 +10,7 @@ use deploy::scenario::Scenario;
 use deploy::up::{RunResult, UpOptions, up};
 use ego_fuser::Method;
 use protocol::RunId;
+use sim_replay::output;
 use sim_replay::synth::{self, Subset, SynthError, SynthOptions};
 
 use super::{BadInput, Outcome, programs};
@@ -82,16 +83,16 @@ impl Arguments {
         if synth::are_kept(&options).map_err(|error| BadInput(error.to_string()))? {
             return Ok(folder);
         }
-        eprintln!(
+        output::note(format_args!(
             "generating {} frames of {} vehicles (seed {}) into {}",
             self.frames,
             self.agents,
             self.seed,
             folder.display()
-        );
+        ));
         let began = Instant::now();
         generate(&options)?;
-        eprintln!("generated in {:.1} s", began.elapsed().as_secs_f64());
+        output::note(format_args!("generated in {:.1} s", began.elapsed().as_secs_f64()));
         Ok(folder)
     }
 
@@ -108,12 +109,12 @@ impl Arguments {
     fn print(&self, results: &[RunResult]) -> anyhow::Result<()> {
         let Some(last) = results.last() else { return Ok(()) };
         if self.json {
-            println!("{}", serde_json::to_string_pretty(&last.metrics)?);
+            output::line(serde_json::to_string_pretty(&last.metrics)?)?;
             return Ok(());
         }
         let metrics: Vec<_> = results.iter().map(|result| result.metrics.clone()).collect();
-        print!("{}", report::table(&metrics));
-        print!("{}", report::run_notes(last));
+        output::text(report::table(&metrics))?;
+        output::text(report::run_notes(last))?;
         Ok(())
     }
 }

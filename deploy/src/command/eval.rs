@@ -21,9 +21,11 @@ use ego_fuser::pairing::PairingConfig;
 use ego_fuser::trust::TrustConfig;
 use indicatif::{ProgressBar, ProgressStyle};
 use protocol::{CodecConfig, ConfidenceGate, Dtype};
+use sim_replay::dataset::IntensityScale;
 use sim_replay::dataset::LeftOut;
 use sim_replay::evaluation_protocol::ProtocolConfig;
 use sim_replay::link::LinkConfig;
+use sim_replay::output;
 
 use super::{BadInput, Outcome};
 
@@ -128,6 +130,9 @@ pub(crate) struct Arguments {
     /// Scenarios to judge at most, evenly spread [default: all].
     #[arg(long, value_parser = clap::value_parser!(u64).range(1..))]
     scenarios: Option<u64>,
+    /// Number that stored intensities are divided by [default: auto; `sim-replay inspect --help` says by what].
+    #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
+    intensity_scale: IntensityScale,
     /// Threads to compute with.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
     threads: u16,
@@ -205,11 +210,13 @@ impl Arguments {
         }
         bar.finish_and_clear();
         match (self.json, &all[..]) {
-            (true, [one]) => println!("{}", serde_json::to_string_pretty(one)?),
-            (true, several) => println!("{}", serde_json::to_string_pretty(several)?),
+            (true, [one]) => output::line(serde_json::to_string_pretty(one)?)?,
+            (true, several) => output::line(serde_json::to_string_pretty(several)?)?,
             (false, several) => {
-                print!("{}", report::table(several));
-                several.iter().take(1).filter_map(|metrics| metrics.protocol.as_ref()).for_each(|it| println!("{it}"));
+                output::text(report::table(several))?;
+                if let Some(protocol) = several.iter().find_map(|metrics| metrics.protocol.as_ref()) {
+                    output::line(protocol)?;
+                }
             }
         }
         Ok(left_out(&all))
@@ -256,7 +263,7 @@ impl Arguments {
             }),
             frames: self.frames.map(at_most),
             stepped: self.link.as_deref().map(|link| self.stepped(link)).transpose()?,
-            part: Part { scenarios: self.scenarios.map(at_most), ticks: None },
+            part: Part { scenarios: self.scenarios.map(at_most), ticks: None, intensity_scale: self.intensity_scale },
             protocol: self.protocol.clone(),
         })
     }
@@ -326,10 +333,10 @@ fn left_out(all: &[Metrics]) -> Outcome {
     let mut sum = LeftOut::default();
     all.iter().for_each(|metrics| sum.merge(&metrics.left_out));
     for problem in sum.problems() {
-        eprintln!("left out: {}", problem.message);
+        output::note(format_args!("left out: {}", problem.message));
     }
     if let Some(one) = all.iter().map(|metrics| &metrics.left_out).find(|one| **one != LeftOut::default()) {
-        eprintln!("{one}");
+        output::note(one);
     }
     Outcome::of(!sum.is_nothing())
 }
@@ -339,7 +346,7 @@ fn tables(spec: &Path, out: &Path) -> anyhow::Result<Outcome> {
     let mut progress = TableProgress(ProgressBar::new_spinner());
     let filled = table::run(&TableSpec::read(spec)?, out, &mut progress)?;
     progress.0.finish_and_clear();
-    filled.iter().for_each(|table| println!("{}", table::markdown(table)));
+    filled.iter().try_for_each(|table| output::line(table::markdown(table)))?;
     Ok(Outcome::Done)
 }
 
@@ -350,7 +357,7 @@ impl TableObserver for TableProgress {
     fn cell(&mut self, table: &str, row: &str, column: &str, known: bool) {
         let text = format!("{table}: {row}, {column}{}", if known { ", known" } else { "" });
         if self.0.is_hidden() {
-            eprintln!("{text}");
+            output::note(&text);
         }
         self.0.set_message(text);
     }

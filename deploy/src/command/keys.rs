@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use deploy::keys::{KeyError, KeyPlan, make};
 use protocol::{CavId, Party, Role};
+use sim_replay::output;
 
 use super::{BadInput, Outcome};
 
@@ -51,9 +52,9 @@ impl Arguments {
             KeyError::Io { .. } => anyhow::Error::from(error),
         })?;
         if self.json {
-            println!("{}", serde_json::to_string_pretty(&written)?);
+            output::line(serde_json::to_string_pretty(&written)?)?;
         } else {
-            written.iter().for_each(|path| println!("{}", path.display()));
+            written.iter().try_for_each(|path| output::line(path.display()))?;
         }
         Ok(Outcome::Done)
     }

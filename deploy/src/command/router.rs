@@ -8,6 +8,7 @@ use anyhow::Context;
 use protocol::{RunId, Runs};
 use sim_replay::bus::shutdown::Stop;
 use sim_replay::bus::{BusOptions, Credentials, Endpoint, Guard, ROUTER, Refusals, STOP_LIMIT, open};
+use sim_replay::output;
 use zenoh::Wait;
 
 use super::Outcome;
@@ -53,7 +54,7 @@ impl Arguments {
         if let Some(path) = &self.zenohd {
             let text = serde_json::to_string_pretty(&options.for_zenohd())? + "\n";
             std::fs::write(path, text).with_context(|| path.display().to_string())?;
-            eprintln!("{}", path.display());
+            output::note(path.display());
             return Ok(Outcome::Done);
         }
         let stop = Stop::new();
@@ -63,7 +64,7 @@ impl Arguments {
         }
         stop.enforce(STOP_LIMIT);
         let session = open(&options)?;
-        eprintln!("routing at {} (Ctrl-C ends it)", options.endpoint());
+        output::note(format_args!("routing at {} (Ctrl-C ends it)", options.endpoint()));
         let (mut refusals, mut said) = (Refusals::of(options.endpoint()), BTreeMap::new());
         loop {
             let ended = stop.wait_until(Instant::now() + LOOK_ROUND);

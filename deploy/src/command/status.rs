@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use deploy::status::RunStatus;
+use sim_replay::output;
 
 use super::{BadInput, Outcome};
 
@@ -29,11 +30,12 @@ impl Arguments {
         };
         let status = RunStatus::read(&folder).map_err(bad_input)?;
         if self.json {
-            println!("{}", serde_json::to_string_pretty(&status)?);
+            output::line(serde_json::to_string_pretty(&status)?)?;
         } else {
-            print!("{}", status.table());
+            output::text(status.table())?;
         }
-        anyhow::ensure!(status.is_well(), "run {} is not well", status.run);
+        let troubles = status.troubles();
+        anyhow::ensure!(troubles.is_empty(), "run {} is not well: {}", status.run, troubles.join("; "));
         Ok(Outcome::Done)
     }
 }

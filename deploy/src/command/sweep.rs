@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use deploy::sweep::{Experiment, Sweep, SweepOptions};
+use sim_replay::output;
 
 use super::Outcome;
 
@@ -39,9 +40,9 @@ impl Arguments {
         }
         let options = SweepOptions { out: out.clone(), jobs: usize::from(self.jobs), dry_run: self.dry_run };
         let table = sweep.run(&options)?;
-        print!("{table}");
+        output::text(&table)?;
         if !self.dry_run {
-            eprintln!("report {}", out.join("report.html").display());
+            output::note(format_args!("report {}", out.join("report.html").display()));
         }
         Ok(Outcome::Done)
     }

@@ -7,6 +7,7 @@ use deploy::scenario::Scenario;
 use deploy::up::{UpOptions, up};
 use ego_fuser::Method;
 use protocol::RunId;
+use sim_replay::output;
 
 use super::{Outcome, programs};
 
@@ -57,9 +58,9 @@ impl Arguments {
         scenario.check(&self.scenario)?;
         let result = up(&scenario, &UpOptions { runs: self.runs, programs: programs()?, prefix: "up" })?;
         if self.json {
-            println!("{}", serde_json::to_string_pretty(&result.metrics)?);
+            output::line(serde_json::to_string_pretty(&result.metrics)?)?;
         } else {
-            print!("{}", report::run_table(&result));
+            output::text(report::run_table(&result))?;
         }
         Ok(Outcome::of(result.lost_data()))
     }

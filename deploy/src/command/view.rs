@@ -9,6 +9,7 @@ use deploy::view::{LiveRun, Onlooker, RecordedRun, ViewError, serve_live, serve_
 use protocol::{CavId, Role, RunId};
 use sim_replay::bus::shutdown::Stop;
 use sim_replay::bus::{Bus, BusOptions, Credentials, Endpoint, Identity, process_id};
+use sim_replay::output;
 use sim_replay::web::WebServer;
 
 use super::{BadInput, Outcome};
@@ -54,7 +55,7 @@ impl Arguments {
                     ViewError::NotRecorded(_) | ViewError::Empty(_) => anyhow::Error::from(BadInput(error.to_string())),
                     ViewError::Recording(_) => anyhow::Error::from(error),
                 })?;
-                eprintln!("{} moments of run {}", run.len(), run.name());
+                output::note(format_args!("{} moments of run {}", run.len(), run.name()));
                 #[cfg(feature = "rerun")]
                 if let Some(destination) = &self.rerun {
                     deploy::view::write_for_rerun(&run, destination)?;
@@ -81,7 +82,7 @@ impl Arguments {
             }
         };
         let server = server.map_err(|error| BadInput(format!("cannot serve at {}: {error}", self.listen)))?;
-        eprintln!("http://{}/ (Ctrl-C ends it)", server.address());
+        output::note(format_args!("http://{}/ (Ctrl-C ends it)", server.address()));
         while !stop.wait_until(Instant::now() + Duration::from_secs(3600)) {}
         say_dropped(&server);
         Ok(Outcome::Done)
@@ -99,7 +100,7 @@ impl Arguments {
         let mut log = Some(log);
         Ok(Some(Box::new(move |frame| {
             if let Some(Err(error)) = log.as_mut().map(|log| log.write(frame)) {
-                eprintln!("{error}; nothing more is written for Rerun");
+                output::note(format_args!("{error}; nothing more is written for Rerun"));
                 log = None;
             }
         })))
@@ -109,6 +110,6 @@ impl Arguments {
 fn say_dropped(server: &WebServer) {
     let dropped = server.readers().dropped();
     if dropped > 0 {
-        eprintln!("{dropped} readers did not read and were dropped");
+        output::note(format_args!("{dropped} readers did not read and were dropped"));
     }
 }

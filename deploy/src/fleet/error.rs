@@ -64,6 +64,19 @@ pub enum FleetError {
         /// The vehicles there are.
         found: Vec<String>,
     },
+    /// A vehicle is to take its pose from a recording that has none.
+    #[error(
+        "vehicle {cav}: pose is {source_name}, but scenario {name} has no poses of it (no lidar_pose); choose pose: pgc, \
+         which finds them"
+    )]
+    NoPoses {
+        /// The vehicle.
+        cav: CavId,
+        /// Where its pose was to come from.
+        source_name: &'static str,
+        /// The scenario.
+        name: String,
+    },
     /// The weights cannot be used.
     #[error("weights: {0}")]
     Weights(#[from] WeightsError),

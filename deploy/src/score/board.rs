@@ -179,14 +179,14 @@ impl Board {
         let ego = tick.poses.iter().position(|(cav, _)| *cav == self.ego);
         let posed_nanos = ego.and_then(|ego| tick.posed_nanos.get(ego).copied());
         let stamps = StageStamps::of(began_nanos, posed_nanos, done_nanos, &result.stages);
-        self.judge_result((truth.frame_index, capture_nanos), stamps, result, boxes, world_from_lidar);
+        self.judge_result((truth.tick, capture_nanos), stamps, result, boxes, world_from_lidar);
     }
 
     /// Judges a frame whose truth is known already, at once; `poses` are everyone's estimates. Nothing that
     /// [`Self::truth`], [`Self::result`] and [`Self::pose`] take may be given for it.
     pub fn judge_whole(
         &mut self,
-        capture_nanos: u64,
+        (tick, capture_nanos): (u64, u64),
         latency_ms: Option<f64>,
         result: Detections,
         boxes: Vec<Box3d>,
@@ -195,12 +195,12 @@ impl Board {
     ) {
         self.judge_poses(poses, &world_from_lidar);
         let stamps = StageStamps { detected_ms: latency_ms, ..StageStamps::default() };
-        self.judge_result((result.frame_index, capture_nanos), stamps, result, boxes, world_from_lidar);
+        self.judge_result((tick, capture_nanos), stamps, result, boxes, world_from_lidar);
     }
 
     fn judge_result(
         &mut self,
-        (frame_index, capture_nanos): (u64, u64),
+        (tick, capture_nanos): (u64, u64),
         stamps: StageStamps,
         result: Detections,
         boxes: Vec<Box3d>,
@@ -213,7 +213,8 @@ impl Board {
         let ego_error = result.pose.world_from_cav().zip(true_pose(&world_from_lidar, &self.ego));
         let ego_error = ego_error.map(|(found, truth)| PoseError::between(found, truth));
         self.records.push(FrameRecord {
-            frame_index,
+            tick,
+            agent_frame: result.agent_frame,
             capture_nanos,
             latency_ms: stamps.detected_ms,
             stamps,
@@ -232,7 +233,7 @@ impl Board {
         neighbours::add(&mut self.neighbours, &result);
         self.bytes.extend(bytes);
         self.ages_ms.extend(ages_ms);
-        self.keep_showpiece(frame_index, result, boxes, world_from_lidar);
+        self.keep_showpiece(tick, result, boxes, world_from_lidar);
     }
 
     /// Adds a frame to the score; returns how many detections count as found.
@@ -260,7 +261,7 @@ impl Board {
 
     fn keep_showpiece(
         &mut self,
-        frame_index: u64,
+        tick: u64,
         result: Detections,
         boxes: Vec<Box3d>,
         world_from_lidar: Vec<(CavId, Pose)>,
@@ -270,7 +271,7 @@ impl Board {
             worth(result.fused.len(), boxes.len()) > worth(best.result.fused.len(), best.truth.len())
         });
         if better {
-            self.best = Some(JudgedFrame { frame_index, result, truth: boxes, world_from_lidar });
+            self.best = Some(JudgedFrame { tick, result, truth: boxes, world_from_lidar });
         }
     }
 }

@@ -8,8 +8,10 @@ use super::StageStamps;
 /// One line of `frames.csv`.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct FrameRecord {
-    /// Which frame of the scene, counted from 0.
-    pub frame_index: u64,
+    /// Tick of the scene, counted from 0.
+    pub tick: u64,
+    /// Frame of the ego's own agent, see [`Detections::agent_frame`].
+    pub agent_frame: u64,
     /// Capture time on the scene's clock, nanoseconds.
     pub capture_nanos: u64,
     /// From the publication of the tick to that of its detections, milliseconds; none where nothing was published.
@@ -44,8 +46,8 @@ pub struct FrameRecord {
 /// A result and what it was judged against, for pictures.
 #[derive(Debug, Clone)]
 pub struct JudgedFrame {
-    /// Which frame of the scene, counted from 0.
-    pub frame_index: u64,
+    /// Tick of the scene, counted from 0.
+    pub tick: u64,
     /// The ego's result.
     pub result: Detections,
     /// What was there, in the ego's LiDAR frame.

@@ -4,6 +4,7 @@ mod board;
 mod frame_record;
 mod neighbours;
 mod node;
+mod numbered_results;
 mod open_ticks;
 mod result_lines;
 mod stage_stamps;

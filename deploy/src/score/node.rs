@@ -15,6 +15,7 @@ use sim_replay::bus::{Arrival, Bus, BusError, Event, Identity, Inbox, Presence, 
 use zenoh::Session;
 
 use super::Board;
+use super::numbered_results::NumberedResults;
 use super::result_lines::ResultLines;
 use crate::absences::Absences;
 
@@ -155,6 +156,7 @@ impl ScorerNode {
             books: BTreeMap::new(),
             progress: Arc::clone(&progress),
             detections,
+            numbered: NumberedResults::default(),
             published: BTreeMap::new(),
         };
         let thread = thread::Builder::new().name(SCORER.into()).spawn(move || worker.run());
@@ -224,6 +226,7 @@ struct Worker {
     books: Books,
     progress: Arc<Mutex<Progress>>,
     detections: ResultLines,
+    numbered: NumberedResults,
     // When each recent tick was published, by capture time: for the latency that is shown while the run goes.
     published: BTreeMap<u64, u64>,
 }
@@ -238,6 +241,7 @@ impl Worker {
                 Taken::Closed => break,
             }
         }
+        self.write_results(true);
         self.board.close();
         (self.board, self.books, self.detections.finish())
     }
@@ -263,7 +267,9 @@ impl Worker {
         while self.published.len() > PLACES {
             self.published.pop_first();
         }
+        self.numbered.tick(stamp.capture_nanos, truth.tick);
         self.board.truth(stamp, truth);
+        self.write_results(false);
         self.note(|progress| progress.ticks += 1);
         Some(())
     }
@@ -271,7 +277,8 @@ impl Worker {
     fn result(&mut self, arrival: &Arrival) -> Option<()> {
         let result: Detections = self.inbox.decode(arrival, &Limits::DEFAULT)?;
         let stamp = &arrival.header.stamp;
-        self.detections.add(&DetectionsReport::new(stamp, result.clone()));
+        self.numbered.result(DetectionsReport::new(stamp, None, result.clone()));
+        self.write_results(false);
         let began = self.published.get(&stamp.capture_nanos);
         let latency_ms = began.map(|began| (stamp.publish_nanos as f64 - *began as f64) / 1e6);
         let heard = result.heard.clone();
@@ -288,6 +295,13 @@ impl Worker {
         });
         self.board.result(stamp, result);
         Some(())
+    }
+
+    /// Writes the results whose tick is known, or will not be.
+    fn write_results(&mut self, is_over: bool) {
+        while let Some(report) = self.numbered.next(is_over) {
+            self.detections.add(&report);
+        }
     }
 
     fn pose(&mut self, arrival: &Arrival) -> Option<()> {

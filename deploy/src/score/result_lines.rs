@@ -99,7 +99,7 @@ mod tests {
         let stamp = Stamp { cav: ego.clone(), epoch: 1, sequence: tick, capture_nanos: tick, publish_nanos: tick };
         let result = Detections {
             ego,
-            frame_index: tick,
+            agent_frame: tick,
             method: "max".into(),
             pose: PoseEstimate::new(Pose::IDENTITY, 1.0),
             detections: vec![],
@@ -108,7 +108,7 @@ mod tests {
             heard: vec![],
             stages: vec![],
         };
-        DetectionsReport::new(&stamp, result)
+        DetectionsReport::new(&stamp, Some(tick), result)
     }
 
     #[test]
@@ -133,7 +133,7 @@ mod tests {
         lines.add(&report(99));
         assert_eq!(lines.finish(), 30);
         let written = disk.lines();
-        assert_eq!((written.len(), &written[fitting]["frame_index"]), (fitting + 1, &99.into()));
+        assert_eq!((written.len(), &written[fitting]["tick"]), (fitting + 1, &99.into()));
 
         let full = Disk::default();
         let mut lines = ResultLines::over(full.clone());

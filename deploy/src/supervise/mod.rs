@@ -3,6 +3,7 @@
 //! Every process reads its standard input as a lifeline: the supervisor holds the other end and never writes, so that
 //! the death of the supervisor, however sudden, ends the fleet.
 
+mod said;
 #[cfg(test)]
 mod tests;
 mod watcher;
@@ -76,7 +77,17 @@ pub enum Happening {
         /// Whether the run can go on without it.
         is_optional: bool,
     },
-    /// It ended by itself, as it should.
+    /// It printed a line of its report.
+    Said {
+        /// The line.
+        line: String,
+    },
+    /// It was asked to end, and ended in another way than it should.
+    Failed {
+        /// How it ended, in words.
+        how: String,
+    },
+    /// It ended as it should, by itself or as it was asked to.
     Done {
         /// It says that data were lost.
         data_lost: bool,

@@ -27,6 +27,7 @@ fn next(events: &Receiver<ProcessEvent>) -> Happening {
 fn who_ends_well_is_done() {
     let (supervisor, events, folder) = start(shell("job", Life::Task, "echo hello; exit 3"), 3);
     assert!(matches!(next(&events), Happening::Started { .. }));
+    assert_eq!(next(&events), Happening::Said { line: "hello".into() });
     assert_eq!(next(&events), Happening::Done { data_lost: true });
     assert_eq!(std::fs::read_to_string(folder.path().join("job.log")).unwrap(), "hello\n");
     assert!(supervisor.stop(PATIENCE).killed.is_empty());
@@ -42,6 +43,24 @@ fn a_killed_service_is_started_again() {
     let Happening::Started { pid: second } = next(&events) else { panic!("not restarted") };
     assert_ne!(first, second);
     assert!(supervisor.stop(PATIENCE).killed.is_empty(), "sleep ends on SIGTERM");
+    assert_eq!(next(&events), Happening::Done { data_lost: false });
+}
+
+#[test]
+fn how_it_ends_when_it_is_asked_to_is_told_with_its_last_words() {
+    let waits = |code| format!("trap 'echo 7 missing; exit {code}' TERM; echo up; while :; do sleep 0.05; done");
+    for (code, ended) in [
+        (0, Happening::Done { data_lost: false }),
+        (3, Happening::Done { data_lost: true }),
+        (1, Happening::Failed { how: "ended with code 1".into() }),
+    ] {
+        let (supervisor, events, _folder) = start(shell("recorder", Life::Optional, &waits(code)), 3);
+        assert!(matches!(next(&events), Happening::Started { .. }));
+        assert_eq!(next(&events), Happening::Said { line: "up".into() });
+        assert!(supervisor.stop(PATIENCE).killed.is_empty());
+        assert_eq!(next(&events), Happening::Said { line: "7 missing".into() });
+        assert_eq!(next(&events), ended);
+    }
 }
 
 #[test]
@@ -61,6 +80,7 @@ fn the_lifeline_holds_as_long_as_the_supervisor() {
     while std::fs::read_to_string(&log).unwrap().is_empty() && began.elapsed() < PATIENCE {
         std::thread::yield_now();
     }
+    assert_eq!(next(&events), Happening::Said { line: "up".into() });
     // Its input does not end, so neither does it.
     assert!(events.recv_timeout(Duration::from_millis(200)).is_err());
     drop(supervisor.stop(PATIENCE));
@@ -69,7 +89,7 @@ fn the_lifeline_holds_as_long_as_the_supervisor() {
 
 #[test]
 fn bad_input_is_not_tried_again() {
-    let (_supervisor, events, _folder) = start(shell("car", Life::Service, "echo bad map; exit 2"), 5);
+    let (_supervisor, events, _folder) = start(shell("car", Life::Service, "echo bad map >&2; exit 2"), 5);
     assert!(matches!(next(&events), Happening::Started { .. }));
     assert_eq!(next(&events), Happening::GaveUp { how: "ended with code 2: bad map".into(), is_optional: false });
 }
@@ -130,7 +150,7 @@ fn a_task_that_is_struck_down_takes_up_its_job_and_one_that_cannot_do_it_stays_d
     assert!(matches!(next(&events), Happening::Started { .. }));
     assert!(supervisor.stop(PATIENCE).killed.is_empty());
 
-    let (_supervisor, events, _folder) = start(shell("replay", Life::Task, "echo no scene; exit 1"), 3);
+    let (_supervisor, events, _folder) = start(shell("replay", Life::Task, "echo no scene >&2; exit 1"), 3);
     assert!(matches!(next(&events), Happening::Started { .. }));
     assert_eq!(next(&events), Happening::GaveUp { how: "ended with code 1: no scene".into(), is_optional: false });
 }

@@ -10,8 +10,9 @@ use std::time::{Duration, Instant};
 use rustix::process::{Pid, Signal, kill_process};
 use tokio::process::{Child, Command};
 use tokio::sync::{mpsc, watch};
+use tokio::task::JoinHandle;
 
-use super::{Happening, Life, ProcessEvent, ProcessSpec, SuperviseError};
+use super::{Happening, Life, ProcessEvent, ProcessSpec, SuperviseError, said};
 
 /// Exit code of our programs for bad usage or input: starting again cannot help.
 const BAD_INPUT: i32 = 2;
@@ -23,6 +24,8 @@ const PANIC: i32 = 101;
 const RECOVERED: Duration = Duration::from_secs(10);
 /// First pause before a restart; it doubles up to [`LONGEST_PAUSE`].
 pub(super) const FIRST_PAUSE: Duration = Duration::from_millis(200);
+/// How long the report of a process that has ended may still be on its way.
+const LAST_WORDS: Duration = Duration::from_secs(1);
 /// Longest pause before a restart.
 const LONGEST_PAUSE: Duration = Duration::from_secs(5);
 
@@ -76,6 +79,7 @@ impl Watcher {
                     // Taken out, as waiting for a child closes the input that it still holds.
                     let _lifeline = child.stdin.take();
                     self.tell(Happening::Started { pid: child.id().unwrap_or(0) });
+                    let report = self.follow(&mut child);
                     let stop = self.stop.clone();
                     // A wish of an earlier life.
                     while self.replace.try_recv().is_ok() {}
@@ -85,7 +89,7 @@ impl Watcher {
                             let _ = child.kill().await;
                             why
                         },
-                        status = child.wait() => match status {
+                        status = child.wait() => match heard_out(report, status).await {
                             Ok(status) if is_done(status) && self.spec.life != Life::Service => {
                                 self.tell(Happening::Done { data_lost: !status.success() });
                                 return false;
@@ -98,7 +102,11 @@ impl Watcher {
                             }
                             Err(error) => error.to_string(),
                         },
-                        deadline = asked_to_stop(stop) => return end(child, deadline).await,
+                        deadline = asked_to_stop(stop) => {
+                            let status = end(&mut child, deadline).await;
+                            let status = heard_out(report, status).await;
+                            return self.ended_as_asked(status);
+                        }
                     }
                 }
             };
@@ -123,12 +131,34 @@ impl Watcher {
         Command::new(&self.spec.program)
             .args(&self.spec.args)
             .stdin(Stdio::piped())
-            .stdout(self.log.file.try_clone()?)
+            .stdout(Stdio::piped())
             .stderr(self.log.file.try_clone()?)
             // Ctrl-C on a terminal reaches a whole process group: ours alone, so that the fleet ends in order.
             .process_group(0)
             .kill_on_drop(true)
             .spawn()
+    }
+
+    /// Tells how a process ended that was asked to. Returns whether it had to be killed.
+    fn ended_as_asked(&self, status: Option<ExitStatus>) -> bool {
+        match status {
+            None => return true,
+            // Before it listens to signals it has nothing to lose.
+            Some(status) if is_done(status) || status.signal() == Some(Signal::TERM.as_raw()) => {
+                self.tell(Happening::Done { data_lost: status.code() == Some(DATA_LOST) });
+            }
+            Some(status) => self.tell(Happening::Failed { how: in_words(status) }),
+        }
+        false
+    }
+
+    /// Follows what a process prints, in a task that ends with its output.
+    fn follow(&self, child: &mut Child) -> Option<JoinHandle<()>> {
+        let (output, log) = (child.stdout.take()?, self.log.file.try_clone().ok()?);
+        let (events, name) = (self.events.clone(), self.spec.name.clone());
+        Some(tokio::spawn(said::follow(output, log, move |line| {
+            let _ = events.send(ProcessEvent { name: name.clone(), what: Happening::Said { line } });
+        })))
     }
 
     fn give_up(&self, how: &str) -> bool {
@@ -153,20 +183,29 @@ async fn asked_to_stop(mut stop: watch::Receiver<Option<Instant>>) -> Instant {
     }
 }
 
-/// Asks a process to end, kills it at the deadline. Returns whether it had to be killed.
-async fn end(mut child: Child, deadline: Instant) -> bool {
+/// Asks a process to end, kills it at the deadline. How it ended; `None`: it had to be killed.
+async fn end(child: &mut Child, deadline: Instant) -> Option<ExitStatus> {
     if let Some(pid) = child.id().and_then(|pid| Pid::from_raw(i32::try_from(pid).ok()?)) {
         // It may have ended in this very moment, which is as good.
         let _ = kill_process(pid, Signal::TERM);
         // Stopped, it would not hear.
         let _ = kill_process(pid, Signal::CONT);
     }
-    if tokio::time::timeout_at(deadline.into(), child.wait()).await.is_ok() {
-        return false;
+    if let Ok(Ok(status)) = tokio::time::timeout_at(deadline.into(), child.wait()).await {
+        return Some(status);
     }
     // The wait after the kill cannot fail to end; an error means that it is gone already.
     let _ = child.kill().await;
-    true
+    None
+}
+
+/// How a process ended, once what it printed has been read.
+async fn heard_out<T>(report: Option<JoinHandle<()>>, status: T) -> T {
+    if let Some(report) = report {
+        // Whoever else holds its output open is not waited for.
+        let _ = tokio::time::timeout(LAST_WORDS, report).await;
+    }
+    status
 }
 
 fn is_done(status: ExitStatus) -> bool {

@@ -23,6 +23,7 @@ use ego_fuser::feature_store::FeatureStore;
 use indicatif::{ProgressBar, ProgressStyle};
 use sim_replay::dataset::{self, ReadError, Scenario};
 use sim_replay::link::LinkError;
+use sim_replay::output;
 use sim_replay::synth::{self, Subset, SynthError, SynthOptions};
 
 pub use cell::{Cell, CellKey, MessageCounts};
@@ -173,12 +174,12 @@ impl Sweep {
     /// Says how many runs there are and how long they will take.
     fn announce(&self, known: &[Option<Cell>], missing: &[usize], options: &SweepOptions) -> Result<(), SweepError> {
         let (runs, frames) = (known.len(), self.frames());
-        eprintln!(
+        output::note(format_args!(
             "{}: {} = {runs} runs of {frames} frames, {} done before",
             self.experiment.name,
             check::product(&self.experiment.grid),
             runs - missing.len()
-        );
+        ));
         let Some(&first) = missing.first() else { return Ok(()) };
         let done: Vec<&Cell> = known.iter().flatten().collect();
         let seconds: f64 = done.iter().map(|cell| cell.wall_seconds).sum();
@@ -186,7 +187,7 @@ impl Sweep {
         let per_frame = if judged > 0.0 { seconds / judged } else { self.probe(&self.points[first])? };
         let jobs = options.jobs.clamp(1, missing.len());
         let minutes = per_frame * (missing.len() * frames) as f64 / jobs as f64 / 60.0;
-        eprintln!("about {minutes:.1} minutes for {} runs with {jobs} jobs", missing.len());
+        output::note(format_args!("about {minutes:.1} minutes for {} runs with {jobs} jobs", missing.len()));
         Ok(())
     }
 
@@ -233,7 +234,7 @@ impl Sweep {
             let done = 1 + done.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
             bar.set_message(format!("{done}/{} runs", missing.len()));
             if bar.is_hidden() {
-                eprintln!("{done}/{} runs done", missing.len());
+                output::note(format_args!("{done}/{} runs done", missing.len()));
             }
         };
         let computed = if jobs > 1 && missing.len() > 1 {
@@ -315,7 +316,7 @@ fn generate(experiment: &Experiment) -> Result<(), SweepError> {
     if synth::are_kept(&options)? {
         return Ok(());
     }
-    eprintln!("generating {} scenarios into {}", generate.scenarios, experiment.dataset.display());
+    output::note(format_args!("generating {} scenarios into {}", generate.scenarios, experiment.dataset.display()));
     let bar = progress("{bar:30} {percent} %  {eta} left", 1000 * options.scenarios());
     let generated = synth::generate_whole(&options, &|thousandths| bar.set_position(thousandths));
     bar.finish_and_clear();

@@ -219,6 +219,6 @@ impl Experiment {
     /// The part of the data set that is looked at.
     #[must_use]
     pub fn part(&self) -> crate::evaluation::Part {
-        crate::evaluation::Part { scenarios: self.scenarios, ticks: self.ticks }
+        crate::evaluation::Part { scenarios: self.scenarios, ticks: self.ticks, ..Default::default() }
     }
 }

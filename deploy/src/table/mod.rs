@@ -175,7 +175,7 @@ impl Run<'_> {
                 limit_bytes: (self.spec.maps_limit_gb.max(0.0) * 1e9) as u64,
             }),
             frames: self.spec.frames,
-            part: Part { scenarios: table.scenarios, ticks: None },
+            part: Part { scenarios: table.scenarios, ..Part::default() },
             protocol: self.spec.protocol.clone(),
             ..EvaluationOptions::default()
         };

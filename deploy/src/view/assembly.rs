@@ -200,7 +200,7 @@ impl Moment {
         let posed = result.and_then(|result| self.poses.get(&result.ego)).map(|(posed, _)| *posed);
         SceneFrame {
             capture_s: capture_nanos as f64 / 1e9,
-            frame_index: self.truth.as_ref().map(|(_, truth)| truth.frame_index),
+            tick: self.truth.as_ref().map(|(_, truth)| truth.tick),
             ego: result.map(|result| result.ego.clone()),
             method: result.map(|result| result.method.clone()),
             latency_ms: self.result.as_ref().and_then(|(done, _)| since_began_ms(*done)),

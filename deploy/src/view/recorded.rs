@@ -73,8 +73,8 @@ impl RecordedRun {
             return Err(ViewError::NotRecorded(path.into()));
         }
         let recording = Recording::open(&file)?;
-        if let Some(damage) = recording.damage() {
-            tracing::warn!("{}: {} bytes at its end are lost: {}", file.display(), damage.lost_bytes, damage.reason);
+        for damage in recording.damage() {
+            tracing::warn!("{}: {damage}", file.display());
         }
         let name = recording.entries().first().map_or(String::new(), |entry| entry.key.run.to_string());
         let mut moments = BTreeMap::<u64, Vec<usize>>::new();

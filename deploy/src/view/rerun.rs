@@ -66,9 +66,9 @@ impl RerunLog {
     /// [`RerunError::Log`].
     pub fn write(&mut self, frame: &SceneFrame) -> Result<(), RerunError> {
         self.stream.set_duration_secs("capture", frame.capture_s);
-        match frame.frame_index.and_then(|index| i64::try_from(index).ok()) {
-            Some(index) => self.stream.set_time_sequence("frame", index),
-            None => self.stream.disable_timeline("frame"),
+        match frame.tick.and_then(|tick| i64::try_from(tick).ok()) {
+            Some(tick) => self.stream.set_time_sequence("tick", tick),
+            None => self.stream.disable_timeline("tick"),
         }
         for (vehicle, points) in frame.clouds() {
             self.vehicle(vehicle, points)?;

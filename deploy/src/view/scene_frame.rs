@@ -17,8 +17,8 @@ pub(super) const POINT_BYTES: usize = 6;
 pub struct SceneFrame {
     /// Capture time on the scene's clock, seconds.
     pub capture_s: f64,
-    /// Which frame of the scene, where the truth says so.
-    pub frame_index: Option<u64>,
+    /// Tick of the scene, where the truth says so.
+    pub tick: Option<u64>,
     /// The fusing vehicle.
     pub ego: Option<CavId>,
     /// Fusion method.

@@ -54,14 +54,14 @@ fn truth(tick: u64) -> Truth {
         world_from_lidar: pose_of(cav_id, tick),
         objects: vec![object.clone()],
     };
-    Truth { frame_index: tick, agents: [EGO, OTHER].map(agent).into() }
+    Truth { tick, agents: [EGO, OTHER].map(agent).into() }
 }
 
 fn detections(tick: u64) -> Detections {
     let box3d = Box3d { center_m: [10.0, 0.0, -1.0], size_m: [4.0, 1.8, 1.6], heading_rad: 0.0 };
     Detections {
         ego: cav(EGO),
-        frame_index: tick,
+        agent_frame: tick,
         method: "max".into(),
         pose: PoseEstimate::new(pose_of(EGO, tick), 0.9),
         detections: vec![Detection { box3d, score: 0.8, source: None }],
@@ -130,7 +130,7 @@ fn check(frame: &Value, points: usize) {
     assert_eq!((&frame["ego"], &frame["method"]), (&EGO.into(), &"max".into()));
     assert_eq!(frame["truth"].as_array().unwrap().len(), 1, "everyone lists it, and it is shown once");
     // 10 m ahead of an ego at (tick, 0) that looks 0.2 rad to the left.
-    let tick = frame["frame_index"].as_u64().unwrap() as f64;
+    let tick = frame["tick"].as_u64().unwrap() as f64;
     let x = frame["detections"][0]["center_m"][0].as_f64().unwrap();
     assert!((x - (tick + 10.0 * 0.2_f64.cos())).abs() < 1e-9, "{x}");
     assert!((frame["latency_ms"].as_f64().unwrap() - 50.0).abs() < 1.0, "{}", frame["latency_ms"]);
@@ -152,7 +152,7 @@ fn a_recorded_run_is_shown_in_any_order() {
     assert_eq!((run.len(), run.name()), (TICKS as usize, "test"));
     for index in [3, 0, 4, 3] {
         let (frame, points) = parsed(&run.frame(index).unwrap().unwrap().to_bytes());
-        assert_eq!(frame["frame_index"], index);
+        assert_eq!(frame["tick"], index);
         check(&frame, points);
         assert!(points > 10_000, "two sweeps");
         assert_eq!((&frame["swept_ms"], &frame["posed_ms"]), (&3.0.into(), &20.0.into()));
@@ -231,7 +231,7 @@ fn a_replay_that_begins_anew_is_shown_from_its_beginning() {
             let mut header = wire::decode_header([payload.as_slice()]).unwrap();
             header.stamp.epoch = epoch;
             let seen = Seen { topic: &topic, header: &header, arrived_nanos: 0, payload: Some(&payload) };
-            frames.extend(assembly.add(&seen).and_then(|frame| frame.frame_index));
+            frames.extend(assembly.add(&seen).and_then(|frame| frame.tick));
         }
         frames
     };

@@ -13,9 +13,10 @@ use ego_fuser::evaluate::{EvaluateConfig, EvaluatedFrame, Evaluator};
 use ego_fuser::multi_scale::{MULTI_SCALE_KIND, OfflineDetector};
 use protocol::CodecConfig;
 use serde_json::json;
-use sim_replay::dataset::{LoadOptions, Scenario};
+use sim_replay::dataset::{IntensityScale, LoadOptions, Scenario};
 use sim_replay::frame::Frame;
 use sim_replay::ground_truth;
+use sim_replay::output;
 
 use super::{BadInput, progress, scenarios};
 
@@ -25,6 +26,9 @@ pub(crate) struct Arguments {
     /// Datasets, splits or scenarios.
     #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
     data: Vec<PathBuf>,
+    /// Number that stored intensities are divided by [default: auto; `sim-replay inspect --help` says by what].
+    #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
+    intensity_scale: IntensityScale,
     /// Weights of encoder and head.
     #[arg(long, value_name = "FILE")]
     weights: PathBuf,
@@ -46,7 +50,7 @@ impl Arguments {
     /// Evaluates and prints a line per method.
     pub(crate) fn run(self) -> Result<()> {
         tch::set_num_threads(i32::from(self.threads.max(1)));
-        let scenarios = scenarios(&self.data)?;
+        let scenarios = scenarios(&self.data, self.intensity_scale)?;
         if kind_of(&self.weights)?.as_deref() == Some(MULTI_SCALE_KIND) {
             return self.run_multi_scale(&scenarios);
         }
@@ -68,7 +72,7 @@ impl Arguments {
             rows.push(evaluate(config, &scenarios, self.frames.unwrap_or(usize::MAX), self.json)?);
         }
         if self.json {
-            println!("{}", serde_json::to_string_pretty(&rows)?);
+            output::line(serde_json::to_string_pretty(&rows)?)?;
         }
         Ok(())
     }
@@ -97,9 +101,9 @@ impl Arguments {
         }
         let row = tally.row("multi_scale");
         if self.json {
-            println!("{}", serde_json::to_string_pretty(&[row])?);
+            output::line(serde_json::to_string_pretty(&[row])?)?;
         } else {
-            print_row(&row);
+            print_row(&row)?;
         }
         Ok(())
     }
@@ -129,20 +133,20 @@ fn evaluate(config: EvaluateConfig, scenarios: &[Scenario], frames: usize, json:
     bar.finish_and_clear();
     let row = tally.row(method.name());
     if !json {
-        print_row(&row);
+        print_row(&row)?;
     }
     Ok(row)
 }
 
-fn print_row(row: &serde_json::Value) {
+fn print_row(row: &serde_json::Value) -> std::io::Result<()> {
     let ap = |name: &str| THRESHOLDS.map(|iou| format!("{:.4}", row[name][format!("{iou}")].as_f64().unwrap_or(0.0)));
     let (global, frame) = (ap("ap_global").join(" "), ap("ap_frame_order").join(" "));
-    println!(
+    output::line(format_args!(
         "{:<10} AP@0.3/0.5/0.7 global {global}, frame order {frame}, {} frames, {} bytes a neighbour",
         row["method"].as_str().unwrap_or_default(),
         row["frames"],
         row["payload_bytes_mean"]
-    );
+    ))
 }
 
 /// What the frames of one method add up to.

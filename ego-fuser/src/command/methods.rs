@@ -2,6 +2,7 @@
 
 use anyhow::Result;
 use ego_fuser::Method;
+use sim_replay::output;
 
 /// Lists the collaboration methods.
 #[derive(Debug, clap::Args)]
@@ -19,10 +20,10 @@ impl Arguments {
                 .iter()
                 .map(|method| serde_json::json!({"method": method, "exchange": method.exchange(), "summary": method.summary()}))
                 .collect();
-            println!("{}", serde_json::to_string_pretty(&rows)?);
+            output::line(serde_json::to_string_pretty(&rows)?)?;
         } else {
             for method in Method::ALL {
-                println!("{method:<10} {}", method.summary());
+                output::line(format_args!("{method:<10} {}", method.summary()))?;
             }
         }
         Ok(())

@@ -12,6 +12,7 @@ use ego_fuser::pairing::PairingConfig;
 use ego_fuser::trust::TrustConfig;
 use protocol::{CavId, Role};
 use sim_replay::bus::{BusArgs, PeerArgs, STOP_LIMIT, log_to_stderr};
+use sim_replay::output;
 
 use super::BadInput;
 
@@ -77,12 +78,12 @@ impl Arguments {
             tracing::warn!("{overdue}");
         }
         if self.json {
-            println!("{}", serde_json::to_string(&report)?);
+            output::line(serde_json::to_string(&report)?)?;
         } else {
             let node::NodeReport { frames, fused, at_deadline, failed } = report;
-            println!(
+            output::line(format_args!(
                 "{frames} frames, {fused} neighbours' messages fused, {at_deadline} at the deadline, {failed} failed"
-            );
+            ))?;
         }
         Ok(())
     }

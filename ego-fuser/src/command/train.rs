@@ -17,7 +17,7 @@ use ego_fuser::model::ModelError;
 use ego_fuser::samples::{Augmentation, Moments, SampleConfig, SampleKind, SamplePoses};
 use ego_fuser::train::{self, Accuracy, Observer, StepReport, TrainConfig, TrainError};
 use protocol::Dtype;
-use sim_replay::dataset::Layout;
+use sim_replay::dataset::{IntensityScale, Layout, OpenOptions};
 use sim_replay::evaluation_protocol::ProtocolConfig;
 
 use super::BadInput;
@@ -31,6 +31,9 @@ pub(crate) struct Arguments {
     /// Datasets to measure AP on; none: no validation.
     #[arg(long, num_args = 1.., value_name = "DIR")]
     validation: Vec<PathBuf>,
+    /// Number that stored intensities are divided by [default: auto; `sim-replay inspect --help` says by what].
+    #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
+    intensity_scale: IntensityScale,
     /// Method: none, early or one that exchanges feature maps; `ego-fuser methods` lists them.
     #[arg(long, default_value = "none")]
     method: Method,
@@ -131,7 +134,7 @@ impl Arguments {
         let mut bar = Progress::default();
         let summary = train::run(&config, &mut bar).map_err(blamed)?;
         bar.0.finish();
-        self.options.print(&summary.trained, &serde_json::json!({"accuracy": summary.accuracy}));
+        self.options.print(&summary.trained, &serde_json::json!({"accuracy": summary.accuracy}))?;
         Ok(())
     }
 
@@ -163,6 +166,7 @@ impl Arguments {
             data: self.data.clone(),
             validation: self.validation.clone(),
             protocol: self.protocol.clone(),
+            open: OpenOptions { intensity_scale: self.intensity_scale, ..OpenOptions::default() },
             method: self.method,
             detector: self.config.clone(),
             init: self.init.clone(),

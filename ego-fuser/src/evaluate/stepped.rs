@@ -286,7 +286,7 @@ impl<'a> Run<'a> {
         let objects = ground_truth::merge(&frames.iter().collect::<Vec<_>>(), 0, &self.evaluator.rule);
         let objects = objects.into_iter().map(|(_, object)| object).collect();
         let stamp = protocol::Stamp { publish_nanos: done_nanos, ..stamp(&own.cav, capture_nanos) };
-        Ok(Some(EvaluatedFrame { stamp, result, frames, poses, objects }))
+        Ok(Some(EvaluatedFrame { tick, stamp, result, frames, poses, objects }))
     }
 
     /// Lays a message where it waits for its tick.
@@ -337,7 +337,7 @@ impl<'a> Run<'a> {
                 Some((_, Skipped::NotNeeded)) | None => self.courier.received(&view.cav),
             }
         }
-        let mut result = self.evaluator.report(tick, own, &views, &bytes, output);
+        let mut result = self.evaluator.report(tick - self.config.ticks.start, own, &views, &bytes, output);
         if self.evaluator.ego.method() != Method::None {
             for cav in senders.iter().filter(|cav| views.iter().all(|view| view.cav != **cav)) {
                 let reason = dropped.iter().rev().find(|lost| lost.cav == *cav).map(|lost| lost.reason);

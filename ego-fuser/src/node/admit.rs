@@ -37,8 +37,8 @@ impl Node<'_> {
         let view = View { cav: cav.clone(), pose, capture_nanos, content };
         if *cav == self.cav {
             self.keep_time(capture_nanos);
-            let frame_index = arrival.header.stamp.sequence;
-            self.frames.push_back(OwnFrame { frame_index, capture_nanos, transport, begun: arrival.at, view });
+            let agent_frame = arrival.header.stamp.sequence;
+            self.frames.push_back(OwnFrame { agent_frame, capture_nanos, transport, begun: arrival.at, view });
             return;
         }
         if let Some(neighbourhood) = &mut self.neighbourhood {

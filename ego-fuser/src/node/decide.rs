@@ -56,7 +56,7 @@ impl Node<'_> {
     }
 
     fn fuse(&mut self, frame: OwnFrame) {
-        let OwnFrame { frame_index, capture_nanos, transport, begun, view: own } = frame;
+        let OwnFrame { agent_frame, capture_nanos, transport, begun, view: own } = frame;
         let waited = begun.elapsed();
         let mut choice = self.choose(capture_nanos);
         let own_topic = self.topic(&self.cav);
@@ -70,7 +70,7 @@ impl Node<'_> {
                 let stages = before.into_iter().chain(stages).collect();
                 let result = Detections {
                     ego: self.cav.clone(),
-                    frame_index,
+                    agent_frame,
                     method: self.ego.method().name().to_owned(),
                     pose: own.pose,
                     detections,
@@ -182,7 +182,7 @@ impl Node<'_> {
             wire::encode(stamp, result)
         });
         self.json.offer_encoded(capture_nanos, move |stamp| {
-            let head = DetectionsReport::new(stamp, result).to_json().into_bytes();
+            let head = DetectionsReport::new(stamp, None, result).to_json().into_bytes();
             Ok(Encoded { head, body: Body::Empty })
         });
     }

@@ -106,7 +106,7 @@ struct Received {
 /// A frame that has begun.
 struct OwnFrame {
     /// Sequence of the own agent's message.
-    frame_index: u64,
+    agent_frame: u64,
     capture_nanos: u64,
     /// From its publication to its arrival.
     transport: Duration,

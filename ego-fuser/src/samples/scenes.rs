@@ -6,7 +6,7 @@ use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 
 use agent::training::DataListing;
 use protocol::PointCloud;
-use sim_replay::dataset::{self, LoadOptions, Scenario};
+use sim_replay::dataset::{self, LoadOptions, OpenOptions, Scenario};
 use sim_replay::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
 use sim_replay::frame::Frame;
 
@@ -42,11 +42,12 @@ impl SceneSet {
     /// Opens datasets, splits or scenarios, with the agents of the protocol, however many.
     ///
     /// # Errors
-    /// [`SampleError::Read`] when a folder cannot be read, [`SampleError::Protocol`] when the protocol contradicts itself, [`SampleError::Empty`] when there is no tick in any of them.
-    pub fn open(folders: &[PathBuf], protocol: &ProtocolConfig) -> Result<Self, SampleError> {
+    /// [`SampleError::Read`] when a folder cannot be read, [`SampleError::Protocol`] when the protocol contradicts
+    /// itself, [`SampleError::Empty`] when there is no tick in any of them.
+    pub fn open(folders: &[PathBuf], options: &OpenOptions, protocol: &ProtocolConfig) -> Result<Self, SampleError> {
         let (mut scenarios, mut problems) = (Vec::new(), Vec::new());
         for folder in folders {
-            let dataset = dataset::open(folder)?;
+            let dataset = dataset::open_with(folder, options)?;
             let protocol = protocol.resolve(dataset.layout).map_err(SampleError::Protocol)?;
             let protocol = EvaluationProtocol { max_agents: usize::MAX, ..protocol };
             scenarios.extend(dataset.scenarios.iter().filter_map(|scenario| protocol.arrange(scenario)));

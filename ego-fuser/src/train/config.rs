@@ -4,6 +4,7 @@ use std::path::PathBuf;
 
 use agent::model_config::DetectorConfig;
 use agent::training::RunConfig;
+use sim_replay::dataset::OpenOptions;
 
 use crate::feature_store::KeptMaps;
 use crate::fusion::FusionConfig;
@@ -21,6 +22,8 @@ pub struct TrainConfig {
     pub validation: Vec<PathBuf>,
     /// Which agents take part. Range and classes stand in `samples`.
     pub protocol: ProtocolConfig,
+    /// What these datasets do not say of themselves.
+    pub open: OpenOptions,
     /// The method.
     pub method: Method,
     /// The network, where `init` does not say.

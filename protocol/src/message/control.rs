@@ -26,7 +26,7 @@ pub enum Control {
     /// Operator to replay: go on from this tick.
     Seek {
         /// Which, counted from 0.
-        frame_index: u64,
+        tick: u64,
     },
     /// Replay to all: nothing more will come.
     End {
@@ -49,7 +49,7 @@ pub enum Control {
         /// Who.
         process: ProcessId,
         /// Which tick, counted from 0.
-        frame_index: u64,
+        tick: u64,
     },
 }
 

@@ -12,10 +12,10 @@ use crate::{CavId, Detection, Doubt, DropReason, Limits, Stamp, WireError};
 pub struct Detections {
     /// The vehicle that fused, whose LiDAR frame the boxes are in.
     pub ego: CavId,
-    /// Which frame of the ego's own agent, counted from 0: the sequence of the agent's message that the frame began
-    /// with, or the tick of the scene where nothing was sent. A number left out is a frame that was never decided. The
-    /// same moment has the same capture time everywhere, but no vehicle knows the scene's own count of it.
-    pub frame_index: u64,
+    /// Frame of the ego's own agent, counted from 0: the sequence of the agent's message that the frame began with; in
+    /// virtual time, where every sweep is taken, ticks since the first. A number left out is a frame that was never
+    /// decided. The same moment has the same capture time everywhere, but no vehicle knows the scene's tick.
+    pub agent_frame: u64,
     /// Fusion method, as in the configuration.
     pub method: String,
     /// Where the ego believes to be.
@@ -98,6 +98,8 @@ metadata_only!(Detections, Detections);
 /// JSON object.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct DetectionsReport {
+    /// Tick of the scene, counted from 0, where the writer knows it: the scorer does, the ego does not.
+    pub tick: Option<u64>,
     /// See [`Stamp::epoch`].
     pub epoch: u64,
     /// See [`Stamp::sequence`].
@@ -112,11 +114,11 @@ pub struct DetectionsReport {
 }
 
 impl DetectionsReport {
-    /// The result of `stamp`'s frame.
+    /// The result of `stamp`'s frame, at a tick of the scene where that is known.
     #[must_use]
-    pub fn new(stamp: &Stamp, result: Detections) -> Self {
+    pub fn new(stamp: &Stamp, tick: Option<u64>, result: Detections) -> Self {
         let Stamp { cav: _, epoch, sequence, capture_nanos, publish_nanos } = *stamp;
-        Self { epoch, sequence, capture_nanos, publish_nanos, result }
+        Self { tick, epoch, sequence, capture_nanos, publish_nanos, result }
     }
 
     /// As JSON, on one line.

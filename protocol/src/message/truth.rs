@@ -10,8 +10,8 @@ use crate::{Box3d, CavId, Limits, Pose, WireError};
 /// Objects are kept as each agent annotates them: which of them count for an ego is the scorer's rule.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct Truth {
-    /// Which frame of the scene, counted from 0.
-    pub frame_index: u64,
+    /// Tick of the scene, counted from 0.
+    pub tick: u64,
     /// Every vehicle of the scene, in the scene's order.
     pub agents: Vec<AgentTruth>,
 }
@@ -83,7 +83,7 @@ mod tests {
             TrueObject { id: 1, class: "car".into(), world_from_object: Pose::IDENTITY, size_m, speed_mps: None };
         let agent = AgentTruth { cav: cav.clone(), world_from_lidar: Pose::IDENTITY, objects: vec![object] };
         let stamp = Stamp { cav, epoch: 1, sequence: 0, capture_nanos: 5, publish_nanos: 7 };
-        wire::encode(&stamp, Truth { frame_index: 0, agents: vec![agent] }).map(|encoded| encoded.to_vec())
+        wire::encode(&stamp, Truth { tick: 0, agents: vec![agent] }).map(|encoded| encoded.to_vec())
     }
 
     #[test]

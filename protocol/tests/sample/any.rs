@@ -136,9 +136,9 @@ fn any_detections() -> impl Strategy<Value = Detections> {
     let neighbours = (vec(fused, 0..4), vec(skipped, 0..4), vec(heard, 0..4));
     let lists = (vec(any_detection(), 0..20), neighbours, vec(any_timing(), 0..4));
     (any_cav(), any::<u64>(), "[a-z]{1,10}", any_estimate(), lists).prop_map(
-        |(ego, frame_index, method, pose, (detections, (fused, skipped, heard), stages))| Detections {
+        |(ego, agent_frame, method, pose, (detections, (fused, skipped, heard), stages))| Detections {
             ego,
-            frame_index,
+            agent_frame,
             method,
             pose,
             detections,
@@ -166,7 +166,7 @@ fn any_truth() -> impl Strategy<Value = Truth> {
         world_from_lidar,
         objects,
     });
-    (any::<u64>(), vec(agent, 0..4)).prop_map(|(frame_index, agents)| Truth { frame_index, agents })
+    (any::<u64>(), vec(agent, 0..4)).prop_map(|(tick, agents)| Truth { tick, agents })
 }
 
 fn any_control() -> impl Strategy<Value = Control> {
@@ -177,10 +177,10 @@ fn any_control() -> impl Strategy<Value = Control> {
         Just(Control::Resume),
         Just(Control::Probe),
         any::<u64>().prop_map(|ticks| Control::Step { ticks }),
-        any::<u64>().prop_map(|frame_index| Control::Seek { frame_index }),
+        any::<u64>().prop_map(|tick| Control::Seek { tick }),
         (any::<u64>(), vec(sent, 0..6)).prop_map(|(ticks, sent)| Control::End { ticks, sent }),
         (any_process(), vec(any_topic(), 0..6)).prop_map(|(process, heard)| Control::Ready { process, heard }),
-        (any_process(), any::<u64>()).prop_map(|(process, frame_index)| Control::Done { process, frame_index }),
+        (any_process(), any::<u64>()).prop_map(|(process, tick)| Control::Done { process, tick }),
     ]
 }
 

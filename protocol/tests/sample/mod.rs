@@ -86,7 +86,7 @@ pub(crate) fn ledger() -> Ledger {
 pub(crate) fn detections() -> Detections {
     Detections {
         ego: cav("4279"),
-        frame_index: 3,
+        agent_frame: 3,
         method: "attention".into(),
         pose: pose(),
         detections: vec![detection(0.5), detection(1.0)],
@@ -122,7 +122,7 @@ fn truth() -> Truth {
         world_from_lidar: pose_at([5.0, 5.0, 2.0]),
         objects: vec![object.clone(), TrueObject { id: 18, speed_mps: None, ..object.clone() }],
     };
-    Truth { frame_index: 9, agents: vec![agent("4279"), agent("-1")] }
+    Truth { tick: 9, agents: vec![agent("4279"), agent("-1")] }
 }
 
 pub(crate) fn every_kind() -> Vec<Message> {
@@ -171,11 +171,11 @@ pub(crate) fn every_kind() -> Vec<Message> {
         Control::Pause,
         Control::Resume,
         Control::Step { ticks: 2 },
-        Control::Seek { frame_index: 5 },
+        Control::Seek { tick: 5 },
         Control::End { ticks: 100, sent: vec![TopicCount { topic: topic.clone(), messages: 100 }] },
         Control::Ready { process: process.clone(), heard: vec![topic] },
         Control::Probe,
-        Control::Done { process, frame_index: 4 },
+        Control::Done { process, tick: 4 },
     ];
     messages.extend(controls.map(Message::Control));
     messages

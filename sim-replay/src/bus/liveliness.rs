@@ -1,10 +1,16 @@
 //! Who is there: liveliness tokens and those who watch for them.
 
-use protocol::{CavId, Key, Role, RunId, Selector, Topic};
+use std::collections::BTreeSet;
+use std::time::Duration;
+
+use protocol::{CavId, Key, ProcessId, Role, RunId, Selector, Topic};
 use zenoh::sample::SampleKind;
 use zenoh::{Session, Wait};
 
-use super::BusError;
+use super::{BusError, process_id};
+
+/// How long a router may take to say who is there.
+const LOOK_LIMIT: Duration = Duration::from_secs(3);
 
 /// This process is alive, for as long as the value is.
 ///
@@ -31,6 +37,21 @@ impl Presence {
     pub fn withdraw(self) -> Result<(), BusError> {
         self.0.undeclare().wait().map_err(|cause| BusError::zenoh("withdrawing a liveliness token", &cause))
     }
+}
+
+/// Every process of a run that is there now.
+///
+/// # Errors
+/// [`BusError::Zenoh`] when the session is closed.
+pub fn present(session: &Session, run: &RunId) -> Result<BTreeSet<ProcessId>, BusError> {
+    let selector = Selector::everyone_alive(run);
+    let tokens = session.liveliness().get(selector.as_str()).timeout(LOOK_LIMIT).wait();
+    let tokens = tokens.map_err(|cause| BusError::zenoh(format!("looking for {selector}"), &cause))?;
+    let process = |reply: zenoh::query::Reply| match reply.result().ok()?.key_expr().as_str().parse() {
+        Ok(Key { topic: Topic::Alive { role, cav }, .. }) => Some(process_id(role, &cav)),
+        _ => None,
+    };
+    Ok(std::iter::from_fn(|| tokens.recv().ok()).filter_map(process).collect())
 }
 
 /// A process came or went.

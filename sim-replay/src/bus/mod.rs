@@ -47,7 +47,7 @@ pub use endpoint::Endpoint;
 pub use error::BusError;
 pub use guard::Guard;
 pub use inbox_limits::InboxLimits;
-pub use liveliness::{Presence, Sighting, Watch};
+pub use liveliness::{Presence, Sighting, Watch, present};
 pub use membership::{Bus, Identity};
 pub use metrics::{MetricsServer, exposition};
 pub use publisher::{Overflow, Publisher, PublisherOptions, unix_nanos};

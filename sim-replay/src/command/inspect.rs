@@ -1,12 +1,13 @@
 //! `sim-replay inspect`: what is in a dataset, and what is wrong with it.
 
 use std::io::Write;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use indicatif::{ProgressBar, ProgressStyle};
 use sim_replay::dataset::{IntensityScale, OpenOptions, layouts_text};
 use sim_replay::evaluation_protocol::ProtocolConfig;
-use sim_replay::inspect::{Report, inspect};
+use sim_replay::inspect::{Report, inspect, inspect_map};
+use sim_replay::output;
 
 use crate::cli::Outcome;
 
@@ -14,7 +15,7 @@ use crate::cli::Outcome;
 #[derive(Debug, clap::Args)]
 #[command(after_help = format!("Layouts, and the files that decide:\n{}", layouts_text()))]
 pub(crate) struct Args {
-    /// Dataset, split, scenario or sequence; the layout is found out.
+    /// Dataset, split, scenario or sequence, whose layout is found out; or an OpenDRIVE map (.xodr).
     dir: PathBuf,
     /// Number that stored intensities are divided by [default: 255 for bytes and red; of other numbers the range of each
     /// agent's first sweeps tells: up to 1 as they are, up to 255 by 255].
@@ -29,6 +30,9 @@ pub(crate) struct Args {
 
 /// Prints the findings to standard output.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
+    if args.dir.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("xodr")) && args.dir.is_file() {
+        return run_map(&args.dir, args.json);
+    }
     let report = with_progress(args);
     let mut out = std::io::stdout().lock();
     if args.json {
@@ -38,6 +42,25 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
         writeln!(out, "{report}")?;
     }
     Ok(if report.problems.is_empty() { Outcome::Done } else { Outcome::BadInput })
+}
+
+/// Prints what a map holds to standard output.
+fn run_map(path: &Path, json: bool) -> anyhow::Result<Outcome> {
+    let report = match inspect_map(path) {
+        Ok(report) => report,
+        Err(error) => {
+            output::note(format_args!("error: {error}"));
+            return Ok(Outcome::BadInput);
+        }
+    };
+    let mut out = std::io::stdout().lock();
+    if json {
+        serde_json::to_writer_pretty(&mut out, &report)?;
+        writeln!(out)?;
+    } else {
+        writeln!(out, "{report}")?;
+    }
+    Ok(Outcome::Done)
 }
 
 /// Reads everything; a bar on a terminal says how far.

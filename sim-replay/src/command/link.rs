@@ -5,6 +5,7 @@ use protocol::{CavId, Role, Stream};
 use sim_replay::bus::{BusArgs, PeerArgs, STOP_LIMIT, log_to_stderr};
 use sim_replay::link::node::{self, LinkReport, NodeOptions};
 use sim_replay::link::{Air, PRESETS};
+use sim_replay::output;
 
 use crate::cli::Outcome;
 
@@ -46,7 +47,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     let air = match Air::open(&args.link, args.seed) {
         Ok(air) => air,
         Err(error) => {
-            eprintln!("error: {error}");
+            output::note(format_args!("error: {error}"));
             return Ok(Outcome::BadInput);
         }
     };
@@ -62,18 +63,27 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     if let Err(overdue) = bus.leave(STOP_LIMIT) {
         tracing::warn!("{overdue}");
     }
-    Ok(Outcome::Done)
+    Ok(if report.is_complete() { Outcome::Done } else { Outcome::DataLost })
 }
 
 fn print(report: &LinkReport, as_json: bool) -> anyhow::Result<()> {
     if as_json {
-        println!("{}", serde_json::to_string(report)?);
+        output::line(serde_json::to_string(report)?)?;
         return Ok(());
     }
-    let LinkReport { offered, arrived, copies, under_way, dropped } = report;
-    println!("{offered} messages: {arrived} arrived, {copies} of them twice, {under_way} still under way");
+    let LinkReport { offered, arrived, copies, under_way, longest_ms, dropped } = report;
+    output::line(format_args!(
+        "{offered} messages: {arrived} arrived, {copies} of them twice, {under_way} still under way"
+    ))?;
     for (reason, count) in dropped {
-        println!("{count} dropped: {reason}");
+        output::line(format_args!("{count} dropped: {reason}"))?;
+    }
+    // What the run lost stands last.
+    if !report.is_complete() {
+        let seconds = *longest_ms as f64 * 1e-3;
+        output::line(format_args!(
+            "{under_way} of {offered} messages were still under way at the end, the oldest for {seconds:.1} s"
+        ))?;
     }
     Ok(())
 }

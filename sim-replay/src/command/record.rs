@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use anyhow::Context;
 use protocol::{CavId, Role, Stream};
 use sim_replay::bus::{BusArgs, STOP_LIMIT, log_to_stderr};
+use sim_replay::output;
 use sim_replay::recording::{self, RecordReport, RecorderError, RecorderOptions, RecordingOptions};
 
 use crate::cli::Outcome;
@@ -47,10 +48,16 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
         without: args.without.clone(),
         keeps_running: args.keep_running || args.bus.supervised,
     };
-    let report = match recording::record(&bus, &options, &stop) {
+    // Who waits for the report is told at once of a failure; the last line counts.
+    let mut on_failure = |report: &RecordReport| {
+        if args.json && serde_json::to_string(report).map_err(Into::into).and_then(output::line).is_err() {
+            tracing::error!("the failure cannot be printed");
+        }
+    };
+    let report = match recording::record(&bus, &options, &stop, &mut on_failure) {
         Ok(report) => report,
         Err(RecorderError::Recording(error)) => {
-            eprintln!("error: {error}");
+            output::note(format_args!("error: {error}"));
             return Ok(Outcome::BadInput);
         }
         Err(error) => return Err(error.into()),
@@ -64,15 +71,14 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
 
 fn print(report: &RecordReport, as_json: bool) -> anyhow::Result<()> {
     if as_json {
-        println!("{}", serde_json::to_string(report)?);
+        output::line(serde_json::to_string(report)?)?;
         return Ok(());
     }
-    println!("{} messages, {:.1} MB in {}", report.messages, report.bytes as f64 / 1e6, report.file.display());
-    if report.overwritten > 0 {
-        println!("{} came faster than the disk takes them", report.overwritten);
-    }
-    if let Some(failure) = &report.failure {
-        println!("{} not written: {failure}", report.not_written);
-    }
-    Ok(())
+    output::line(format_args!(
+        "{} messages, {:.1} MB in {}",
+        report.messages,
+        report.bytes as f64 / 1e6,
+        report.file.display()
+    ))?;
+    report.loss_in_words().map_or(Ok(()), |words| Ok(output::line(words)?))
 }

@@ -3,19 +3,21 @@
 use std::path::PathBuf;
 
 use sim_replay::bus::log_to_stderr;
+use sim_replay::output;
 use sim_replay::recording::{RecordingOptions, recover};
 
 use crate::cli::Outcome;
 
-/// Copy what is whole of a recording that was cut short (power, disk, kill) into a new, indexed file.
+/// Copy what is whole of a recording that was cut short (power, disk, kill) or damaged into a new, indexed file.
 ///
-/// `stream` plays a cut recording as it is; other programs want the index.
+/// `stream` plays such a recording as it is; other programs want the index.
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
-    /// The recording that was cut.
+    /// The recording that was cut or damaged.
     from: PathBuf,
     /// The new file.
-    to: PathBuf,
+    #[arg(long, value_name = "FILE.mcap")]
+    out: PathBuf,
     /// Leave out the channels for ROS 2 tools.
     #[arg(long)]
     plain: bool,
@@ -28,20 +30,20 @@ pub(crate) struct Args {
 pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     log_to_stderr();
     let options = RecordingOptions { with_ros: !args.plain, ..RecordingOptions::default() };
-    let report = match recover(&args.from, &args.to, options) {
+    let report = match recover(&args.from, &args.out, options) {
         Ok(report) => report,
         Err(error) => {
-            eprintln!("error: {error}");
+            output::note(format_args!("error: {error}"));
             return Ok(Outcome::BadInput);
         }
     };
     if args.json {
-        println!("{}", serde_json::to_string(&report)?);
+        output::line(serde_json::to_string(&report)?)?;
     } else {
-        println!("{} messages in {}", report.messages, args.to.display());
-        if let Some(damage) = &report.damage {
-            println!("{} bytes behind byte {} are lost: {}", damage.lost_bytes, damage.whole_bytes, damage.reason);
+        output::line(format_args!("{} messages in {}", report.messages, args.out.display()))?;
+        for damage in &report.damage {
+            output::line(damage)?;
         }
     }
-    Ok(if report.damage.is_some() { Outcome::DataLost } else { Outcome::Done })
+    Ok(if report.damage.is_empty() { Outcome::Done } else { Outcome::DataLost })
 }

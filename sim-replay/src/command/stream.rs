@@ -9,6 +9,7 @@ use protocol::{CavId, DropReason, Role};
 use sim_replay::bus::{BusArgs, Route, STOP_LIMIT, log_to_stderr};
 use sim_replay::dataset::{self, IntensityScale, LoadOptions, OpenOptions, Scenario};
 use sim_replay::link::{CapacityConfig, DelayLaw, LinkConfig, LossLaw};
+use sim_replay::output;
 use sim_replay::stream::{AirReport, Replay, StreamError, StreamOptions, StreamReport};
 
 use crate::cli::Outcome;
@@ -191,40 +192,47 @@ fn open(args: &Args) -> anyhow::Result<Scenario> {
 }
 
 fn bad_input(error: &anyhow::Error) -> Outcome {
-    eprintln!("error: {error:#}");
+    output::note(format_args!("error: {error:#}"));
     Outcome::BadInput
 }
 
 fn print(report: &StreamReport, as_json: bool) -> anyhow::Result<()> {
     if as_json {
-        println!("{}", serde_json::to_string(report)?);
+        output::line(serde_json::to_string(report)?)?;
         return Ok(());
     }
     let messages: u64 = report.sent.iter().map(|count| count.messages).sum();
-    println!("{} ticks, {messages} messages in {:.1} s", report.ticks, report.seconds);
+    output::line(format_args!("{} ticks, {messages} messages in {:.1} s", report.ticks, report.seconds))?;
     let lateness = &report.lateness;
-    println!(
+    output::line(format_args!(
         "late by p50 {:.1} ms, p95 {:.1} ms, at most {:.1} ms; {} ticks over 5 ms",
         lateness.p50_ms, lateness.p95_ms, lateness.max_ms, lateness.late_ticks
-    );
+    ))?;
     if let Some(AirReport { offered, arrived, dropped }) = &report.air {
-        println!("{offered} sensor frames crossed a link: {arrived} arrived{}", by_reason(dropped));
+        output::line(format_args!("{offered} sensor frames crossed a link: {arrived} arrived{}", by_reason(dropped)))?;
     }
     if report.absent_frames > 0 {
-        println!("{} frames do not exist: their vehicles came later or have left", report.absent_frames);
+        output::line(format_args!(
+            "{} frames do not exist: their vehicles came later or have left",
+            report.absent_frames
+        ))?;
     }
     if report.left_out_parts > 0 {
-        println!("{} objects or other parts of frames were left out, see the log", report.left_out_parts);
-    }
-    if report.unreadable_frames > 0 {
-        println!("{} frames could not be read", report.unreadable_frames);
-    }
-    if report.unanswered > 0 {
-        println!("{} ticks were not answered", report.unanswered);
+        output::line(format_args!(
+            "{} objects or other parts of frames were left out, see the log",
+            report.left_out_parts
+        ))?;
     }
     if !report.unsent.is_empty() {
         let unsent: u64 = report.unsent.values().sum();
-        println!("{unsent} of the messages were not sent{}", by_reason(&report.unsent));
+        output::line(format_args!("{unsent} of the messages were not sent{}", by_reason(&report.unsent)))?;
+    }
+    // What the run lost stands last.
+    if report.unreadable_frames > 0 {
+        output::line(format_args!("{} frames could not be read", report.unreadable_frames))?;
+    }
+    if report.unanswered > 0 {
+        output::line(format_args!("{} ticks were not answered", report.unanswered))?;
     }
     Ok(())
 }

@@ -1,7 +1,7 @@
 //! The folders of the OPV2V family: `<root>/<split>/<scenario>/<agent>/<frame>.yaml` with a sweep beside it, entered at any
 //! level.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::{BTreeMap, BTreeSet, HashSet};
 use std::path::{Path, PathBuf};
 
 use protocol::CavId;
@@ -30,6 +30,8 @@ pub(super) struct ScenarioFolder {
     pub(super) has_radar: bool,
     /// Suffix of the sweeps.
     pub(super) suffix: &'static str,
+    /// Agents that have sweeps and nothing else.
+    pub(super) without_yaml: BTreeSet<CavId>,
 }
 
 /// Folders of scenarios at or below `dir`. Folders below that cannot be listed are left out.
@@ -130,7 +132,9 @@ impl ScenarioFolder {
         let variants: BTreeSet<String> = by_agent.values().flat_map(|agent| agent.variants.iter().cloned()).collect();
         let has_radar = by_agent.values().any(|agent| agent.has_radar);
         let variants = variants.into_iter().collect();
-        Ok(Self { dir: dir.to_owned(), agents, stems, missing, variants, has_radar, suffix })
+        let bare = by_agent.iter().filter(|(_, agent)| agent.is_without_yaml);
+        let without_yaml = bare.map(|(id, _)| id.clone()).collect();
+        Ok(Self { dir: dir.to_owned(), agents, stems, missing, variants, has_radar, suffix, without_yaml })
     }
 
     /// The metadata file of a frame.
@@ -151,7 +155,12 @@ impl ScenarioFolder {
 
     /// The reader of all agents' sweeps.
     pub(super) fn sweeps(&self, options: &OpenOptions) -> Sweeps {
-        let of_agent = |agent: &CavId| self.stems.iter().map(|stem| self.pcd(agent, stem, None)).collect::<Vec<_>>();
+        let missing: HashSet<(&CavId, &str)> =
+            self.missing.iter().map(|frame| (&frame.agent, frame.stem.as_str())).collect();
+        let of_agent = |agent: &CavId| {
+            let stems = self.stems.iter().filter(|stem| !missing.contains(&(agent, stem.as_str())));
+            stems.map(|stem| self.pcd(agent, stem, None)).take(Sweeps::MOST_TRIED).collect::<Vec<_>>()
+        };
         let sweeps = Sweeps::new(SweepStorage::ByName, options);
         self.agents.iter().fold(sweeps, |sweeps, agent| sweeps.with_agent(agent.clone(), of_agent(agent)))
     }

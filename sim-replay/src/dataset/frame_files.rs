@@ -16,8 +16,9 @@ pub(super) const BIN: &str = ".bin";
 /// What lies in an agent's folder.
 #[derive(Debug, Default)]
 pub(super) struct AgentFolder {
-    /// Stems with both YAML and sweep.
+    /// Stems with both YAML and sweep; with a sweep alone where there is no YAML at all.
     pub(super) stems: BTreeSet<String>,
+    pub(super) is_without_yaml: bool,
     pub(super) variants: BTreeSet<String>,
     pub(super) has_radar: bool,
 }
@@ -38,25 +39,40 @@ fn is_number(stem: &str) -> bool {
     !stem.is_empty() && stem.bytes().all(|byte| byte.is_ascii_digit())
 }
 
+/// The stems of frames, and those of other files. Copies such as `000070 (1)` beside numbers are no moments; frames may
+/// have other names where most have.
+pub(super) fn usual_stems(all: BTreeSet<&str>) -> (BTreeSet<&str>, BTreeSet<&str>) {
+    let (numbers, others): (BTreeSet<&str>, BTreeSet<&str>) = all.iter().partition(|stem| is_number(stem));
+    let is_copy = |stem: &&&str| {
+        let rest = stem.trim_start_matches(|letter: char| letter.is_ascii_digit());
+        numbers.contains(&stem[..stem.len() - rest.len()])
+    };
+    let names = others.iter().filter(|stem| !is_copy(stem)).count();
+    if !numbers.is_empty() && numbers.len() >= names { (numbers, others) } else { (all, BTreeSet::new()) }
+}
+
+/// One problem for all files of other names than frames have.
+pub(super) fn named_once(dir: &Path, strays: &[String]) -> Option<ReadError> {
+    let first = strays.iter().min()?;
+    let reason = format!("{} files whose names are no frame numbers are left out, first: {first}", strays.len());
+    Some(ReadError::malformed(dir, reason))
+}
+
 impl AgentFolder {
     /// Sorts the files of `dir`. What has to be left out goes to `problems`.
     pub(super) fn new(dir: &Path, listing: &Listing, suffix: &str, problems: &mut Vec<ReadError>) -> Self {
-        let all: BTreeSet<&str> = yaml_stems(listing).collect();
-        let numbered: BTreeSet<&str> = all.iter().copied().filter(|stem| is_number(stem)).collect();
-        // Copies such as `000070 (1)` beside numbers are no moments. Frames may have other names where most have.
-        let is_copy = |stem: &&&str| {
-            let rest = stem.trim_start_matches(|letter: char| letter.is_ascii_digit());
-            numbered.contains(&stem[..stem.len() - rest.len()])
-        };
-        let others = all.iter().filter(|stem| !is_copy(stem)).count();
-        let are_numbers = !numbered.is_empty() && numbered.len() >= others;
-        let (yamls, mut strays) = if are_numbers {
-            let strays = all.difference(&numbered).map(|stem| format!("{stem}.yaml")).collect();
-            (numbered, strays)
-        } else {
-            (all, Vec::new())
-        };
-        let mut agent = Self::default();
+        let mut listed: BTreeSet<&str> = yaml_stems(listing).collect();
+        let is_without_yaml = listed.is_empty();
+        if is_without_yaml {
+            // Sweeps alone are frames without poses and boxes.
+            let sweeps = files::stems(&listing.files, suffix).into_iter();
+            listed.extend(sweeps.filter(|stem| !stem.contains('_')));
+        }
+        let (yamls, strays) = usual_stems(listed);
+        let are_numbers = !yamls.is_empty() && yamls.iter().all(|stem| is_number(stem));
+        let ending = if is_without_yaml { suffix } else { ".yaml" };
+        let mut strays: Vec<String> = strays.into_iter().map(|stem| format!("{stem}{ending}")).collect();
+        let mut agent = Self { is_without_yaml, ..Self::default() };
         let mut without_yaml = BTreeSet::new();
         for name in files::stems(&listing.files, suffix) {
             match Sweep::of(name, &yamls) {

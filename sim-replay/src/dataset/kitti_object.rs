@@ -8,6 +8,7 @@ use std::sync::Arc;
 use nalgebra::{Isometry3, Matrix3, Point3, Rotation3, UnitQuaternion};
 use protocol::{CavId, Handedness, Pose};
 
+use super::frame_files::{named_once, usual_stems};
 use super::kitti_text::{self, Calibration};
 use super::points::{SweepStorage, Sweeps};
 use super::{FrameSource, Layout, OpenOptions, Problem, ReadError, Scenario, Tick, classes, files, single_vehicle};
@@ -33,10 +34,17 @@ pub(super) fn is_split(dir: &Path) -> bool {
 }
 
 /// Opens a split.
-pub(super) fn open(root: &Path, dir: &Path, options: &OpenOptions) -> Result<Scenario, ReadError> {
+pub(super) fn open(
+    root: &Path,
+    dir: &Path,
+    options: &OpenOptions,
+    problems: &mut Vec<ReadError>,
+) -> Result<Scenario, ReadError> {
     let velodyne = dir.join("velodyne");
     let listing = files::list(&velodyne)?;
-    let stems = files::stems(&listing.files, ".bin");
+    let (stems, strays) = usual_stems(files::stems(&listing.files, ".bin").into_iter().collect());
+    let strays: Vec<String> = strays.into_iter().map(|stem| format!("{stem}.bin")).collect();
+    problems.extend(named_once(&velodyne, &strays));
     let times = (0u64..).map(|index| options.period_nanos.saturating_mul(index));
     let tick = |(stem, capture_nanos): (&str, u64)| Tick { stem: stem.to_owned(), capture_nanos };
     let ticks: Vec<Tick> = stems.into_iter().zip(times).map(tick).collect();
@@ -215,6 +223,15 @@ mod tests {
         let frame = dataset::open(dir.path()).unwrap().scenarios[0].load(0, 0, &LoadOptions::default()).unwrap();
         assert_eq!(frame.objects[0].class, ObjectClass::Other);
         assert!(frame.problems[0].message.contains("type: \"Ufo\" is no known type of object"), "{:?}", frame.problems);
+    }
+
+    #[test]
+    fn copies_are_no_sweeps() {
+        let dir = build("");
+        fs::write(dir.path().join("training/velodyne/000000 (1).bin"), "").unwrap();
+        let dataset = dataset::open(dir.path()).unwrap();
+        assert_eq!((dataset.scenarios[0].ticks.len(), dataset.problems.len()), (1, 1));
+        assert!(dataset.problems[0].to_string().ends_with("first: 000000 (1).bin"), "{:?}", dataset.problems);
     }
 
     #[test]

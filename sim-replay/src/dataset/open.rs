@@ -14,7 +14,7 @@ use super::written_pose::WrittenPose;
 use super::yaml::{self, Field};
 use super::{
     Dataset, FrameSource, Layout, ReadError, Scenario, Tick, dair, files, kitti_object, kitti_odometry, layouts_text,
-    localization, nuscenes, recorded,
+    localization, nuscenes, recorded, unfinished,
 };
 
 /// How far below the opened folder sequences of a single vehicle are looked for.
@@ -25,7 +25,7 @@ const FRAMES_TO_TRY: usize = 5;
 const SHOWN_PROBLEMS: usize = 5;
 
 /// What a dataset does not say of itself.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub struct OpenOptions {
     /// Time from one stored frame to the next where neither time stamps nor the length of a simulator's tick are
     /// recorded, nanoseconds. The datasets of the OPV2V family store ten frames a second.
@@ -36,7 +36,7 @@ pub struct OpenOptions {
 
 impl Default for OpenOptions {
     fn default() -> Self {
-        Self { period_nanos: 100_000_000, intensity_scale: IntensityScale::Auto }
+        Self { period_nanos: 100_000_000, intensity_scale: IntensityScale::AUTO }
     }
 }
 
@@ -54,6 +54,12 @@ pub fn open(dir: &Path) -> Result<Dataset, ReadError> {
 /// # Errors
 /// As [`open`].
 pub fn open_with(dir: &Path, options: &OpenOptions) -> Result<Dataset, ReadError> {
+    let mut dataset = open_any(dir, options)?;
+    unfinished::report(dir, &mut dataset);
+    Ok(dataset)
+}
+
+fn open_any(dir: &Path, options: &OpenOptions) -> Result<Dataset, ReadError> {
     if let Some(file) = recorded::file_of(dir) {
         return recorded::open(&file);
     }
@@ -86,7 +92,7 @@ fn open_single_vehicles(
     problems: &mut Vec<ReadError>,
 ) -> Result<(), ReadError> {
     let opened = if kitti_object::is_split(dir) {
-        kitti_object::open(root, dir, options)
+        kitti_object::open(root, dir, options, problems)
     } else if kitti_odometry::is_sequence(dir) {
         kitti_odometry::open(root, dir, options, problems)
     } else if localization::is_sequence(dir) {

@@ -25,8 +25,6 @@ use crate::pcd::{self, IntensityKind, IntensityOrigin, PcdCloud};
 const MAX_BYTES: u64 = 1 << 30;
 /// Sweeps of an agent that decide what its files do not tell.
 const SAMPLES: usize = 3;
-/// Files that are tried for these.
-const MOST_TRIED: usize = 30;
 
 /// How the points of a file are stored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
@@ -59,6 +57,9 @@ struct AgentSweeps {
 }
 
 impl Sweeps {
+    /// Files of an agent that are looked at to find samples.
+    pub(super) const MOST_TRIED: usize = 30;
+
     /// Sweeps of files that are stored so.
     pub(super) fn new(storage: SweepStorage, options: &OpenOptions) -> Self {
         Self { storage, scale: options.intensity_scale, agents: BTreeMap::new() }
@@ -67,7 +68,7 @@ impl Sweeps {
     /// Adds an agent with the files of its plain sweeps, in order. The first that can be read and hold points decide what
     /// files do not tell of themselves; nothing is read before the first [`Self::read`].
     pub(super) fn with_agent(mut self, agent: CavId, files: impl IntoIterator<Item = PathBuf>) -> Self {
-        let files = files.into_iter().take(MOST_TRIED).collect();
+        let files = files.into_iter().take(Self::MOST_TRIED).collect();
         self.agents.insert(agent, AgentSweeps { files, ..AgentSweeps::default() });
         self
     }

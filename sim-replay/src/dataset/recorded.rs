@@ -25,9 +25,8 @@ pub(super) fn file_of(path: &Path) -> Option<PathBuf> {
 pub(super) fn open(file: &Path) -> Result<Dataset, ReadError> {
     let recording = Recording::open(file).map_err(as_read_error)?;
     let mut problems = Vec::new();
-    if let Some(damage) = recording.damage() {
-        let reason = format!("{} bytes at its end are lost: {}", damage.lost_bytes, damage.reason);
-        problems.push(ReadError::malformed(file, reason));
+    for damage in recording.damage() {
+        problems.push(ReadError::malformed(file, damage.to_string()));
     }
     let name = file.file_stem().map_or("recording".into(), |stem| stem.to_string_lossy().into_owned());
     let source = Recorded::new(recording, &mut problems)?;

@@ -4,6 +4,7 @@
 
 mod boxes;
 mod cells;
+mod map;
 mod survey;
 mod sweeps;
 mod table;
@@ -11,6 +12,7 @@ mod table;
 use protocol::{CavId, Handedness};
 use serde::Serialize;
 
+pub use map::{MapReport, inspect_map};
 pub use survey::inspect;
 pub use sweeps::SweepReport;
 

@@ -374,7 +374,7 @@ mod tests {
             [
                 "/1/000010.pcd:13: intensity: \"5e\" is no number: the file is cut off here, after 1 of 2 POINTS",
                 "/1/000013.pcd: 2 of 2 points are not finite and are left out, the first in line 12",
-                "/1/000014.yaml:1: lidar_pose: a list of 3, expected 6 numbers",
+                "/1/000014.yaml:1: lidar_pose: a list of 3, expected 6 numbers or a 4x4 matrix",
                 "/1/000016.yaml: does not exist beside 000016.pcd: the frame is left out",
             ]
         );
@@ -382,6 +382,62 @@ mod tests {
         let agent = &report.scenarios[0].agents[0];
         assert_eq!((agent.points, agent.dropped_points), (Summary::of(&[1, 0, 2, 2]), 3));
         assert_eq!(report.ticks.len(), 4, "annotations of sound YAML count even where the sweep is broken");
+    }
+
+    /// Messages and table of an agent whose sweeps have these intensities.
+    fn of_intensities(sweeps: &[&[f32]]) -> (Vec<String>, String) {
+        let dir = tempfile::tempdir().unwrap();
+        for (stem, intensities) in sweeps.iter().enumerate() {
+            let points: Vec<[f32; 4]> = intensities.iter().map(|&intensity| [10.0, 0.0, -1.3, intensity]).collect();
+            write(dir.path(), &format!("1/{stem:06}.yaml"), YAML.as_bytes());
+            write(dir.path(), &format!("1/{stem:06}.pcd"), &sweep(&points));
+        }
+        let (report, messages) = survey(dir.path());
+        (messages, report.to_string())
+    }
+
+    #[test]
+    fn intensities_are_told_and_what_is_wrong_with_them_is_a_problem() {
+        let (messages, table) = of_intensities(&[&[0.0, 0.25, 1.0], &[0.5]]);
+        assert!(messages.is_empty(), "{messages:?}");
+        let line = "  sweeps of 1: PCD, ascii; intensity from intensity, divided by 1: 0.000 to 1.000, median 0.500";
+        assert!(table.contains(line), "{table}");
+        let (messages, table) = of_intensities(&[&[0.0, 51.0, 255.0]]);
+        assert!(messages.is_empty() && table.contains("divided by 255: 0.000 to 1.000, median 0.200"), "{table}");
+        let message = |sweeps: &[&[f32]]| of_intensities(sweeps).0.concat();
+        assert_eq!(
+            message(&[&[0.5], &[0.5, 0.5]]),
+            "/1: sweeps of agent 1: all 3 intensities are 0.5 (field intensity divided by 1), expected a sensor's, which \
+             differ"
+        );
+        assert_eq!(
+            message(&[&[0.5], &[1.0], &[0.25], &[200.0, 0.0]]),
+            "/1: sweeps of agent 1: 1 of 5 intensities are above 1, up to 200 (field intensity divided by 1): see \
+             --intensity-scale"
+        );
+        assert!(message(&[&[-0.5, 0.5]]).contains("1 of 2 intensities are below 0, down to -0.5"));
+        assert_eq!(
+            message(&[&[1.0, 700.0]]),
+            "/1: sweeps of agent 1: intensities reach 700, neither 0 to 1 nor 0 to 255 (field intensity divided by \
+             1023): state the scale by --intensity-scale"
+        );
+    }
+
+    #[test]
+    fn a_missing_intensity_and_implausible_points_are_problems() {
+        let dir = tempfile::tempdir().unwrap();
+        write(dir.path(), "1/000010.yaml", YAML.as_bytes());
+        let head = "FIELDS x y z ring\nSIZE 4 4 4 4\nTYPE F F F F\nWIDTH 2\nDATA ascii\n";
+        write(dir.path(), "1/000010.pcd", format!("{head}1 2 3 0\n4000 5 6 1\n").as_bytes());
+        let (_, messages) = survey(dir.path());
+        assert_eq!(
+            messages,
+            [
+                "/1: sweeps of agent 1: no field of intensity (intensity, reflectivity, remission, rgb, ...): it is 0 for \
+                 all points",
+                "/1: sweeps of agent 1: 50.0 % of the points lie within 300 m, usual are 95.0 % or more",
+            ]
+        );
     }
 
     #[test]

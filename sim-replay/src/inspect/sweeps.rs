@@ -127,7 +127,7 @@ fn intensity_fault(report: &SweepReport, sweeps: &[&SweepFindings], scale: Inten
     if points > 1 && min.total_cmp(&max).is_eq() {
         return Some(format!("all {points} intensities are {min} ({from}), expected a sensor's, which differ"));
     }
-    let is_unusual = scale == IntensityScale::Auto && !USUAL_DIVISORS.contains(&origin.divisor);
+    let is_unusual = scale == IntensityScale::AUTO && !USUAL_DIVISORS.contains(&origin.divisor);
     is_unusual.then(|| {
         let stored = max * origin.divisor;
         format!(

@@ -2,6 +2,7 @@
 
 use super::config::CapacityConfig;
 use super::trace::{OPPORTUNITY_BYTES, Step, Trace};
+use super::trace_config::TraceConfig;
 
 /// Work of one byte: 8 bits, times the nanoseconds of a second, so that bits per second times nanoseconds are work.
 const WORK_PER_BYTE: u128 = 8_000_000_000;
@@ -17,6 +18,14 @@ pub(super) enum Capacity {
     Steps(Vec<(Step, u128)>),
     /// Moments, nanoseconds, repeated from the last one on.
     Opportunities(Vec<u64>),
+    /// Another, from a later moment on.
+    Later {
+        all: Box<Self>,
+        /// The moment, nanoseconds.
+        offset_nanos: u64,
+        /// The work that could be done before it.
+        before: u128,
+    },
 }
 
 /// Work of so many bytes.
@@ -40,7 +49,12 @@ impl Capacity {
                 });
                 Self::Steps(steps.collect())
             }
-            (_, Some(Trace::Opportunities(times))) => Self::Opportunities(times.clone()),
+            (config, Some(Trace::Opportunities(times))) => {
+                let offset_nanos = config.trace().map_or(0, TraceConfig::offset_nanos);
+                let all = Self::Opportunities(times.clone());
+                let before = all.done_by(offset_nanos);
+                if offset_nanos == 0 { all } else { Self::Later { all: Box::new(all), offset_nanos, before } }
+            }
             _ => Self::Unlimited,
         }
     }
@@ -61,6 +75,7 @@ impl Capacity {
                 let passed = times.partition_point(|&time| time <= rest) as u128;
                 (u128::from(rounds) * times.len() as u128 + passed) * work(OPPORTUNITY_BYTES)
             }
+            Self::Later { all, offset_nanos, before } => all.done_by(nanos.saturating_add(*offset_nanos)) - before,
         }
     }
 
@@ -86,6 +101,9 @@ impl Capacity {
                 let period = times[times.len() - 1];
                 u64::try_from(rounds).ok()?.checked_mul(period)?.checked_add(times[place])
             }
+            Self::Later { all, offset_nanos, before } => {
+                Some(all.time_of(wanted.checked_add(*before)?)?.saturating_sub(*offset_nanos))
+            }
         }
     }
 }
@@ -104,7 +122,7 @@ mod tests {
             loss: 0.0,
         };
         let trace = Trace::Steps(rates.iter().enumerate().map(step).collect());
-        Capacity::new(&CapacityConfig::Trace("trace.csv".into()), Some(&trace))
+        Capacity::new(&CapacityConfig::Trace(TraceConfig::new("trace.csv".as_ref())), Some(&trace))
     }
 
     proptest! {
@@ -116,7 +134,10 @@ mod tests {
             times.sort_unstable();
             times.push(5_001);
             let times = times.iter().map(|ms| ms * 1_000_000).collect();
-            for capacity in [steps(&rates), Capacity::Constant(constant), Capacity::Opportunities(times)] {
+            let opportunities = Capacity::Opportunities(times);
+            let (all, offset_nanos) = (Box::new(opportunities.clone()), 9 * constant);
+            let later = Capacity::Later { before: all.done_by(offset_nanos), all, offset_nanos };
+            for capacity in [steps(&rates), Capacity::Constant(constant), opportunities, later] {
                 let Some(nanos) = capacity.time_of(work(bytes)) else {
                     prop_assert_eq!(rates.last(), Some(&0));
                     continue;

@@ -6,6 +6,7 @@ use serde::{Deserialize, Serialize};
 
 use super::device_clock::{ClockStep, DeviceClock};
 use super::trace::{Trace, TraceError};
+use super::trace_config::TraceConfig;
 
 /// Payload of one fragment where loss is drawn per fragment, bytes: what fits an 802.11p frame with its headers.
 pub(super) const FRAGMENT_BYTES: u64 = 1400;
@@ -105,9 +106,19 @@ pub enum CapacityConfig {
         burst_bytes: u64,
     },
     /// Rates over time from a CSV file: `time_s,rate_mbps,delay_ms,loss`.
-    Trace(PathBuf),
+    Trace(TraceConfig),
     /// Delivery opportunities of 1,500 bytes each, as mahimahi records them: one line a packet, milliseconds; repeated.
-    Mahimahi(PathBuf),
+    Mahimahi(TraceConfig),
+}
+
+impl CapacityConfig {
+    /// The trace that it follows.
+    pub(super) fn trace(&self) -> Option<&TraceConfig> {
+        match self {
+            Self::Unlimited | Self::TokenBucket { .. } => None,
+            Self::Trace(trace) | Self::Mahimahi(trace) => Some(trace),
+        }
+    }
 }
 
 /// What happens to those who have to wait.
@@ -334,6 +345,9 @@ impl LinkConfig {
             time("reorder.extra_ms", extra_ms)?;
         }
         probability("duplicate", self.duplicate)?;
+        if let Some(trace) = self.capacity.trace() {
+            bounded("offset_s", trace.offset_s, 0.0, 1e9, "0 to 1e9 s")?;
+        }
         for Outage { from_s, to_s } in &self.outages {
             bounded("outages.from_s", *from_s, 0.0, 1e9, "0 to 1e9 s")?;
             bounded("outages.to_s", *to_s, *from_s, 1e9, "after from_s")?;
@@ -344,10 +358,7 @@ impl LinkConfig {
     /// The file of the trace that the capacity names.
     #[must_use]
     pub fn trace_file(&self) -> Option<&Path> {
-        match &self.capacity {
-            CapacityConfig::Unlimited | CapacityConfig::TokenBucket { .. } => None,
-            CapacityConfig::Trace(path) | CapacityConfig::Mahimahi(path) => Some(path),
-        }
+        self.capacity.trace().map(|trace| trace.path.as_path())
     }
 
     /// The trace that the capacity names; relative paths start at `folder`.
@@ -355,10 +366,11 @@ impl LinkConfig {
     /// # Errors
     /// [`LinkError`] when it is not readable, or has to say what it does not.
     pub(super) fn read_trace(&self, folder: &Path) -> Result<Option<Trace>, LinkError> {
+        let offset_nanos = self.capacity.trace().map_or(0, TraceConfig::offset_nanos);
         let trace = match &self.capacity {
             CapacityConfig::Unlimited | CapacityConfig::TokenBucket { .. } => None,
-            CapacityConfig::Trace(path) => Some(Trace::read_csv(&folder.join(path))?),
-            CapacityConfig::Mahimahi(path) => Some(Trace::read_mahimahi(&folder.join(path))?),
+            CapacityConfig::Trace(TraceConfig { path, .. }) => Some(Trace::read_csv(&folder.join(path), offset_nanos)?),
+            CapacityConfig::Mahimahi(TraceConfig { path, .. }) => Some(Trace::read_mahimahi(&folder.join(path))?),
         };
         let has_steps = matches!(trace, Some(Trace::Steps(_)));
         if self.delay == DelayLaw::Trace && !has_steps {

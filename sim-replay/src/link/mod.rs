@@ -20,6 +20,7 @@ mod loss;
 pub mod node;
 mod preset;
 mod trace;
+mod trace_config;
 
 pub use air::{Air, Fate, Outcome, Parcel};
 pub use config::{
@@ -29,6 +30,7 @@ pub use config::{
 pub use device_clock::{ClockStep, DeviceClock};
 pub use preset::PRESETS;
 pub use trace::{Step, Trace, TraceError};
+pub use trace_config::TraceConfig;
 
 /// Nanoseconds of so many milliseconds; 0 for what is below 0 or no number.
 fn nanos_of_ms(ms: f64) -> u64 {

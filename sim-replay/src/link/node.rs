@@ -23,6 +23,8 @@ const PLACES: usize = 64;
 const MAX_VEHICLES: usize = 64;
 /// Vehicles that are remembered for having been turned away, so that the log names each once.
 const MAX_TURNED_AWAY: usize = 1024;
+/// Messages that are under way for longer at the end are of no use to anybody any more, milliseconds.
+const STUCK_MS: u64 = 5_000;
 /// How often the node looks for newcomers though nothing happens.
 const LOOK_ROUND: Duration = Duration::from_millis(20);
 
@@ -62,6 +64,16 @@ pub struct LinkReport {
     pub dropped: BTreeMap<DropReason, u64>,
     /// Still under way at the end.
     pub under_way: u64,
+    /// For how long the oldest of these was, milliseconds.
+    pub longest_ms: u64,
+}
+
+impl LinkReport {
+    /// Whether what is still under way is so because the run has ended, and not because the link carries nothing.
+    #[must_use]
+    pub fn is_complete(&self) -> bool {
+        self.longest_ms <= STUCK_MS
+    }
 }
 
 /// Carries messages until all agents have ended and everything has arrived, or `stop` is requested.
@@ -74,6 +86,8 @@ pub fn run(bus: &Bus, air: Air, options: &NodeOptions, stop: &Stop) -> Result<Li
     node.carry(stop)?;
     let Node { vehicles, kept, mut report, .. } = node;
     report.under_way = kept.len() as u64;
+    let longest = kept.values().map(|arrival| arrival.at.elapsed()).max().unwrap_or_default();
+    report.longest_ms = u64::try_from(longest.as_millis()).unwrap_or(u64::MAX);
     for topic in kept.values().map(|arrival| &arrival.topic) {
         bus.books().dropped(topic, DropReason::Stale);
     }

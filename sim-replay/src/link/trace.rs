@@ -35,6 +35,14 @@ pub enum TraceError {
         /// What would be right.
         must: &'static str,
     },
+    /// It ends before the link is to begin.
+    #[error("{}: offset_s is {offset_s}, behind the last line", path.display())]
+    Past {
+        /// The file.
+        path: PathBuf,
+        /// Where the link is to begin, seconds.
+        offset_s: f64,
+    },
     /// There is nothing in it.
     #[error("{}: no line with numbers", path.display())]
     Empty {
@@ -66,11 +74,12 @@ pub enum Trace {
 }
 
 impl Trace {
-    /// Reads `time_s,rate_mbps,delay_ms,loss`: one line for every change, times rising from 0.
+    /// Reads `time_s,rate_mbps,delay_ms,loss`: one line for every change, times rising, the first at `offset_nanos` or
+    /// before. There the link begins.
     ///
     /// # Errors
     /// [`TraceError`] names the file and the line.
-    pub fn read_csv(path: &Path) -> Result<Self, TraceError> {
+    pub fn read_csv(path: &Path, offset_nanos: u64) -> Result<Self, TraceError> {
         let text = read(path)?;
         let mut lines = text.lines().enumerate();
         let header = lines.next().map_or("", |(_, line)| line.trim());
@@ -97,13 +106,27 @@ impl Trace {
                 ));
             }
             let from_nanos = (time_s * 1e9).round() as u64;
-            let rises = steps.last().map_or(from_nanos == 0, |last| from_nanos > last.from_nanos);
+            let rises = steps.last().map_or(from_nanos <= offset_nanos, |last| from_nanos > last.from_nanos);
             if !rises {
-                return Err(wrong(path, index, line, "later than the line before, the first at 0"));
+                return Err(wrong(
+                    path,
+                    index,
+                    line,
+                    "later than the line before, the first at offset_s (0) or before",
+                ));
             }
             steps.push(Step { from_nanos, bits_per_s: (rate_mbps * 1e6).round() as u64, delay_ms, loss });
         }
-        if steps.is_empty() { Err(TraceError::Empty { path: path.to_owned() }) } else { Ok(Self::Steps(steps)) }
+        let is_past = steps.last().is_some_and(|last| last.from_nanos < offset_nanos);
+        if is_past {
+            return Err(TraceError::Past { path: path.to_owned(), offset_s: offset_nanos as f64 * 1e-9 });
+        }
+        let begin = steps.partition_point(|step| step.from_nanos <= offset_nanos).saturating_sub(1);
+        let shifted = |step: &Step| Step { from_nanos: step.from_nanos.saturating_sub(offset_nanos), ..*step };
+        match steps.get(begin..) {
+            Some(left @ [_, ..]) => Ok(Self::Steps(left.iter().map(shifted).collect())),
+            _ => Err(TraceError::Empty { path: path.to_owned() }),
+        }
     }
 
     /// Reads delivery opportunities as mahimahi writes them: one line a packet, whole milliseconds that never fall.
@@ -158,9 +181,26 @@ mod tests {
     #[test]
     fn steps_hold_until_the_next() {
         let (_folder, path) = file("time_s,rate_mbps,delay_ms,loss\n0,27,10,0\n2.5,1.5,40,0.1\n\n");
-        let trace = Trace::read_csv(&path).unwrap();
+        let trace = Trace::read_csv(&path, 0).unwrap();
         let rate = |seconds: f64| trace.at((seconds * 1e9) as u64).unwrap().bits_per_s;
         assert_eq!([rate(0.0), rate(2.499), rate(2.5), rate(900.0)], [27_000_000, 27_000_000, 1_500_000, 1_500_000]);
+    }
+
+    #[test]
+    fn a_link_begins_at_any_moment_of_its_trace() {
+        let text = "time_s,rate_mbps,delay_ms,loss\n10,27,10,0\n12.5,1.5,40,0.1\n20,6,5,0\n";
+        let (_folder, path) = file(text);
+        let steps = |offset_s: f64| match Trace::read_csv(&path, (offset_s * 1e9) as u64) {
+            Ok(Trace::Steps(steps)) => {
+                Ok(steps.iter().map(|step| (step.from_nanos as f64 * 1e-9, step.bits_per_s)).collect::<Vec<_>>())
+            }
+            other => Err(other.unwrap_err().to_string()),
+        };
+        assert_eq!(steps(10.0).unwrap(), [(0.0, 27_000_000), (2.5, 1_500_000), (10.0, 6_000_000)]);
+        assert_eq!(steps(13.0).unwrap(), [(0.0, 1_500_000), (7.0, 6_000_000)]);
+        assert_eq!(steps(20.0).unwrap(), [(0.0, 6_000_000)]);
+        assert!(steps(9.0).unwrap_err().contains("trace.txt:2:"), "it has not begun");
+        assert!(steps(20.5).unwrap_err().contains("offset_s is 20.5, behind the last line"));
     }
 
     #[test]
@@ -175,12 +215,12 @@ mod tests {
             ("0,1,0,nan\n", 2),
         ] {
             let (_folder, path) = file(&format!("{header}{text}"));
-            let message = Trace::read_csv(&path).unwrap_err().to_string();
+            let message = Trace::read_csv(&path, 0).unwrap_err().to_string();
             assert!(message.contains(&format!("trace.txt:{line}:")), "{message}");
         }
-        assert!(matches!(Trace::read_csv(Path::new("no/such/trace.csv")), Err(TraceError::Io { .. })));
+        assert!(matches!(Trace::read_csv(Path::new("no/such/trace.csv"), 0), Err(TraceError::Io { .. })));
         let (_folder, path) = file("time,rate\n");
-        assert!(Trace::read_csv(&path).unwrap_err().to_string().contains("header"));
+        assert!(Trace::read_csv(&path, 0).unwrap_err().to_string().contains("header"));
         let (_folder, path) = file("2\n5\n3\n");
         let message = Trace::read_mahimahi(&path).unwrap_err().to_string();
         assert!(message.contains("trace.txt:3: \"3\"") && message.contains("not before the line above"), "{message}");

@@ -181,10 +181,12 @@ pub(super) mod tests {
         file.extend([0; 20]);
         assert_eq!(
             decode(&file).unwrap_err().to_string(),
-            "POINTS: 2 points of 12 bytes stated, 20 bytes found: the file is cut off"
+            "POINTS: 2 points of 12 bytes stated, but only 20 bytes follow the header: the file is cut off"
         );
-        file.extend([0; 20]);
-        assert_eq!(decode(&file).unwrap_err().to_string(), "POINTS: 2 points of 12 bytes stated, 40 bytes found");
+        file.extend([0; 4]);
+        assert_eq!(decode(&file).unwrap().points.len(), 2);
+        file.extend([7; 4096]);
+        assert_eq!(decode(&file).unwrap().points.len(), 2, "more may follow");
     }
 
     #[test]
@@ -204,12 +206,18 @@ pub(super) mod tests {
         let lengths_at = file.len() - decode_packed_len(&file) - 8;
         let mut cut = file.clone();
         cut.truncate(file.len() - 1);
-        assert!(decode(&cut).unwrap_err().reason.contains("packed bytes stated"));
+        let packed = decode_packed_len(&file);
+        assert_eq!(
+            decode(&cut).unwrap_err().to_string(),
+            format!("DATA: {packed} packed bytes stated, but only {} follow: the file is cut off", packed - 1)
+        );
+        let stretched = [&file[..], &[0; 3731]].concat();
+        assert_eq!(decode(&stretched).unwrap().points, cloud);
         let mut absurd = file.clone();
         absurd[lengths_at + 4..lengths_at + 8].copy_from_slice(&u32::MAX.to_le_bytes());
         assert_eq!(
             decode(&absurd).unwrap_err().to_string(),
-            "DATA: 10 points of 16 bytes stated, 4294967295 bytes found"
+            "DATA: 10 points of 16 bytes stated, but unpacked they are 4294967295 bytes: more"
         );
     }
 

@@ -3,11 +3,18 @@
 
 use mcap::records::op;
 use mcap::{McapError, McapResult};
+use protocol::{HEADER_LEN, wire};
 
 /// Opcode and length before every record.
 pub(super) const RECORD_HEAD: usize = 9;
 /// Times, size and checksum before a chunk's first text.
 const CHUNK_HEAD: usize = 28;
+/// Channel, sequence and times before a message's payload.
+pub(super) const MESSAGE_HEAD: usize = 22;
+/// Length of the record that ends the data.
+pub(super) const DATA_END_LEN: usize = 4;
+/// Packings of chunks that are read.
+const PACKINGS: [&[u8]; 3] = [b"", b"zstd", b"lz4"];
 
 /// Checks the lengths in a chunk, a schema or a channel. Of a chunk that is packed the records are checked when they are
 /// unpacked.
@@ -23,6 +30,50 @@ pub(super) fn check(opcode: u8, record: &[u8]) -> McapResult<()> {
         _ => Some(()),
     };
     fits.ok_or(McapError::UnexpectedEoc)
+}
+
+/// Whether what is in a record among the data is as long as the record.
+pub(super) fn is_filled(opcode: u8, record: &[u8]) -> bool {
+    let texts = |head: usize, count: usize| {
+        let mut rest = record.get(head..)?;
+        for _ in 0..count {
+            rest = text(rest)?.1;
+        }
+        Some(rest)
+    };
+    let rest = match opcode {
+        op::HEADER | op::METADATA => texts(0, 2),
+        op::SCHEMA => texts(2, 3),
+        op::CHANNEL => texts(4, 3),
+        op::MESSAGE => return record.len() >= MESSAGE_HEAD,
+        op::CHUNK => texts(CHUNK_HEAD, 1).and_then(long),
+        op::MESSAGE_INDEX => texts(2, 1),
+        // Behind its contents stands their checksum.
+        op::ATTACHMENT => texts(16, 2).and_then(long).filter(|rest| rest.len() == 4).map(|_| [].as_slice()),
+        op::DATA_END => record.get(DATA_END_LEN..),
+        _ => None,
+    };
+    rest.is_some_and(<[u8]>::is_empty)
+}
+
+/// Whether a chunk of `len` bytes begins here: its packing is known, and its records fill the rest.
+pub(super) fn is_chunk_head(bytes: &[u8], len: u64) -> bool {
+    let Some((packing, rest)) = bytes.get(CHUNK_HEAD..).and_then(text) else { return false };
+    let Some((&records_len, _)) = rest.split_first_chunk() else { return false };
+    let head_len = (CHUNK_HEAD + 4 + packing.len() + 8) as u64;
+    PACKINGS.contains(&packing) && u64::from_le_bytes(records_len).checked_add(head_len) == Some(len)
+}
+
+/// The channel of a message, and its payload.
+pub(super) fn message(record: &[u8]) -> Option<(u16, &[u8])> {
+    let (&channel, _) = record.split_first_chunk()?;
+    Some((u16::from_le_bytes(channel), record.get(MESSAGE_HEAD..)?))
+}
+
+/// The length of one of our messages, as its header tells it; `None` where there is no sound header.
+pub(super) fn own_message(payload: &[u8]) -> Option<u64> {
+    let header = wire::decode_header([payload]).ok()?;
+    header.body_len.checked_add(u64::from(header.metadata_len))?.checked_add(HEADER_LEN as u64)
 }
 
 fn chunk_fits(chunk: &[u8]) -> Option<()> {
@@ -51,6 +102,12 @@ fn channel_fits(channel: &[u8]) -> Option<()> {
 fn text(bytes: &[u8]) -> Option<(&[u8], &[u8])> {
     let (&len, rest) = bytes.split_first_chunk()?;
     rest.split_at_checked(usize::try_from(u32::from_le_bytes(len)).ok()?)
+}
+
+/// What follows bytes behind their length in 64 bits.
+fn long(bytes: &[u8]) -> Option<&[u8]> {
+    let (&len, rest) = bytes.split_first_chunk()?;
+    rest.get(usize::try_from(u64::from_le_bytes(len)).ok()?..)
 }
 
 #[cfg(test)]

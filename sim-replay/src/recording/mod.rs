@@ -12,21 +12,26 @@
 //! are capture times on the scene's clock.
 //!
 //! The file grows by whole chunks of at most some MiB or a second, each with its own checksum. One that ends in the middle
-//! of a chunk (power, disk, `kill -9`) reads up to its last whole chunk ([`Recording::damage`] says what is lost), and
-//! [`recover`] makes an indexed file of it again.
+//! of a chunk (power, disk, `kill -9`) reads up to its last whole chunk, one with a bit that is not as it was written reads
+//! but for that chunk ([`Recording::damage`] says what is lost), and [`recover`] makes an indexed file of it again. Files that
+//! other programs have rewritten are read too: packed by zstd or lz4, or with messages that stand in no chunk.
 
+mod chunk;
+mod damage;
 mod error;
 mod lengths;
 mod reader;
 mod recorder;
+mod records;
 mod recover;
 mod ros;
 mod ros_schema;
 mod sink;
 mod writer;
 
+pub use damage::Damage;
 pub use error::RecordingError;
-pub use reader::{Damage, Entry, Recording};
+pub use reader::{Entry, Recording};
 pub use recorder::{RecordReport, RecorderError, RecorderOptions, record};
 pub use recover::{RecoverReport, recover};
 pub use sink::Store;

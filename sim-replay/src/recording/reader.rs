@@ -1,28 +1,26 @@
-//! Reading a recording, whole or cut.
+//! Reading a recording: whole, cut, or with parts that are damaged.
 
 use std::collections::VecDeque;
 use std::fs::File;
-use std::io::{BufReader, ErrorKind, Read};
 use std::ops::ControlFlow;
 use std::os::unix::fs::FileExt;
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 
-use mcap::read::ChannelAccumulator;
-use mcap::records::{Record, op};
-use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
-use mcap::{McapError, McapResult, Message, parse_record};
+use mcap::Message;
+use mcap::records::op;
 use protocol::{Header, Key, wire};
 
+use super::chunk::{Channels, unpack};
+use super::damage::Damage;
 use super::lengths::{self, RECORD_HEAD};
+use super::records::{RawRecord, Records};
 use super::{OWN_ENCODING, RecordingError};
 
-/// A chunk that claims more than this, packed or not, is not ours: we close them at a few MiB and one message.
-const MAX_CHUNK_BYTES: usize = 256 << 20;
-/// Bytes taken from a file at once: a length that is wrong costs no more memory than what is there.
-const READ_BYTES: usize = 1 << 20;
 /// Chunks that are kept unpacked: neighbours in time are neighbours in the file.
 const KEPT_CHUNKS: usize = 4;
+/// With more parts than this damaged, nothing more of a file is read.
+const MAX_DAMAGED: usize = 1000;
 
 /// A message of a recording, where it lies and what its header says.
 #[derive(Debug, Clone)]
@@ -33,36 +31,28 @@ pub struct Entry {
     pub header: Header,
     /// When it reached the recorder, nanoseconds on the Unix clock.
     pub arrived_nanos: u64,
-    chunk: usize,
-    /// Which message of the chunk.
+    /// Which of the records that hold messages.
+    holder: usize,
+    /// Which message of it.
     place: usize,
 }
 
-/// What is wrong with the end of a recording.
-#[derive(Debug, Clone, PartialEq, Eq, serde::Serialize)]
-pub struct Damage {
-    /// Where the whole part ends, bytes.
-    pub whole_bytes: u64,
-    /// Bytes behind it: of these nothing is read.
-    pub lost_bytes: u64,
-    /// What was found there.
-    pub reason: String,
-}
-
-/// Where a chunk's record begins, and how long its body is.
+/// A record that holds messages: a chunk, or a message that stands in none.
 #[derive(Debug, Clone, Copy)]
-struct ChunkPlace {
+struct Holder {
     begin: u64,
+    /// Length of its body.
     len: usize,
+    is_chunk: bool,
 }
 
 type Messages = Arc<Vec<Message<'static>>>;
 
-/// All channels, and the chunks that were read last.
+/// All channels, and the messages that were read last.
 #[derive(Debug)]
 struct Unpacked {
-    channels: ChannelAccumulator<'static>,
-    chunks: VecDeque<(usize, Messages)>,
+    channels: Channels,
+    kept: VecDeque<(usize, Messages)>,
 }
 
 /// A recording whose messages can be read in any order.
@@ -70,40 +60,37 @@ struct Unpacked {
 pub struct Recording {
     path: PathBuf,
     file: File,
-    chunks: Vec<ChunkPlace>,
+    holders: Vec<Holder>,
     entries: Vec<Entry>,
-    damage: Option<Damage>,
+    damage: Vec<Damage>,
     unpacked: Mutex<Unpacked>,
 }
 
 impl Recording {
-    /// Opens a recording and looks through all of it once; every chunk is compared with its checksum. One that is cut is
-    /// read up to its last whole chunk, see [`Self::damage`].
+    /// Opens a recording and looks through all of it once; every chunk is compared with its checksum. Parts that are cut
+    /// off or damaged are left out, see [`Self::damage`].
     ///
     /// # Errors
     /// [`RecordingError`] when the file cannot be read or is no recording of ours.
     pub fn open(path: &Path) -> Result<Self, RecordingError> {
         let io = |source| RecordingError::io(path, source);
+        let not_ours = |reason| RecordingError::NotOurs { path: path.into(), reason };
         let file = File::open(path).map_err(io)?;
         let size = file.metadata().map_err(io)?.len();
-        let mut contents = Contents { whole_bytes: mcap::MAGIC.len() as u64, ..Contents::default() };
-        let options = LinearReaderOptions::default().with_emit_chunks(true);
-        let read = for_each_record(BufReader::new(&file), options, |opcode, body| contents.take(opcode, body));
-        let not_ours = |reason| RecordingError::NotOurs { path: path.into(), reason };
-        let reason = match read {
-            Err(McapError::BadMagic) => return Err(not_ours("not an MCAP file".into())),
-            Err(error) => Some(error.to_string()),
-            Ok(()) => (!contents.has_end).then(|| "the file ends without an index".into()),
-        };
-        let Contents { channels, has_own, chunks, entries, whole_bytes, has_end: _ } = contents;
+        let mut records = Records::open(&file, size).map_err(io)?.ok_or_else(|| not_ours("not an MCAP file".into()))?;
+        let mut contents = Contents { channels: Channels::of_summary(&file, size).map_err(io)?, ..Contents::default() };
+        contents.look_through(&mut records, size).map_err(io)?;
+        let damage = contents.damage();
+        let Contents { channels, has_any, has_own, holders, entries, .. } = contents;
         if !has_own {
-            let what = reason.map_or(String::new(), |reason| format!("; {reason}"));
-            return Err(not_ours(format!("no channel of encoding {OWN_ENCODING:?} in it{what}")));
+            let what = damage.first().map_or(String::new(), |damage| format!("; {damage}"));
+            return Err(not_ours(match has_any || damage.is_empty() {
+                true => format!("no channel of encoding {OWN_ENCODING:?} in it{what}"),
+                false => format!("none of its messages can be read{what}"),
+            }));
         }
-        let lost_bytes = size.saturating_sub(whole_bytes);
-        let damage = reason.map(|reason| Damage { whole_bytes, lost_bytes, reason });
-        let unpacked = Mutex::new(Unpacked { channels, chunks: VecDeque::new() });
-        Ok(Self { path: path.into(), file, chunks, entries, damage, unpacked })
+        let unpacked = Mutex::new(Unpacked { channels, kept: VecDeque::new() });
+        Ok(Self { path: path.into(), file, holders, entries, damage, unpacked })
     }
 
     /// The file.
@@ -118,10 +105,10 @@ impl Recording {
         &self.entries
     }
 
-    /// What of the file could not be read, if anything.
+    /// What of the file could not be read, in its order.
     #[must_use]
-    pub fn damage(&self) -> Option<&Damage> {
-        self.damage.as_ref()
+    pub fn damage(&self) -> &[Damage] {
+        &self.damage
     }
 
     /// The bytes of a message, as they were on the wire.
@@ -129,140 +116,181 @@ impl Recording {
     /// # Errors
     /// [`RecordingError`] when the file has changed since it was opened.
     pub fn read(&self, entry: &Entry) -> Result<Vec<u8>, RecordingError> {
-        let messages = self.messages(entry.chunk)?;
-        let changed = || RecordingError::malformed(&self.path, self.chunks[entry.chunk].begin, "the file has changed");
-        messages.get(entry.place).map(|message| message.data.to_vec()).ok_or_else(changed)
+        let messages = self.messages(entry.holder)?;
+        let message = messages.get(entry.place).ok_or_else(|| self.changed(entry.holder, "the file has changed"))?;
+        Ok(message.data.to_vec())
     }
 
-    /// The messages of whatever channel, chunk by chunk. For [`super::recover`].
-    pub(super) fn chunks(&self) -> impl Iterator<Item = Result<Messages, RecordingError>> {
-        (0..self.chunks.len()).map(|chunk| self.messages(chunk))
+    /// The messages of whatever channel, in the order of the file. For [`super::recover`].
+    pub(super) fn all(&self) -> impl Iterator<Item = Result<Messages, RecordingError>> {
+        (0..self.holders.len()).map(|holder| self.messages(holder))
     }
 
-    fn messages(&self, chunk: usize) -> Result<Messages, RecordingError> {
+    fn changed(&self, holder: usize, reason: impl Into<String>) -> RecordingError {
+        RecordingError::malformed(&self.path, self.holders[holder].begin, reason)
+    }
+
+    fn messages(&self, holder: usize) -> Result<Messages, RecordingError> {
         let mut unpacked = self.unpacked.lock().unwrap_or_else(PoisonError::into_inner);
-        if let Some((_, messages)) = unpacked.chunks.iter().find(|(known, _)| *known == chunk) {
+        if let Some((_, messages)) = unpacked.kept.iter().find(|(known, _)| *known == holder) {
             return Ok(Arc::clone(messages));
         }
-        let ChunkPlace { begin, len } = self.chunks[chunk];
+        let Holder { begin, len, is_chunk } = self.holders[holder];
         let mut body = vec![0; len];
         let read = self.file.read_exact_at(&mut body, begin + RECORD_HEAD as u64);
         read.map_err(|source| RecordingError::io(&self.path, source))?;
-        let messages = unpack(&body, &mut unpacked.channels);
-        let messages = messages.map_err(|error| RecordingError::malformed(&self.path, begin, error.to_string()))?;
-        let messages = Arc::new(messages);
-        unpacked.chunks.truncate(KEPT_CHUNKS - 1);
-        unpacked.chunks.push_front((chunk, Arc::clone(&messages)));
+        let messages = match is_chunk {
+            true => unpack(&body, &mut unpacked.channels).map(|(messages, _)| messages),
+            false => unpacked.channels.message(&body).map(|message| message.into_iter().collect()),
+        };
+        let messages = Arc::new(messages.map_err(|error| self.changed(holder, error.to_string()))?);
+        unpacked.kept.truncate(KEPT_CHUNKS - 1);
+        unpacked.kept.push_front((holder, Arc::clone(&messages)));
         Ok(messages)
     }
+}
+
+/// A part of the file that is passed over.
+#[derive(Debug)]
+struct Lost {
+    begin: u64,
+    end: u64,
+    /// Messages of ours before it.
+    before: usize,
+    reason: String,
 }
 
 /// What a first look through a file finds.
 #[derive(Default)]
 struct Contents {
-    channels: ChannelAccumulator<'static>,
-    /// Whether one of the channels is ours.
+    channels: Channels,
+    /// Whether there are messages at all, and whether some are ours.
+    has_any: bool,
     has_own: bool,
-    chunks: Vec<ChunkPlace>,
+    holders: Vec<Holder>,
     entries: Vec<Entry>,
-    /// Where the last whole record ends.
-    whole_bytes: u64,
-    /// Whether the data end where they were meant to.
-    has_end: bool,
+    lost: Vec<Lost>,
 }
 
 impl Contents {
-    /// Takes the next record of the file in.
-    fn take(&mut self, opcode: u8, body: &[u8]) -> McapResult<ControlFlow<()>> {
-        match opcode {
-            op::DATA_END => {
-                self.has_end = true;
-                return Ok(ControlFlow::Break(()));
+    /// Takes all records of a file of `size` bytes, but for what is damaged.
+    fn look_through(&mut self, records: &mut Records<'_>, size: u64) -> std::io::Result<()> {
+        loop {
+            let begin = records.at();
+            let taken = match records.next()? {
+                Ok(Some(record)) => self.take(&record),
+                Ok(None) if self.lost.last().is_some_and(|lost| lost.end == size) => return Ok(()),
+                Ok(None) => return Ok(self.lose((begin, begin), "the file ends without an index".into())),
+                Err(reason) => Err(reason),
+            };
+            match taken {
+                Ok(ControlFlow::Continue(())) => {}
+                Ok(ControlFlow::Break(stated_crc)) => {
+                    self.check_whole(begin, stated_crc, records.crc());
+                    return Ok(());
+                }
+                Err(reason) if self.lost.len() >= MAX_DAMAGED => {
+                    return Ok(self.lose((begin, size), format!("too many damaged parts; {reason}")));
+                }
+                Err(reason) => {
+                    let has_chunks = self.has_chunks();
+                    let is_own = |id| self.channels.get(id).is_some_and(|channel| is_own(&channel.message_encoding));
+                    records.seek(begin + 1, |id| !has_chunks && is_own(id))?;
+                    self.lose((begin, records.at()), reason);
+                }
             }
-            op::CHUNK => self.take_chunk(body)?,
-            _ => {}
         }
-        self.whole_bytes += (RECORD_HEAD + body.len()) as u64;
-        Ok(ControlFlow::Continue(()))
     }
 
-    fn take_chunk(&mut self, body: &[u8]) -> McapResult<()> {
-        let messages = unpack(body, &mut self.channels)?;
-        let chunk = self.chunks.len();
-        self.chunks.push(ChunkPlace { begin: self.whole_bytes, len: body.len() });
+    /// Whether messages stand in chunks: where they do, those of a damaged one are not taken one by one.
+    fn has_chunks(&self) -> bool {
+        let first = self.holders.first().map(|holder| holder.is_chunk);
+        self.channels.has_chunks.or(first).unwrap_or(false)
+    }
+
+    /// Takes the next record of the file in; ends with the checksum of the data, where it ends them.
+    fn take(&mut self, record: &RawRecord<'_>) -> Result<ControlFlow<u32>, String> {
+        let RawRecord { begin, opcode, body } = *record;
+        let added = match opcode {
+            op::DATA_END => {
+                let crc = body.first_chunk().map_or(0, |crc| u32::from_le_bytes(*crc));
+                return Ok(ControlFlow::Break(crc));
+            }
+            op::CHUNK => {
+                let (messages, orphans) = unpack(body, &mut self.channels).map_err(|error| error.to_string())?;
+                self.add(Holder { begin, len: body.len(), is_chunk: true }, &messages);
+                if orphans > 0 {
+                    let what = format!("{orphans} messages of channels that are described nowhere");
+                    self.lose((begin, begin), what);
+                }
+                Ok(())
+            }
+            op::MESSAGE => self.take_message(begin, body)?,
+            _ => self.channels.add(opcode, body),
+        };
+        added.map(|()| ControlFlow::Continue(())).map_err(|error| error.to_string())
+    }
+
+    /// A message that stands in no chunk has no checksum but its own.
+    fn take_message(&mut self, begin: u64, body: &[u8]) -> Result<mcap::McapResult<()>, String> {
+        let message = self.channels.message(body).map_err(|error| error.to_string())?;
+        let message = message.ok_or("a message of a channel that is described nowhere")?;
+        if is_own(&message.channel.message_encoding)
+            && lengths::own_message(&message.data) != Some(message.data.len() as u64)
+        {
+            return Err("a message that is not as long as it says".into());
+        }
+        self.add(Holder { begin, len: body.len(), is_chunk: false }, &[message]);
+        Ok(Ok(()))
+    }
+
+    fn add(&mut self, holder: Holder, messages: &[Message<'static>]) {
+        self.has_any |= !messages.is_empty();
         for (place, message) in messages.iter().enumerate() {
-            if message.channel.message_encoding != OWN_ENCODING {
+            if !is_own(&message.channel.message_encoding) {
                 continue;
             }
             self.has_own = true;
             // What was no sound message when it was recorded is none now.
             let header = wire::decode_header([message.data.as_ref()]).ok();
             if let Some((key, header)) = message.channel.topic.parse().ok().zip(header) {
-                self.entries.push(Entry { key, header, arrived_nanos: message.log_time, chunk, place });
+                let holder = self.holders.len();
+                self.entries.push(Entry { key, header, arrived_nanos: message.log_time, holder, place });
             }
         }
-        Ok(())
+        self.holders.push(holder);
+    }
+
+    /// Notes a part that is passed over; one that goes on where the last ended belongs to it.
+    fn lose(&mut self, (begin, end): (u64, u64), reason: String) {
+        match self.lost.last_mut() {
+            Some(last) if last.end == begin && end > begin && last.end > last.begin => last.end = end,
+            _ => self.lost.push(Lost { begin, end, before: self.entries.len(), reason }),
+        }
+    }
+
+    /// Compares the checksum of all data, which is of use where no chunk has one of its own.
+    fn check_whole(&mut self, end: u64, stated: u32, found: u32) {
+        if stated != 0 && stated != found && self.lost.is_empty() && self.holders.iter().all(|holder| !holder.is_chunk)
+        {
+            self.lose((end, end), "the checksum of the data does not agree with them".into());
+        }
+    }
+
+    fn damage(&self) -> Vec<Damage> {
+        let first = self.entries.first().map_or(0, |entry| entry.arrived_nanos);
+        let seconds = |entry: &Entry| (entry.arrived_nanos as f64 - first as f64) * 1e-9;
+        let damage = |lost: &Lost| Damage {
+            begin_bytes: lost.begin,
+            lost_bytes: lost.end - lost.begin,
+            from_s: self.entries[..lost.before].last().map(seconds),
+            to_s: self.entries.get(lost.before).map(seconds),
+            reason: lost.reason.clone(),
+        };
+        self.lost.iter().map(damage).collect()
     }
 }
 
-/// The messages of a chunk, once it has been compared with its checksum; its channels are added to `channels`.
-fn unpack(body: &[u8], channels: &mut ChannelAccumulator<'static>) -> McapResult<Vec<Message<'static>>> {
-    lengths::check(op::CHUNK, body)?;
-    let head = [[op::CHUNK].as_slice(), &(body.len() as u64).to_le_bytes()].concat();
-    let options = LinearReaderOptions::default().with_skip_start_magic(true).with_prevalidate_chunk_crcs(true);
-    let (mut messages, mut unpacked_bytes) = (Vec::new(), 0);
-    for_each_record(head.chain(body), options, |opcode, data| {
-        unpacked_bytes += data.len();
-        if unpacked_bytes > MAX_CHUNK_BYTES {
-            return Err(McapError::ChunkTooLarge(unpacked_bytes as u64));
-        }
-        // Others have no place in a chunk, and the parser trusts the lengths in some of them.
-        if !matches!(opcode, op::SCHEMA | op::CHANNEL | op::MESSAGE) {
-            return Ok(ControlFlow::Continue(()));
-        }
-        lengths::check(opcode, data)?;
-        match parse_record(opcode, data)? {
-            Record::Schema { header, data } => channels.add_schema_from_slice(header, &data)?,
-            Record::Channel(channel) => channels.add_channel(channel)?,
-            Record::Message { header, data } => {
-                if let Some(channel) = channels.get(header.channel_id) {
-                    messages.push(Message {
-                        channel,
-                        sequence: header.sequence,
-                        log_time: header.log_time,
-                        publish_time: header.publish_time,
-                        data: data.into_owned().into(),
-                    });
-                }
-            }
-            _ => {}
-        }
-        Ok(ControlFlow::Continue(()))
-    })?;
-    Ok(messages)
-}
-
-/// Gives the records of `source` to `visit`, one after the other, until it has had enough or there are no more.
-fn for_each_record(
-    mut source: impl Read,
-    options: LinearReaderOptions,
-    mut visit: impl FnMut(u8, &[u8]) -> McapResult<ControlFlow<()>>,
-) -> McapResult<()> {
-    let options = options.with_record_length_limit(MAX_CHUNK_BYTES).with_skip_end_magic(true);
-    let mut reader = LinearReader::new_with_options(options);
-    while let Some(event) = reader.next_event() {
-        match event? {
-            LinearReadEvent::ReadRequest(wanted) => match source.read(reader.insert(wanted.min(READ_BYTES))) {
-                Ok(count) => reader.notify_read(count),
-                Err(error) if error.kind() == ErrorKind::Interrupted => {}
-                Err(error) => return Err(error.into()),
-            },
-            LinearReadEvent::Record { opcode, data } => {
-                if visit(opcode, data)?.is_break() {
-                    return Ok(());
-                }
-            }
-        }
-    }
-    Ok(())
+fn is_own(encoding: &str) -> bool {
+    encoding == OWN_ENCODING
 }

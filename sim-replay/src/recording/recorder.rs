@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use protocol::{Key, RunId, Selector, Stream, Topic, Verb};
-use serde::Serialize;
+use serde::{Deserialize, Serialize};
 
 use super::{RecordingError, RecordingOptions, RecordingWriter};
 use crate::bus::mailbox::Taken;
@@ -32,7 +32,7 @@ pub struct RecorderOptions {
 }
 
 /// How a recording went.
-#[derive(Debug, Clone, PartialEq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 pub struct RecordReport {
     /// The file.
     pub file: PathBuf,
@@ -40,6 +40,8 @@ pub struct RecordReport {
     pub messages: u64,
     /// Its size.
     pub bytes: u64,
+    /// From the first message to the last that is in it, seconds.
+    pub seconds: f64,
     /// Messages that came faster than they could be written.
     pub overwritten: u64,
     /// Messages that came after writing had failed, or were in the chunk with which it did.
@@ -53,6 +55,23 @@ impl RecordReport {
     #[must_use]
     pub fn is_complete(&self) -> bool {
         self.overwritten == 0 && self.not_written == 0 && self.failure.is_none()
+    }
+
+    /// What is missing in the file, in words; `None` where nothing is.
+    #[must_use]
+    pub fn loss_in_words(&self) -> Option<String> {
+        let Self { file, messages, seconds, overwritten, not_written, failure, .. } = self;
+        let missing = overwritten + not_written;
+        match failure {
+            None if missing == 0 => None,
+            None => Some(format!("recording with gaps: the disk is too slow, {missing} messages missing")),
+            Some(why) if *messages == 0 => Some(format!("nothing is recorded: {why}, {missing} messages missing")),
+            Some(why) => Some(format!(
+                "recording cut at {seconds:.1} s: {why}, {missing} messages missing; sim-replay recover {} --out {}",
+                file.display(),
+                file.with_extension("whole.mcap").display()
+            )),
+        }
     }
 }
 
@@ -68,17 +87,22 @@ pub enum RecorderError {
 }
 
 /// Records the run of `bus` until it is over or `stop` is requested. When the disk is full, or refuses for any other
-/// reason, the run goes on, and what would have been recorded is counted.
+/// reason, `on_failure` is told once, the run goes on, and what would have been recorded is counted.
 ///
 /// # Errors
 /// [`RecorderError`] when the recording cannot begin.
-pub fn record(bus: &Bus, options: &RecorderOptions, stop: &Stop) -> Result<RecordReport, RecorderError> {
+pub fn record(
+    bus: &Bus,
+    options: &RecorderOptions,
+    stop: &Stop,
+    on_failure: &mut dyn FnMut(&RecordReport),
+) -> Result<RecordReport, RecorderError> {
     let (writer, failure) = match RecordingWriter::create(&options.out, options.recording) {
         Ok(writer) => (Some(writer), None),
         // A run that waits for its recorder is not to wait in vain.
         Err(error) if options.keeps_running => {
             tracing::error!("nothing is recorded, the run goes on: {error}");
-            (None, Some(error.to_string()))
+            (None, Some(in_words(&error)))
         }
         Err(error) => return Err(error.into()),
     };
@@ -91,15 +115,21 @@ pub fn record(bus: &Bus, options: &RecorderOptions, stop: &Stop) -> Result<Recor
         run: &bus.identity().run,
         over: None,
         taken: 0,
+        span: None,
+        on_failure,
         report: RecordReport {
             file: options.out.clone(),
             messages: 0,
             bytes: 0,
+            seconds: 0.0,
             overwritten: 0,
             not_written: 0,
             failure,
         },
     };
+    if recorder.report.failure.is_some() {
+        (recorder.on_failure)(&recorder.report);
+    }
     recorder.listen(&tap, options.keeps_running);
     let report = recorder.finish(tap.overwritten());
     presence.withdraw()?;
@@ -115,6 +145,9 @@ struct Recorder<'a> {
     over: Option<Instant>,
     /// Messages that were to be written.
     taken: u64,
+    /// When the first of them and the last one arrived, nanoseconds.
+    span: Option<(u64, u64)>,
+    on_failure: &'a mut dyn FnMut(&RecordReport),
     report: RecordReport,
 }
 
@@ -153,17 +186,23 @@ impl Recorder<'_> {
             return;
         }
         self.taken += 1;
+        self.span = Some((self.span.map_or(overheard.arrived_nanos, |(first, _)| first), overheard.arrived_nanos));
         self.attempt(|writer| writer.write(&overheard.key, overheard.arrived_nanos, &overheard.bytes()));
     }
 
     fn attempt(&mut self, write: impl FnOnce(&mut RecordingWriter<std::fs::File>) -> Result<(), RecordingError>) {
         let Some(writer) = &mut self.writer else { return };
         let written = write(writer);
-        self.report.messages = writer.whole_messages();
+        if writer.whole_messages() > self.report.messages {
+            self.report.messages = writer.whole_messages();
+            self.report.seconds = self.span.map_or(0.0, |(first, last)| last.saturating_sub(first) as f64 * 1e-9);
+        }
         if let Err(error) = written {
             tracing::error!("the recording ends here, the run goes on: {error}");
-            self.report.failure = Some(error.to_string());
+            self.report.failure = Some(in_words(&error));
+            self.report.not_written = self.taken - self.report.messages;
             self.writer = None;
+            (self.on_failure)(&self.report);
         }
     }
 
@@ -179,5 +218,14 @@ impl Recorder<'_> {
             tracing::error!(messages = self.report.overwritten, "the disk was too slow for the run");
         }
         self.report
+    }
+}
+
+/// Why writing failed, without the file, which stands in the report.
+fn in_words(error: &RecordingError) -> String {
+    match error {
+        RecordingError::Io { source, .. } if source.kind() == std::io::ErrorKind::StorageFull => "disk full".into(),
+        RecordingError::Io { source, .. } => source.to_string(),
+        other => other.to_string(),
     }
 }

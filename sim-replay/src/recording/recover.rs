@@ -7,12 +7,12 @@ use serde::Serialize;
 use super::{Damage, OWN_ENCODING, Recording, RecordingError, RecordingOptions, RecordingWriter};
 
 /// What was recovered.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+#[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct RecoverReport {
     /// Messages of the run, counted once.
     pub messages: u64,
     /// What is lost; nothing where the recording was whole.
-    pub damage: Option<Damage>,
+    pub damage: Vec<Damage>,
 }
 
 /// Writes what can be read of the recording `from` into the new file `to`.
@@ -23,8 +23,8 @@ pub fn recover(from: &Path, to: &Path, options: RecordingOptions) -> Result<Reco
     let recording = Recording::open(from)?;
     let mut writer = RecordingWriter::create(to, options)?;
     let mut messages = 0;
-    for chunk in recording.chunks() {
-        for message in chunk?.iter() {
+    for held in recording.all() {
+        for message in held?.iter() {
             let (topic, encoding) = (&message.channel.topic, message.channel.message_encoding.as_str());
             // The channels for ROS 2 follow from ours.
             if matches!(encoding, OWN_ENCODING | "json")
@@ -36,5 +36,5 @@ pub fn recover(from: &Path, to: &Path, options: RecordingOptions) -> Result<Reco
         }
     }
     writer.finish()?;
-    Ok(RecoverReport { messages, damage: recording.damage().cloned() })
+    Ok(RecoverReport { messages, damage: recording.damage().to_vec() })
 }

@@ -1,6 +1,6 @@
 //! Writing a recording: messages in, whole chunks out.
 
-use std::collections::BTreeMap;
+use std::collections::{BTreeMap, BTreeSet};
 use std::fs::File;
 use std::path::{Path, PathBuf};
 
@@ -16,6 +16,10 @@ use super::{OWN_ENCODING, RecordingError};
 
 /// A chunk is closed when it holds this much: what a crash costs, beside the last second.
 const CHUNK_BYTES: usize = 4 << 20;
+/// What is recorded is told to ROS 2 tools as it is: sweeps in coordinates of a map (UTM, for example) reach further than
+/// a receiver takes.
+const ANY_SIZE: Limits =
+    Limits { max_abs_value: f32::MAX, max_points: u64::MAX, max_body_bytes: u64::MAX, ..Limits::DEFAULT };
 
 /// How to write a recording.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -45,6 +49,8 @@ pub struct RecordingWriter<S: Store> {
     /// Messages and bytes of the chunk that is open.
     open: (u64, usize),
     whole_messages: u64,
+    /// Topics with messages that ROS 2 tools are not told of.
+    untold: BTreeSet<Topic>,
     /// Why nothing more is written.
     ended: Option<String>,
 }
@@ -84,6 +90,7 @@ impl<S: Store> RecordingWriter<S> {
             channels: BTreeMap::new(),
             open: (0, 0),
             whole_messages: 0,
+            untold: BTreeSet::new(),
             ended: None,
         };
         writer.flush()?;
@@ -113,7 +120,7 @@ impl<S: Store> RecordingWriter<S> {
         self.mcap.write_to_known_channel(&head, payload)?;
         self.open = (self.open.0 + 1, self.open.1 + payload.len());
         if self.options.with_ros {
-            for RosMessage { topic, ros_type, cdr } in translated(key, payload) {
+            for RosMessage { topic, ros_type, cdr } in self.translated(key, payload) {
                 let channel_id = self.channel(&topic, "cdr", Some(ros_type))?;
                 self.mcap.write_to_known_channel(&MessageHeader { channel_id, ..head }, &cdr)?;
                 self.open.1 += cdr.len();
@@ -166,6 +173,22 @@ impl<S: Store> RecordingWriter<S> {
         Ok(id)
     }
 
+    /// A message for ROS 2 tools; none where ROS has no word for it. One that is not sound is named, once for its topic.
+    fn translated(&mut self, key: &Key, payload: &[u8]) -> Vec<RosMessage> {
+        if !ros::has_word_for(&key.topic) {
+            return Vec::new();
+        }
+        match wire::decode_any([payload], &ANY_SIZE) {
+            Ok((header, message)) => ros::translate(&key.topic, header.stamp.capture_nanos, &message),
+            Err(error) => {
+                if self.untold.insert(key.topic.clone()) {
+                    tracing::warn!("{key}: recorded as it came, but not for ROS 2 tools: {error}");
+                }
+                Vec::new()
+            }
+        }
+    }
+
     fn check_open(&self) -> Result<(), RecordingError> {
         match &self.ended {
             None => Ok(()),
@@ -197,14 +220,4 @@ fn failure(path: &Path, error: McapError) -> RecordingError {
         other => std::io::Error::other(other),
     };
     RecordingError::io(path, source)
-}
-
-fn translated(key: &Key, payload: &[u8]) -> Vec<RosMessage> {
-    if !ros::has_word_for(&key.topic) {
-        return Vec::new();
-    }
-    match wire::decode_any([payload], &Limits::DEFAULT) {
-        Ok((header, message)) => ros::translate(&key.topic, header.stamp.capture_nanos, &message),
-        Err(_) => Vec::new(),
-    }
 }

@@ -350,13 +350,13 @@ impl<'a> Replay<'a> {
             Control::Resume => self.clock.resume(None),
             Control::Pause => self.clock.pause(),
             Control::Step { ticks } => self.clock.step(ticks),
-            Control::Seek { frame_index } => match usize::try_from(frame_index) {
+            Control::Seek { tick } => match usize::try_from(tick) {
                 Ok(index) if index < self.tick_count => {
                     self.schedule.seek(index);
                     self.clock.rebase();
                     self.reading.want(&self.schedule.ahead(READ_AHEAD));
                 }
-                _ => tracing::warn!(frame_index, ticks = self.tick_count, "no such tick to seek"),
+                _ => tracing::warn!(tick, ticks = self.tick_count, "no such tick to seek"),
             },
             Control::End { .. } | Control::Ready { .. } | Control::Probe | Control::Done { .. } => {}
         }
@@ -387,7 +387,7 @@ impl<'a> Replay<'a> {
                 Err(error) => self.report.unreadable(capture_nanos, &error),
             }
         }
-        self.outlet.offer_truth(capture_nanos, Truth { frame_index: tick_index as u64, agents });
+        self.outlet.offer_truth(capture_nanos, Truth { tick: tick_index as u64, agents });
         self.deliver();
         self.report.ticks += 1;
         self.clock.published(capture_nanos, due);

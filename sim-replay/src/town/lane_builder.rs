@@ -1,8 +1,9 @@
 //! From a road network to a lane graph.
 
 use super::conflicts;
+use super::finding::Finding;
 use super::lane::{JunctionId, Lane, LaneGraph, LaneId, Turn, wrap_angle};
-use super::road::{Contact, LaneKind, Road, RoadLink, RoadNetwork};
+use super::road::{Connection, Contact, LaneKind, Road, RoadLink, RoadNetwork};
 
 /// Distance between the points taken from the curves before they are spread evenly, metres.
 const FINE_STEP_M: f64 = 0.25;
@@ -10,6 +11,8 @@ const FINE_STEP_M: f64 = 0.25;
 const STEP_M: f64 = 1.0;
 /// A link whose lanes are farther apart than this is refused, metres.
 const LINK_GAP_M: f64 = 0.5;
+/// The same in height, where roads are banked: few maps bank the roads of a junction as those that lead there.
+const BANKED_STEP_M: f64 = 1.0;
 /// A link whose lanes differ in heading by more than this is refused, radians.
 const LINK_TURN_RAD: f64 = 0.35;
 /// Where neither lane nor road has a speed limit, metres per second.
@@ -42,8 +45,22 @@ pub struct LinkCounts {
     pub refused: usize,
 }
 
-/// Builds the driving lanes of `network` and their links. Traffic keeps right: lanes with negative ids lead along
-/// their road, the others against it.
+impl LinkCounts {
+    /// The refused links as a finding of the map.
+    pub(super) fn finding(&self) -> Option<Finding> {
+        (self.refused > 0).then(|| Finding {
+            line: 1,
+            within: None,
+            element: "OpenDRIVE".into(),
+            found: format!("links lanes that are more than {LINK_GAP_M} m or {LINK_TURN_RAD} rad apart"),
+            action: "links left out".into(),
+            count: self.refused,
+        })
+    }
+}
+
+/// Builds the driving lanes of `network` and their links. Which lanes lead along their road and which against it is
+/// [`Road::leads_along`]'s answer: traffic keeps right or left, road by road.
 #[must_use]
 pub fn lane_graph(network: &RoadNetwork) -> (LaneGraph, LinkCounts) {
     let mut table = LaneTable { first_section: Vec::new(), ids: Vec::new() };
@@ -65,7 +82,7 @@ pub fn lane_graph(network: &RoadNetwork) -> (LaneGraph, LinkCounts) {
         }
     }
     let mut graph = LaneGraph::new(lanes);
-    link_neighbours(&mut graph, &origins, &table);
+    link_neighbours(&mut graph, network, &origins, &table);
     let counts = link_successors(&mut graph, network, &origins, &table);
     conflicts::find(&mut graph);
     (graph, counts)
@@ -99,13 +116,14 @@ fn build_lane(road: &Road, origin: Origin, id: LaneId) -> Option<Lane> {
         return None;
     }
     let (from, to) = (section.s_m.min(road.length_m), road.section_end_m(origin.section));
-    let (centerline, widths_m, length_m) = center_line(road, origin, from, to)?;
+    let (centerline, [widths_m, banks_rad], length_m) = center_line(road, origin, from, to)?;
     let middle = (from + to) / 2.0;
     let limit = source.speed_limit_mps.or_else(|| road.speed_limit_mps(middle)).unwrap_or(DEFAULT_LIMIT_MPS);
     let mut sorted = widths_m.clone();
     sorted.sort_unstable_by(f64::total_cmp);
     let mut lane = Lane::new(id, centerline, sorted[sorted.len() / 2], limit);
     (lane.widths_m, lane.length_m) = (widths_m, length_m);
+    lane.banks_rad = if road.lateral.is_level() { Vec::new() } else { banks_rad };
     lane.junction = road.junction.map(|junction| JunctionId(junction as u32));
     lane.in_junction = road.junction.is_some();
     if lane.in_junction {
@@ -119,18 +137,23 @@ fn build_lane(road: &Road, origin: Origin, id: LaneId) -> Option<Lane> {
     Some(lane)
 }
 
-/// Even points of a lane's middle in driving direction, the widths there and the length; `None` for a lane of no or of absurd length.
-fn center_line(road: &Road, origin: Origin, from: f64, to: f64) -> Option<(Vec<[f64; 3]>, Vec<f64>, f64)> {
+/// Even points of a lane's middle in driving direction, the widths and banks there, and the length; `None` for a lane of
+/// no or of absurd length.
+fn center_line(road: &Road, origin: Origin, from: f64, to: f64) -> Option<(Vec<[f64; 3]>, [Vec<f64>; 2], f64)> {
+    let along = road.leads_along(origin.section, origin.lane);
     let fine = ((to - from) / FINE_STEP_M).ceil().max(1.0) as usize;
-    let mut samples: Vec<([f64; 3], f64)> = (0..=fine)
+    let mut samples: Vec<([f64; 3], [f64; 2])> = (0..=fine)
         .map(|i| {
             let s = from + (to - from) * i as f64 / fine as f64;
             // Lane offsets may jump where the next section begins: stay on this side of it.
-            let [low, high] = road.lane_span_m(origin.section, origin.lane, s.min(to - 1e-6).max(from));
-            (road.point_at(s, (low + high) / 2.0), high - low)
+            let inside = s.min(to - 1e-6).max(from);
+            let [low, high] = road.lane_span_m(origin.section, origin.lane, inside);
+            let bank = road.bank_rad(origin.section, origin.lane, inside);
+            let point = road.point_at(origin.section, s, (low + high) / 2.0);
+            (point, [high - low, if along { bank } else { -bank }])
         })
         .collect();
-    if origin.lane > 0 {
+    if !along {
         samples.reverse();
     }
     let mut lengths = vec![0.0];
@@ -144,27 +167,30 @@ fn center_line(road: &Road, origin: Origin, from: f64, to: f64) -> Option<(Vec<[
         return None;
     }
     let steps = (total / STEP_M).round().max(1.0) as usize;
-    let (mut points, mut widths, mut place) = (Vec::new(), Vec::new(), 0);
+    let (mut points, mut widths, mut banks, mut place) = (Vec::new(), Vec::new(), Vec::new(), 0);
     for i in 0..=steps {
         let wanted = total * i as f64 / steps as f64;
         while place + 2 < lengths.len() && lengths[place + 1] < wanted {
             place += 1;
         }
         let share = ((wanted - lengths[place]) / (lengths[place + 1] - lengths[place]).max(1e-12)).clamp(0.0, 1.0);
-        let ((a, width_a), (b, width_b)) = (samples[place], samples[place + 1]);
+        let ((a, [width_a, bank_a]), (b, [width_b, bank_b])) = (samples[place], samples[place + 1]);
         points.push(std::array::from_fn(|axis| a[axis] + share * (b[axis] - a[axis])));
         widths.push(width_a + share * (width_b - width_a));
+        banks.push(bank_a + share * (bank_b - bank_a));
     }
-    Some((points, widths, total))
+    Some((points, [widths, banks], total))
 }
 
-fn link_neighbours(graph: &mut LaneGraph, origins: &[Origin], table: &LaneTable) {
-    for (lane, origin) in graph.lanes.iter_mut().zip(origins) {
-        // Seen in driving direction, the reference line is always to the left.
-        let inwards = origin.lane - origin.lane.signum();
-        let outwards = origin.lane + origin.lane.signum();
-        lane.left = table.get(origin.road, origin.section, inwards);
-        lane.right = table.get(origin.road, origin.section, outwards);
+fn link_neighbours(graph: &mut LaneGraph, network: &RoadNetwork, origins: &[Origin], table: &LaneTable) {
+    for (lane, &Origin { road: index, section, lane: id }) in graph.lanes.iter_mut().zip(origins) {
+        let road = &network.roads[index];
+        let along = road.leads_along(section, id);
+        let beside =
+            |other: i32| table.get(index, section, other).filter(|_| road.leads_along(section, other) == along);
+        let (inner, outer) = (beside(id - id.signum()), beside(id + id.signum()));
+        // Seen along the road, the reference line is to the left of lanes with negative ids.
+        (lane.left, lane.right) = if (id < 0) == along { (inner, outer) } else { (outer, inner) };
     }
 }
 
@@ -195,7 +221,7 @@ fn link_successors(graph: &mut LaneGraph, network: &RoadNetwork, origins: &[Orig
 fn candidates(network: &RoadNetwork, origin: Origin, table: &LaneTable) -> Vec<LaneId> {
     let road = &network.roads[origin.road];
     let Some(lane) = road.sections[origin.section].lane(origin.lane) else { return Vec::new() };
-    let forward = origin.lane < 0;
+    let forward = road.leads_along(origin.section, origin.lane);
     let link = if forward { lane.successor } else { lane.predecessor };
     let next_section = if forward { Some(origin.section + 1) } else { origin.section.checked_sub(1) };
     if let Some(section) = next_section.filter(|&section| section < road.sections.len()) {
@@ -208,21 +234,67 @@ fn candidates(network: &RoadNetwork, origin: Origin, table: &LaneTable) -> Vec<L
             link.and_then(|lane| table.get(road, section, lane)).into_iter().collect()
         }
         Some(RoadLink::Junction(junction)) => {
-            let connections = network.junctions[junction].connections.iter();
-            let links = connections.filter(|connection| connection.incoming == origin.road).flat_map(|connection| {
-                let section = table.end_section(connection.connecting, connection.contact);
-                let matching = connection.lane_links.iter().filter(|&&(from, _)| from == origin.lane);
-                matching.filter_map(move |&(_, to)| table.get(connection.connecting, section, to))
-            });
-            links.collect()
+            let end = if forward { Contact::End } else { Contact::Start };
+            through_junction(network, junction, origin, end, table)
         }
     }
+}
+
+/// Lanes that the connections of a junction name for the lane of `origin`, which leads into it at `end` of its road.
+fn through_junction(
+    network: &RoadNetwork,
+    place: usize,
+    origin: Origin,
+    end: Contact,
+    table: &LaneTable,
+) -> Vec<LaneId> {
+    let junction = &network.junctions[place];
+    let mut lanes = Vec::new();
+    for connection in junction.connections.iter().filter(|connection| connection.incoming == origin.road) {
+        let section = table.end_section(connection.connecting, connection.contact);
+        let onto = |to| table.get(connection.connecting, section, to);
+        lanes.extend(
+            linked(connection, |&(from, to)| (from == origin.lane).then_some(to), origin.lane).filter_map(onto),
+        );
+    }
+    // A direct junction is passed both ways: from the linked road onto the incoming one too.
+    let back = junction
+        .connections
+        .iter()
+        .filter(|connection| junction.direct && connection.connecting == origin.road && connection.contact == end);
+    for connection in back {
+        for contact in [Contact::Start, Contact::End] {
+            let road = &network.roads[connection.incoming];
+            let link = if contact == Contact::Start { road.predecessor } else { road.successor };
+            if link != Some(RoadLink::Junction(place)) {
+                continue;
+            }
+            let section = table.end_section(connection.incoming, contact);
+            let onto = |to| table.get(connection.incoming, section, to);
+            lanes.extend(
+                linked(connection, |&(to, from)| (from == origin.lane).then_some(to), origin.lane).filter_map(onto),
+            );
+        }
+    }
+    lanes
+}
+
+/// The lanes of one end of a connection that `pick` finds for a lane of the other; the same id where it has no links.
+fn linked<'a>(
+    connection: &'a Connection,
+    pick: impl FnMut(&(i32, i32)) -> Option<i32> + 'a,
+    same: i32,
+) -> impl Iterator<Item = i32> + 'a {
+    let same = connection.lane_links.is_empty().then_some(same);
+    connection.lane_links.iter().filter_map(pick).chain(same)
 }
 
 /// Whether one lane ends where the other begins, in place and heading.
 fn meets(lane: &Lane, next: &Lane) -> bool {
     let (end, start) = (lane.centerline[lane.centerline.len() - 1], next.centerline[0]);
-    let gap = (end[0] - start[0]).hypot(end[1] - start[1]).hypot(end[2] - start[2]);
+    let (beside, step) = ((end[0] - start[0]).hypot(end[1] - start[1]), (end[2] - start[2]).abs());
     let turn = wrap_angle(next.start_heading_rad() - lane.end_heading_rad());
-    gap < LINK_GAP_M && turn.abs() < LINK_TURN_RAD
+    let is_banked = !(lane.banks_rad.is_empty() && next.banks_rad.is_empty());
+    let near = if is_banked { beside < LINK_GAP_M && step < BANKED_STEP_M } else { beside.hypot(step) < LINK_GAP_M };
+    near && turn.abs() < LINK_TURN_RAD
 }

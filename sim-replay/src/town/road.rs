@@ -4,6 +4,8 @@
 //! Lane ids count outwards from the reference line, positive to the left, negative to the right.
 
 use super::curve::{Curve, Pose2, cubic, cubic_slope};
+use super::finding::Finding;
+use super::lateral::LateralProfile;
 
 /// Farthest that lanes may lie beside the reference line, metres.
 pub(super) const MAX_OFFSET_M: f64 = 1000.0;
@@ -17,17 +19,8 @@ pub struct RoadNetwork {
     pub roads: Vec<Road>,
     /// The junctions; links refer to them by place.
     pub junctions: Vec<Junction>,
-    /// What the map holds and this program leaves out.
-    pub ignored: Ignored,
-}
-
-/// What a map held and was left out.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Ignored {
-    /// Superelevation or lateral shape records that are not level.
-    pub superelevations: usize,
-    /// Lanes kept level by the map (`level="true"`) on roads that are not.
-    pub level_lanes: usize,
+    /// Parts of the map that were not built as its file gives them.
+    pub findings: Vec<Finding>,
 }
 
 /// One road.
@@ -37,6 +30,8 @@ pub struct Road {
     pub id: String,
     /// Length along the reference line, metres.
     pub length_m: f64,
+    /// Whether traffic keeps left: lanes with positive ids lead along the road. Else it keeps right.
+    pub left_hand: bool,
     /// The junction that it leads through.
     pub junction: Option<usize>,
     /// What its start meets.
@@ -47,6 +42,8 @@ pub struct Road {
     pub plan_view: Vec<Curve>,
     /// Height along the road.
     pub elevation: Profile,
+    /// Superelevation, crossfall and shape.
+    pub lateral: LateralProfile,
     /// Shift of the lanes' origin across the road.
     pub lane_offset: Profile,
     /// Lane sections, by rising `s`; at least one.
@@ -115,6 +112,18 @@ pub struct RoadLane {
     pub successor: Option<i32>,
     /// Its own speed limit, metres per second.
     pub speed_limit_mps: Option<f64>,
+    /// Whether it is level, with all lanes outside it, at the height of its inner border.
+    pub level: bool,
+    /// Whether traffic leads against the direction of its side.
+    pub reversed: bool,
+}
+
+impl RoadLane {
+    /// A lane without links and speed limit of its own.
+    #[must_use]
+    pub fn new(kind: LaneKind, width: Profile) -> Self {
+        Self { kind, width, predecessor: None, successor: None, speed_limit_mps: None, level: false, reversed: false }
+    }
 }
 
 /// What a lane is for.
@@ -139,6 +148,8 @@ pub enum LaneKind {
 pub struct Junction {
     /// Its id in the map.
     pub id: String,
+    /// Whether its connections join two roads directly, for both directions, without a road inside the junction.
+    pub direct: bool,
     /// The ways through it.
     pub connections: Vec<Connection>,
 }
@@ -148,11 +159,11 @@ pub struct Junction {
 pub struct Connection {
     /// The road that leads into the junction.
     pub incoming: usize,
-    /// The road inside the junction.
+    /// The road inside the junction; in a direct junction, the other road.
     pub connecting: usize,
     /// The end at which the connecting road is entered.
     pub contact: Contact,
-    /// Lane of the incoming road, lane of the connecting road.
+    /// Lane of the incoming road, lane of the connecting road. Empty: lanes of one id.
     pub lane_links: Vec<(i32, i32)>,
 }
 
@@ -245,6 +256,12 @@ impl LaneSection {
         side.get((id.unsigned_abs() as usize).checked_sub(1)?)
     }
 
+    /// Whether lanes are kept level where the road is not.
+    #[must_use]
+    pub fn has_level_lanes(&self) -> bool {
+        self.left.iter().chain(&self.right).any(|lane| lane.level)
+    }
+
     /// Ids of all lanes, from the rightmost to the leftmost.
     pub fn lane_ids(&self) -> impl Iterator<Item = i32> + use<> {
         let (right, left) = (self.right.len() as i32, self.left.len() as i32);
@@ -262,11 +279,64 @@ impl Road {
         curve.at((s_m - curve.s_m).clamp(0.0, curve.length_m))
     }
 
-    /// Place at `s_m`, `t_m`, on the road's surface, metres.
+    /// Place at `s_m`, `t_m` of section `section`, on the road's surface, metres.
     #[must_use]
-    pub fn point_at(&self, s_m: f64, t_m: f64) -> [f64; 3] {
-        let pose = self.pose_at(s_m).moved(0.0, t_m, 0.0);
-        [pose.x, pose.y, self.elevation.at(s_m)]
+    pub fn point_at(&self, section: usize, s_m: f64, t_m: f64) -> [f64; 3] {
+        let z_m = self.elevation.at(s_m);
+        if self.lateral.is_level() {
+            let pose = self.pose_at(s_m).moved(0.0, t_m, 0.0);
+            return [pose.x, pose.y, z_m];
+        }
+        let [aside_m, height_m] = self.aside_m(section, s_m, t_m);
+        let pose = self.pose_at(s_m).moved(0.0, aside_m, 0.0);
+        [pose.x, pose.y, z_m + height_m]
+    }
+
+    /// Distance beside the reference line (positive to the left) and height over it of the surface at `s_m`, `t_m` of
+    /// section `section`, metres. On a level road that is `t_m` and 0.
+    #[must_use]
+    pub fn aside_m(&self, section: usize, s_m: f64, t_m: f64) -> [f64; 2] {
+        if self.lateral.is_level() {
+            return [t_m, 0.0];
+        }
+        let left = t_m > 0.0;
+        match self.level_from_m(section, s_m, left) {
+            Some(edge_m) if t_m != edge_m && (t_m > edge_m) == left => {
+                let [aside_m, height_m] = self.lateral.at(s_m, edge_m);
+                [aside_m + t_m - edge_m, height_m]
+            }
+            _ => self.lateral.at(s_m, t_m),
+        }
+    }
+
+    /// Inner border of the lanes of one side that stay level, metres.
+    fn level_from_m(&self, section: usize, s_m: f64, left: bool) -> Option<f64> {
+        let lanes = self.sections.get(section).map(|section| if left { &section.left } else { &section.right })?;
+        let place = lanes.iter().position(|lane| lane.level)? as i32 + 1;
+        let [low, high] = self.lane_span_m(section, if left { place } else { -place }, s_m);
+        Some(if left { low } else { high })
+    }
+
+    /// Slope across lane `id` of section `section` at `s_m` as an angle, radians; positive where the left side of the
+    /// road (not of the lane's traffic) is higher.
+    #[must_use]
+    pub fn bank_rad(&self, section: usize, id: i32, s_m: f64) -> f64 {
+        if self.lateral.is_level() {
+            return 0.0;
+        }
+        let [low, high] = self.lane_span_m(section, id, s_m);
+        // A lane of no width yet lies as the lane around its place.
+        let half_m = (high - low).max(0.2) / 2.0;
+        let [right, left] = [-half_m, half_m].map(|offset| self.aside_m(section, s_m, (low + high) / 2.0 + offset));
+        (left[1] - right[1]).atan2(left[0] - right[0])
+    }
+
+    /// Whether traffic on lane `id` of section `section` leads along the road.
+    #[must_use]
+    pub fn leads_along(&self, section: usize, id: i32) -> bool {
+        let reversed =
+            self.sections.get(section).and_then(|section| section.lane(id)).is_some_and(|lane| lane.reversed);
+        ((id < 0) != self.left_hand) != reversed
     }
 
     /// End of section `index`, metres.
@@ -326,24 +396,20 @@ mod tests {
 
     #[test]
     fn lane_spans_stack_outwards_from_the_offset() {
-        let lane = |width: f64| RoadLane {
-            kind: LaneKind::Driving,
-            width: Profile::constant(width),
-            predecessor: None,
-            successor: None,
-            speed_limit_mps: None,
-        };
+        let lane = |width: f64| RoadLane::new(LaneKind::Driving, Profile::constant(width));
         let section = LaneSection { s_m: 0.0, left: vec![lane(3.0)], right: vec![lane(3.5), lane(2.0)] };
         assert_eq!(section.lane_ids().collect::<Vec<_>>(), [-2, -1, 1]);
         assert!(section.lane(0).is_none() && section.lane(2).is_none() && section.lane(-2).is_some());
         let road = Road {
             id: "1".into(),
             length_m: 10.0,
+            left_hand: false,
             junction: None,
             predecessor: None,
             successor: None,
             plan_view: vec![],
             elevation: Profile::default(),
+            lateral: LateralProfile::default(),
             lane_offset: Profile::constant(0.5),
             sections: vec![section],
             speed_limits: vec![],

@@ -62,7 +62,7 @@ pub fn cold_start(folder: &Path, is_secured: bool) -> ColdStart {
     let results = crate::fleet::results(&up.folder);
     let first = results.iter().position(is_fused).expect("there is one");
     let published_ms = results[first]["publish_nanos"].as_u64().expect("a number") / 1_000_000;
-    let index = results[first]["frame_index"].as_u64().expect("a number");
+    let index = results[first]["agent_frame"].as_u64().expect("a number");
     let pids = up.pids();
     let asked = Instant::now();
     signal(up.pid(), "INT");
@@ -171,7 +171,7 @@ fn each(
 
 /// Latency and moment of each result, from `frames.csv`; its lines are those of the results.
 fn latencies(table: &str, published_ms: &[u64]) -> Vec<(u64, f64)> {
-    let latency = |line: &str| line.split(',').nth(2)?.parse().ok();
+    let latency = |line: &str| line.split(',').nth(3)?.parse().ok();
     published_ms.iter().copied().zip(table.lines().skip(1).filter_map(latency)).collect()
 }
 
@@ -199,7 +199,7 @@ mod tests {
         assert!((slope(&[(0.0, 1.0), (1.0, 3.0), (2.0, 5.0)]) - 2.0).abs() < 1e-12);
         assert_eq!(slope(&[(1.0, 4.0)]), 0.0);
         assert_eq!(p99((1..=200).map(f64::from).collect()), 198.0);
-        let table = "frame_index,capture_nanos,latency_ms\n0,0,12.5\n1,100,\n2,200,14.0\n";
+        let table = "tick,agent_frame,capture_nanos,latency_ms\n0,0,0,12.5\n1,1,100,\n2,2,200,14.0\n";
         assert_eq!(latencies(table, &[10, 20]), [(10, 12.5), (20, 14.0)]);
     }
 }

@@ -60,9 +60,7 @@ pub fn all(root: &Path) -> Vec<Reader> {
     fs::write(file("experiment", "links/newest-first.yaml"), seeds::LINK).expect("a writable folder");
     let mut all = vec![
         in_memory("pcd", seeds::clouds(), |_, bytes| pcd::decode(bytes).is_ok()),
-        in_memory("opendrive", text(seeds::OPENDRIVE), |_, bytes| {
-            std::str::from_utf8(bytes).is_ok_and(|text| town::opendrive::read(text).is_ok())
-        }),
+        in_memory("opendrive", text(seeds::OPENDRIVE), |_, bytes| town::opendrive::read_bytes(bytes).is_ok()),
         on_disk("mcap recording", vec![seeds::recording(root)], file("mcap", "a.mcap"), read_recording),
         on_disk("scenario", text(seeds::SCENARIO), file("scenario", "a.yaml"), |path, _| {
             // What it names is not there, which is no fault of the file.
@@ -75,7 +73,7 @@ pub fn all(root: &Path) -> Vec<Reader> {
         on_disk("link", text(seeds::LINK), file("link", "a.yaml"), |path, _| {
             LinkConfig::open(&path.to_string_lossy()).is_ok()
         }),
-        on_disk("link trace", text(seeds::TRACE), file("trace", "a.csv"), |path, _| Trace::read_csv(path).is_ok()),
+        on_disk("link trace", text(seeds::TRACE), file("trace", "a.csv"), |path, _| Trace::read_csv(path, 0).is_ok()),
         on_disk("mahimahi trace", text(seeds::MAHIMAHI), file("mahimahi", "a.txt"), |path, _| {
             Trace::read_mahimahi(path).is_ok()
         }),
@@ -196,7 +194,7 @@ fn read_recording(path: &Path, _: &[u8]) -> bool {
             let _ = wire::decode_any([&bytes[..]], &Limits::DEFAULT);
         }
     }
-    recording.damage().is_none()
+    recording.damage().is_empty()
 }
 
 fn weights() -> Vec<u8> {

@@ -45,7 +45,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let summary = train_encoder(&config, &mut |report| tell(&bar, report))?;
     bar.finish();
     card(&config, &summary).write(&config.run.out)?;
-    args.options.print(&summary.trained, &serde_json::json!({"accuracy": summary.accuracy}));
+    args.options.print(&summary.trained, &serde_json::json!({"accuracy": summary.accuracy}))?;
     Ok(())
 }
 

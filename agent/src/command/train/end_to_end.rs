@@ -73,6 +73,6 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let mut card = ModelCard::new(&title, how);
     card.trained(&config.run, &trained, "all sweeps", "sweeps");
     card.write(&config.run.out)?;
-    args.options.print(&trained, &serde_json::json!({}));
+    args.options.print(&trained, &serde_json::json!({}))?;
     Ok(())
 }

@@ -75,7 +75,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let SceneSummary { preparing_seconds, accuracy, cells_shown, .. } = summary;
     let more =
         serde_json::json!({"preparing_seconds": preparing_seconds, "accuracy": accuracy, "cells_shown": cells_shown});
-    args.options.print(&summary.trained, &more);
+    args.options.print(&summary.trained, &more)?;
     Ok(())
 }
 

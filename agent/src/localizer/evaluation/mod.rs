@@ -42,7 +42,7 @@ pub enum EvaluationError {
     #[error("there is no sweep in {0:?}")]
     Empty(Vec<PathBuf>),
     /// A sweep has no pose to compare with.
-    #[error("{scenario}: {cav} at {stem}: there is no true pose to compare with")]
+    #[error("{scenario}: {cav} at {stem}: there is no true pose to compare with (agent localize finds poses without)")]
     NoTruth {
         /// The scenario.
         scenario: String,

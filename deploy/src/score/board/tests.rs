@@ -35,7 +35,7 @@ fn truth(tick: u64) -> Truth {
     };
     let (first, second) = (object(1, "car", 10.0), object(2, "van", 30.0));
     Truth {
-        frame_index: tick,
+        tick,
         agents: vec![
             agent("e", 0.0, vec![first.clone(), object(9, "pedestrian", 5.0)]),
             agent("n", 20.0, vec![first, second]),
@@ -51,7 +51,7 @@ fn result(tick: u64, at_x: &[f64]) -> Detections {
     };
     Detections {
         ego: cav("e"),
-        frame_index: tick,
+        agent_frame: tick,
         method: "max".into(),
         pose: PoseEstimate::new(Pose::from_xyz_yaw([1.0, 0.0, 0.0], 0.0), 1.0),
         detections: at_x.iter().map(found).collect(),

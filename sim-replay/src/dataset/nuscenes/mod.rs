@@ -154,7 +154,7 @@ impl Builder<'_> {
 
     fn scenario(self, agents: Vec<CavId>, parts: Parts, options: &OpenOptions) -> Scenario {
         let Parts { ticks, moments, missing, contents } = parts;
-        let is_unit = |agent: &&CavId| self.layout == Layout::V2xSim && agent.as_str() == rig::ROADSIDE_UNIT;
+        let is_unit = |agent: &&CavId| rig::is_roadside_unit(self.layout, agent.as_str());
         let sweeps = agents.iter().fold(Sweeps::new(SweepStorage::FiveFloats, options), |sweeps, agent| {
             let file = |tick: &Tick| Some(self.root.join(&contents.get(&tick.stem)?.sweeps.get(agent)?.file));
             sweeps.with_agent(agent.clone(), moments.iter().filter_map(file))
@@ -187,11 +187,15 @@ impl Builder<'_> {
             })?;
             agents.push((id, channel.clone()));
         }
-        let is_unit = |name: &str| self.layout == Layout::V2xSim && name == rig::ROADSIDE_UNIT;
         let listed = |name: &str| self.scene.vehicles.iter().position(|vehicle| vehicle == name).unwrap_or(usize::MAX);
         agents.sort_by_key(|(id, _)| {
             let name = id.as_str();
-            (is_unit(name), listed(name), name.parse::<u64>().unwrap_or(u64::MAX), name.to_owned())
+            (
+                rig::is_roadside_unit(self.layout, name),
+                listed(name),
+                name.parse::<u64>().unwrap_or(u64::MAX),
+                name.to_owned(),
+            )
         });
         Ok(agents)
     }

@@ -9,8 +9,6 @@ use crate::dataset::Layout;
 
 /// The agent of data sets with one vehicle.
 const ONLY_AGENT: &str = "0";
-/// The unit beside the road of V2X-Sim; vehicles are numbered from 1.
-pub(super) const ROADSIDE_UNIT: &str = "0";
 
 /// The layout that names its channels so, and the name of the agent; nothing for LiDARs that are not read.
 pub(super) fn agent_of(channel: &str) -> Option<(Layout, &str)> {
@@ -21,6 +19,11 @@ pub(super) fn agent_of(channel: &str) -> Option<(Layout, &str)> {
         return Some((Layout::Mars, vehicle.strip_prefix('_').unwrap_or(ONLY_AGENT)));
     }
     (channel == "LIDAR_TOP").then_some((Layout::NuScenes, ONLY_AGENT))
+}
+
+/// True for units beside the road: number 0 of V2X-Sim, and negative numbers as everywhere.
+pub(super) fn is_roadside_unit(layout: Layout, agent: &str) -> bool {
+    (layout == Layout::V2xSim && agent == "0") || agent.starts_with('-')
 }
 
 /// Quarter turns, counter-clockwise, that bring the axes of a LiDAR to x forward: nuScenes mounts its own with y forward.

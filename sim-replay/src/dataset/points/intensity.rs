@@ -12,15 +12,15 @@ use crate::pcd::{IntensityKind, PcdCloud};
 /// Largest number in a byte.
 const BYTE: f32 = 255.0;
 
-/// Divisor of the intensities that a data set stores.
+/// Divisor of the intensities that a data set stores: [`Self::AUTO`], or a number parsed from text.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]
-pub enum IntensityScale {
-    /// By the type of the field, or by the range of the agent's first sweeps.
-    #[default]
-    Auto,
-    /// This positive number, whatever the files hold.
-    Divisor(f32),
+pub struct IntensityScale {
+    /// A normal, positive number.
+    divisor: Option<f32>,
 }
+
+// Never NaN.
+impl Eq for IntensityScale {}
 
 /// Why a text is no [`IntensityScale`].
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
@@ -32,30 +32,33 @@ impl FromStr for IntensityScale {
 
     fn from_str(text: &str) -> Result<Self, Self::Err> {
         if text == "auto" {
-            return Ok(Self::Auto);
+            return Ok(Self::AUTO);
         }
         let divisor = text.parse().ok().filter(|divisor: &f32| divisor.is_normal() && *divisor > 0.0);
-        divisor.map(Self::Divisor).ok_or_else(|| IntensityScaleError(text.to_owned()))
+        divisor.map(|divisor| Self { divisor: Some(divisor) }).ok_or_else(|| IntensityScaleError(text.to_owned()))
     }
 }
 
 impl fmt::Display for IntensityScale {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        match self {
-            Self::Auto => f.write_str("auto"),
-            Self::Divisor(divisor) => write!(f, "{divisor}"),
+        match self.divisor {
+            None => f.write_str("auto"),
+            Some(divisor) => write!(f, "{divisor}"),
         }
     }
 }
 
 impl IntensityScale {
+    /// By the type of the field, or by the range of the agent's first sweeps.
+    pub const AUTO: Self = Self { divisor: None };
+
     /// Divides what a file stores. `by_range` gives the divisor of numbers whose type does not tell their scale.
     pub(super) fn apply(self, cloud: &mut PcdCloud, by_range: impl FnOnce() -> f32) {
         let Some(origin) = &mut cloud.intensity else { return };
-        origin.divisor = match (self, origin.kind) {
-            (Self::Divisor(divisor), _) => divisor,
-            (Self::Auto, IntensityKind::RedByte | IntensityKind::Byte) => BYTE,
-            (Self::Auto, IntensityKind::Number) => by_range(),
+        origin.divisor = match (self.divisor, origin.kind) {
+            (Some(divisor), _) => divisor,
+            (None, IntensityKind::RedByte | IntensityKind::Byte) => BYTE,
+            (None, IntensityKind::Number) => by_range(),
         };
         let divisor = origin.divisor;
         #[expect(clippy::float_cmp, reason = "a division by exactly 1 changes nothing")]
@@ -91,7 +94,7 @@ mod tests {
 
     #[test]
     fn the_type_or_the_range_tells_the_scale() {
-        let auto = |kind, stored| scaled(IntensityScale::Auto, kind, stored);
+        let auto = |kind, stored| scaled(IntensityScale::AUTO, kind, stored);
         assert_eq!(auto(IntensityKind::RedByte, 194.0), (194.0 / 255.0, 255.0));
         assert_eq!(auto(IntensityKind::Byte, 1.0), (1.0 / 255.0, 255.0));
         assert_eq!(auto(IntensityKind::Number, 0.99), (0.99, 1.0));
@@ -100,17 +103,16 @@ mod tests {
         assert_eq!(auto(IntensityKind::Number, 256.0).1, 511.0);
         assert_eq!(auto(IntensityKind::Number, 40_000.0).1, 65_535.0);
         assert_eq!(auto(IntensityKind::Number, f32::MAX).1, u32::MAX as f32);
-        assert_eq!(scaled(IntensityScale::Divisor(100.0), IntensityKind::Byte, 50.0), (0.5, 100.0));
+        assert_eq!(scaled("100".parse().unwrap(), IntensityKind::Byte, 50.0), (0.5, 100.0));
     }
 
     #[test]
     fn the_option_is_auto_or_a_positive_number() {
-        assert_eq!("auto".parse(), Ok(IntensityScale::Auto));
-        assert_eq!("255".parse(), Ok(IntensityScale::Divisor(255.0)));
+        assert_eq!("auto".parse(), Ok(IntensityScale::AUTO));
+        assert_eq!("255".parse::<IntensityScale>().unwrap().to_string(), "255");
         for wrong in ["", "0", "-1", "nan", "inf", "byte"] {
             let error = wrong.parse::<IntensityScale>().unwrap_err().to_string();
             assert!(error.starts_with(&format!("{wrong:?}, expected auto or a positive number")), "{error}");
         }
-        assert_eq!(IntensityScale::Divisor(255.0).to_string(), "255");
     }
 }

@@ -1,12 +1,12 @@
 //! Recordings written, read back, cut and filled up.
 
+mod damaged;
 mod public_reader;
 
 use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex};
 
-use proptest::prelude::*;
 use protocol::message::AgentTruth;
 use protocol::{
     CavId, DetectionsReport, Gnss, GnssSource, Key, Lidar, PointCloud, Pose, RunId, Stamp, Stream, TrueObject, Truth,
@@ -44,7 +44,7 @@ fn truth(tick: u64) -> Truth {
         world_from_lidar: pose(tick),
         objects: vec![object.clone()],
     };
-    Truth { frame_index: tick, agents: AGENTS.map(agent).into() }
+    Truth { tick, agents: AGENTS.map(agent).into() }
 }
 
 /// The messages of one tick, as they come from the network.
@@ -124,8 +124,8 @@ fn recorded(ticks: u64, points: usize, options: RecordingOptions) -> Vec<u8> {
 /// Every message of every channel: topic, encoding, data.
 fn messages_of(recording: &Recording) -> Vec<(String, String, Vec<u8>)> {
     let mut messages = Vec::new();
-    for chunk in recording.chunks() {
-        for message in chunk.unwrap().iter() {
+    for held in recording.all() {
+        for message in held.unwrap().iter() {
             let channel = &message.channel;
             messages.push((channel.topic.clone(), channel.message_encoding.clone(), message.data.to_vec()));
         }
@@ -150,7 +150,7 @@ fn what_is_read_is_what_was_written() {
         let options = RecordingOptions { zstd_level, with_ros: true };
         let path = write(folder.path(), &recorded(3, 100, options));
         let recording = Recording::open(&path).unwrap();
-        assert_eq!(recording.damage(), None);
+        assert_eq!(recording.damage(), []);
         let expected: Vec<_> = (0..3).flat_map(|tick| tick_messages(tick, 100)).collect();
         assert_eq!(recording.entries().len(), expected.len());
         for (entry, (key, payload)) in recording.entries().iter().zip(&expected) {
@@ -165,35 +165,24 @@ fn what_is_read_is_what_was_written() {
 }
 
 #[test]
-fn a_chunk_that_asks_for_a_huge_window_is_refused() {
-    let folder = tempfile::tempdir().unwrap();
-    let options = RecordingOptions { zstd_level: Some(1), with_ros: false };
-    let mut bytes = recorded(3, 100, options);
-    let frame = bytes.windows(4).position(|bytes| bytes == [0x28, 0xb5, 0x2f, 0xfd]).unwrap();
-    // The window descriptor of the frame: 2 GiB. zstd itself allows a stream 128 MiB, and looks before it allocates.
-    assert_eq!(bytes[frame + 4] & 0x20, 0, "a frame with a window");
-    bytes[frame + 5] = 21 << 3;
-    let error = Recording::open(&write(folder.path(), &bytes)).unwrap_err();
-    assert!(error.to_string().contains("too much memory"), "{error}");
-}
-
-#[test]
-fn a_record_that_reaches_beyond_its_chunk_is_refused() {
-    let folder = tempfile::tempdir().unwrap();
-    let mut bytes = recorded(1, 100, RecordingOptions { zstd_level: None, with_ros: false });
-    let number = |bytes: &[u8], at: usize| u64::from_le_bytes(bytes[at..at + 8].try_into().unwrap());
-    let mut at = mcap::MAGIC.len();
-    while bytes[at] != mcap::records::op::CHUNK {
-        at += 9 + number(&bytes, at + 1) as usize;
+fn sweeps_in_coordinates_of_a_map_are_told_to_ros_tools_too() {
+    let disk = Disk::new(usize::MAX);
+    let mut writer = RecordingWriter::over(disk.clone(), Path::new("t"), RecordingOptions::default()).unwrap();
+    // UTM: east, north, height.
+    let far = PointCloud { xyzi: vec![[458_000.0, 5_428_000.0, 115.0, 0.5]] };
+    let key = Key::stream(&RunId::new("test").unwrap(), &CavId::new("4279").unwrap(), Stream::Lidar);
+    for points in [far, PointCloud { xyzi: vec![[f32::NAN; 4]] }] {
+        let payload = wire::encode(&stamp("4279", 0), Lidar { points }).unwrap().to_vec();
+        writer.write(&key, 5, &payload).unwrap();
     }
-    // Behind two times come the length unpacked, the checksum (0: none), no name of a packing, the length.
-    let chunk = at + 9;
-    bytes[chunk + 24..chunk + 28].fill(0);
-    assert_eq!(bytes[chunk + 28..chunk + 32], [0; 4]);
-    let shorter = number(&bytes, chunk + 32) - 4;
-    bytes[chunk + 32..chunk + 40].copy_from_slice(&shorter.to_le_bytes());
-    let error = Recording::open(&write(folder.path(), &bytes)).unwrap_err();
-    assert!(error.to_string().contains("in the middle of a record"), "{error}");
+    writer.finish().unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let recording = Recording::open(&write(folder.path(), &disk.bytes())).unwrap();
+    let messages = messages_of(&recording);
+    let told: Vec<_> = messages.iter().filter(|(topic, ..)| topic == "/4279/points").collect();
+    assert_eq!((messages.len(), told.len()), (3, 1), "what is no number is recorded as it came");
+    let north = 5_428_000.0_f32.to_le_bytes();
+    assert!(told[0].2.windows(4).any(|bytes| bytes == north));
 }
 
 #[test]
@@ -242,9 +231,9 @@ fn a_recovered_recording_has_an_index_and_the_same_messages() {
     let path = write(folder.path(), &whole[..whole.len() / 2]);
     let to = folder.path().join("whole.mcap");
     let report = recover(&path, &to, RecordingOptions::default()).unwrap();
-    assert!(report.damage.is_some());
+    assert_eq!(report.damage.len(), 1);
     let (cut, recovered) = (Recording::open(&path).unwrap(), Recording::open(&to).unwrap());
-    assert_eq!(recovered.damage(), None);
+    assert_eq!(recovered.damage(), []);
     assert_eq!(report.messages as usize, cut.entries().len());
     assert!(has_index(&to) && !has_index(&path));
     for (left, right) in cut.entries().iter().zip(recovered.entries()) {
@@ -259,7 +248,7 @@ fn json_stands_beside_our_own_messages() {
     let disk = Disk::new(usize::MAX);
     let mut writer = RecordingWriter::over(disk.clone(), Path::new("t"), RecordingOptions::default()).unwrap();
     let key: Key = "v2v/test/4279/detections/json".parse().unwrap();
-    let text = br#"{"frame_index": 0}"#;
+    let text = br#"{"tick": 0}"#;
     assert!(serde_json::from_slice::<DetectionsReport>(text).is_err(), "any JSON will do");
     writer.write(&key, 5, text).unwrap();
     for (key, payload) in tick_messages(0, 1) {
@@ -294,7 +283,7 @@ fn the_first_of_two_replays_of_one_moment_is_taken_with_its_own_truth() {
         writer.write(&key, 5, &payload).unwrap();
         if key.topic == protocol::Topic::Truth {
             let second = Stamp { epoch: 2, ..stamp("replay", 0) };
-            let nothing = Truth { frame_index: 0, agents: Vec::new() };
+            let nothing = Truth { tick: 0, agents: Vec::new() };
             // The same once more is no news.
             for stamp in [stamp("replay", 0), second] {
                 writer.write(&key, 6, &wire::encode(&stamp, nothing.clone()).unwrap().to_vec()).unwrap();
@@ -332,7 +321,8 @@ fn a_full_disk_leaves_what_is_whole() {
     drop(writer);
     let recording = Recording::open(&write(folder.path(), &disk.bytes())).unwrap();
     assert_eq!(recording.entries().len(), 2 * 5);
-    assert_eq!(recording.damage().map(|damage| damage.lost_bytes), Some(0), "only the index is missing");
+    let [damage] = recording.damage() else { panic!("{:?}", recording.damage()) };
+    assert_eq!((damage.lost_bytes, damage.to_s), (0, None), "only the index is missing");
 }
 
 #[test]
@@ -349,47 +339,4 @@ fn what_is_no_recording_is_refused_with_a_reason() {
     RecordingWriter::over(disk.clone(), Path::new("t"), RecordingOptions::default()).unwrap().finish().unwrap();
     let error = Recording::open(&write(folder.path(), &disk.bytes())).unwrap_err();
     assert!(error.to_string().contains("no channel of encoding"), "{error}");
-}
-
-proptest! {
-    #![proptest_config(ProptestConfig::with_cases(64))]
-
-    #[test]
-    fn a_cut_recording_reads_up_to_its_last_whole_chunk(at in 0.0_f64..1.0, packed: bool) {
-        let options = RecordingOptions { zstd_level: packed.then_some(1), with_ros: true };
-        let whole = recorded(4, 40, options);
-        let folder = tempfile::tempdir().unwrap();
-        let cut = (at * whole.len() as f64) as usize;
-        let all: Vec<_> = (0..4).flat_map(|tick| tick_messages(tick, 40)).collect();
-        match Recording::open(&write(folder.path(), &whole[..cut])) {
-            Err(error) => prop_assert!(matches!(error, RecordingError::NotOurs { .. }), "{}", error),
-            Ok(recording) => {
-                let count = recording.entries().len();
-                prop_assert_eq!(count % 5, 0, "whole chunks, which are whole ticks here");
-                for (entry, (key, payload)) in recording.entries().iter().zip(&all) {
-                    prop_assert_eq!(&entry.key, key);
-                    prop_assert_eq!(&recording.read(entry).unwrap(), payload);
-                }
-                if let Some(damage) = recording.damage() {
-                    prop_assert_eq!(damage.whole_bytes + damage.lost_bytes, cut as u64);
-                } else {
-                    prop_assert_eq!(count, 20);
-                }
-            }
-        }
-    }
-
-    #[test]
-    fn a_damaged_recording_gives_what_was_written_or_nothing(at in 8_usize..4000, bit in 0_u8..8) {
-        let mut bytes = recorded(3, 40, RecordingOptions::default());
-        let at = at % bytes.len();
-        bytes[at] ^= 1 << bit;
-        let folder = tempfile::tempdir().unwrap();
-        let all: Vec<_> = (0..3).flat_map(|tick| tick_messages(tick, 40)).map(|(_, payload)| payload).collect();
-        if let Ok(recording) = Recording::open(&write(folder.path(), &bytes)) {
-            for entry in recording.entries() {
-                prop_assert!(all.contains(&recording.read(entry).unwrap()));
-            }
-        }
-    }
 }

@@ -1,6 +1,8 @@
-//! Typed access to XML elements, with errors that say where.
+//! Typed access to XML elements, with errors that name the place, and findings where a value is treated as absent.
 
 use roxmltree::Node;
+
+use super::super::finding::FindingLog;
 
 /// Why a map cannot be used.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -52,21 +54,71 @@ pub enum OpenDriveError {
     },
 }
 
+impl OpenDriveError {
+    /// Writes the error down as a finding: what it is about was handled by `action`.
+    pub(super) fn note(&self, log: &mut FindingLog, action: &str) {
+        match self {
+            Self::TooLarge { .. } | Self::Xml(_) => log.add(1, "OpenDRIVE", &self.to_string(), action),
+            Self::Element { line, element, problem } => log.add(*line, element, problem, action),
+            Self::Missing { line, element, attribute } => {
+                log.add(*line, element, &format!("has no attribute {attribute}"), action);
+            }
+            Self::Value { line, element, attribute, value, expected } => {
+                log.add(*line, element, &format!("{attribute}=\"{value}\", expected {expected}"), action);
+            }
+        }
+    }
+}
+
+/// Where the lines of a text begin, bytes. The document itself would count them anew for each place.
+pub(super) struct LineIndex(Vec<usize>);
+
+impl LineIndex {
+    pub(super) fn new(text: &str) -> Self {
+        Self(text.bytes().enumerate().filter(|&(_, byte)| byte == b'\n').map(|(place, _)| place + 1).collect())
+    }
+
+    fn line(&self, place: usize) -> u32 {
+        self.0.partition_point(|&start| start <= place) as u32 + 1
+    }
+}
+
 /// An XML element.
 #[derive(Clone, Copy)]
-pub(super) struct Element<'a, 'input>(pub(super) Node<'a, 'input>);
+pub(super) struct Element<'a, 'input> {
+    node: Node<'a, 'input>,
+    lines: &'a LineIndex,
+}
 
 /// Children of `parent` with a name.
 pub(super) fn children<'a, 'input>(
     parent: Element<'a, 'input>,
     name: &'static str,
 ) -> impl Iterator<Item = Element<'a, 'input>> {
-    parent.0.children().filter(move |node| node.has_tag_name(name)).map(Element)
+    parent.elements().filter(move |element| element.node.has_tag_name(name))
 }
 
 impl<'a, 'input> Element<'a, 'input> {
+    /// The root of a document with the lines of its text.
+    pub(super) fn root(node: Node<'a, 'input>, lines: &'a LineIndex) -> Self {
+        Self { node, lines }
+    }
+
     pub(super) fn name(&self) -> &'a str {
-        self.0.tag_name().name()
+        self.node.tag_name().name()
+    }
+
+    /// All child elements.
+    pub(super) fn elements(self) -> impl Iterator<Item = Self> {
+        let lines = self.lines;
+        self.node.children().filter(Node::is_element).map(move |node| Self { node, lines })
+    }
+
+    /// The largest size of a number among the descendants with a name; 0 where there is none.
+    pub(super) fn largest(&self, name: &'static str, attribute: &'static str) -> f64 {
+        let nodes = self.node.descendants().filter(|node| node.has_tag_name(name));
+        let values = nodes.filter_map(|node| node.attribute(attribute)?.trim().parse::<f64>().ok());
+        values.map(f64::abs).filter(|value| value.is_finite()).fold(0.0, f64::max)
     }
 
     /// The first child with a name.
@@ -80,7 +132,7 @@ impl<'a, 'input> Element<'a, 'input> {
     }
 
     pub(super) fn optional_text(&self, attribute: &'static str) -> Option<&'a str> {
-        self.0.attribute(attribute)
+        self.node.attribute(attribute)
     }
 
     pub(super) fn text(&self, attribute: &'static str) -> Result<&'a str, OpenDriveError> {
@@ -106,7 +158,7 @@ impl<'a, 'input> Element<'a, 'input> {
         low: f64,
         high: f64,
     ) -> Result<f64, OpenDriveError> {
-        if self.0.has_attribute(attribute) { self.number(attribute, low, high) } else { Ok(default) }
+        if self.node.has_attribute(attribute) { self.number(attribute, low, high) } else { Ok(default) }
     }
 
     /// A lane id.
@@ -130,8 +182,19 @@ impl<'a, 'input> Element<'a, 'input> {
         Ok(coefficients)
     }
 
+    /// Writes a finding about this element down.
+    pub(super) fn note(&self, log: &mut FindingLog, found: &str, action: &str) {
+        log.add(self.line(), self.name(), found, action);
+    }
+
+    /// Writes the value of an attribute down as a finding.
+    pub(super) fn note_value(&self, log: &mut FindingLog, attribute: &'static str, action: &str) {
+        let value = self.optional_text(attribute).unwrap_or_default();
+        self.note(log, &format!("{attribute}=\"{value}\""), action);
+    }
+
     pub(super) fn line(&self) -> u32 {
-        self.0.document().text_pos_at(self.0.range().start).row
+        self.lines.line(self.node.range().start)
     }
 
     pub(super) fn error_element(&self, problem: &str) -> OpenDriveError {
@@ -161,5 +224,7 @@ impl<'a, 'input> Element<'a, 'input> {
 
 /// Lanes on one side of a road, at most.
 pub(super) const MAX_LANES: i32 = 64;
+/// Longest road and longest element of a reference line, metres.
+pub(super) const MAX_LENGTH_M: f64 = 100_000.0;
 /// Places farther from the origin than this are refused, metres.
 pub(super) const MAX_COORDINATE_M: f64 = 1e7;

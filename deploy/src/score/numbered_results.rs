@@ -1,0 +1,90 @@
+//! Results with the tick of the scene, which the truth of the same capture time tells.
+
+use std::collections::{BTreeMap, VecDeque};
+
+use protocol::DetectionsReport;
+
+/// Results that may wait for their truth, and ticks that are remembered.
+const PLACES: usize = 256;
+
+/// Results on their way to the file. They keep their order, and wait only while their truth may still come.
+#[derive(Default)]
+pub(super) struct NumberedResults {
+    /// By capture time.
+    ticks: BTreeMap<u64, u64>,
+    waiting: VecDeque<DetectionsReport>,
+}
+
+impl NumberedResults {
+    /// Takes note of the tick at a capture time.
+    pub(super) fn tick(&mut self, capture_nanos: u64, tick: u64) {
+        self.ticks.insert(capture_nanos, tick);
+        if self.ticks.len() > PLACES {
+            self.ticks.pop_first();
+        }
+    }
+
+    /// Adds a result behind those that wait.
+    pub(super) fn result(&mut self, report: DetectionsReport) {
+        self.waiting.push_back(report);
+    }
+
+    /// The next result whose tick is known, or will not be: a later truth has come, too many wait, or it `is_over`.
+    pub(super) fn next(&mut self, is_over: bool) -> Option<DetectionsReport> {
+        let capture_nanos = self.waiting.front()?.capture_nanos;
+        let tick = self.ticks.get(&capture_nanos).copied();
+        let is_past = self.ticks.last_key_value().is_some_and(|(newest, _)| *newest > capture_nanos);
+        if tick.is_none() && !is_past && !is_over && self.waiting.len() <= PLACES {
+            return None;
+        }
+        let report = self.waiting.pop_front()?;
+        Some(DetectionsReport { tick, ..report })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use protocol::{CavId, Detections, Pose, PoseEstimate, Stamp};
+
+    use super::*;
+
+    fn report(capture_nanos: u64) -> DetectionsReport {
+        let ego = CavId::new("e").unwrap();
+        let stamp = Stamp { cav: ego.clone(), epoch: 1, sequence: 0, capture_nanos, publish_nanos: 0 };
+        let pose = PoseEstimate::new(Pose::IDENTITY, 1.0);
+        let (agent_frame, method) = (0, "max".to_owned());
+        let (detections, fused, skipped, heard, stages) = Default::default();
+        let result = Detections { ego, agent_frame, method, pose, detections, fused, skipped, heard, stages };
+        DetectionsReport::new(&stamp, None, result)
+    }
+
+    fn ticks(results: &mut NumberedResults, is_over: bool) -> Vec<(u64, Option<u64>)> {
+        std::iter::from_fn(|| results.next(is_over)).map(|report| (report.capture_nanos, report.tick)).collect()
+    }
+
+    #[test]
+    fn results_carry_the_tick_of_their_capture_time_whichever_comes_first() {
+        let mut results = NumberedResults::default();
+        results.tick(100, 7);
+        results.result(report(100));
+        results.result(report(200));
+        assert_eq!(ticks(&mut results, false), [(100, Some(7))]);
+        results.tick(200, 8);
+        results.tick(300, 9);
+        assert_eq!(ticks(&mut results, false), [(200, Some(8))]);
+    }
+
+    #[test]
+    fn a_truth_that_is_lost_holds_nobody_up() {
+        let mut results = NumberedResults::default();
+        results.result(report(100));
+        results.result(report(200));
+        assert_eq!(ticks(&mut results, false), []);
+        results.tick(200, 8);
+        assert_eq!(ticks(&mut results, false), [(100, None), (200, Some(8))]);
+        results.result(report(300));
+        assert_eq!(ticks(&mut results, true), [(300, None)]);
+        (0..=PLACES as u64).for_each(|k| results.result(report(400 + k)));
+        assert_eq!(ticks(&mut results, false), [(400, None)]);
+    }
+}

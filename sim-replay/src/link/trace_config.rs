@@ -1,0 +1,78 @@
+//! Which trace a link follows, and from which of its moments on.
+
+use std::fmt;
+use std::path::{Path, PathBuf};
+
+use serde::de::value::MapAccessDeserializer;
+use serde::de::{Error, MapAccess, Visitor};
+use serde::{Deserialize, Deserializer, Serialize};
+
+/// A trace: its path alone, or `{path, offset_s}`.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct TraceConfig {
+    /// The file.
+    pub path: PathBuf,
+    /// The moment of the trace at which the link begins, seconds.
+    pub offset_s: f64,
+}
+
+impl TraceConfig {
+    /// A trace from its beginning on.
+    #[must_use]
+    pub fn new(path: &Path) -> Self {
+        Self { path: path.to_owned(), offset_s: 0.0 }
+    }
+
+    /// [`Self::offset_s`] in nanoseconds.
+    pub(super) fn offset_nanos(&self) -> u64 {
+        (self.offset_s * 1e9).round().max(0.0) as u64
+    }
+}
+
+impl<'de> Deserialize<'de> for TraceConfig {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        deserializer.deserialize_any(PathOrFields)
+    }
+}
+
+struct PathOrFields;
+
+impl<'de> Visitor<'de> for PathOrFields {
+    type Value = TraceConfig;
+
+    fn expecting(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        formatter.write_str("the path of a trace, or {path, offset_s}")
+    }
+
+    fn visit_str<E: Error>(self, path: &str) -> Result<TraceConfig, E> {
+        Ok(TraceConfig::new(Path::new(path)))
+    }
+
+    fn visit_map<A: MapAccess<'de>>(self, map: A) -> Result<TraceConfig, A::Error> {
+        #[derive(Deserialize)]
+        #[serde(deny_unknown_fields)]
+        struct Fields {
+            path: PathBuf,
+            #[serde(default)]
+            offset_s: f64,
+        }
+        let Fields { path, offset_s } = Fields::deserialize(MapAccessDeserializer::new(map))?;
+        Ok(TraceConfig { path, offset_s })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_path_alone_begins_at_the_beginning() {
+        let read = |text: &str| serde_saphyr::from_str::<TraceConfig>(text);
+        assert_eq!(read("air.csv").unwrap(), TraceConfig::new(Path::new("air.csv")));
+        let later = TraceConfig { offset_s: 90.5, ..TraceConfig::new(Path::new("air.csv")) };
+        assert_eq!(read("{path: air.csv, offset_s: 90.5}").unwrap(), later);
+        assert_eq!(read(&serde_json::to_string(&later).unwrap()).unwrap(), later);
+        assert!(read("{path: air.csv, ofset_s: 1}").unwrap_err().to_string().contains("ofset_s"));
+        assert!(read("{offset_s: 1}").unwrap_err().to_string().contains("path"));
+    }
+}

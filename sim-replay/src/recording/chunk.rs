@@ -1,0 +1,156 @@
+//! Messages out of the records that hold them: chunks, packed or not, and messages that stand in none.
+
+use std::fs::File;
+use std::io::{self, ErrorKind, Read};
+use std::ops::ControlFlow;
+use std::os::unix::fs::FileExt;
+use std::sync::Arc;
+
+use mcap::read::ChannelAccumulator;
+use mcap::records::{Record, op};
+use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
+use mcap::{Channel, MAGIC, McapError, McapResult, Message, parse_record};
+
+use super::lengths::{self, RECORD_HEAD};
+use super::records::MAX_RECORD_BYTES;
+
+/// Bytes taken from a source at once: a length that is wrong costs no more memory than what is there.
+const READ_BYTES: usize = 1 << 20;
+/// The record that ends a file before its magic number: where the summary begins, and its checksum.
+const FOOTER_LEN: usize = 20;
+/// A summary that claims more than this is not read.
+const MAX_SUMMARY_BYTES: u64 = 64 << 20;
+
+/// What channels are called. They are described before their first message, in the same chunk as a rule, and once more in
+/// the summary, which tells of those whose chunk is damaged.
+#[derive(Debug, Default)]
+pub(super) struct Channels {
+    told: ChannelAccumulator<'static>,
+    repeated: ChannelAccumulator<'static>,
+    /// Whether the summary lists chunks; `None` where there is no sound one.
+    pub(super) has_chunks: Option<bool>,
+}
+
+impl Channels {
+    /// Those that the summary of a file of `size` bytes repeats; none where it has no sound one.
+    pub(super) fn of_summary(file: &File, size: u64) -> io::Result<Self> {
+        let mut channels = Self::default();
+        if let Some(summary) = summary(file, size)? {
+            let options = LinearReaderOptions::default().with_skip_start_magic(true);
+            let mut has_chunks = false;
+            // What stands behind a record that is none of a summary is not used.
+            let _ = for_each_record(&summary[..], options, |opcode, data| {
+                has_chunks |= opcode == op::CHUNK_INDEX;
+                add(&mut channels.repeated, opcode, data).map(|()| ControlFlow::Continue(()))
+            });
+            channels.has_chunks = Some(has_chunks);
+        }
+        Ok(channels)
+    }
+
+    pub(super) fn get(&self, id: u16) -> Option<Arc<Channel<'static>>> {
+        self.told.get(id).or_else(|| self.repeated.get(id))
+    }
+
+    /// Adds what a schema or a channel record tells; others tell nothing.
+    pub(super) fn add(&mut self, opcode: u8, data: &[u8]) -> McapResult<()> {
+        add(&mut self.told, opcode, data)
+    }
+
+    /// The message of a record; `None` where its channel is described nowhere.
+    pub(super) fn message(&self, record: &[u8]) -> McapResult<Option<Message<'static>>> {
+        let Record::Message { header, data } = parse_record(op::MESSAGE, record)? else { return Ok(None) };
+        Ok(self.get(header.channel_id).map(|channel| Message {
+            channel,
+            sequence: header.sequence,
+            log_time: header.log_time,
+            publish_time: header.publish_time,
+            data: data.into_owned().into(),
+        }))
+    }
+}
+
+fn add(channels: &mut ChannelAccumulator<'static>, opcode: u8, data: &[u8]) -> McapResult<()> {
+    if !matches!(opcode, op::SCHEMA | op::CHANNEL) {
+        return Ok(());
+    }
+    lengths::check(opcode, data)?;
+    match parse_record(opcode, data)? {
+        Record::Schema { header, data } => channels.add_schema_from_slice(header, &data),
+        Record::Channel(channel) => channels.add_channel(channel),
+        _ => Ok(()),
+    }
+}
+
+/// The summary of a whole file, once it has been compared with its checksum.
+fn summary(file: &File, size: u64) -> io::Result<Option<Vec<u8>>> {
+    let end_len = (RECORD_HEAD + FOOTER_LEN + MAGIC.len()) as u64;
+    let Some(footer_begin) = size.checked_sub(end_len) else { return Ok(None) };
+    let mut end = [0; RECORD_HEAD + FOOTER_LEN + MAGIC.len()];
+    file.read_exact_at(&mut end, footer_begin)?;
+    let (head, rest) = end.split_at(RECORD_HEAD);
+    let (footer, magic) = rest.split_at(FOOTER_LEN);
+    let number =
+        |at: usize| footer.get(at..).and_then(<[u8]>::first_chunk).map_or(0, |bytes| u64::from_le_bytes(*bytes));
+    let begin = number(0);
+    let len = footer_begin.checked_sub(begin).filter(|len| begin > 0 && *len <= MAX_SUMMARY_BYTES);
+    let Some(len) = len.filter(|_| head[0] == op::FOOTER && magic == MAGIC) else { return Ok(None) };
+    let mut summary = vec![0; len as usize];
+    file.read_exact_at(&mut summary, begin)?;
+    let mut crc = crc32fast::Hasher::new();
+    crc.update(&summary);
+    crc.update(head);
+    crc.update(&footer[..FOOTER_LEN - 4]);
+    let stated = &footer[FOOTER_LEN - 4..];
+    Ok((stated == [0; 4] || stated == crc.finalize().to_le_bytes()).then_some(summary))
+}
+
+/// The messages of a chunk, once it has been compared with its checksum, and the number of those whose channel is described
+/// nowhere; its channels are added to `channels`.
+pub(super) fn unpack(body: &[u8], channels: &mut Channels) -> McapResult<(Vec<Message<'static>>, usize)> {
+    lengths::check(op::CHUNK, body)?;
+    let head = [[op::CHUNK].as_slice(), &(body.len() as u64).to_le_bytes()].concat();
+    let options = LinearReaderOptions::default().with_skip_start_magic(true).with_prevalidate_chunk_crcs(true);
+    let (mut messages, mut orphans, mut unpacked_bytes) = (Vec::new(), 0, 0);
+    for_each_record(head.chain(body), options, |opcode, data| {
+        unpacked_bytes += data.len();
+        if unpacked_bytes > MAX_RECORD_BYTES {
+            return Err(McapError::ChunkTooLarge(unpacked_bytes as u64));
+        }
+        // Others have no place in a chunk, and the parser trusts the lengths in some of them.
+        match opcode {
+            op::MESSAGE => match channels.message(data)? {
+                Some(message) => messages.push(message),
+                None => orphans += 1,
+            },
+            _ => channels.add(opcode, data)?,
+        }
+        Ok(ControlFlow::Continue(()))
+    })?;
+    Ok((messages, orphans))
+}
+
+/// Gives the records of `source` to `visit`, one after the other, until it has had enough or there are no more.
+fn for_each_record(
+    mut source: impl Read,
+    options: LinearReaderOptions,
+    mut visit: impl FnMut(u8, &[u8]) -> McapResult<ControlFlow<()>>,
+) -> McapResult<()> {
+    let options = options.with_record_length_limit(MAX_RECORD_BYTES).with_skip_end_magic(true);
+    let mut reader = LinearReader::new_with_options(options);
+    while let Some(event) = reader.next_event() {
+        match event? {
+            LinearReadEvent::ReadRequest(wanted) => match source.read(reader.insert(wanted.min(READ_BYTES))) {
+                Ok(count) => reader.notify_read(count),
+                Err(error) if error.kind() == ErrorKind::Interrupted => {}
+                Err(error) => return Err(error.into()),
+            },
+            LinearReadEvent::Record { opcode, data } => {
+                if visit(opcode, data)?.is_break() {
+                    return Ok(());
+                }
+            }
+        }
+    }
+    Ok(())
+}

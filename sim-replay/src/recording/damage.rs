@@ -1,0 +1,34 @@
+//! Parts of a recording that cannot be read.
+
+use std::fmt;
+
+use serde::Serialize;
+
+/// A part of a recording that is lost: cut off, or with a bit that is not as it was written.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Damage {
+    /// Where it begins, bytes.
+    pub begin_bytes: u64,
+    /// Its length, bytes: of these nothing is read.
+    pub lost_bytes: u64,
+    /// Arrival of the last message before it, seconds since the first of the recording; `None`: there is none before it.
+    pub from_s: Option<f64>,
+    /// Arrival of the first message behind it, likewise; `None`: there is none behind it.
+    pub to_s: Option<f64>,
+    /// What was found there.
+    pub reason: String,
+}
+
+impl fmt::Display for Damage {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let Self { begin_bytes, lost_bytes, from_s, to_s, reason } = self;
+        write!(f, "{lost_bytes} bytes from byte {begin_bytes} on are lost, ")?;
+        match (from_s, to_s) {
+            (Some(from), Some(to)) => write!(f, "from {from:.1} s to {to:.1} s")?,
+            (Some(from), None) => write!(f, "from {from:.1} s on")?,
+            (None, Some(to)) => write!(f, "until {to:.1} s after its first message")?,
+            (None, None) => write!(f, "with all its messages")?,
+        }
+        write!(f, ": {reason}")
+    }
+}

@@ -1,0 +1,170 @@
+//! The records of a recording, one after the other, and where they go on behind a part that is damaged.
+
+use std::fs::File;
+use std::io;
+use std::os::unix::fs::FileExt;
+
+use mcap::records::op;
+use protocol::HEADER_LEN;
+
+use super::lengths::{self, RECORD_HEAD};
+
+/// A record that claims more than this is not ours: we close chunks at a few MiB and one message.
+pub(super) const MAX_RECORD_BYTES: usize = 256 << 20;
+/// Bytes that are searched at once.
+const WINDOW: usize = 1 << 20;
+/// Bytes of a record by which it is known: those before a chunk's records, or those before a message's payload.
+const KNOWN_BY: usize = RECORD_HEAD + lengths::MESSAGE_HEAD + HEADER_LEN;
+
+/// A record as it lies in the file.
+pub(super) struct RawRecord<'a> {
+    /// Where it begins.
+    pub(super) begin: u64,
+    pub(super) opcode: u8,
+    pub(super) body: &'a [u8],
+}
+
+/// Goes through the records of a file.
+pub(super) struct Records<'a> {
+    file: &'a File,
+    size: u64,
+    /// Where the next record begins.
+    at: u64,
+    body: Vec<u8>,
+    /// Of everything that was read so far.
+    crc: crc32fast::Hasher,
+}
+
+impl<'a> Records<'a> {
+    /// The records of a file of `size` bytes, behind its magic number; `None` where it neither begins nor ends with one.
+    pub(super) fn open(file: &'a File, size: u64) -> io::Result<Option<Self>> {
+        let magic_len = mcap::MAGIC.len() as u64;
+        let has_magic = |at: u64| -> io::Result<bool> {
+            let mut found = [0; mcap::MAGIC.len()];
+            file.read_exact_at(&mut found, at)?;
+            Ok(found == *mcap::MAGIC)
+        };
+        if size < magic_len || !has_magic(0)? && !has_magic(size - magic_len)? {
+            return Ok(None);
+        }
+        let mut crc = crc32fast::Hasher::new();
+        crc.update(mcap::MAGIC);
+        Ok(Some(Self { file, size, at: magic_len, body: Vec::new(), crc }))
+    }
+
+    /// Where the next record begins.
+    pub(super) fn at(&self) -> u64 {
+        self.at
+    }
+
+    /// CRC-32 of the file up to the next record, where nothing was passed over.
+    pub(super) fn crc(&self) -> u32 {
+        self.crc.clone().finalize()
+    }
+
+    /// The next record; `None` at the end of the file. Where none can be, the reason, and nothing is read.
+    pub(super) fn next(&mut self) -> io::Result<Result<Option<RawRecord<'_>>, String>> {
+        let (begin, left) = (self.at, self.size - self.at);
+        if left == 0 {
+            return Ok(Ok(None));
+        }
+        let mut head = [0; RECORD_HEAD];
+        if left < RECORD_HEAD as u64 {
+            return Ok(Err("the file ends in the middle of a record".into()));
+        }
+        self.file.read_exact_at(&mut head, begin)?;
+        let (opcode, claimed) = split_head(head);
+        if !is_known(opcode) {
+            return Ok(Err(format!("a record of kind {opcode:#04x} where none can be")));
+        }
+        let len = match usize::try_from(claimed) {
+            Ok(len) if len <= MAX_RECORD_BYTES => len,
+            _ => return Ok(Err(format!("a record of {claimed} bytes, {MAX_RECORD_BYTES} at most are read"))),
+        };
+        if claimed > left - RECORD_HEAD as u64 {
+            return Ok(Err("the file ends in the middle of a record".into()));
+        }
+        self.body.resize(len, 0);
+        self.file.read_exact_at(&mut self.body, begin + RECORD_HEAD as u64)?;
+        if !lengths::is_filled(opcode, &self.body) {
+            return Ok(Err(format!("a record of kind {opcode:#04x} is not as long as what is in it")));
+        }
+        if opcode != op::DATA_END {
+            self.crc.update(&head);
+            self.crc.update(&self.body);
+        }
+        self.at = begin + (RECORD_HEAD + len) as u64;
+        Ok(Ok(Some(RawRecord { begin, opcode, body: &self.body })))
+    }
+
+    /// Goes on at the next chunk or end of the data from `from` on whose lengths agree, or at the next message outside a
+    /// chunk whose channel `is_own` and whose header is sound; else at the end of the file.
+    pub(super) fn seek(&mut self, from: u64, is_own: impl Fn(u16) -> bool) -> io::Result<()> {
+        let mut window = Vec::new();
+        let mut begin = from;
+        while begin < self.size {
+            let left = self.size - begin;
+            let len = left.min((WINDOW + KNOWN_BY) as u64) as usize;
+            window.resize(len, 0);
+            self.file.read_exact_at(&mut window, begin)?;
+            let is_record = |place: &usize| is_record(&window[*place..], left - *place as u64, &is_own);
+            let found = (0..len.min(WINDOW)).filter(|place| is_known(window[*place])).find(is_record);
+            if let Some(place) = found {
+                self.at = begin + place as u64;
+                return Ok(());
+            }
+            begin += len.min(WINDOW) as u64;
+        }
+        self.at = self.size;
+        Ok(())
+    }
+}
+
+fn split_head(head: [u8; RECORD_HEAD]) -> (u8, u64) {
+    let [opcode, len @ ..] = head;
+    (opcode, u64::from_le_bytes(len))
+}
+
+/// Whether records of this kind stand among the data.
+fn is_known(opcode: u8) -> bool {
+    matches!(
+        opcode,
+        op::HEADER
+            | op::SCHEMA
+            | op::CHANNEL
+            | op::MESSAGE
+            | op::CHUNK
+            | op::MESSAGE_INDEX
+            | op::ATTACHMENT
+            | op::METADATA
+            | op::DATA_END
+    )
+}
+
+/// Whether a record begins here for certain, `left` bytes before the end of the file.
+fn is_record(bytes: &[u8], left: u64, is_own: &impl Fn(u16) -> bool) -> bool {
+    let Some((&head, body)) = bytes.split_first_chunk::<RECORD_HEAD>() else { return false };
+    let (opcode, len) = split_head(head);
+    if len > left - RECORD_HEAD as u64 {
+        return false;
+    }
+    match opcode {
+        op::CHUNK => lengths::is_chunk_head(body, len),
+        op::MESSAGE => lengths::message(body).is_some_and(|(channel, payload)| {
+            let payload_len = len.saturating_sub(lengths::MESSAGE_HEAD as u64);
+            is_own(channel) && lengths::own_message(payload) == Some(payload_len)
+        }),
+        op::DATA_END => {
+            len == lengths::DATA_END_LEN as u64 && begins_summary(&body[lengths::DATA_END_LEN.min(body.len())..])
+        }
+        _ => false,
+    }
+}
+
+/// Whether the bytes behind what seems to be the end of the data are those of a summary or footer.
+fn begins_summary(bytes: &[u8]) -> bool {
+    bytes.split_first_chunk::<RECORD_HEAD>().is_some_and(|(&head, _)| {
+        let (opcode, len) = split_head(head);
+        matches!(opcode, op::FOOTER | op::SCHEMA | op::CHANNEL | op::CHUNK_INDEX | op::STATISTICS) && len < 1 << 32
+    })
+}
