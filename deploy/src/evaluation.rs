@@ -182,7 +182,7 @@ pub(crate) fn judged(
     }
     evaluator.add_left_out_files(&problems);
     let grid = evaluator.ego().detector().config().feature_grid();
-    let channels = evaluator.ego().detector().config().feature_channels();
+    let channels = evaluator.ego().detector().config().sent_channels();
     let map_values = u64::from(grid.width) * u64::from(grid.height) * u64::try_from(channels).unwrap_or(0);
     let left = options.frames.unwrap_or(usize::MAX);
     let is_stepped = options.stepped.is_some();

@@ -129,11 +129,11 @@ impl Fleet {
         self.protocol.rule_within(self.detector.lidar_range_m)
     }
 
-    /// Numbers in one feature map of the model.
+    /// Numbers in one feature map of the model, as it crosses the air.
     #[must_use]
     pub fn map_values(&self) -> u64 {
         let grid = self.detector.feature_grid();
-        u64::from(grid.width) * u64::from(grid.height) * self.detector.feature_channels() as u64
+        u64::from(grid.width) * u64::from(grid.height) * self.detector.sent_channels() as u64
     }
 
     /// Where poses come from: the name that all vehicles share, or `mixed`.

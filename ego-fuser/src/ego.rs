@@ -209,10 +209,11 @@ impl Ego {
 
     fn is_own_shape(&self, map: &DecodedFeatures) -> bool {
         let DecodedFeatures { features, sent } = map;
-        let [channels, ..] = self.detector.map_shape();
+        let [channels, ..] = self.detector.sent_shape();
         let cells = features.grid.cells();
         features.grid == self.detector.grid()
             && i64::from(features.channels) == channels
+            && features.code_of == self.detector.code_of()
             && features.values.len() == cells * features.channels as usize
             && sent.as_ref().is_none_or(|sent| sent.len() == cells)
     }
@@ -256,7 +257,7 @@ impl Ego {
 
     /// A map `[1, C, H, W]` and what was sent of it `[1, 1, H, W]`.
     fn tensors(&self, map: &DecodedFeatures, is_ego: bool) -> Result<(Tensor, Tensor), EgoError> {
-        let [channels, height, width] = self.detector.map_shape();
+        let [channels, height, width] = self.detector.sent_shape();
         if !self.is_own_shape(map) {
             return Err(EgoError::OwnMap {
                 channels: map.features.channels,
@@ -265,8 +266,7 @@ impl Ego {
                 expected: self.detector.grid(),
             });
         }
-        let values = Tensor::f_from_slice(&map.features.values)?.f_view([1, channels, height, width])?;
-        Ok((values, sent_cells(map, is_ego, [height, width])?))
+        Ok((self.detector.received(map)?, sent_cells(map, is_ego, [height, width])?))
     }
 
     /// The kept maps of the vehicles that take part, and where they belong now. An ego that does not know where it is

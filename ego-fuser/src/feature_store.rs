@@ -155,7 +155,7 @@ impl FeatureStore {
                 let message = match scenario.load(agent, tick, &LoadOptions::default()) {
                     Ok(frame) => {
                         let map = detector.encode(&frame.points)?.features;
-                        self.packed(detector.to_message(&map)?)?
+                        self.packed(detector.to_kept(&map)?)?
                     }
                     Err(_) => Vec::new(),
                 };

@@ -6,11 +6,15 @@ use deploy::evaluation::{EvaluationOptions, evaluate};
 use ego_fuser::Method;
 use serde_json::{Value, json};
 use sim_replay::dataset::{self, Layout};
+use sim_replay::evaluation_protocol::ProtocolConfig;
 use sim_replay::synth::{SceneLayout, Subset, SynthOptions, generate};
 
 /// Layouts that hold both agents and their boxes, and as what they are read. A line for each.
-const LAYOUTS: [(SceneLayout, Layout); 2] =
-    [(SceneLayout::Opv2v, Layout::Opv2v), (SceneLayout::V2v4real, Layout::V2v4Real)];
+const LAYOUTS: [(SceneLayout, Layout); 3] = [
+    (SceneLayout::Opv2v, Layout::Opv2v),
+    (SceneLayout::V2v4real, Layout::V2v4Real),
+    (SceneLayout::V2xreal, Layout::V2xReal),
+];
 /// Methods without and with messages.
 const METHODS: [Method; 2] = [Method::None, Method::Max];
 /// Released weights, trained with other scenes.
@@ -18,8 +22,13 @@ const WEIGHTS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../deploy/weights");
 
 /// Average precision of a method, by threshold and order.
 fn average_precision(scene: &Path, method: Method) -> Value {
-    let options =
-        EvaluationOptions { dataset: scene.to_owned(), weights: WEIGHTS.into(), ..EvaluationOptions::default() };
+    let options = EvaluationOptions {
+        dataset: scene.to_owned(),
+        weights: WEIGHTS.into(),
+        // One protocol for all: each layout has its own otherwise.
+        protocol: ProtocolConfig { preset: Some("opv2v".into()), ..ProtocolConfig::default() },
+        ..EvaluationOptions::default()
+    };
     let metrics = evaluate(&options, method, &mut || {}).unwrap();
     assert_eq!(metrics.frames, 4);
     json!([metrics.ap_global, metrics.ap_frame_order])

@@ -175,7 +175,7 @@ pub(super) fn options(experiment: &Experiment, point: &Point, maps: &Path) -> Re
     let weights = weights_of(&experiment.weights, point.method)?;
     let read = Weights::load(&weights).map_err(EvaluateError::from).map_err(boxed)?;
     let config: DetectorConfig = read.config().map_err(EvaluateError::from).map_err(boxed)?;
-    let channels = u64::try_from(config.feature_channels()).unwrap_or(0);
+    let channels = u64::try_from(config.sent_channels()).unwrap_or(0);
     Ok(EvaluationOptions {
         dataset: experiment.dataset.clone(),
         weights,

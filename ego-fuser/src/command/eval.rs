@@ -96,7 +96,9 @@ impl Arguments {
                 let objects = ground_truth::merge(&frames.iter().collect::<Vec<_>>(), 0, &rule);
                 let objects: Vec<_> = objects.into_iter().map(|(_, object)| object).collect();
                 tally.frames += 1;
-                tally.scorer.add(&detector.detect(&frames)?.0, &objects);
+                let (detections, sent_bytes) = detector.detect(&frames)?;
+                tally.scorer.add(&detections, &objects);
+                tally.payload_bytes.extend(sent_bytes);
             }
         }
         let row = tally.row("multi_scale");

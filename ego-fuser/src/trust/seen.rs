@@ -4,7 +4,7 @@ use agent::detector::{Detector, DetectorError};
 use agent::model_config::YAxis;
 use agent::postprocess::{AgentBoxes, PostprocessConfig, postprocess};
 use nalgebra::Isometry3;
-use protocol::{BevGrid, DecodedFeatures};
+use protocol::BevGrid;
 use tch::Tensor;
 
 use crate::ego::Content;
@@ -39,7 +39,7 @@ impl Seen {
     /// Looks at a message; `empty` is the map of an empty world, `[C, H, W]`. Points are encoded for it.
     pub(super) fn in_message(content: &Content, detector: &mut Detector, empty: &[f32]) -> Result<Self, DetectorError> {
         match content {
-            Content::Features(map) => Self::in_map(map, detector, empty),
+            Content::Features(map) => Self::in_map(&detector.received(map)?, map.sent.as_deref(), detector, empty),
             Content::Boxes(found) => {
                 let at = |[x, y, _]: [f64; 3]| [x, y];
                 let all: Vec<_> = found.iter().map(|found| (at(found.box3d.center_m), found.score)).collect();
@@ -47,8 +47,7 @@ impl Seen {
             }
             Content::Points(points) => {
                 let encoded = detector.encode(points)?.features;
-                let features = detector.to_message(&detector.through_compressor(&encoded)?)?;
-                let seen = Self::in_map(&DecodedFeatures { features, sent: None }, detector, empty)?;
+                let seen = Self::in_map(&detector.through_compressor(&encoded)?, None, detector, empty)?;
                 Ok(Self { is_blind: seen.vehicles.is_empty(), ..seen })
             }
         }
@@ -60,13 +59,12 @@ impl Seen {
         Self { vehicles, sure: Sure::Boxes(all), print, is_blind: false }
     }
 
-    fn in_map(map: &DecodedFeatures, detector: &Detector, empty: &[f32]) -> Result<Self, DetectorError> {
-        let DecodedFeatures { features, sent } = map;
-        let grid = features.grid;
-        let tensor = Tensor::f_from_slice(&features.values)?.f_view(detector.map_shape())?;
-        let heads = detector.heads(&tensor)?;
+    /// In a map `[1, C, H, W]`, of which the `sent` cells came; all where absent.
+    fn in_map(map: &Tensor, sent: Option<&[bool]>, detector: &Detector, empty: &[f32]) -> Result<Self, DetectorError> {
+        let grid = detector.grid();
+        let heads = detector.heads(map)?;
         // What was left out has no features that a head could make sense of.
-        let was_sent = |cell: usize| sent.as_ref().is_none_or(|sent| sent[cell]);
+        let was_sent = |cell: usize| sent.is_none_or(|sent| sent[cell]);
         let limits =
             PostprocessConfig { score_threshold: SURE, ..PostprocessConfig::for_late_fusion(detector.config()) };
         let boxes = detector.boxes(&heads, SURE)?;
@@ -76,7 +74,8 @@ impl Seen {
             cell_of(&grid, x, y).is_none_or(was_sent).then_some(([x, y], found.score))
         });
         let found: Vec<_> = found.collect();
-        let print = features.values.iter().zip(empty).step_by((empty.len() / PRINT_VALUES).max(1));
+        let values: Vec<f32> = Vec::try_from(&map.f_contiguous()?.f_view([-1])?)?;
+        let print = values.iter().zip(empty).step_by((empty.len() / PRINT_VALUES).max(1));
         let print = print.map(|(value, nothing)| value - nothing).collect();
         if detector.config().y_axis == YAxis::Right {
             // The cells of a mirrored world lie elsewhere; its boxes do not.

@@ -1,10 +1,10 @@
 //! `sim-replay convert`: write a data set in another layout.
 
 use std::io::IsTerminal;
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 
 use indicatif::ProgressBar;
-use sim_replay::dataset;
+use sim_replay::dataset::{self, IntensityScale, OpenOptions};
 use sim_replay::output;
 use sim_replay::synth::{ConvertOptions, Converted, SceneLayout, SynthError, convert};
 
@@ -26,6 +26,9 @@ pub(crate) struct Args {
     /// Layout of the files.
     #[arg(long, value_enum)]
     layout: SceneLayout,
+    /// Number that stored intensities are divided by [default: by the type and the range of the numbers, as inspect shows].
+    #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
+    intensity_scale: IntensityScale,
     /// Write into a folder that is not empty; what the layout writes there is replaced.
     #[arg(long)]
     force: bool,
@@ -36,13 +39,21 @@ pub(crate) struct Args {
 
 /// Converts and prints a summary to standard output.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
-    let input = match dataset::open(&args.from) {
+    let open = OpenOptions { intensity_scale: args.intensity_scale, ..OpenOptions::default() };
+    let input = match dataset::open_with(&args.from, &open) {
         Ok(input) => input,
         Err(error) => {
             output::note(format_args!("error: {error}"));
             return Ok(Outcome::BadInput);
         }
     };
+    if overlap(&args.from, &args.out) {
+        output::note(format_args!(
+            "error: {}: the input lies there; take another folder for --out",
+            args.out.display()
+        ));
+        return Ok(Outcome::BadInput);
+    }
     let bar = if std::io::stderr().is_terminal() { ProgressBar::new(0) } else { ProgressBar::hidden() };
     let options = ConvertOptions { out: args.out.clone(), layout: args.layout, force: args.force };
     let result = convert(&input, &options, &|done, total| {
@@ -61,6 +72,12 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
             Ok(Outcome::BadInput)
         }
     }
+}
+
+/// Whether one of the two lies in the other: what is read would be replaced.
+fn overlap(from: &Path, out: &Path) -> bool {
+    let real = |path: &Path| path.canonicalize().ok();
+    real(from).zip(real(out)).is_some_and(|(from, out)| from.starts_with(&out) || out.starts_with(&from))
 }
 
 fn print(converted: &Converted, args: &Args) -> std::io::Result<()> {
@@ -83,4 +100,21 @@ fn print(converted: &Converted, args: &Args) -> std::io::Result<()> {
     super::synth::print_omitted(omitted)?;
     let summary = left_out.to_string();
     if summary.is_empty() { Ok(()) } else { output::line(summary) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_input_is_not_written_over() {
+        let folder = tempfile::tempdir().unwrap();
+        let [from, out, inside] = ["a", "b", "a/c"].map(|name| folder.path().join(name));
+        std::fs::create_dir_all(&inside).unwrap();
+        assert!(!overlap(&from, &out), "a folder that is not there yet");
+        std::fs::create_dir(&out).unwrap();
+        assert!(!overlap(&from, &out));
+        assert!(overlap(&from, &from) && overlap(&from, &inside) && overlap(&inside, &from));
+        assert!(overlap(&from, &inside.join("..")));
+    }
 }

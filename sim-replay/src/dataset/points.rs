@@ -54,6 +54,8 @@ struct AgentSweeps {
     files: Vec<PathBuf>,
     form: OnceLock<Result<FloatForm, String>>,
     divisor: OnceLock<f32>,
+    /// Whether it is told that there are no intensities.
+    is_told: OnceLock<()>,
 }
 
 impl Sweeps {
@@ -91,6 +93,11 @@ impl Sweeps {
         let unknown = AgentSweeps::default();
         let agent = self.agents.get(agent).unwrap_or(&unknown);
         let mut cloud = agent.read_stored(self.storage, path)?;
+        if cloud.intensity.is_none() {
+            agent.is_told.get_or_init(|| {
+                tracing::warn!("{}: no field of intensity, as in others maybe: it is 0", path.display())
+            });
+        }
         self.scale.apply(&mut cloud, || agent.divisor(self.storage));
         Ok(cloud)
     }
@@ -103,14 +110,23 @@ impl AgentSweeps {
             let clouds = self.files.iter().filter_map(|path| self.read_stored(storage, path).ok());
             let clouds = clouds.filter(|cloud| !cloud.points.is_empty()).take(SAMPLES);
             let largest = clouds.flat_map(|cloud| cloud.points.xyzi).map(|point| point[3]).fold(0.0, f32::max);
-            intensity::divisor_of_range(largest)
+            let divisor = intensity::divisor_of_range(largest);
+            if divisor > intensity::BYTE {
+                let file = self.files.first().map(|path| path.display().to_string()).unwrap_or_default();
+                tracing::warn!(
+                    "{file} and those after it: intensities reach {largest}, neither 0 to 1 nor 0 to 255: divided by \
+                     {divisor}; --intensity-scale states another number"
+                );
+            }
+            divisor
         })
     }
 
     /// How many floats a point has.
     fn form(&self, path: &Path) -> Result<FloatForm, ReadError> {
         let form = self.form.get_or_init(|| {
-            let samples = self.files.iter().filter_map(|path| files::read_limited(path, MAX_BYTES).ok());
+            let files = self.files.iter().filter(|path| !is_pcd(path));
+            let samples = files.filter_map(|path| files::read_limited(path, MAX_BYTES).ok());
             FloatForm::of(&samples.filter(|bytes| !bytes.is_empty()).take(SAMPLES).collect::<Vec<_>>())
         });
         form.clone().map_err(|reason| ReadError::malformed(path, reason))
@@ -118,9 +134,8 @@ impl AgentSweeps {
 
     /// Reads a sweep with the intensities that are stored.
     fn read_stored(&self, storage: SweepStorage, path: &Path) -> Result<PcdCloud, ReadError> {
-        let is_pcd = path.extension().is_some_and(|kind| kind.eq_ignore_ascii_case("pcd"));
         match storage {
-            SweepStorage::ByName if is_pcd => read_pcd_stored(path),
+            SweepStorage::ByName if is_pcd(path) => read_pcd_stored(path),
             SweepStorage::ByName => read_floats(path, self.form(path)?),
             SweepStorage::FiveFloats => read_floats(path, FloatForm::Five),
             SweepStorage::Planar => read_planar(path),
@@ -133,6 +148,10 @@ fn read_floats(path: &Path, form: FloatForm) -> Result<PcdCloud, ReadError> {
     let bytes = files::read_limited(path, MAX_BYTES)?;
     check_whole_points(path, bytes.len(), 4 * form.numbers())?;
     Ok(form.points(&bytes))
+}
+
+fn is_pcd(path: &Path) -> bool {
+    path.extension().is_some_and(|kind| kind.eq_ignore_ascii_case("pcd"))
 }
 
 /// Reads a PCD file that is no sweep of a LiDAR: the fourth value is as stored, or the red byte of a colour from 0 to 1.

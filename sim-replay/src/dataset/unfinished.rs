@@ -1,10 +1,10 @@
-//! Folders whose writing was interrupted.
+//! Marks of folders whose writing was interrupted.
 
 use std::path::{Path, PathBuf};
 
 use super::{Dataset, ReadError};
 
-/// The file that marks a folder while a data set is written into it. Who opens the folder is told.
+/// The file that marks a folder while a data set is written into it. Opening such a folder reports a problem.
 pub const UNFINISHED: &str = ".unfinished";
 
 /// Adds a problem for each mark in the folder that was opened and in those of its scenarios.

@@ -1,4 +1,4 @@
-//! Data sets that were opened, written in another layout.
+//! Conversion: a data set that was opened, written in another layout.
 
 use std::collections::BTreeMap;
 use std::path::PathBuf;
@@ -43,7 +43,8 @@ pub struct Converted {
     pub left_out: LeftOut,
 }
 
-/// Writes all scenarios of a data set in a layout. `progress` hears how many moments are done and how many there are.
+/// Writes all scenarios of a data set in a layout. `progress` is called with the number of moments
+/// that are done and their total, from any thread.
 ///
 /// # Errors
 /// [`SynthError`] where the layout cannot hold a scene or a file cannot be written. A frame that cannot be read is left out
@@ -86,13 +87,12 @@ fn header(scenario: &Scenario, dataset: &Dataset) -> Result<SceneHeader, SynthEr
             format!("scenario {}: two moments at {} and {} ns: times do not rise", scenario.name, pair[0], pair[1]);
         return Err(SynthError::Layout { layout: "of the input", reason });
     }
-    let from = format!("{:?}", dataset.layout);
     let is_roadside = |id: &CavId| scenario.roadside_units.contains(id);
     let agents = scenario.agents.iter().map(|id| SceneAgent { id: id.clone(), is_roadside: is_roadside(id) });
     Ok(SceneHeader {
         name: scenario.name.clone(),
         agents: agents.collect(),
-        origin: converted_yaml(&from, &scenario.name, tick_nanos),
+        origin: converted_yaml(dataset.layout.name(), &scenario.name, tick_nanos),
         capture_nanos,
         tick_nanos,
     })

@@ -5,30 +5,21 @@ use std::fs;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-use nalgebra::Vector3;
-use protocol::{CavId, Handedness, PointCloud, Pose};
+use protocol::CavId;
 
-use super::cast::{Body, Placement};
 use super::error::SynthError;
-use super::layout::{
-    AgentFrame, BoxAnchor, Moment, Omissions, SceneAgent, SceneHeader, SceneLayout, SceneWriter, Simulated,
-    SweepVariant, Unfinished, make_folder,
-};
-use super::lidar::{LIDAR_MOUNT_M, Lidar, lidar_motion};
+use super::layout::{Moment, Omissions, SceneAgent, SceneHeader, SceneLayout, SceneWriter, Unfinished, make_folder};
 use super::options::{Subset, SynthOptions};
 use super::positioning::{Fix, Positioning};
 use super::protocol_file::protocol_yaml;
-use super::radar::{Radar, velocity_to_red};
 use super::recording::{RecordedFrame, Recording, SceneSpec, record};
+use super::sensing::Bench;
 use super::traffic::STEP_S;
-use super::vehicle::{Vehicle, VehicleKind};
 use super::world::World;
-use crate::frame::{Frame, Object, ObjectClass};
+use crate::frame::Frame;
 use crate::random::derive_seed;
 use crate::town::{self, Finding, Town, TownSource};
 
-/// The farthest that any sensor looks, metres.
-const SIGHT_M: f64 = 152.0;
 /// Length of a step of the simulation, nanoseconds.
 const STEP_NANOS: u64 = (STEP_S * 1e9) as u64;
 
@@ -129,34 +120,20 @@ pub(super) fn check_folder(out: &std::path::Path, force: bool) -> Result<(), Syn
 }
 
 /// One scenario to be written.
-struct Scene<'a, 't> {
-    options: &'a SynthOptions,
-    world: &'a World<'t>,
-    spec: SceneSpec,
+pub(super) struct Scene<'a, 't> {
+    pub(super) options: &'a SynthOptions,
+    pub(super) world: &'a World<'t>,
+    pub(super) spec: SceneSpec,
 }
 
 /// One agent over the whole scene.
-struct Agent {
-    vehicle: usize,
-    id: i64,
-    cav: CavId,
-    fixes: Vec<Fix>,
-}
-
-/// A vehicle that a sensor may see, as an annotation has it.
-#[derive(Debug, Clone, Copy)]
-struct Annotation<'a> {
-    id: i64,
-    vehicle: &'a Vehicle,
-    placement: Placement,
-    speed_mps: f64,
-}
-
-/// The sensors and buffers of one thread.
-#[derive(Default)]
-struct Bench {
-    lidar: Lidar,
-    radar: Radar,
+pub(super) struct Agent {
+    /// Index among the recording's vehicles.
+    pub(super) vehicle: usize,
+    pub(super) id: i64,
+    pub(super) cav: CavId,
+    /// One for each moment.
+    pub(super) fixes: Vec<Fix>,
 }
 
 impl Scene<'_, '_> {
@@ -242,68 +219,10 @@ impl Scene<'_, '_> {
         });
         total.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner)
     }
-
-    fn moment(&self, recording: &Recording, agents: &[Agent], index: usize, bench: &mut Bench) -> Moment {
-        let frames = agents.iter().enumerate().filter_map(|(place, agent)| {
-            let (frame, variants, simulated) = self.frame(recording, agent, index, bench)?;
-            Some(AgentFrame { agent: place, frame, variants, simulated: Some(simulated) })
-        });
-        Moment { index, frames: frames.collect() }
-    }
-
-    fn frame(
-        &self,
-        recording: &Recording,
-        agent: &Agent,
-        index: usize,
-        bench: &mut Bench,
-    ) -> Option<(Frame, Vec<SweepVariant>, Simulated)> {
-        let moment = &recording.frames[index];
-        let own = moment.of(agent.vehicle)?;
-        let here = own.motion.end.position_m;
-        let (mut bodies, seen) = vehicles_around(recording, moment, agent.vehicle);
-        self.world.standing_near(here.x, here.y, SIGHT_M, &mut bodies);
-
-        let noise = |sensor: u64| derive_seed(self.spec.seed, &[sensor, agent.id as u64, moment.tick]);
-        let ground = self.world.ground();
-        let sensor = lidar_motion(&own.motion);
-        let sweep = bench.lidar.sweep(&sensor, ground, &bodies, self.options.weather, noise(5));
-        let (points, hits) = (sweep.points.to_vec(), sweep.hits.to_vec());
-        let mut variants = Vec::with_capacity(self.options.copies.len());
-        for (&weather, name) in self.options.copies.iter().filter_map(|weather| Some((weather, weather.variant()?))) {
-            let copy = bench.lidar.again(&sensor, &bodies, weather, noise(7 + weather as u64));
-            let (points, labels) = (copy.points.to_vec(), copy.labels.to_vec());
-            variants.push(SweepVariant { name: name.to_owned(), points, labels });
-        }
-        let half_length_m = 0.5 * recording.vehicles[agent.vehicle].size_m[0];
-        let radar = (self.options.layout == SceneLayout::Opv2v).then(|| {
-            let mount = LIDAR_MOUNT_M;
-            let returns = bench.radar.returns(&own.motion, half_length_m, mount, STEP_S, ground, &bodies, noise(6));
-            let red = |&[x, y, z, velocity]: &[f32; 4]| [x, y, z, velocity_to_red(velocity)];
-            PointCloud { xyzi: returns.iter().map(red).collect() }
-        });
-
-        let is_hit = |(_, hits): &(Annotation<'_>, &u32)| **hits > 0;
-        let mut annotations: Vec<Annotation<'_>> =
-            seen.into_iter().zip(&hits).filter(is_hit).map(|(annotation, _)| annotation).collect();
-        annotations.sort_unstable_by_key(|annotation| annotation.id);
-        let fix = agent.fixes[index];
-        let frame = Frame {
-            points: PointCloud { xyzi: points },
-            radar,
-            world_from_lidar: Some(own.motion.end.mounted(LIDAR_MOUNT_M).isometry().into()),
-            world_from_vehicle: Some(own.motion.end.isometry().into()),
-            gnss_world_from_vehicle: Some(fix.estimate.isometry().into()),
-            speed_mps: Some(own.speed_mps),
-            objects: annotations.iter().map(object).collect(),
-            ..Frame::empty(agent.cav.clone(), capture_nanos(moment), Handedness::Right)
-        };
-        let anchors = annotations.iter().map(anchor).collect();
-        Some((frame, variants, Simulated { fix, anchors }))
-    }
 }
 
-fn capture_nanos(frame: &RecordedFrame) -> u64 {
+/// When the sweeps of a moment end, on the clock of the scene.
+pub(super) fn capture_nanos(frame: &RecordedFrame) -> u64 {
     frame.tick * STEP_NANOS
 }
 
@@ -315,59 +234,4 @@ fn counts(moment: &Moment) -> Summary {
         annotations: sum(|frame| frame.objects.len()),
         ..Summary::default()
     }
-}
-
-/// The origin of a vehicle, and the way from there to the centre of its box.
-fn anchor(annotation: &Annotation<'_>) -> BoxAnchor {
-    let up = annotation.placement.rotation() * Vector3::new(0.0, 0.0, annotation.vehicle.size_m[2] / 2.0);
-    BoxAnchor { location_m: annotation.placement.position_m.into(), center_offset_m: up.into() }
-}
-
-fn object(annotation: &Annotation<'_>) -> Object {
-    let BoxAnchor { location_m, center_offset_m } = anchor(annotation);
-    let pose: Pose = annotation.placement.isometry().into();
-    let translation_m = std::array::from_fn(|axis| location_m[axis] + center_offset_m[axis]);
-    Object {
-        id: annotation.id,
-        class: class(annotation.vehicle.kind),
-        world_from_object: Pose { translation_m, ..pose },
-        size_m: annotation.vehicle.size_m,
-        speed_mps: Some(annotation.speed_mps),
-    }
-}
-
-fn class(kind: VehicleKind) -> ObjectClass {
-    match kind {
-        VehicleKind::Sedan | VehicleKind::Hatchback | VehicleKind::Suv | VehicleKind::Pickup => ObjectClass::Car,
-        VehicleKind::Van => ObjectClass::Van,
-        VehicleKind::Truck => ObjectClass::Truck,
-        VehicleKind::Bus => ObjectClass::Bus,
-    }
-}
-
-/// All vehicles but one's own that any sensor may see, as bodies and as what an annotation would say.
-fn vehicles_around<'a>(
-    recording: &'a Recording,
-    frame: &'a RecordedFrame,
-    own: usize,
-) -> (Vec<Body<'a>>, Vec<Annotation<'a>>) {
-    let here = frame.of(own).map_or_else(Default::default, |moving| moving.motion.end.position_m);
-    let near = |motion: &super::cast::Sweep| (motion.end.position_m - here).xy().norm() < SIGHT_M + 10.0;
-    let moving = frame.moving.iter().filter(|moving| moving.vehicle != own && near(&moving.motion));
-    let moving = moving.map(|moving| {
-        let vehicle: &Vehicle = &recording.vehicles[moving.vehicle];
-        (vehicle, moving.motion, moving.id, moving.speed_mps)
-    });
-    let parked = recording
-        .parked
-        .iter()
-        .map(|parked| (&parked.vehicle, super::cast::Sweep::still(parked.placement), parked.id, 0.0));
-    let parked = parked.filter(|(_, motion, ..)| near(motion));
-    moving
-        .chain(parked)
-        .map(|(vehicle, motion, id, speed_mps)| {
-            let annotation = Annotation { id, vehicle, placement: motion.end, speed_mps };
-            (Body { shape: &vehicle.shape, motion }, annotation)
-        })
-        .unzip()
 }

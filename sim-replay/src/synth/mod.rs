@@ -30,6 +30,7 @@ mod positioning;
 mod protocol_file;
 pub mod radar;
 mod recording;
+mod sensing;
 mod terrain;
 mod traffic;
 pub mod vehicle;

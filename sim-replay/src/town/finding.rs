@@ -13,7 +13,7 @@ const MAX_TEXT: usize = 100;
 /// A part of a map that was left out, treated as absent or built otherwise than the file gives it.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize)]
 pub struct Finding {
-    /// Line in the file, from 1; that of the first where there are several.
+    /// Line in the file, from 1; that of the first where there are several. 0 where it is about no single line.
     pub line: u32,
     /// Id of the road or junction in which it stands.
     pub within: Option<String>,
@@ -29,7 +29,9 @@ pub struct Finding {
 
 impl fmt::Display for Finding {
     fn fmt(&self, out: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(out, "line {}: ", self.line)?;
+        if self.line > 0 {
+            write!(out, "line {}: ", self.line)?;
+        }
         if let Some(within) = &self.within {
             write!(out, "{within}: ")?;
         }

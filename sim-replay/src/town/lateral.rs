@@ -3,7 +3,7 @@
 //! In a cross-section, `t` and `h` turn with the superelevation about the reference line: a place at `t` on a road with
 //! superelevation alone lies `t cos` beside the line and `t sin` above it. Crossfall and shape give `h` over `t`.
 
-use super::road::Profile;
+use super::profile::Profile;
 
 /// Steepest superelevation and crossfall, radians; steeper ones are no road.
 pub(super) const MAX_SLOPE_RAD: f64 = 1.4;

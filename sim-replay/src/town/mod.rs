@@ -16,11 +16,13 @@ mod furniture;
 mod ground;
 mod lane;
 pub mod lane_builder;
+pub mod lane_links;
 mod lane_queries;
 pub mod lateral;
 mod layout;
 mod noise;
 pub mod opendrive;
+pub mod profile;
 pub mod road;
 mod solid;
 mod surface;
@@ -192,7 +194,7 @@ pub fn read_map(path: &Path) -> Result<Map, TownError> {
     let network = opendrive::read_bytes(&bytes);
     let mut network = network.map_err(|source| TownError::OpenDrive { path: path.into(), source })?;
     let (lanes, counts) = lane_builder::lane_graph(&network);
-    network.findings.extend(counts.finding());
+    network.findings.extend(counts.findings);
     Ok(Map { network, lanes })
 }
 

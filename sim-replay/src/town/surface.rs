@@ -8,9 +8,11 @@ use super::road::{LaneKind, Road, RoadNetwork};
 pub(crate) const STEP_M: f64 = 2.0;
 /// Edge of a cell of the index, metres.
 const CELL_M: f64 = 6.0;
-/// Width of the pieces across a road that is bent across, and the most of them.
+/// Width of the pieces across a road that is bent across, metres.
 const PIECE_M: f64 = 1.0;
+/// Most pieces across one strip of such a road, and of all of them together.
 const MAX_PIECES: f64 = 64.0;
+const MAX_ALL_PIECES: f64 = 2e6;
 /// How far a slope across goes on beside the road, metres.
 const BESIDE_M: f64 = 4.0;
 /// Most cells of the index that all patches together may touch: some 100 MB.
@@ -131,6 +133,7 @@ impl Patch {
 impl Surface {
     pub(crate) fn new(network: &RoadNetwork) -> Self {
         let roads: Vec<Vec<CrossSection>> = network.roads.iter().map(cross_sections).collect();
+        let most_pieces = most_pieces(network);
         let mut patches = Vec::new();
         for (place, sections) in roads.iter().enumerate() {
             let road = &network.roads[place];
@@ -139,7 +142,7 @@ impl Surface {
                 let before = patches.len();
                 let mut strip = |a: [f64; 2], b: [f64; 2], carriageway| {
                     if a[1] - a[0] > 0.01 || b[1] - b[0] > 0.01 {
-                        strips(road, [(from, a), (to, b)], |quad, z_m| {
+                        strips(road, [(from, a), (to, b)], most_pieces, |quad, z_m| {
                             patches.push(Patch { quad, z_m, top_m: f64::NAN, road: place as u32, carriageway });
                         });
                     }
@@ -188,16 +191,28 @@ impl Surface {
     }
 }
 
+/// Most pieces across one strip: fewer where a map has so many roads that are not level that they would fill the memory.
+fn most_pieces(network: &RoadNetwork) -> f64 {
+    let banked = network.roads.iter().filter(|road| !road.lateral.is_level());
+    let cuts: f64 = banked.map(|road| road.length_m / STEP_M + road.sections.len() as f64).sum();
+    (MAX_ALL_PIECES / (3.0 * cuts).max(1.0)).floor().clamp(1.0, MAX_PIECES)
+}
+
 /// The pieces of a road's surface between two cross-sections and, in each, two `t`: one, or several side by side where
 /// the road is bent across. Calls `piece` with the corners in the order of [`Patch::quad`] and their heights.
-fn strips(road: &Road, [(from, a), (to, b)]: [(CrossSection, [f64; 2]); 2], mut piece: impl FnMut(Quad, [f64; 4])) {
+fn strips(
+    road: &Road,
+    [(from, a), (to, b)]: [(CrossSection, [f64; 2]); 2],
+    most_pieces: f64,
+    mut piece: impl FnMut(Quad, [f64; 4]),
+) {
     if road.lateral.is_level() {
         let quad = [from.at(a[0]), to.at(b[0]), to.at(b[1]), from.at(a[1])];
         return piece(quad, [from.z_m, to.z_m, to.z_m, from.z_m]);
     }
     let is_straight = road.lateral.is_flat() && !road.sections[from.section].has_level_lanes();
     let width_m = (a[1] - a[0]).max(b[1] - b[0]);
-    let count = if is_straight { 1 } else { (width_m / PIECE_M).ceil().clamp(1.0, MAX_PIECES) as usize };
+    let count = if is_straight { 1 } else { (width_m / PIECE_M).ceil().clamp(1.0, most_pieces) as usize };
     let corner = |cut: &CrossSection, range: [f64; 2], place: usize| {
         let t_m = range[0] + (range[1] - range[0]) * place as f64 / count as f64;
         road.point_at(cut.section, cut.s_m, t_m)

@@ -1,7 +1,7 @@
 //! Sweeps of little-endian `f32`, point after point: `x y z intensity`, or a fifth number behind these.
 //!
 //! Nothing in such a file tells how many numbers a point has. The first sweeps of an agent do: read by the right number,
-//! neighbouring points resemble each other, no intensity is negative, and the fifth number mostly is a laser's.
+//! neighbouring points resemble each other, and the fifth number mostly is a laser's.
 
 use super::plausibility::TINY;
 use crate::pcd::{IntensityKind, IntensityOrigin, PcdCloud};
@@ -10,12 +10,16 @@ use crate::pcd::{IntensityKind, IntensityOrigin, PcdCloud};
 const LEAST_POINTS: usize = 8;
 /// Numbers of a sample that are looked at.
 const MOST_NUMBERS: usize = 200_000;
-/// Largest share of points with a number that no sensor writes.
-const IMPOSSIBLE_SHARE: f64 = 0.05;
+/// Largest share of numbers that no sensor writes.
+const ABSURD_SHARE: f64 = 0.05;
 /// Number beyond which nothing is a coordinate or an intensity.
 const LARGEST: f32 = 1e7;
 /// Least share of whole numbers from 0 to 255 in a column of lasers.
 const LASER_SHARE: f64 = 0.99;
+/// Numbers per point that files may have and that are not read.
+const OTHER_NUMBERS: [usize; 3] = [3, 6, 7];
+/// How much less unlike neighbours must be with these.
+const MUCH_LESS: f64 = 0.5;
 
 /// Numbers per point.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -55,59 +59,31 @@ impl FloatForm {
 
     /// `None` where the sample is empty or cut off, and says nothing.
     fn of_sample(bytes: &[u8]) -> Option<Result<Self, String>> {
-        let fits = |form: &Self| bytes.len().is_multiple_of(4 * form.numbers());
-        let mut forms: Vec<Self> = [Self::Four, Self::Five].into_iter().filter(fits).collect();
-        if bytes.is_empty() || forms.is_empty() {
-            return None;
-        }
-        let (numbers, _) = bytes.as_chunks::<4>();
+        let (numbers, rest) = bytes.as_chunks::<4>();
+        let fits = |form: &Self| rest.is_empty() && numbers.len().is_multiple_of(form.numbers());
+        let forms: Vec<Self> = [Self::Four, Self::Five].into_iter().filter(fits).collect();
+        let &first = forms.first().filter(|_| !numbers.is_empty())?;
+        let all = numbers.len();
         let numbers: Vec<f32> = numbers.iter().take(MOST_NUMBERS).map(|&bytes| f32::from_le_bytes(bytes)).collect();
         if numbers.len() < LEAST_POINTS * 4 {
-            return Some(Ok(forms[0]));
+            return Some(Ok(first));
         }
-        if let [Self::Four, Self::Five] = forms[..]
-            && Self::Five.is_likelier(&numbers)
-        {
-            forms.reverse();
+        if let Some(fault) = absurd(&numbers) {
+            return Some(Err(format!("no sweep of x y z intensity or x y z intensity ring as f32: {fault}")));
         }
-        let found = forms.iter().find(|form| form.fault(&numbers).is_none());
-        let fault =
-            |form: &Self| format!("{} floats per point: {}", form.numbers(), form.fault(&numbers).unwrap_or_default());
-        Some(found.copied().ok_or_else(|| {
-            let faults: Vec<String> = forms.iter().map(fault).collect();
-            format!("no sweep of x y z intensity or x y z intensity ring as f32: with {}", faults.join("; with "))
-        }))
-    }
-
-    /// Whether five numbers explain a sample of which both are possible better than four.
-    fn is_likelier(self, numbers: &[f32]) -> bool {
-        let is_laser = |number: f32| (0.0..=255.0).contains(&number) && number.fract() == 0.0;
-        let fifth = || numbers.chunks_exact(5).map(|point| point[4]);
-        let lasers = fifth().filter(|&number| is_laser(number)).count() as f64 / (numbers.len() / 5) as f64;
-        let all_whole = numbers.iter().all(|number| number.fract() == 0.0);
-        if lasers >= LASER_SHARE && !all_whole {
-            return true;
+        if forms.contains(&Self::Five) && has_lasers(&numbers) {
+            return Some(Ok(Self::Five));
         }
-        unlikeness(numbers, 5) < unlikeness(numbers, 4)
-    }
-
-    /// What no sensor writes, if it is in more than a few points.
-    fn fault(self, numbers: &[f32]) -> Option<String> {
-        let points = numbers.chunks_exact(self.numbers());
-        let all = points.len().max(1) as f64;
-        let impossible = |number: f32| number.abs() > LARGEST || (number != 0.0 && number.abs() < TINY);
-        let count = |is_wrong: &dyn Fn(&[f32]) -> bool| points.clone().filter(|point| is_wrong(point)).count() as f64;
-        let absurd = count(&|point| point.iter().any(|&number| impossible(number))) / all;
-        let negative = count(&|point| point[3] < 0.0) / all;
-        let percent = |share: f64| format!("{:.1} %", 100.0 * share);
-        if absurd > IMPOSSIBLE_SHARE {
-            return Some(format!(
-                "{} of the points have a number beyond 1e7 or below 1e-30, usual is none",
-                percent(absurd)
-            ));
-        }
-        let fault = || format!("{} of the intensities are negative, usual is none", percent(negative));
-        (negative > IMPOSSIBLE_SHARE).then(fault)
+        let unlikeness_of = |form: &Self| unlikeness(&numbers, form.numbers());
+        let form = forms.into_iter().min_by(|a, b| unlikeness_of(a).total_cmp(&unlikeness_of(b))).unwrap_or(first);
+        let is_better =
+            |step: &usize| all.is_multiple_of(*step) && unlikeness(&numbers, *step) < MUCH_LESS * unlikeness_of(&form);
+        Some(match OTHER_NUMBERS.into_iter().find(is_better) {
+            Some(step) => Err(format!(
+                "it looks like {step} floats per point, expected 4 (x y z intensity) or 5 (and the laser's number)"
+            )),
+            None => Ok(form),
+        })
     }
 
     /// Takes the points out of a file of whole points.
@@ -118,6 +94,21 @@ impl FloatForm {
         let intensity = Some(IntensityOrigin::stored("4th float", IntensityKind::Number));
         PcdCloud { intensity, form: self.name(), ..PcdCloud::of_finite(points, Vec::new()) }
     }
+}
+
+/// What no sensor writes, if it is in more than a few of the numbers.
+fn absurd(numbers: &[f32]) -> Option<String> {
+    let is_absurd = |number: f32| number.abs() > LARGEST || (number != 0.0 && number.abs() < TINY);
+    let share = numbers.iter().filter(|&&number| is_absurd(number)).count() as f64 / numbers.len() as f64;
+    let fault = || format!("{:.1} % of the numbers are beyond 1e7 or below 1e-30, usual is none", 100.0 * share);
+    (share > ABSURD_SHARE).then(fault)
+}
+
+/// Whether every fifth number is a laser's, and not all numbers could be.
+fn has_lasers(numbers: &[f32]) -> bool {
+    let is_laser = |number: f32| (0.0..=255.0).contains(&number) && number.fract() == 0.0;
+    let lasers = numbers.chunks_exact(5).filter(|point| is_laser(point[4])).count();
+    lasers as f64 >= LASER_SHARE * (numbers.len() / 5) as f64 && numbers.iter().any(|number| number.fract() != 0.0)
 }
 
 /// How little each number resembles the one `step` later. Logarithms, so that no column outweighs the others.

@@ -10,7 +10,7 @@ use std::str::FromStr;
 use crate::pcd::{IntensityKind, PcdCloud};
 
 /// Largest number in a byte.
-const BYTE: f32 = 255.0;
+pub(super) const BYTE: f32 = 255.0;
 
 /// Divisor of the intensities that a data set stores: [`Self::AUTO`], or a number parsed from text.
 #[derive(Debug, Clone, Copy, PartialEq, Default)]

@@ -81,41 +81,46 @@ impl Tables {
 
     /// Adds the rows of a scene.
     pub(super) fn add(&mut self, scene: SceneTables<'_>) {
-        let token = |kind: &str, parts: &[&str]| scene_token(&scene, kind, parts);
-        let log = token("log", &[]);
+        let samples = scene.samples.iter();
+        let tokens: Vec<String> =
+            samples.map(|sample| scene_token(&scene, "sample", &[&sample.moment.to_string()])).collect();
+        self.add_scene(&scene, &tokens);
+        let scene_token = scene_token(&scene, "scene", &[]);
+        for ((sample, token), (prev, next)) in scene.samples.iter().zip(&tokens).zip(neighbours(&tokens)) {
+            self.push(
+                "sample",
+                json!({
+                    "token": token, "timestamp": sample.micros, "prev": prev, "next": next, "scene_token": scene_token,
+                }),
+            );
+        }
+        self.add_sweeps(&scene, &tokens);
+        self.add_annotations(&scene, &tokens);
+    }
+
+    /// The scene, its log and its map.
+    fn add_scene(&mut self, scene: &SceneTables<'_>, sample_tokens: &[String]) {
+        let [log, map, token] = ["log", "map", "scene"].map(|kind| scene_token(scene, kind, &[]));
         self.push(
             "log",
-            json!({ "token": log, "logfile": "", "vehicle": "generated", "date_captured": "", "location": "generated" }),
+            json!({
+                "token": log, "logfile": "", "vehicle": "", "date_captured": "", "location": "",
+            }),
         );
-        self.push(
-            "map",
-            json!({ "token": token("map", &[]), "log_tokens": [log], "category": "semantic_prior", "filename": "" }),
-        );
-        let sample_tokens: Vec<String> =
-            scene.samples.iter().map(|sample| token("sample", &[&sample.moment.to_string()])).collect();
-        let ends = |place: Option<&String>| place.cloned().unwrap_or_default();
+        self.push("map", json!({ "token": map, "log_tokens": [log], "category": "semantic_prior", "filename": "" }));
+        let end = |token: Option<&String>| token.cloned().unwrap_or_default();
         let mut row = json!({
-            "token": token("scene", &[]),
+            "token": token,
             "log_token": log,
             "nbr_samples": scene.samples.len(),
-            "first_sample_token": ends(sample_tokens.first()),
-            "last_sample_token": ends(sample_tokens.last()),
+            "first_sample_token": end(sample_tokens.first()),
+            "last_sample_token": end(sample_tokens.last()),
             "name": scene.name,
         });
         if let Some(row) = row.as_object_mut() {
             row.extend(scene.fields.clone());
         }
         self.push("scene", row);
-        for ((sample, token), (prev, next)) in scene.samples.iter().zip(&sample_tokens).zip(neighbours(&sample_tokens))
-        {
-            let scene_token = scene_token(&scene, "scene", &[]);
-            self.push(
-                "sample",
-                json!({ "token": token, "timestamp": sample.micros, "prev": prev, "next": next, "scene_token": scene_token }),
-            );
-        }
-        self.add_sweeps(&scene, &sample_tokens);
-        self.add_annotations(&scene, &sample_tokens);
     }
 
     /// Sensors, their mounts, the sweeps and the poses of the vehicles: a chain of sweeps per channel.

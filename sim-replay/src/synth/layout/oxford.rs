@@ -46,15 +46,15 @@ impl Style for Oxford {
     }
 
     fn write_poses(&self, root: &Path, sequence: &Sequence<'_>) -> Result<(), SynthError> {
-        let (stamps, rows) = padded(sequence.sweeps);
+        let (Some(first), Some(last)) = (sequence.sweeps.first(), sequence.sweeps.last()) else { return Ok(()) };
+        let (stamps, rows) = padded(first, sequence.sweeps, last);
         let file = root.join(&sequence.folder).join("velodyne_left_False.h5");
         write_file(&file, poses_file(&stamps, &rows))
     }
 }
 
 /// Time stamps and rows of 3x4 matrices. Those that are left out by readers are copies of the first and of the last pose.
-fn padded(sweeps: &[SweepPose]) -> (Vec<i64>, Vec<[f64; 12]>) {
-    let (Some(first), Some(last)) = (sweeps.first(), sweeps.last()) else { return (Vec::new(), Vec::new()) };
+fn padded(first: &SweepPose, sweeps: &[SweepPose], last: &SweepPose) -> (Vec<i64>, Vec<[f64; 12]>) {
     let before = (1..=TRIMMED as u64).rev().map(|step| SweepPose { micros: first.micros - step, ..*first });
     let after = (1..=TRIMMED as u64).map(|step| SweepPose { micros: last.micros + step, ..*last });
     before.chain(sweeps.iter().copied()).chain(after).map(|sweep| (sweep.micros as i64, row(&sweep))).unzip()

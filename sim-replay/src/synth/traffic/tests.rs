@@ -225,7 +225,7 @@ fn vehicles_drive_on_the_side_that_the_map_gives() {
 
 #[test]
 fn vehicles_lean_with_a_banked_road_and_pass_side_by_side() {
-    let (radius_m, bank_rad) = (80.0_f64, 0.7_f64);
+    let (radius_m, bank_rad): (f64, f64) = (80.0, 0.7);
     let length_m = std::f64::consts::TAU * radius_m;
     // A circle to the left, its right side high; both ends meet.
     let link = r#"<link><predecessor elementType="road" elementId="1" contactPoint="end"/>

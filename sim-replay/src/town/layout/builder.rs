@@ -3,9 +3,8 @@
 use super::super::clothoid;
 use super::super::curve::{Curve, CurveShape, Pose2};
 use super::super::lateral::LateralProfile;
-use super::super::road::{
-    Connection, Contact, Junction, LaneKind, LaneSection, Profile, Road, RoadLane, RoadLink, RoadNetwork,
-};
+use super::super::profile::Profile;
+use super::super::road::{Connection, Contact, Junction, LaneKind, LaneSection, Road, RoadLane, RoadLink, RoadNetwork};
 
 /// Lanes across a road, each outwards from the reference line: kind and width in metres.
 #[derive(Debug, Clone, Default)]

@@ -6,7 +6,8 @@
 
 use super::super::curve::{cubic, cubic_slope};
 use super::super::finding::FindingLog;
-use super::super::road::{MAX_OFFSET_M, Profile, RoadLane};
+use super::super::profile::Profile;
+use super::super::road::{MAX_OFFSET_M, RoadLane};
 use super::OpenDriveError;
 use super::element::Element;
 use super::lanes::Stretch;

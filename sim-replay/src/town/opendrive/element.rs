@@ -70,24 +70,43 @@ impl OpenDriveError {
     }
 }
 
-/// Where the lines of a text begin, bytes. The document itself would count them anew for each place.
-pub(super) struct LineIndex(Vec<usize>);
+/// Line numbers of places in a text, with one count for each block: the document itself would count from its beginning
+/// for each place, and a list of all lines could be larger than the text.
+pub(super) struct LineIndex<'input> {
+    text: &'input [u8],
+    /// Line breaks before each block.
+    breaks: Vec<u32>,
+}
 
-impl LineIndex {
-    pub(super) fn new(text: &str) -> Self {
-        Self(text.bytes().enumerate().filter(|&(_, byte)| byte == b'\n').map(|(place, _)| place + 1).collect())
+/// Length of the blocks, bytes.
+const BLOCK: usize = 4096;
+
+impl<'input> LineIndex<'input> {
+    pub(super) fn new(text: &'input str) -> Self {
+        let text = text.as_bytes();
+        let mut breaks = vec![0];
+        for block in text.chunks(BLOCK) {
+            breaks.push(breaks[breaks.len() - 1] + line_breaks(block));
+        }
+        Self { text, breaks }
     }
 
     fn line(&self, place: usize) -> u32 {
-        self.0.partition_point(|&start| start <= place) as u32 + 1
+        let place = place.min(self.text.len());
+        let block = place / BLOCK;
+        self.breaks[block] + line_breaks(&self.text[block * BLOCK..place]) + 1
     }
+}
+
+fn line_breaks(bytes: &[u8]) -> u32 {
+    bytes.iter().map(|&byte| u32::from(byte == b'\n')).sum()
 }
 
 /// An XML element.
 #[derive(Clone, Copy)]
 pub(super) struct Element<'a, 'input> {
     node: Node<'a, 'input>,
-    lines: &'a LineIndex,
+    lines: &'a LineIndex<'input>,
 }
 
 /// Children of `parent` with a name.
@@ -100,7 +119,7 @@ pub(super) fn children<'a, 'input>(
 
 impl<'a, 'input> Element<'a, 'input> {
     /// The root of a document with the lines of its text.
-    pub(super) fn root(node: Node<'a, 'input>, lines: &'a LineIndex) -> Self {
+    pub(super) fn root(node: Node<'a, 'input>, lines: &'a LineIndex<'input>) -> Self {
         Self { node, lines }
     }
 
@@ -228,3 +247,19 @@ pub(super) const MAX_LANES: i32 = 64;
 pub(super) const MAX_LENGTH_M: f64 = 100_000.0;
 /// Places farther from the origin than this are refused, metres.
 pub(super) const MAX_COORDINATE_M: f64 = 1e7;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lines_are_counted_over_all_blocks() {
+        let text: String = (0..1500).map(|line| "x".repeat(line % 17) + "\n").collect();
+        assert!(text.len() > 3 * BLOCK);
+        let lines = LineIndex::new(&text);
+        for place in (0..=text.len()).step_by(7).chain([BLOCK, BLOCK - 1, text.len(), text.len() + 9]) {
+            let counted = text.bytes().take(place).filter(|&byte| byte == b'\n').count() as u32 + 1;
+            assert_eq!(lines.line(place), counted, "{place}");
+        }
+    }
+}

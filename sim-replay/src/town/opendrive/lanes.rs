@@ -1,7 +1,8 @@
 //! `<lanes>`: sections and their lanes.
 
 use super::super::finding::FindingLog;
-use super::super::road::{LaneKind, LaneSection, MAX_WIDTH_M, Profile, RoadLane};
+use super::super::profile::Profile;
+use super::super::road::{LaneKind, LaneSection, MAX_WIDTH_M, RoadLane};
 use super::OpenDriveError;
 use super::border::widths_from_borders;
 use super::element::{Element, MAX_LANES, children};

@@ -2,7 +2,8 @@
 
 use super::super::finding::FindingLog;
 use super::super::lateral::{CrossShape, LateralProfile, MAX_SHAPE_M, MAX_SLOPE_RAD};
-use super::super::road::{MAX_OFFSET_M, Profile};
+use super::super::profile::Profile;
+use super::super::road::MAX_OFFSET_M;
 use super::OpenDriveError;
 use super::element::{Element, MAX_LENGTH_M, children};
 

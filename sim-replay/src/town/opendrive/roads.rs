@@ -1,7 +1,8 @@
 //! `<road>`: a road from its parts, without its links.
 
 use super::super::finding::FindingLog;
-use super::super::road::{MAX_OFFSET_M, Profile, Road};
+use super::super::profile::Profile;
+use super::super::road::{MAX_OFFSET_M, Road};
 use super::element::{Element, MAX_LENGTH_M, children};
 use super::profile::{read_lateral, read_profile};
 use super::speed::read_speed;
@@ -34,7 +35,7 @@ pub(super) fn read(element: Element, log: &mut FindingLog) -> Result<Road, OpenD
         lateral: read_lateral(element, length_m, log),
         sections: lanes::read_sections(lanes, &lane_offset, length_m, log)?,
         lane_offset,
-        speed_limits: read_speed_limits(element, log)?,
+        speed_limits: read_speed_limits(element, log),
         objects: beside::read_objects(element, log),
         signals: beside::read_signals(element, log),
         structures: beside::read_structures(element, length_m, log),
@@ -52,16 +53,17 @@ fn read_rule(element: Element, log: &mut FindingLog) -> bool {
     }
 }
 
-fn read_speed_limits(road: Element, log: &mut FindingLog) -> Result<Vec<(f64, f64)>, OpenDriveError> {
+fn read_speed_limits(road: Element, log: &mut FindingLog) -> Vec<(f64, f64)> {
     let mut limits: Vec<(f64, f64)> = Vec::new();
     for element in children(road, "type") {
-        let s = element.number("s", 0.0, MAX_LENGTH_M)?;
-        if let Some(limit) = element.child("speed").and_then(|speed| read_speed(speed, log)) {
-            limits.push((s, limit));
+        let Some(limit) = element.child("speed").and_then(|speed| read_speed(speed, log)) else { continue };
+        match element.number("s", 0.0, MAX_LENGTH_M) {
+            Ok(s_m) => limits.push((s_m, limit)),
+            Err(error) => error.note(log, "speed limit treated as absent"),
         }
     }
     limits.sort_by(|a, b| a.0.total_cmp(&b.0));
-    Ok(limits)
+    limits
 }
 
 /// Names what is not read of a road and could change where its surface lies.

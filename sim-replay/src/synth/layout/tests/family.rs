@@ -13,7 +13,8 @@ use crate::synth::positioning::Fix;
 use crate::synth::{ConvertOptions, SynthOptions, Weather, convert, generate};
 
 /// A line for each layout, when there is a reader of it.
-const LAYOUTS: [(SceneLayout, Layout); 1] = [(SceneLayout::V2v4real, Layout::V2v4Real)];
+const LAYOUTS: [(SceneLayout, Layout); 2] =
+    [(SceneLayout::V2v4real, Layout::V2v4Real), (SceneLayout::V2xreal, Layout::V2xReal)];
 
 #[test]
 fn a_scene_is_the_same_in_every_layout_that_is_read() {

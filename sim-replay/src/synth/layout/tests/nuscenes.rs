@@ -52,7 +52,7 @@ fn ticks(root: &Path, version: &str, channels: impl Fn(&Value) -> Vec<String>, s
     for scene in &scenes {
         let mut token = &scene["first_sample_token"];
         let mut count = 0;
-        while text(token) != "" {
+        while !text(token).is_empty() {
             let sample = tables.row("sample", token);
             ticks.push(tick(&tables, root, token, &channels(scene), scale));
             token = &sample["next"];

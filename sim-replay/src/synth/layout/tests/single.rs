@@ -48,7 +48,8 @@ fn nclt_keeps_poses_and_points_to_its_resolution() {
     let (sequences, others) = sequences(SceneLayout::Nclt, Layout::Nclt);
     let expected = by_agent(&expected());
     // 5 mm, 1 of 255 steps, and nothing beyond 100 m behind, to the left and above.
-    let fits = |&&[x, y, z, _]: &&[f32; 4]| x >= -100.0 && y <= 100.0 && z <= 100.0;
+    let has_step = |metres: f32| ((f64::from(metres) + 100.0) / 0.005).round() >= 0.0;
+    let fits = |&&[x, y, z, _]: &&[f32; 4]| has_step(x) && has_step(-y) && has_step(-z);
     let outside: usize =
         expected.iter().flatten().map(|tick| tick.clouds[0].iter().filter(|point| !fits(point)).count()).sum();
     assert_eq!(others.iter().sum::<u64>(), outside as u64);
