@@ -7,11 +7,11 @@ use agent::decode::decode;
 use agent::model_config::DetectorConfig;
 use agent::nms::rotated_nms;
 use agent::postprocess::footprint;
-use agent::rotated_iou::Polygon;
 use criterion::{Criterion, criterion_group, criterion_main};
 use protocol::Box3d;
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
+use sim_replay::rotated_iou::Polygon;
 
 /// `count` boxes around `vehicles` places, as a head leaves them: many near-copies of each vehicle.
 fn boxes(count: usize, vehicles: usize, seed: u64) -> (Vec<Polygon>, Vec<f32>) {

@@ -31,7 +31,6 @@ pub mod process;
 pub mod rate;
 pub mod registration;
 pub mod residual;
-pub mod rotated_iou;
 pub mod shrink;
 pub mod sparse;
 pub mod statistics;

@@ -1,6 +1,6 @@
 //! Non-maximum suppression of rotated boxes.
 
-use crate::rotated_iou::Polygon;
+use sim_replay::rotated_iou::Polygon;
 
 /// Indices of the boxes that stay, by falling score.
 ///

@@ -3,11 +3,11 @@
 use nalgebra::{Isometry3, Point3};
 use protocol::{Box3d, CavId, Detection};
 use serde::{Deserialize, Serialize};
+use sim_replay::rotated_iou::Polygon;
 
 use crate::decode::Decoded;
 use crate::model_config::DetectorConfig;
 use crate::nms::rotated_nms;
-use crate::rotated_iou::Polygon;
 
 /// Boxes at or below this score are not judged. It holds for every method: a box that a vehicle sends counts as one that
 /// the ego finds in a fused map.

@@ -8,7 +8,7 @@
 //! [`Ordering::Global`] sorts by score over all frames; [`Ordering::Frame`] keeps the frames one after another (the
 //! default of OpenCOOD).
 
-use agent::rotated_iou::Polygon;
+use sim_replay::rotated_iou::Polygon;
 use protocol::{Box3d, Detection};
 
 /// Overlaps at which AP is reported.

@@ -109,6 +109,9 @@ pub struct Frame {
     pub speed_mps: Option<f64>,
     /// What this CAV's annotation lists. A CAV never lists itself.
     pub objects: Vec<Object>,
+    /// All objects that the agents of the tick together are expected to find, where the data set has such a list; it stands
+    /// on the ego's frame. `None` where the lists of the agents are merged.
+    pub cooperative_objects: Option<Vec<Object>>,
     /// Parts of the frame that were left out: an object without a sound box, a field that cannot be read.
     pub problems: Vec<Problem>,
     /// Which way the axes of the recording turned.
@@ -130,6 +133,7 @@ impl Frame {
             gnss_world_from_vehicle: None,
             speed_mps: None,
             objects: Vec::new(),
+            cooperative_objects: None,
             problems: Vec::new(),
             source_handedness,
         }

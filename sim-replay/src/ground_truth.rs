@@ -4,6 +4,9 @@
 //! `opencood/utils/box_utils.py`): annotations of the current tick, moved by true poses, reduced to upright boxes in
 //! the ego's LiDAR frame, kept where their corners lie in range, merged by id. The ego itself is not removed: where a
 //! partner lists it, it is an object near the origin.
+//!
+//! Data sets with a cooperative annotation of a tick (DAIR-V2X, V2X-Seq) are judged by that list alone, as their public
+//! protocols do: see [`annotations`].
 
 use std::collections::HashSet;
 
@@ -74,10 +77,16 @@ pub fn merge(frames_of_tick: &[&Frame], ego_index: usize, rule: &GroundTruthRule
     let Some(ego) = frames_of_tick.get(ego_index) else { return Vec::new() };
     let Some(world_from_ego) = ego.world_from_lidar else { return Vec::new() };
     let ego_from_world = world_from_ego.isometry().inverse();
+    let annotations = annotations(frames_of_tick);
+    let contributors = match frames_of_tick.iter().position(|frame| frame.cooperative_objects.is_some()) {
+        // The list is about the tick, whoever is in range.
+        Some(holder) => vec![holder],
+        None => contributors(frames_of_tick, ego_index, rule.comm_range_m),
+    };
     let mut seen = HashSet::new();
     let mut merged = Vec::new();
-    for index in contributors(frames_of_tick, ego_index, rule.comm_range_m) {
-        for object in frames_of_tick[index].objects.iter().filter(|object| rule.classes.contains(object.class)) {
+    for index in contributors {
+        for object in annotations[index].iter().filter(|object| rule.classes.contains(object.class)) {
             let box3d = upright_box(object, &ego_from_world);
             if rule.keeps(&box3d) && seen.insert(object.id) {
                 merged.push((object.id, box3d));
@@ -85,6 +94,19 @@ pub fn merge(frames_of_tick: &[&Frame], ego_index: usize, rule: &GroundTruthRule
         }
     }
     merged
+}
+
+/// The objects that each frame of a tick contributes to the truth: what its agent lists. Where a frame holds the
+/// cooperative annotation of the tick, it contributes that one, and the others nothing.
+#[must_use]
+pub fn annotations<'a>(frames_of_tick: &[&'a Frame]) -> Vec<&'a [Object]> {
+    let holder = frames_of_tick.iter().position(|frame| frame.cooperative_objects.is_some());
+    let contribution = |(index, frame): (usize, &&'a Frame)| match (holder, &frame.cooperative_objects) {
+        (None, _) => frame.objects.as_slice(),
+        (Some(holder), Some(objects)) if holder == index => objects.as_slice(),
+        _ => &[],
+    };
+    frames_of_tick.iter().enumerate().map(contribution).collect()
 }
 
 /// Indices of the agents whose annotations count: the ego first, then those within range of it.
@@ -155,6 +177,17 @@ mod tests {
         assert_eq!(ids(&frames[..1], 0, &GroundTruthRule::OPV2V), [7]);
         let seen_by_two = merge(&[&frames[0], &frames[1]], 1, &GroundTruthRule::OPV2V);
         assert_eq!(seen_by_two[0].1.center_m, [-30.0, 0.0, -1.0]);
+    }
+
+    #[test]
+    fn a_cooperative_annotation_takes_the_place_of_all_others() {
+        let mut frames = [frame("1", 0.0, vec![car(7, 20.0, 0.0)]), frame("2", 90.0, vec![car(8, 30.0, 0.0)])];
+        frames[0].cooperative_objects = Some(vec![car(0, 20.0, 1.0), car(1, 30.0, 1.0)]);
+        assert_eq!(ids(&frames, 0, &GroundTruthRule::OPV2V), [0, 1]);
+        assert_eq!(ids(&frames, 1, &GroundTruthRule::OPV2V), [0, 1], "out of range, but the truth of the tick");
+        assert_eq!(ids(&frames[1..], 0, &GroundTruthRule::OPV2V), [8]);
+        let [with_list, other] = annotations(&frames.each_ref())[..] else { panic!("one per frame") };
+        assert_eq!((with_list.len(), other.len()), (2, 0));
     }
 
     #[test]

@@ -20,6 +20,7 @@ pub mod output;
 pub mod pcd;
 pub mod random;
 pub mod recording;
+pub mod rotated_iou;
 pub mod stream;
 pub mod synth;
 pub mod town;

@@ -1,6 +1,6 @@
 //! Training targets, loss, AP, warps and fusion against the reference implementations.
 
-use agent::rotated_iou::Polygon;
+use sim_replay::rotated_iou::Polygon;
 use ego_fuser::average_precision::{Curve, Ordering, Scorer};
 use ego_fuser::fusion::{AlignedViews, AttentionFusion, Fusion, MaxFusion, ViewFacts, regroup};
 use ego_fuser::loss::{LabelTensors, LossConfig, Unassigned, detection_loss};

@@ -22,6 +22,8 @@ pub enum Layout {
     V2xSim,
     /// Open MARS: nuScenes tables of several vehicles.
     Mars,
+    /// nuScenes: tables of one vehicle.
+    NuScenes,
     /// Localization sequences of NCLT, as recorded or as converted by LightLoc.
     Nclt,
     /// Localization sequences of Oxford and QEOxford, as converted by LightLoc.
@@ -52,7 +54,7 @@ const fn row(layout: Layout, name: &'static str, data_sets: &'static str, files:
 }
 
 /// All layouts, in the order in which a folder is tried.
-pub const LAYOUTS: [LayoutDescription; 12] = [
+pub const LAYOUTS: [LayoutDescription; 13] = [
     row(
         Layout::Recording,
         "recording of a live run",
@@ -75,9 +77,20 @@ pub const LAYOUTS: [LayoutDescription; 12] = [
         Layout::V2xSim,
         "V2X-Sim",
         "V2X-Sim 2.0",
-        "v1.0-*/sample_data.json (nuScenes tables) with sweeps LIDAR_TOP_id_<agent>",
+        "<version>/sample.json and sample_data.json (nuScenes tables), a LiDAR LIDAR_TOP_id_<agent>",
     ),
-    row(Layout::Mars, "Open MARS", "Open MARS", "<place>/v1.0/sample_data.json (nuScenes tables), a folder per place"),
+    row(
+        Layout::Mars,
+        "Open MARS",
+        "Open MARS",
+        "<version>/sample.json and sample_data.json (nuScenes tables), a LiDAR LIDAR_FRONT_CENTER or LIDAR_FRONT_CENTER_<vehicle>",
+    ),
+    row(
+        Layout::NuScenes,
+        "nuScenes",
+        "nuScenes",
+        "<version>/sample.json and sample_data.json (nuScenes tables), the LiDAR LIDAR_TOP",
+    ),
     row(
         Layout::Opv2v,
         "OPV2V layout",
@@ -158,15 +171,16 @@ mod tests {
     #[test]
     fn every_layout_has_one_row_of_its_own_name() {
         use Layout::{
-            Dair, KittiObject, KittiOdometry, Mars, Nclt, Opv2v, Oxford, Recording, V2v4Real, V2xReal, V2xSeq, V2xSim,
+            Dair, KittiObject, KittiOdometry, Mars, Nclt, NuScenes, Opv2v, Oxford, Recording, V2v4Real, V2xReal,
+            V2xSeq, V2xSim,
         };
-        let all =
-            [Opv2v, V2v4Real, V2xReal, Dair, V2xSeq, V2xSim, Mars, Nclt, Oxford, KittiOdometry, KittiObject, Recording];
+        let multi_agent = [Opv2v, V2v4Real, V2xReal, Dair, V2xSeq, V2xSim, Mars];
+        let all = [&multi_agent[..], &[NuScenes, Nclt, Oxford, KittiOdometry, KittiObject, Recording]].concat();
         assert!(all.iter().all(|layout| layout.description().layout == *layout));
         let names: HashSet<&str> = LAYOUTS.iter().map(|row| row.name).collect();
         assert_eq!(names.len(), LAYOUTS.len());
         let text = layouts_text();
         assert_eq!(text.lines().count(), LAYOUTS.len());
-        assert!(text.contains("  Open MARS: <place>"), "{text}");
+        assert!(text.contains("  Open MARS: <version>"), "{text}");
     }
 }

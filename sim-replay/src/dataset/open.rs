@@ -13,8 +13,8 @@ use super::v2v4real::V2v4Real;
 use super::written_pose::WrittenPose;
 use super::yaml::{self, Field};
 use super::{
-    Dataset, FrameSource, Layout, ReadError, Scenario, Tick, files, kitti_object, kitti_odometry, layouts_text,
-    localization, recorded, unfinished,
+    Dataset, FrameSource, Layout, ReadError, Scenario, Tick, dair, files, kitti_object, kitti_odometry, layouts_text,
+    localization, nuscenes, recorded, unfinished,
 };
 
 /// How far below the opened folder sequences of a single vehicle are looked for.
@@ -62,6 +62,11 @@ pub fn open_with(dir: &Path, options: &OpenOptions) -> Result<Dataset, ReadError
 fn open_any(dir: &Path, options: &OpenOptions) -> Result<Dataset, ReadError> {
     if let Some(file) = recorded::file_of(dir) {
         return recorded::open(&file);
+    }
+    for reader in [dair::open, nuscenes::open] {
+        if let Some(dataset) = reader(dir, options)? {
+            return Ok(dataset);
+        }
     }
     let mut problems = Vec::new();
     let folders = agent_folders::find(dir, &mut problems)?;

@@ -32,6 +32,8 @@ pub(super) enum SweepStorage {
     /// By its name: `.pcd` is PCD, all else (`.bin`, `.pcd.bin`) little-endian `f32`, 4 or 5 per point.
     #[default]
     ByName,
+    /// Little-endian `f32`, 5 per point: x, y, z, intensity, ring (nuScenes).
+    FiveFloats,
     /// Little-endian `f32`, component by component: all x, all y, all z, all intensities (Oxford).
     Planar,
     /// NCLT's own: `u16` x, y, z in steps of 5 mm from -100 m, `u8` intensity, `u8` laser.
@@ -134,18 +136,18 @@ impl AgentSweeps {
     fn read_stored(&self, storage: SweepStorage, path: &Path) -> Result<PcdCloud, ReadError> {
         match storage {
             SweepStorage::ByName if is_pcd(path) => read_pcd_stored(path),
-            SweepStorage::ByName => self.read_floats(path),
+            SweepStorage::ByName => read_floats(path, self.form(path)?),
+            SweepStorage::FiveFloats => read_floats(path, FloatForm::Five),
             SweepStorage::Planar => read_planar(path),
             SweepStorage::NcltRaw => read_nclt_raw(path),
         }
     }
+}
 
-    fn read_floats(&self, path: &Path) -> Result<PcdCloud, ReadError> {
-        let form = self.form(path)?;
-        let bytes = files::read_limited(path, MAX_BYTES)?;
-        check_whole_points(path, bytes.len(), 4 * form.numbers())?;
-        Ok(form.points(&bytes))
-    }
+fn read_floats(path: &Path, form: FloatForm) -> Result<PcdCloud, ReadError> {
+    let bytes = files::read_limited(path, MAX_BYTES)?;
+    check_whole_points(path, bytes.len(), 4 * form.numbers())?;
+    Ok(form.points(&bytes))
 }
 
 fn is_pcd(path: &Path) -> bool {

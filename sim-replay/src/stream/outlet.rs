@@ -5,6 +5,7 @@ use protocol::{CavId, Gnss, GnssSource, Lidar, Radar, Stream, Topic, TopicCount,
 
 use crate::bus::{Bus, BusError, Publisher, PublisherOptions};
 use crate::frame::{Frame, Object};
+use crate::ground_truth::annotations;
 
 /// Places in the queue of a topic of which nothing may be lost.
 const LOSSLESS_PLACES: usize = 16;
@@ -91,14 +92,23 @@ fn count(sent: &mut Vec<TopicCount>, topic: &Topic) {
     }
 }
 
-/// What of a frame is true: where the vehicle is and what it annotates. `None` where the recording does not know.
-pub(super) fn truth_of(frame: &Frame) -> Option<AgentTruth> {
-    let objects = frame.objects.iter().map(|object: &Object| TrueObject {
+/// What of the frames of a tick is true: where their vehicles are, and what each of them adds to the truth of the tick.
+/// Vehicles whose pose the recording does not know are left out.
+pub(super) fn truth_of(frames_of_tick: &[&Frame]) -> Vec<AgentTruth> {
+    let truth = |(frame, objects): (&&Frame, &[Object])| {
+        let world_from_lidar = frame.world_from_lidar?;
+        let objects = objects.iter().map(true_object).collect();
+        Some(AgentTruth { cav: frame.cav.clone(), world_from_lidar, objects })
+    };
+    frames_of_tick.iter().zip(annotations(frames_of_tick)).filter_map(truth).collect()
+}
+
+fn true_object(object: &Object) -> TrueObject {
+    TrueObject {
         id: object.id,
         class: object.class.name().to_owned(),
         world_from_object: object.world_from_object,
         size_m: object.size_m,
         speed_mps: object.speed_mps,
-    });
-    Some(AgentTruth { cav: frame.cav.clone(), world_from_lidar: frame.world_from_lidar?, objects: objects.collect() })
+    }
 }

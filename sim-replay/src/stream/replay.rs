@@ -366,7 +366,7 @@ impl<'a> Replay<'a> {
         let Planned { tick_index, capture_nanos } = planned;
         let frames: TickFrames = self.reading.take(tick_index);
         self.reading.want(&self.schedule.ahead(READ_AHEAD));
-        let mut agents = Vec::with_capacity(frames.len());
+        let agents = truth_of(&frames.iter().flatten().collect::<Vec<_>>());
         self.present = frames.iter().flatten().map(|frame| frame.cav.clone()).collect();
         if self.options.lockstep.is_empty() && self.options.rate > 0.0 {
             self.report.lateness.add(due.elapsed());
@@ -375,7 +375,6 @@ impl<'a> Replay<'a> {
             match frame {
                 Ok(frame) => {
                     self.report.parts_left_out(&frame);
-                    agents.extend(truth_of(&frame));
                     match &mut self.air {
                         None => self.outlet.offer(agent, capture_nanos, frame),
                         Some(air) => {

@@ -1,0 +1,277 @@
+//! DAIR-V2X-C and V2X-Seq (SPD): one vehicle and one roadside unit, `{vehicle-side,infrastructure-side}/velodyne/<id>.pcd`
+//! with JSON files for calibration and labels, and `cooperative/data_info.json` that says which frames belong together.
+//!
+//! Frames of the two sides have different ids. A tick is a pair of `cooperative/data_info.json` and is named by the id of
+//! the vehicle; frames without partner are left out, as the data sets' own protocols do. The vehicle is the ego. The two
+//! sweeps of a pair are up to some 50 ms apart; both are given the time of the vehicle's.
+//!
+//! The cooperative labels are the ground truth of a pair ([`Frame::cooperative_objects`]). Labels of the two sides
+//! ([`Frame::objects`]) know nothing of each other: see [`labels::share_ids`].
+
+mod calibration;
+mod index;
+mod labels;
+#[cfg(test)]
+mod tests;
+
+use std::collections::HashMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use protocol::{CavId, Handedness};
+
+use self::index::{Index, Kind, Pair};
+use self::labels::{Block, Objects};
+use super::points::{SweepStorage, Sweeps};
+use super::presence::Absences;
+use super::{Dataset, FrameSource, MissingFrame, OpenOptions, Problem, ReadError, Scenario, Tick, files, roots};
+use crate::frame::{Frame, Object};
+use crate::pcd::PcdCloud;
+
+const VEHICLE_SIDE: &str = "vehicle-side";
+const INFRASTRUCTURE_SIDE: &str = "infrastructure-side";
+/// Names of the two agents.
+const VEHICLE: &str = "vehicle";
+const INFRASTRUCTURE: &str = "infrastructure";
+
+/// Opens the data sets at or below `dir`; `None` where there are none.
+pub(super) fn open(dir: &Path, options: &OpenOptions) -> Result<Option<Dataset>, ReadError> {
+    if let Some(root) = files::above(dir).find(|above| is_root(above)).filter(|_| is_side(dir)) {
+        let reason = format!("this is a part of a DAIR-V2X data set: open {}", root.display());
+        return Err(ReadError::Layout { path: dir.to_owned(), reason });
+    }
+    let (mut scenarios, mut problems) = (Vec::new(), Vec::new());
+    for root in &roots::find(dir, is_root) {
+        scenarios.extend(open_root(dir, root, options, &mut problems)?);
+    }
+    let Some(layout) = scenarios.first().map(|scenario| scenario.layout) else { return Ok(None) };
+    Ok(Some(Dataset { layout, scenarios, problems }))
+}
+
+fn is_root(dir: &Path) -> bool {
+    dir.join(index::COOPERATIVE).is_file()
+        && [VEHICLE_SIDE, INFRASTRUCTURE_SIDE].iter().all(|side| dir.join(side).is_dir())
+}
+
+fn is_side(dir: &Path) -> bool {
+    let name = dir.file_name().and_then(|name| name.to_str());
+    name.is_some_and(|name| [VEHICLE_SIDE, INFRASTRUCTURE_SIDE, "cooperative"].contains(&name))
+}
+
+/// One scenario per batch or sequence.
+fn open_root(
+    opened: &Path,
+    root: &Path,
+    options: &OpenOptions,
+    problems: &mut Vec<ReadError>,
+) -> Result<Vec<Scenario>, ReadError> {
+    let Index { kind, groups } = Index::read(root, options.period_nanos, problems)?;
+    let scenarios = groups.into_iter().map(|(group, pairs)| {
+        let name = if root == opened { group } else { format!("{}/{group}", files::name_below(opened, root)) };
+        scenario(name, Sides { root: root.to_owned(), kind }, pairs, options, problems)
+    });
+    Ok(scenarios.collect())
+}
+
+/// A side is absent at a tick where a file is missing without which it has no frame; labels may be missing.
+fn scenario(
+    name: String,
+    sides: Sides,
+    pairs: Vec<(Tick, Pair)>,
+    options: &OpenOptions,
+    problems: &mut Vec<ReadError>,
+) -> Scenario {
+    let agents = [VEHICLE, INFRASTRUCTURE].map(|name| CavId::new(name).expect("a word is an identifier"));
+    let (mut moments, mut missing, mut kept) = (Vec::<Tick>::new(), Vec::new(), HashMap::new());
+    for (tick, pair) in pairs {
+        if moments.last().is_some_and(|last| last.capture_nanos == tick.capture_nanos) {
+            let reason = format!("vehicle frame {} has the time stamp of the one before: left out", tick.stem);
+            problems.push(ReadError::malformed(&sides.root.join(index::COOPERATIVE), reason));
+            continue;
+        }
+        for agent in &agents {
+            if let Some(path) = sides.missing_file(&pair, Side::of(agent)) {
+                let reason = format!("does not exist: {agent} is absent at {}", tick.stem);
+                problems.push(ReadError::malformed(&path, reason));
+                missing.push(MissingFrame { agent: agent.clone(), stem: tick.stem.clone() });
+            }
+        }
+        kept.insert(tick.stem.clone(), pair);
+        moments.push(tick);
+    }
+    let lacks_vehicle =
+        |tick: &&Tick| missing.contains(&MissingFrame { agent: agents[0].clone(), stem: tick.stem.clone() });
+    let ticks: Vec<Tick> = moments.iter().filter(|tick| !lacks_vehicle(tick)).cloned().collect();
+    let sweeps = agents.iter().fold(Sweeps::new(SweepStorage::ByName, options), |sweeps, agent| {
+        let file = |tick: &Tick| Some(sides.points(kept.get(&tick.stem)?, Side::of(agent)));
+        sweeps.with_agent(agent.clone(), moments.iter().filter_map(file))
+    });
+    Scenario {
+        name,
+        absences: Absences::new(&agents, &ticks, &missing).among(moments),
+        roadside_units: vec![agents[1].clone()],
+        agents: agents.to_vec(),
+        ticks,
+        missing,
+        lidar_variants: Vec::new(),
+        has_radar: false,
+        layout: sides.kind.layout(),
+        source_handedness: Handedness::Right,
+        source: Arc::new(Source { sides, pairs: kept, sweeps }),
+    }
+}
+
+/// Who measured.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Side {
+    Vehicle,
+    Infrastructure,
+}
+
+impl Side {
+    fn of(agent: &CavId) -> Self {
+        if agent.as_str() == VEHICLE { Self::Vehicle } else { Self::Infrastructure }
+    }
+}
+
+/// Where the files of a data set lie.
+#[derive(Debug)]
+struct Sides {
+    root: PathBuf,
+    kind: Kind,
+}
+
+impl Sides {
+    fn points(&self, pair: &Pair, side: Side) -> PathBuf {
+        let (folder, id) = match side {
+            Side::Vehicle => (VEHICLE_SIDE, &pair.vehicle),
+            Side::Infrastructure => (INFRASTRUCTURE_SIDE, &pair.infrastructure),
+        };
+        self.root.join(folder).join("velodyne").join(format!("{id}.pcd"))
+    }
+
+    /// What a side saw itself.
+    fn labels(&self, pair: &Pair, side: Side) -> PathBuf {
+        let (folder, id) = match side {
+            Side::Vehicle => ("vehicle-side/label/lidar", &pair.vehicle),
+            Side::Infrastructure => ("infrastructure-side/label/virtuallidar", &pair.infrastructure),
+        };
+        self.root.join(folder).join(format!("{id}.json"))
+    }
+
+    fn cooperative_labels(&self, pair: &Pair) -> PathBuf {
+        let folder = match self.kind {
+            Kind::Dair => "cooperative/label_world",
+            Kind::V2xSeq => "cooperative/label",
+        };
+        self.root.join(folder).join(format!("{}.json", pair.vehicle))
+    }
+
+    fn calibration(&self, folder: &str, id: &str) -> PathBuf {
+        self.root.join(folder).join(format!("{id}.json"))
+    }
+
+    /// The first file that a side cannot do without and that does not exist.
+    fn missing_file(&self, pair: &Pair, side: Side) -> Option<PathBuf> {
+        let calibrations = match side {
+            Side::Vehicle => calibration::VEHICLE.map(|folder| self.calibration(folder, &pair.vehicle)).to_vec(),
+            Side::Infrastructure => vec![self.calibration(calibration::INFRASTRUCTURE, &pair.infrastructure)],
+        };
+        std::iter::once(self.points(pair, side)).chain(calibrations).find(|path| !path.is_file())
+    }
+}
+
+/// A batch or sequence.
+#[derive(Debug)]
+struct Source {
+    sides: Sides,
+    /// By the stem of the tick.
+    pairs: HashMap<String, Pair>,
+    sweeps: Sweeps,
+}
+
+impl Source {
+    fn pair(&self, tick: &Tick) -> Result<&Pair, ReadError> {
+        let unknown = || ReadError::malformed(&self.sides.root, format!("no pair of vehicle frame {}", tick.stem));
+        self.pairs.get(&tick.stem).ok_or_else(unknown)
+    }
+
+    fn vehicle_frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame, ReadError> {
+        let pair = self.pair(tick)?;
+        let poses = calibration::vehicle(&self.sides, pair)?;
+        let world_from_lidar = poses.world_from_lidar();
+        let mut frame = Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Right);
+        frame.world_from_lidar = Some(world_from_lidar.into());
+        frame.world_from_vehicle = Some(poses.world_from_novatel.into());
+        let path = self.sides.labels(pair, Side::Vehicle);
+        let own = labels::in_frame(&path, &world_from_lidar, Block::Vehicle);
+        frame.objects = usable(own, &mut frame.problems).unwrap_or_default();
+        let path = self.sides.cooperative_labels(pair);
+        let cooperative = match self.sides.kind {
+            Kind::Dair => labels::in_world(&path),
+            Kind::V2xSeq => labels::in_frame(&path, &world_from_lidar, Block::Cooperative),
+        };
+        frame.cooperative_objects = usable(cooperative, &mut frame.problems);
+        Ok(frame)
+    }
+
+    fn infrastructure_frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame, ReadError> {
+        let pair = self.pair(tick)?;
+        let world_from_lidar = calibration::infrastructure(&self.sides, pair)?;
+        let mut frame = Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Right);
+        frame.world_from_lidar = Some(world_from_lidar.into());
+        let path = self.sides.labels(pair, Side::Infrastructure);
+        let own = labels::in_frame(&path, &world_from_lidar, Block::Infrastructure);
+        frame.objects = usable(own, &mut frame.problems).unwrap_or_default();
+        // What is wrong with the vehicle's labels is a problem of its frame.
+        let vehicle = calibration::vehicle(&self.sides, pair).and_then(|poses| {
+            labels::in_frame(&self.sides.labels(pair, Side::Vehicle), &poses.world_from_lidar(), Block::Vehicle)
+        });
+        if let Ok((vehicle_objects, _)) = vehicle {
+            labels::share_ids(&mut frame.objects, &vehicle_objects, &world_from_lidar.inverse());
+        }
+        Ok(frame)
+    }
+}
+
+/// The objects of a list; what is wrong with it goes to the frame's problems.
+fn usable(labels: Result<Objects, ReadError>, problems: &mut Vec<Problem>) -> Option<Vec<Object>> {
+    match labels {
+        Ok((objects, wrong)) => {
+            problems.extend(wrong);
+            Some(objects)
+        }
+        Err(error) => {
+            problems.push(Problem::from(&error));
+            None
+        }
+    }
+}
+
+impl FrameSource for Source {
+    fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame, ReadError> {
+        match Side::of(agent) {
+            Side::Vehicle => self.vehicle_frame(agent, tick),
+            Side::Infrastructure => self.infrastructure_frame(agent, tick),
+        }
+    }
+
+    fn points(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> Result<PcdCloud, ReadError> {
+        self.sweeps.read(agent, &self.points_path(agent, tick, variant))
+    }
+
+    fn annotation_path(&self, agent: &CavId, tick: &Tick) -> Option<PathBuf> {
+        let pair = self.pairs.get(&tick.stem)?;
+        Some(match Side::of(agent) {
+            Side::Vehicle => self.sides.cooperative_labels(pair),
+            Side::Infrastructure => self.sides.labels(pair, Side::Infrastructure),
+        })
+    }
+
+    fn points_path(&self, agent: &CavId, tick: &Tick, _variant: Option<&str>) -> PathBuf {
+        // A tick of another scenario has no file here.
+        self.pairs
+            .get(&tick.stem)
+            .map_or_else(|| self.sides.root.clone(), |pair| self.sides.points(pair, Side::of(agent)))
+    }
+}

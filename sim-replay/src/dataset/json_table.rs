@@ -1,0 +1,258 @@
+//! Tables in JSON: lists of rows in files of up to gigabytes, read one row at a time.
+
+use std::borrow::Cow;
+use std::fs::File;
+use std::io::{BufRead, BufReader, Read};
+use std::path::Path;
+
+use serde::Deserialize;
+use serde_json::Value;
+
+use super::ReadError;
+use super::json::Field;
+
+/// Bytes read at once.
+const BUFFER_BYTES: usize = 1 << 20;
+/// Largest row, bytes.
+const MAX_ROW_BYTES: usize = 1 << 20;
+/// Rows that are named where they cannot be used; further ones are counted.
+const MAX_PROBLEMS: usize = 20;
+
+/// Tokens of a row by which most rows of large tables are told from those that are needed, before the rest is parsed.
+#[derive(Debug, Default, Deserialize)]
+#[serde(default)]
+pub(super) struct Keys<'a> {
+    #[serde(borrow)]
+    pub(super) token: Cow<'a, str>,
+    #[serde(borrow)]
+    pub(super) calibrated_sensor_token: Cow<'a, str>,
+    pub(super) is_key_frame: Option<bool>,
+}
+
+/// Reads a table: a file of at most `max_bytes` that holds one list. Its rows are handed over one at a time, the list is
+/// never in memory as a whole. A row that cannot be used, or where the file breaks off, is a problem, and the others count.
+///
+/// Returns how many rows could be used.
+///
+/// # Errors
+/// Where the file cannot be read, is larger, or is broken before its first row that can be used.
+pub(super) fn read(
+    path: &Path,
+    max_bytes: u64,
+    problems: &mut Vec<ReadError>,
+    is_needed: impl Fn(&Keys<'_>) -> bool,
+    mut row: impl FnMut(&Field<'_>) -> Result<(), ReadError>,
+) -> Result<usize, ReadError> {
+    let (mut used, mut unusable, mut first_problems) = (0, 0, Vec::new());
+    let whole = for_each_row(path, max_bytes, |index, raw| {
+        // A row without sound keys is needed for its message.
+        if serde_json::from_slice(raw).is_ok_and(|keys: Keys<'_>| !is_needed(&keys)) {
+            return;
+        }
+        match parse_row(path, index, raw).and_then(|value| row(&Field::entry(path, index, &value))) {
+            Ok(()) => used += 1,
+            Err(problem) => {
+                unusable += 1;
+                if first_problems.len() < MAX_PROBLEMS {
+                    first_problems.push(problem);
+                }
+            }
+        }
+    });
+    if unusable > first_problems.len() {
+        let reason = format!("{unusable} entries cannot be used: left out; the first {MAX_PROBLEMS} are named");
+        first_problems.push(ReadError::malformed(path, reason));
+    }
+    problems.append(&mut first_problems);
+    match whole {
+        Err(error) if used == 0 => return Err(error),
+        Err(error) => problems.push(error),
+        Ok(()) => {}
+    }
+    Ok(used)
+}
+
+fn parse_row(path: &Path, index: usize, raw: &[u8]) -> Result<Value, ReadError> {
+    serde_json::from_slice(raw).map_err(|error| ReadError::Malformed {
+        path: path.to_owned(),
+        line: None,
+        field: Some(index.to_string()),
+        reason: format!("no sound JSON: {error}"),
+    })
+}
+
+/// Hands over the entries of the list as they stand in the file. An entry need not be sound: it ends where its brackets are
+/// closed.
+fn for_each_row(path: &Path, max_bytes: u64, mut entry: impl FnMut(usize, &[u8])) -> Result<(), ReadError> {
+    let file = File::open(path).map_err(|error| ReadError::io(path, error))?;
+    let size = file.metadata().map_err(|error| ReadError::io(path, error))?.len();
+    if size > max_bytes {
+        let reason = format!("{size} bytes: larger than {max_bytes} bytes, the most that is read");
+        return Err(ReadError::malformed(path, reason));
+    }
+    // The limit holds as well for what grows while it is read.
+    let mut reader = BufReader::with_capacity(BUFFER_BYTES, file.take(max_bytes));
+    let mut list = RowSplitter::default();
+    loop {
+        let bytes = reader.fill_buf().map_err(|error| ReadError::io(path, error))?;
+        if bytes.is_empty() {
+            return list.finish().map_err(|reason| list.error(path, reason));
+        }
+        let count = bytes.len();
+        list.push(bytes, &mut entry).map_err(|reason| list.error(path, reason))?;
+        reader.consume(count);
+    }
+}
+
+/// Splits the text of a list into its entries.
+#[derive(Debug, Default)]
+struct RowSplitter {
+    /// The entry that has begun.
+    entry: Vec<u8>,
+    count: usize,
+    /// Brackets that are open: 0 before the list and behind it.
+    depth: usize,
+    is_string: bool,
+    is_escaped: bool,
+    is_over: bool,
+    /// Lines that are over.
+    lines: u64,
+}
+
+impl RowSplitter {
+    fn push(&mut self, bytes: &[u8], entry: &mut impl FnMut(usize, &[u8])) -> Result<(), String> {
+        for &byte in bytes {
+            self.lines += u64::from(byte == b'\n');
+            match byte {
+                _ if self.depth == 0 => self.outside(byte)?,
+                b',' | b']' if self.depth == 1 && !self.is_string => self.end(byte, entry)?,
+                _ => self.inside(byte)?,
+            }
+        }
+        Ok(())
+    }
+
+    fn outside(&mut self, byte: u8) -> Result<(), String> {
+        match byte {
+            byte if byte.is_ascii_whitespace() => Ok(()),
+            b'[' if !self.is_over => {
+                self.depth = 1;
+                Ok(())
+            }
+            _ if self.is_over => Err("more follows the list".into()),
+            _ => Err(format!("{:?}, expected a list", char::from(byte))),
+        }
+    }
+
+    fn inside(&mut self, byte: u8) -> Result<(), String> {
+        match (self.is_string, byte) {
+            (true, _) if self.is_escaped => self.is_escaped = false,
+            (true, b'\\') => self.is_escaped = true,
+            (_, b'"') => self.is_string = !self.is_string,
+            (false, b'{' | b'[') => self.depth += 1,
+            // The list itself stays open: it ends at its own bracket.
+            (false, b'}' | b']') => self.depth = (self.depth - 1).max(1),
+            _ => {}
+        }
+        if self.entry.len() == MAX_ROW_BYTES {
+            return Err(format!("entry {} is larger than {MAX_ROW_BYTES} bytes", self.count));
+        }
+        self.entry.push(byte);
+        Ok(())
+    }
+
+    /// The end of an entry, or of the list.
+    fn end(&mut self, byte: u8, entry: &mut impl FnMut(usize, &[u8])) -> Result<(), String> {
+        let is_last = byte == b']';
+        let is_blank = self.entry.iter().all(u8::is_ascii_whitespace);
+        if !(is_last && is_blank && self.count == 0) {
+            entry(self.count, &self.entry);
+            self.count += 1;
+        }
+        self.entry.clear();
+        if is_last {
+            (self.depth, self.is_over) = (0, true);
+        }
+        Ok(())
+    }
+
+    fn finish(&self) -> Result<(), String> {
+        if self.is_over { Ok(()) } else { Err(format!("ends within the list, behind {} entries", self.count)) }
+    }
+
+    fn error(&self, path: &Path, reason: String) -> ReadError {
+        ReadError::Malformed { path: path.to_owned(), line: Some(self.lines + 1), field: None, reason }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// What was read of a table of numbers, the problems, and the result.
+    fn read_numbers(text: &str, max_bytes: u64) -> (Vec<u64>, Vec<String>, Result<usize, String>) {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("table.json");
+        std::fs::write(&path, text).unwrap();
+        let shown = |error: &ReadError| error.to_string().replace(&*path.to_string_lossy(), "");
+        let (mut problems, mut numbers) = (Vec::new(), Vec::new());
+        let result = read(
+            &path,
+            max_bytes,
+            &mut problems,
+            |keys| keys.token != "other",
+            |row| {
+                numbers.push(row.required("n")?.count()?);
+                Ok(())
+            },
+        );
+        (numbers, problems.iter().map(shown).collect(), result.map_err(|error| shown(&error)))
+    }
+
+    #[test]
+    fn rows_of_a_table_are_taken_one_by_one() {
+        let (numbers, problems, result) =
+            read_numbers(r#"[{"n": 1}, {"n": "x", "token": "other"}, {"n": "7"}, {"m": 2}, 3]"#, 100);
+        assert_eq!((numbers, result), (vec![1, 7], Ok(2)));
+        assert_eq!(problems, [": 3.n: missing", ": 4: 3, expected a map"]);
+        let many = format!("[{}]", vec!["{}"; 50].join(","));
+        let (_, problems, result) = read_numbers(&many, 1000);
+        assert_eq!((problems.len(), result), (21, Ok(0)));
+        assert_eq!(problems[20], ": 50 entries cannot be used: left out; the first 20 are named");
+    }
+
+    #[test]
+    fn a_row_that_is_no_json_costs_itself_alone() {
+        let (numbers, problems, result) = read_numbers(r#"[{"n": 1}, {"n": NaN}, , {"n": "a]\"b"}, {"n": 4}]"#, 100);
+        assert_eq!((numbers, result), (vec![1, 4], Ok(2)));
+        assert_eq!(problems.len(), 3);
+        assert!(problems[0].starts_with(": 1: no sound JSON: expected value"), "{problems:?}");
+        assert!(problems[1].starts_with(": 2: no sound JSON: EOF"), "{problems:?}");
+    }
+
+    #[test]
+    fn a_table_that_breaks_off_gives_what_came_before() {
+        let (numbers, problems, result) = read_numbers("[{\"n\": 1},\n {\"n\"", 100);
+        assert_eq!((numbers, result), (vec![1], Ok(1)));
+        assert_eq!(problems, [":2: ends within the list, behind 1 entries"]);
+        assert_eq!(read_numbers("[{", 100).2.unwrap_err(), ":1: ends within the list, behind 0 entries");
+        assert_eq!(read_numbers("", 100).2.unwrap_err(), ":1: ends within the list, behind 0 entries");
+        assert_eq!(read_numbers("{}", 100).2.unwrap_err(), ":1: '{', expected a list");
+        assert_eq!(read_numbers("\n[{\"n\": 1}] x", 100).1, [":2: more follows the list"]);
+        assert_eq!(read_numbers(" [ ] ", 100), (vec![], vec![], Ok(0)));
+        assert_eq!(read_numbers("[1, 2]", 5).2.unwrap_err(), ": 6 bytes: larger than 5 bytes, the most that is read");
+    }
+
+    #[test]
+    fn entries_are_the_same_however_the_file_is_cut_into_reads() {
+        let text = br#" [ {"a": [1, 2], "b": "],[\\\""} , 3,"x" ] "#;
+        let whole = serde_json::from_slice::<Vec<Value>>(text).unwrap();
+        for size in 1..text.len() {
+            let (mut list, mut entries) = (RowSplitter::default(), Vec::new());
+            for bytes in text.chunks(size) {
+                list.push(bytes, &mut |_, raw| entries.push(serde_json::from_slice::<Value>(raw).unwrap())).unwrap();
+            }
+            assert_eq!((list.finish(), &entries), (Ok(()), &whole));
+        }
+    }
+}
