@@ -8,8 +8,8 @@
 //! [`Ordering::Global`] sorts by score over all frames; [`Ordering::Frame`] keeps the frames one after another (the
 //! default of OpenCOOD).
 
-use sim_replay::rotated_iou::Polygon;
 use protocol::{Box3d, Detection};
+use sim_replay::rotated_iou::Polygon;
 
 /// Overlaps at which AP is reported.
 pub const THRESHOLDS: [f64; 3] = [0.3, 0.5, 0.7];

@@ -157,7 +157,7 @@ fn the_code_crosses_the_air_and_offline_and_live_see_the_same_boxes() {
         assert_eq!((live.len(), ledger.total().dropped_total()), (TICKS, 0));
         for (live, offline) in live.iter().zip(&offline) {
             assert!(!live.detections.is_empty());
-            assert_eq!(&live.detections, offline, "ratio {compress_ratio:?}, frame {}", live.frame_index);
+            assert_eq!(&live.detections, offline, "ratio {compress_ratio:?}, frame {}", live.agent_frame);
             let metadata = live.fused[0].payload_bytes - expected_bytes;
             assert!((60..200).contains(&metadata), "{metadata} bytes beside the map");
         }

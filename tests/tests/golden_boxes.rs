@@ -5,10 +5,10 @@ use agent::decode::{Decoded, decode, decode_box, sigmoid};
 use agent::model_config::AnchorConfig;
 use agent::nms::rotated_nms;
 use agent::postprocess::{self, AgentBoxes, Candidate, PostprocessConfig, corners_to_box, footprint};
-use sim_replay::rotated_iou::Polygon;
 use nalgebra::{Isometry3, Matrix4};
 use protocol::{Box3d, Pose};
 use serde_json::Value;
+use sim_replay::rotated_iou::Polygon;
 use tests::fixtures::{Golden, assert_close, golden};
 
 #[test]

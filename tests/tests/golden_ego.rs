@@ -1,6 +1,5 @@
 //! Training targets, loss, AP, warps and fusion against the reference implementations.
 
-use sim_replay::rotated_iou::Polygon;
 use ego_fuser::average_precision::{Curve, Ordering, Scorer};
 use ego_fuser::fusion::{AlignedViews, AttentionFusion, Fusion, MaxFusion, ViewFacts, regroup};
 use ego_fuser::loss::{LabelTensors, LossConfig, Unassigned, detection_loss};
@@ -8,6 +7,7 @@ use ego_fuser::targets::{BOX_CODE, Labels, Positive, TargetAssigner, TargetRule}
 use ego_fuser::warp::opencood::{self, Interpolation};
 use ego_fuser::warp::{coalign, warp_to_ego};
 use protocol::{BevGrid, Box3d, Pose};
+use sim_replay::rotated_iou::Polygon;
 use tch::{Device, Kind, Tensor};
 use tests::fixtures::{Golden, assert_close, golden};
 

@@ -42,7 +42,7 @@ pub(super) fn preset(name: &str) -> Option<EvaluationProtocol> {
     let known = PRESETS.iter().any(|(known, _)| *known == name);
     known.then(|| {
         let (agents, ego) = match name {
-            "v2xreal-v2v" => (AgentKinds::Vehicles, EgoKind::Vehicle),
+            "v2xreal-v2v" | "v2xsim" => (AgentKinds::Vehicles, EgoKind::Vehicle),
             "v2xreal-i2i" | "rcooper" => (AgentKinds::Units, EgoKind::Unit),
             _ => (AgentKinds::All, EgoKind::Vehicle),
         };
@@ -71,16 +71,18 @@ fn rule(name: &str) -> GroundTruthRule {
         "v2v4real" => GroundTruthRule::V2V4REAL,
         // V2X-R: opencood/hypes_yaml/V2X-R, ground truth as wide as the points.
         "v2xr" => range(140.8, 40.0, [-3.0, 1.0], 70.0),
-        // HEAL and CoAlign, dair_v2x configurations: 102.4 x 51.2 m, widened by 1 m where labels are filtered.
-        "dair" | "v2xseq" => range(103.4, 52.2, [-4.5, 2.5], 100.0),
+        // HEAL, dairv2x configurations: the range of the points, z widened by 1 m where labels are filtered. V2X-Seq's own code
+        // takes every pair, however far apart.
+        "dair" | "v2xseq" => range(102.4, 51.2, [-4.5, 2.5], 100.0),
         // V2X-Real: opencood/data_utils/datasets/__init__.py.
         "v2xreal" | "v2xreal-v2v" | "v2xreal-i2i" => range(100.0, 40.0, [-15.0, 15.0], 50.0),
-        // CoAlign, v2xsim2 configurations.
-        "v2xsim" => range(32.0, 32.0, [-8.0, 5.0], 70.0),
+        // HEAL, v2xsim2 configurations, vehicles only. CoAlign has z -3..2 m and 50 m.
+        "v2xsim" => range(32.0, 32.0, [-3.0, 1.0], 70.0),
         // V2X-Radar: communication range of its configurations.
         "v2xradar" => range(140.8, 40.0, [-3.0, 1.0], 300.0),
         // RCooper: roadside units up to 200 m apart.
         "rcooper" => range(200.0, 40.0, [-20.0, 0.0], 200.0),
+        // Open MARS has no annotations and so no protocol: a choice of ours.
         "mars" => range(51.2, 51.2, [-5.0, 3.0], 70.0),
         // OPV2V, V2XSet, V2VDet.
         _ => GroundTruthRule::OPV2V,
