@@ -1,10 +1,10 @@
 //! `sim-replay inspect`: what is in a dataset, and what is wrong with it.
 
-use std::io::Write;
 use std::path::PathBuf;
 
 use indicatif::{ProgressBar, ProgressStyle};
 use sim_replay::inspect::{Report, inspect};
+use sim_replay::output;
 
 use crate::cli::Outcome;
 
@@ -21,12 +21,10 @@ pub(crate) struct Args {
 /// Prints the findings to standard output.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     let report = with_progress(args);
-    let mut out = std::io::stdout().lock();
     if args.json {
-        serde_json::to_writer_pretty(&mut out, &report)?;
-        writeln!(out)?;
+        output::line(serde_json::to_string_pretty(&report)?)?;
     } else {
-        writeln!(out, "{report}")?;
+        output::line(&report)?;
     }
     Ok(if report.problems.is_empty() { Outcome::Done } else { Outcome::BadInput })
 }
