@@ -29,7 +29,7 @@ pub struct AgentInput<'a> {
 /// What the detector makes of one sweep.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Perception {
-    /// The map for intermediate fusion.
+    /// The map for intermediate fusion as it crosses the air: with a compressor, its code.
     pub features: BevFeatures,
     /// `[H, W]`, 0..1: where a vehicle is likely; which cells are worth sending.
     pub confidence: Vec<f32>,
@@ -198,9 +198,8 @@ impl Agent {
     /// [`DetectorError::Shape`] when it is not one of this detector's maps.
     pub fn perceive_map(&mut self, map: &Tensor) -> Result<Perception, DetectorError> {
         let ((map, features), message) = timed(|| {
-            let map = self.detector.through_compressor(map)?;
-            let features = self.detector.to_message(&map)?;
-            Ok((map, features))
+            let sent = self.detector.squeezed(map)?;
+            Ok((self.detector.widened(&sent)?, self.detector.to_message(&sent)?))
         })?;
         let (heads, head) = timed(|| self.detector.heads(&map))?;
         let (detections, boxes) = timed(|| {
@@ -234,6 +233,7 @@ fn timed<T>(step: impl FnOnce() -> Result<T, DetectorError>) -> Result<(T, Durat
 
 #[cfg(test)]
 mod tests {
+    use protocol::DecodedFeatures;
     use tch::Device;
     use tch::nn::VarStore;
 
@@ -280,15 +280,17 @@ mod tests {
     }
 
     #[test]
-    fn what_others_and_the_own_head_see_went_through_the_compressor_once() {
+    fn others_get_the_code_and_the_own_head_sees_what_they_will_make_of_it() {
         let mut agent = agent_with(Some(4));
         let cloud = PointCloud { xyzi: (0..500).map(|k| [(k % 83) as f32 * 0.1 + 3.0, 0.5, -1.5, 0.2]).collect() };
         let encoded = agent.detector.encode(&cloud).unwrap().features;
-        let left = agent.detector.through_compressor(&encoded).unwrap();
-        let (shared, heads) = (agent.detector.to_message(&left).unwrap(), agent.detector.heads(&left).unwrap());
+        let shared = agent.detector.to_message(&agent.detector.squeezed(&encoded).unwrap()).unwrap();
+        let received = agent.detector.received(&DecodedFeatures { features: shared.clone(), sent: None }).unwrap();
+        let heads = agent.detector.heads(&received).unwrap();
         let seen = agent.perceive(&cloud).unwrap();
         assert_eq!((&seen.features, &seen.confidence), (&shared, &heads.confidence));
-        assert_ne!(seen.features, agent.detector.to_message(&encoded).unwrap());
+        assert_eq!((shared.channels, shared.code_of), (16, Some(64)));
+        assert_ne!(seen.confidence, agent.detector.heads(&encoded).unwrap().confidence);
     }
 
     #[test]

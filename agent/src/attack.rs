@@ -268,7 +268,7 @@ mod tests {
         let values = (0..2 * grid.cells()).map(|cell| (cell % 97) as f32 * 0.1).collect();
         let mut confidence = vec![0.0; grid.cells()];
         confidence[5050] = 0.9;
-        let features = BevFeatures { grid, channels: 2, values };
+        let features = BevFeatures { grid, channels: 2, code_of: None, values };
         Perception { features, confidence, detections: vec![], times: PerceptionTimes::default() }
     }
 

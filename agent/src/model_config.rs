@@ -125,7 +125,7 @@ pub struct DetectorConfig {
     pub num_upsample_filters: Vec<i64>,
     /// Reduction of the concatenated map; absent: it crosses the air as it is.
     pub shrink: Option<ShrinkConfig>,
-    /// The learnt channel compressor keeps one channel in so many; absent: none.
+    /// The learnt channel compressor keeps one channel in so many on the air; absent: none.
     pub compress_ratio: Option<i64>,
     /// Anchors of the head.
     pub anchors: AnchorConfig,
@@ -210,13 +210,19 @@ impl DetectorConfig {
         self.num_upsample_filters.iter().sum()
     }
 
-    /// Channels of the map that crosses the air and of the head's input.
+    /// Channels of the map that is fused and of the head's input.
     #[must_use]
     pub fn feature_channels(&self) -> i64 {
         match self.shrink {
             Some(ShrinkConfig::DoubleConv { channels, .. } | ShrinkConfig::Pointwise { channels }) => channels,
             None => self.backbone_channels(),
         }
+    }
+
+    /// Channels of the map that crosses the air: of the code, where there is a compressor.
+    #[must_use]
+    pub fn sent_channels(&self) -> i64 {
+        self.compress_ratio.map_or(self.feature_channels(), |ratio| (self.feature_channels() / ratio).max(1))
     }
 
     /// The lattice of the map that crosses the air.
@@ -306,8 +312,8 @@ impl DetectorConfig {
             Some(ShrinkConfig::Pointwise { .. }) => channels * self.backbone_channels(),
             None => 0,
         };
-        if let Some(ratio) = self.compress_ratio {
-            count += 9 * channels * (2 * (channels / ratio).max(1) + channels);
+        if self.compress_ratio.is_some() {
+            count += 9 * channels * (2 * self.sent_channels() + channels);
         }
         count + channels * self.head_channels()
     }
@@ -412,7 +418,10 @@ mod tests {
         lean.validate().unwrap();
         let grid = lean.feature_grid();
         assert_eq!((lean.feature_channels(), grid.height, grid.width, grid.cell_m), (64, 96, 128, 0.8));
-        assert_eq!(lean.pillar_grid(), [256, 192, 1]);
+        assert_eq!((lean.pillar_grid(), lean.sent_channels()), ([256, 192, 1], 64));
+        let squeezed = |ratio| DetectorConfig { compress_ratio: Some(ratio), ..DetectorConfig::lean() };
+        assert_eq!([1, 32, 100].map(|ratio| squeezed(ratio).sent_channels()), [64, 2, 1]);
+        assert_eq!(squeezed(32).feature_channels(), 64, "behind the air the map is whole again");
     }
 
     #[test]

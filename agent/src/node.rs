@@ -250,7 +250,7 @@ impl Outlet {
         let description = Descriptor {
             model_hash: detector.model_hash(),
             grid: detector.grid(),
-            channels: u32::try_from(detector.map_shape()[0]).unwrap_or(u32::MAX),
+            channels: u32::try_from(detector.sent_shape()[0]).unwrap_or(u32::MAX),
             dtype: options.codec.dtype,
             streams: std::iter::once(Stream::Pose).chain(options.publish.iter().copied()).collect(),
         };

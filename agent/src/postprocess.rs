@@ -9,7 +9,11 @@ use crate::model_config::DetectorConfig;
 use crate::nms::rotated_nms;
 use crate::rotated_iou::Polygon;
 
-/// Limits of the clean-up, with the reference's numbers as defaults.
+/// Boxes at or below this score are not judged. It holds for every method: a box that a vehicle sends counts as one that
+/// the ego finds in a fused map.
+pub const SCORE_THRESHOLD: f32 = 0.1;
+
+/// Limits of the clean-up, with the reference's numbers as defaults but for the score, which is that of all methods here.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct PostprocessConfig {
@@ -30,7 +34,7 @@ pub struct PostprocessConfig {
 impl Default for PostprocessConfig {
     fn default() -> Self {
         Self {
-            score_threshold: 0.2,
+            score_threshold: SCORE_THRESHOLD,
             nms_iou: 0.15,
             nms_max_candidates: 1000,
             max_extent_m: 6.0,
@@ -41,7 +45,7 @@ impl Default for PostprocessConfig {
 }
 
 impl PostprocessConfig {
-    /// The reference's numbers with the range of a detector instead of its fixed one.
+    /// The default numbers with the range of a detector instead of the fixed one.
     #[must_use]
     pub fn for_detector(config: &DetectorConfig) -> Self {
         let [x_low, y_low, z_low, x_high, y_high, z_high] = config.lidar_range_m;

@@ -173,7 +173,7 @@ mod tests {
     fn map() -> (BevFeatures, Vec<f32>) {
         let values = (0..CHANNELS as usize * GRID.cells()).map(|n| (n as f32 * 0.31).cos()).collect();
         let confidence = (0..GRID.cells()).map(|cell| (cell * 101 % 997) as f32 / 997.0).collect();
-        (BevFeatures { grid: GRID, channels: CHANNELS, values }, confidence)
+        (BevFeatures { grid: GRID, channels: CHANNELS, code_of: None, values }, confidence)
     }
 
     fn encode(control: &mut RateControl, capture_nanos: u64, turn: Option<&Turn>) -> EncodedFeatures {

@@ -52,7 +52,8 @@ impl Shrink {
     }
 }
 
-/// Squeezes the channels before the air and widens them again behind it (OpenCOOD's `NaiveCompressor`).
+/// Squeezes the channels before the air and widens them again behind it (OpenCOOD's `NaiveCompressor`): the sender has the
+/// first half, every receiver the second.
 #[derive(Debug)]
 pub struct Compressor {
     encoder: ConvLayer,

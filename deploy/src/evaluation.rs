@@ -10,15 +10,16 @@ use agent::attack::AttackConfig;
 use agent::pose_source::PoseSourceConfig;
 use agent::rate::RateConfig;
 use agent::weights::Weights;
-use ego_fuser::evaluate::stepped::SteppedConfig;
+use ego_fuser::evaluate::stepped::{ComputeTimes, SteppedConfig};
 use ego_fuser::evaluate::{EvaluateConfig, EvaluateError, EvaluatedFrame, Evaluator};
 use ego_fuser::feature_store::{FeatureStore, KeptMaps, MapSource};
 use ego_fuser::trust::TrustConfig;
 use ego_fuser::{Exchange, Method};
 use protocol::{CavId, CodecConfig};
-use sim_replay::dataset::{self, ReadError, Scenario};
+use sim_replay::dataset::{self, IntensityScale, OpenOptions, ReadError, Scenario};
+use sim_replay::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
 
-use crate::metrics::{Messages, Metrics};
+use crate::metrics::Metrics;
 use crate::score::Board;
 use crate::weights_choice::{WeightsChoiceError, weights_of};
 
@@ -49,6 +50,19 @@ pub struct EvaluationOptions {
     pub stepped: Option<SteppedConfig>,
     /// The part of the data set that is judged.
     pub part: Part,
+    /// Whose messages and annotations count, and which objects.
+    pub protocol: ProtocolConfig,
+}
+
+/// A data set, opened to be judged by a protocol.
+#[derive(Debug)]
+pub struct OpenedData {
+    /// The scenarios, with the agents that take part.
+    pub scenarios: Vec<Scenario>,
+    /// The protocol.
+    pub protocol: EvaluationProtocol,
+    /// Parts of the data set that are not used.
+    pub problems: Vec<ReadError>,
 }
 
 /// A part of a data set.
@@ -58,18 +72,24 @@ pub struct Part {
     pub scenarios: Option<usize>,
     /// The first so many ticks of each; all where absent.
     pub ticks: Option<usize>,
+    /// Divisor of the intensities of its sweeps.
+    pub intensity_scale: IntensityScale,
 }
 
 impl Part {
-    /// Opens a data set: all its scenarios, each with the ticks that are asked for. Maps are kept of these, so that another
-    /// choice among them needs no others.
+    /// Opens a data set: all its scenarios, each with the agents of the protocol and the ticks that are asked for. Maps are
+    /// kept of these, so that another choice among them needs no others.
     ///
     /// # Errors
-    /// [`ReadError`] when it cannot be read.
-    pub fn open(&self, path: &Path) -> Result<Vec<Scenario>, ReadError> {
-        let mut scenarios = dataset::open(path)?.scenarios;
+    /// [`EvaluationError`] when it cannot be read, or the protocol contradicts itself.
+    pub fn open(&self, path: &Path, protocol: &ProtocolConfig) -> Result<OpenedData, EvaluationError> {
+        let options = OpenOptions { intensity_scale: self.intensity_scale, ..OpenOptions::default() };
+        let dataset = dataset::open_with(path, &options)?;
+        let protocol = protocol.resolve(dataset.layout).map_err(EvaluationError::Protocol)?;
+        let mut scenarios: Vec<Scenario> =
+            dataset.scenarios.iter().filter_map(|scenario| protocol.arrange(scenario)).collect();
         scenarios.iter_mut().for_each(|scenario| scenario.ticks.truncate(self.ticks.unwrap_or(usize::MAX)));
-        Ok(scenarios)
+        Ok(OpenedData { scenarios, protocol, problems: dataset.problems })
     }
 
     /// Those of all scenarios that are asked for.
@@ -93,6 +113,9 @@ pub enum EvaluationError {
     /// The data set cannot be read.
     #[error(transparent)]
     Dataset(#[from] ReadError),
+    /// The protocol is not known or contradicts itself.
+    #[error("evaluation protocol: {0}")]
+    Protocol(String),
     /// The data set has no frame to judge.
     #[error("{}: there is no frame in it", .0.display())]
     Empty(PathBuf),
@@ -109,15 +132,16 @@ pub enum EvaluationError {
 /// # Errors
 /// [`EvaluationError`] when the data set cannot be read.
 pub fn frame_count(options: &EvaluationOptions) -> Result<usize, EvaluationError> {
-    let scenarios = options.part.open(&options.dataset)?;
+    let scenarios = options.part.open(&options.dataset, &options.protocol)?.scenarios;
     let ticks = options.part.chosen(&scenarios).map(|scenario| scenario.ticks.len()).sum();
     Ok(options.frames.map_or(ticks, |frames| frames.min(ticks)))
 }
 
-/// Runs one method over all scenarios, the first vehicle of each being the ego; `on_frame` is told of every frame.
+/// Runs one method over all scenarios, the first vehicle of each being the ego; `on_frame` is told of every frame. Frames
+/// and parts that cannot be read are left out and counted in [`Metrics::left_out`].
 ///
 /// # Errors
-/// [`EvaluationError`] at the first frame that cannot be read, and when there is none.
+/// [`EvaluationError`] when the data set cannot be opened, and when no frame can be judged.
 pub fn evaluate(
     options: &EvaluationOptions,
     method: Method,
@@ -137,7 +161,7 @@ pub(crate) fn judged(
     on_frame: &mut dyn FnMut(),
 ) -> Result<(Board, Evaluator, Instant), EvaluationError> {
     let began = Instant::now();
-    let scenarios = options.part.open(&options.dataset)?;
+    let OpenedData { scenarios, protocol, problems } = options.part.open(&options.dataset, &options.protocol)?;
     let weights = weights_of(&options.weights, method)?;
     let mut evaluator = Evaluator::new(EvaluateConfig {
         weights: weights.clone(),
@@ -145,7 +169,7 @@ pub(crate) fn judged(
         pose_source: options.pose_source.clone(),
         codec: options.codec,
         rate: options.rate,
-        rule: None,
+        protocol: Some(protocol.clone()),
         delay_nanos: options.delay_nanos,
         attack: options.attack,
         trust: options.trust,
@@ -156,11 +180,13 @@ pub(crate) fn judged(
     if let Some(stepped) = &options.stepped {
         evaluator = evaluator.over_link(stepped.clone());
     }
+    evaluator.add_left_out_files(&problems);
     let grid = evaluator.ego().detector().config().feature_grid();
-    let channels = evaluator.ego().detector().config().feature_channels();
+    let channels = evaluator.ego().detector().config().sent_channels();
     let map_values = u64::from(grid.width) * u64::from(grid.height) * u64::try_from(channels).unwrap_or(0);
     let left = options.frames.unwrap_or(usize::MAX);
-    let is_stepped = options.stepped.is_some();
+    // Without a time to compute, a result is as old as its sweep by definition: that is no latency.
+    let is_timed = options.stepped.as_ref().is_some_and(|stepped| stepped.compute != ComputeTimes::NONE);
     let mut board: Option<Board> = None;
     for scenario in options.part.chosen(&scenarios) {
         let Some(ego) = scenario.agents.first() else { continue };
@@ -170,7 +196,7 @@ pub(crate) fn judged(
         let board = board.get_or_insert_with(|| Board::new(ego.clone(), *evaluator.rule(), map_values));
         board.change_ego(ego);
         let judged = evaluator.run(scenario, &mut |frame| {
-            judge(board, frame, is_stepped);
+            judge(board, frame, is_timed);
             on_frame();
             if board.records().len() >= left { ControlFlow::Break(()) } else { ControlFlow::Continue(()) }
         })?;
@@ -190,13 +216,13 @@ fn maps(kept: &KeptMaps, weights: &Path, scenarios: &[Scenario]) -> Result<MapSo
     Ok(MapSource::new(Arc::new(store.map_err(|error| EvaluateError::from(Box::new(error)))?), weights))
 }
 
-/// Judges a frame; in virtual time its stamp says when it was published.
-pub(crate) fn judge(board: &mut Board, frame: EvaluatedFrame, is_stepped: bool) {
+/// Judges a frame; where computers take a time its stamp says when it was published.
+pub(crate) fn judge(board: &mut Board, frame: EvaluatedFrame, is_timed: bool) {
     let EvaluatedFrame { tick, stamp, result, frames, poses, objects } = frame;
     let poses: Vec<_> = frames.iter().map(|frame| frame.cav.clone()).zip(poses).collect();
     let truth: Vec<(CavId, _)> =
         frames.iter().filter_map(|frame| Some((frame.cav.clone(), frame.world_from_lidar?))).collect();
-    let latency_ms = is_stepped.then(|| (stamp.publish_nanos - stamp.capture_nanos) as f64 / 1e6);
+    let latency_ms = is_timed.then(|| (stamp.publish_nanos - stamp.capture_nanos) as f64 / 1e6);
     board.judge_whole((tick as u64, stamp.capture_nanos), latency_ms, result, objects, &poses, truth);
 }
 
@@ -206,5 +232,6 @@ pub(crate) fn metrics(board: &Board, evaluator: &Evaluator, options: &Evaluation
         None => ("offline", began.elapsed().as_secs_f64()),
     };
     let names = [evaluator.ego().method().name(), options.pose_source.name()];
-    Metrics::of(board, clock, names, seconds, Messages::of(&evaluator.ledger().total()))
+    let metrics = Metrics::of(board, clock, names, seconds, evaluator.ledger(), Some(evaluator.sent_bytes()));
+    Metrics { left_out: evaluator.left_out().clone(), protocol: evaluator.protocol(), ..metrics }
 }

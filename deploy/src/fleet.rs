@@ -12,6 +12,7 @@ use agent::weights::Weights;
 use ego_fuser::Exchange;
 use protocol::{CavId, Party, Role, Stream};
 use sim_replay::dataset;
+use sim_replay::evaluation_protocol::EvaluationProtocol;
 use sim_replay::ground_truth::GroundTruthRule;
 use sim_replay::link::Air;
 use tch::Device;
@@ -25,9 +26,6 @@ use crate::scenario::{Clock, Launch, PoseSource, Publish, Scenario};
 use crate::security::RunKeys;
 use crate::supervise::{Life, ProcessSpec};
 use crate::weights_choice::weights_of;
-
-/// Vehicles farther than this from the ego do not take part, metres (the rule of the OPV2V family).
-const COMM_RANGE_M: f64 = 70.0;
 
 /// Name of the process that plays the scene.
 pub const REPLAY: &str = "replay";
@@ -49,6 +47,8 @@ pub struct Fleet {
     pub scene_dir: PathBuf,
     /// The model, as its weights say.
     pub detector: DetectorConfig,
+    /// How the run is judged.
+    pub protocol: EvaluationProtocol,
 }
 
 impl Fleet {
@@ -72,6 +72,7 @@ impl Fleet {
         }
         let scene = &mut scenario.scene;
         let dataset = dataset::open(&scene.dir)?;
+        let protocol = scenario.protocol.resolve(dataset.layout).map_err(FleetError::Protocol)?;
         let recorded = match &scene.scenario {
             None => dataset.scenarios.first().ok_or_else(|| FleetError::Empty(scene.dir.clone()))?,
             Some(name) => {
@@ -119,27 +120,20 @@ impl Fleet {
         scene.scenario = Some(name);
         scene.agents.clone_from(&agents);
         scenario.ego.id = Some(ego.clone());
-        Ok(Self { scenario, agents, ego, ticks, scene_dir, detector })
+        Ok(Self { scenario, agents, ego, ticks, scene_dir, detector, protocol })
     }
 
-    /// Which objects count: the model's own range, all corners inside, vehicles within 70 m.
+    /// Which objects count: those of the protocol that lie over the area of the model.
     #[must_use]
     pub fn ground_truth_rule(&self) -> GroundTruthRule {
-        let [x_low, y_low, z_low, x_high, y_high, z_high] = self.detector.lidar_range_m;
-        GroundTruthRule {
-            x_m: [x_low, x_high],
-            y_m: [y_low, y_high],
-            z_m: [z_low, z_high],
-            comm_range_m: COMM_RANGE_M,
-            min_corners: 8,
-        }
+        self.protocol.rule_within(self.detector.lidar_range_m)
     }
 
-    /// Numbers in one feature map of the model.
+    /// Numbers in one feature map of the model, as it crosses the air.
     #[must_use]
     pub fn map_values(&self) -> u64 {
         let grid = self.detector.feature_grid();
-        u64::from(grid.width) * u64::from(grid.height) * self.detector.feature_channels() as u64
+        u64::from(grid.width) * u64::from(grid.height) * self.detector.sent_channels() as u64
     }
 
     /// Where poses come from: the name that all vehicles share, or `mixed`.
@@ -248,6 +242,7 @@ impl Fleet {
         args.option("--method", self.scenario.method.name());
         args.option("--deadline-ms", &self.scenario.ego.deadline_ms.to_string());
         self.peers(&mut args);
+        args.option("--comm-range", &self.protocol.ground_truth.comm_range_m.to_string());
         args.option("--max-age-ms", &self.scenario.ego.max_age_ms.to_string());
         if self.scenario.ego.trust {
             args.flag("--trust");

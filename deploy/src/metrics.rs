@@ -1,13 +1,21 @@
 //! `metrics.json`: what a run is judged by, and how each number comes about.
 
+mod answered;
+mod contribution;
+
 use std::collections::BTreeMap;
 
 pub use agent::pose_error::PoseError;
 use agent::statistics::{quantile, sorted};
-use protocol::{CavId, Counts, DropReason};
+use protocol::{CavId, Counts, DropReason, Ledger};
 use serde::{Deserialize, Serialize};
+use sim_replay::dataset::LeftOut;
+use sim_replay::evaluation_protocol::EvaluationProtocol;
 
 use crate::score::{Board, NeighbourRecord};
+
+pub use answered::Answered;
+pub use contribution::Contribution;
 
 /// A pose nearer to the truth than this is a success, metres.
 const SUCCESS_M: f64 = 3.0;
@@ -29,6 +37,9 @@ pub struct Metrics {
     pub ap_global: ByIou,
     /// Average precision with detections in frame order, by score only within a frame, as the reference code does.
     pub ap_frame_order: ByIou,
+    /// Average precision over all ticks, those without a report included; `null` where results have no time of publication.
+    #[serde(default)]
+    pub answered: Option<Answered>,
     /// How far the poses that were fused with lie from the truth.
     pub pose: PoseErrors,
     /// Delays.
@@ -39,22 +50,33 @@ pub struct Metrics {
     pub age_ms: Percentiles,
     /// What crossed the air.
     pub comm: Communication,
+    /// What neighbours contributed.
+    #[serde(default)]
+    pub contribution: Contribution,
     /// Every neighbour that the ego heard.
     #[serde(default)]
     pub neighbours: BTreeMap<CavId, NeighbourRecord>,
     /// The ledger's totals.
     pub messages: Messages,
+    /// The evaluation protocol, with the ground-truth range as it was applied.
+    #[serde(default)]
+    pub protocol: Option<EvaluationProtocol>,
+    /// Data of the scene that could not be used.
+    #[serde(default)]
+    pub left_out: LeftOut,
 }
 
 impl Metrics {
-    /// What a board has seen of a run of `seconds`.
+    /// What a board has seen of a run of `seconds`; `sent_bytes` is the size of all that neighbours sent, where it is known.
     pub(crate) fn of(
         board: &Board,
         clock: &str,
         [method, pose_source]: [&str; 2],
         seconds: f64,
-        messages: Messages,
+        books: &Ledger,
+        sent_bytes: Option<u64>,
     ) -> Self {
+        let fused = board.records().iter().map(|record| record.fused).sum();
         let (ap_global, ap_frame_order) = board.average_precision();
         Self {
             frames: board.records().len() as u64,
@@ -64,12 +86,16 @@ impl Metrics {
             pose_source: pose_source.into(),
             ap_global,
             ap_frame_order,
+            answered: board.answered(),
             pose: board.pose_errors(),
             latency_ms: board.latencies(),
             age_ms: board.ages(),
             comm: board.communication(),
+            contribution: Contribution::of(board.records().len(), fused, board.ego(), books, sent_bytes),
             neighbours: board.neighbours().clone(),
-            messages,
+            messages: Messages::of(&books.total()),
+            protocol: None,
+            left_out: LeftOut::default(),
         }
     }
 }

@@ -2,7 +2,9 @@
 
 use std::fmt::Write as _;
 
-use crate::metrics::{ByIou, Metrics};
+use ego_fuser::{Exchange, Method};
+
+use crate::metrics::{Answered, ByIou, Contribution, Metrics, Percentiles};
 use crate::progress::bytes;
 use crate::up::RunResult;
 
@@ -54,29 +56,121 @@ pub fn run_notes(result: &RunResult) -> String {
     text
 }
 
-/// One line per run or evaluation.
+/// One line per run or evaluation, and what has to be known to compare the lines.
 #[must_use]
 pub fn table(all: &[Metrics]) -> String {
-    let mut text = String::from(
-        "method     poses     frames  AP@0.3  AP@0.5  AP@0.7  frame order 0.5  pose error m  latency ms p50/p95  bytes per neighbour\n",
-    );
-    for metrics in all {
-        let ByIou { at_30, at_50, at_70 } = metrics.ap_global;
-        let latency = &metrics.latency_ms.capture_to_detection;
-        let _ = writeln!(
-            text,
-            "{:<10} {:<9} {:>6}  {:>6}  {:>6}  {:>6}  {:>15}  {:>12}  {:>18}  {:>19}",
-            metrics.method,
-            metrics.pose_source,
-            metrics.frames,
-            number(at_30, 3),
-            number(at_50, 3),
-            number(at_70, 3),
-            number(metrics.ap_frame_order.at_50, 3),
-            number(metrics.pose.mean_m, 2),
-            format!("{} / {}", number(latency.p50, 0), number(latency.p95, 0)),
-            metrics.comm.wire_bytes_mean.map_or("-".into(), bytes),
-        );
+    let mut columns = vec![
+        Column::left("method", all, |metrics| metrics.method.clone()),
+        Column::left("poses", all, |metrics| metrics.pose_source.clone()),
+    ];
+    let is_live = all.iter().any(|metrics| metrics.answered.is_some());
+    columns.push(Column::right(if is_live { "answered" } else { "frames" }, all, frames));
+    for (name, of) in BY_IOU {
+        columns.push(Column::right(&format!("AP@{name}"), all, |metrics| number(of(&metrics.ap_global), 3)));
+    }
+    columns.push(Column::right("frame order 0.5", all, |metrics| number(metrics.ap_frame_order.at_50, 3)));
+    if is_live {
+        let of = |ap: fn(&Answered) -> ByIou| {
+            move |metrics: &Metrics| number(metrics.answered.as_ref().and_then(|answered| ap(answered).at_50), 3)
+        };
+        columns.push(Column::right("all ticks 0.5", all, of(|answered| answered.ap_all_ticks)));
+        columns.push(Column::right("streaming 0.5", all, of(|answered| answered.streaming_ap)));
+    }
+    if all.iter().any(|metrics| metrics.contribution.sent > 0) {
+        let fused = |metrics: &Metrics| number(metrics.contribution.fused_per_frame, 2);
+        columns.push(Column::right("neighbours fused per frame", all, fused));
+    }
+    columns.push(Column::right("pose error m", all, |metrics| number(metrics.pose.mean_m, 2)));
+    columns.push(Column::right("latency ms p50/p95", all, latency));
+    columns.push(Column::right("bytes per neighbour", all, wire_bytes));
+    lines(&columns, all.len()) + &comparison(all)
+}
+
+/// AP by the overlap that it is at.
+const BY_IOU: [(&str, fn(&ByIou) -> Option<f64>); 3] =
+    [("0.3", |ap| ap.at_30), ("0.5", |ap| ap.at_50), ("0.7", |ap| ap.at_70)];
+
+/// What keeps lines of a table from being compared, and what the air has kept from an ego.
+fn comparison(all: &[Metrics]) -> String {
+    let mut text = String::new();
+    if all.windows(2).any(|pair| pair[0].frames != pair[1].frames) {
+        let compare = match all.iter().any(|metrics| metrics.answered.is_some()) {
+            true => {
+                "compare \"all ticks\" and \"streaming\", in which unanswered ticks count, and not AP over other frames"
+            }
+            false => "their AP cannot be compared",
+        };
+        let _ = writeln!(text, "\nwarning: lines are judged over different frames: {compare}");
+    }
+    for Metrics { method, contribution: Contribution { sent, used, sent_bytes_mean, .. }, .. } in all {
+        if used < sent {
+            let size = sent_bytes_mean.map_or(String::new(), |mean| format!(" of {} each", bytes(mean)));
+            let what = shared(method);
+            let _ = writeln!(text, "{method}: of {sent} {what}{size} {used} arrived in time");
+        }
+    }
+    text
+}
+
+/// What neighbours share by a method.
+fn shared(method: &str) -> &'static str {
+    match method.parse().map(Method::exchange) {
+        Ok(Exchange::Features) => "maps",
+        Ok(Exchange::Boxes) => "lists of boxes",
+        Ok(Exchange::Points) => "clouds",
+        Ok(Exchange::Nothing) | Err(_) => "messages",
+    }
+}
+
+fn frames(metrics: &Metrics) -> String {
+    match &metrics.answered {
+        Some(Answered { answered, ticks, .. }) => format!("{answered}/{ticks}"),
+        None => metrics.frames.to_string(),
+    }
+}
+
+fn latency(metrics: &Metrics) -> String {
+    match &metrics.latency_ms.capture_to_detection {
+        Percentiles { p50: None, p95: None, .. } => "-".into(),
+        Percentiles { p50, p95, .. } => format!("{} / {}", number(*p50, 0), number(*p95, 0)),
+    }
+}
+
+/// Of what was fused, or where nothing was, of what was sent.
+fn wire_bytes(metrics: &Metrics) -> String {
+    let mean = metrics.comm.wire_bytes_mean.or(metrics.contribution.sent_bytes_mean);
+    mean.map_or("-".into(), bytes)
+}
+
+/// A column of a table for people.
+struct Column {
+    name: String,
+    is_left: bool,
+    cells: Vec<String>,
+}
+
+impl Column {
+    fn left(name: &str, all: &[Metrics], cell: impl Fn(&Metrics) -> String) -> Self {
+        Self { name: name.to_owned(), is_left: true, cells: all.iter().map(cell).collect() }
+    }
+
+    fn right(name: &str, all: &[Metrics], cell: impl Fn(&Metrics) -> String) -> Self {
+        Self { is_left: false, ..Self::left(name, all, cell) }
+    }
+
+    /// A cell as wide as the widest.
+    fn padded(&self, cell: &str) -> String {
+        let width = self.cells.iter().map(String::len).fold(self.name.len(), usize::max);
+        if self.is_left { format!("{cell:<width$}") } else { format!("{cell:>width$}") }
+    }
+}
+
+/// Header and rows.
+fn lines(columns: &[Column], rows: usize) -> String {
+    let line = |cell: &dyn Fn(&Column) -> String| columns.iter().map(cell).collect::<Vec<_>>().join("  ") + "\n";
+    let mut text = line(&|column| column.padded(&column.name));
+    for row in 0..rows {
+        text += &line(&|column| column.padded(&column.cells[row]));
     }
     text
 }
@@ -90,11 +184,10 @@ mod tests {
     use std::collections::BTreeMap;
 
     use super::*;
-    use crate::metrics::{Communication, Latencies, Messages, Percentiles, PoseErrors};
+    use crate::metrics::{Communication, Latencies, Messages, PoseErrors};
 
-    #[test]
-    fn columns_line_up_and_missing_numbers_are_dashes() {
-        let metrics = |method: &str, at_50| Metrics {
+    fn metrics(method: &str, at_50: Option<f64>) -> Metrics {
+        Metrics {
             frames: 60,
             seconds: 6.0,
             clock: "wall".into(),
@@ -102,16 +195,51 @@ mod tests {
             pose_source: "recorded".into(),
             ap_global: ByIou { at_50, ..ByIou::default() },
             ap_frame_order: ByIou::default(),
+            answered: None,
             pose: PoseErrors::default(),
             latency_ms: Latencies { capture_to_detection: Percentiles { p50: Some(81.4), ..Percentiles::default() } },
             age_ms: Percentiles::default(),
             neighbours: BTreeMap::new(),
             comm: Communication::default(),
+            contribution: Contribution::default(),
             messages: Messages::default(),
-        };
+        }
+    }
+
+    fn answered(method: &str, answered: u64, ap: f64) -> Metrics {
+        let ap = |share: f64| ByIou { at_50: Some(ap * share), ..ByIou::default() };
+        let answered = Answered { answered, ticks: 60, ap_all_ticks: ap(0.5), streaming_ap: ap(0.25) };
+        Metrics { frames: answered.answered, answered: Some(answered), ..metrics(method, ap(1.0).at_50) }
+    }
+
+    #[test]
+    fn columns_line_up_and_missing_numbers_are_dashes() {
         let text = table(&[metrics("none", None), metrics("attention", Some(0.5))]);
         let lines: Vec<&str> = text.lines().collect();
-        assert!(lines.iter().all(|line| line.len() == lines[0].len()), "{text}");
+        assert!(lines.len() == 3 && lines.iter().all(|line| line.len() == lines[0].len()), "{text}");
         assert!(lines[1].contains("81 / -") && lines[2].contains("0.500"), "{text}");
+        assert!(lines[0].contains("frames") && !lines[0].contains("answered"), "{text}");
+    }
+
+    #[test]
+    fn a_live_table_gives_the_answered_ticks_and_warns_where_they_differ() {
+        let text = table(&[answered("max", 33, 0.8), answered("pastat", 29, 0.9)]);
+        let lines: Vec<&str> = text.lines().collect();
+        assert!(lines[1].contains("33/60") && lines[2].contains("29/60"), "{text}");
+        assert!(lines[1].contains("0.400") && lines[1].contains("0.200"), "all ticks and streaming: {text}");
+        assert!(text.contains("warning: lines are judged over different frames"), "{text}");
+        assert!(!table(&[answered("max", 60, 0.8), answered("none", 60, 0.7)]).contains("warning"));
+    }
+
+    #[test]
+    fn what_the_air_kept_back_is_told() {
+        let contribution =
+            Contribution { fused_per_frame: Some(0.05), sent: 38, used: 2, sent_bytes_mean: Some(3_150_000.0) };
+        let latency_ms = Latencies::default();
+        let text = table(&[Metrics { contribution, latency_ms, ..metrics("max", Some(0.8)) }]);
+        assert!(text.contains("neighbours fused per frame") && text.contains("0.05"), "{text}");
+        assert!(text.contains("max: of 38 maps of 3.1 MB each 2 arrived in time"), "{text}");
+        assert!(!text.contains(" / "), "no latency is known: {text}");
+        assert!(!table(&[metrics("max", None)]).contains("neighbours fused"), "nothing crossed any air");
     }
 }

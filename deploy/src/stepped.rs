@@ -25,7 +25,7 @@ use crate::evaluation::judge;
 use crate::fingerprint::Provenance;
 use crate::fleet::{Fleet, FleetError};
 use crate::ledger_report::LedgerReport;
-use crate::metrics::{Messages, Metrics};
+use crate::metrics::Metrics;
 use crate::run_folder::{RunFolder, RunFolderError, name_of_now};
 use crate::scenario::{NoiseMode, PoseSource, Scenario, Stepped};
 use crate::score::Board;
@@ -94,7 +94,7 @@ fn evaluate_config(fleet: &Fleet) -> EvaluateConfig {
         pose_source: pose_source(scenario, &scenario.agents.pose),
         codec: scenario.agents.codec,
         rate: scenario.agents.rate,
-        rule: Some(fleet.ground_truth_rule()),
+        protocol: Some(fleet.protocol.clone()),
         delay_nanos: 0,
         attack: None,
         trust: scenario.ego.trust.then(TrustConfig::default),
@@ -194,7 +194,7 @@ fn write(
     let ledger = evaluator.ledger();
     let balance = ledger.balance();
     let names = [fleet.scenario.method.name(), fleet.pose_source()];
-    let metrics = Metrics::of(board, "stepped", names, board.seconds(), Messages::of(&ledger.total()));
+    let metrics = Metrics::of(board, "stepped", names, board.seconds(), ledger, Some(evaluator.sent_bytes()));
     folder.write_json("metrics.json", &metrics)?;
     folder.write_frames(board.records(), &std::collections::BTreeMap::new())?;
     folder.write_json("ledger.json", &LedgerReport::new(&[], ledger, &balance, (&BTreeSet::new(), 0)))?;

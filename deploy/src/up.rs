@@ -17,7 +17,7 @@ use crate::fingerprint::Provenance;
 use crate::fleet::{Fleet, FleetError, Meeting, RECORDER, REPLAY};
 use crate::keys::KeyError;
 use crate::ledger_report::LedgerReport;
-use crate::metrics::{Messages, Metrics};
+use crate::metrics::Metrics;
 use crate::network::MeetingPlace;
 use crate::progress::Display;
 use crate::run_folder::{RunFolder, RunFolderError, SWEEP_LOG, name_of_now};
@@ -395,5 +395,5 @@ fn missed(fleet: &Fleet, board: &Board, ending: &Ending) -> u64 {
 fn metrics(fleet: &Fleet, board: &Board, progress: &Progress, sum: &Ledger) -> Metrics {
     let seconds = progress.span.map_or(0.0, |(first, last)| last.duration_since(first).as_secs_f64());
     let names = [fleet.scenario.method.name(), fleet.pose_source()];
-    Metrics::of(board, "wall", names, seconds, Messages::of(&sum.total()))
+    Metrics::of(board, "wall", names, seconds, sum, None)
 }

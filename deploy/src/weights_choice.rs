@@ -2,7 +2,12 @@
 
 use std::path::{Path, PathBuf};
 
+use agent::weights::{Weights, WeightsError};
 use ego_fuser::Method;
+use ego_fuser::model::METHOD_KEY;
+
+/// What a training calls its weights.
+const TRAINED_FILE: &str = "weights.safetensors";
 
 /// Why a method has no weights.
 #[derive(Debug, thiserror::Error)]
@@ -16,7 +21,10 @@ pub enum WeightsChoiceError {
         source: std::io::Error,
     },
     /// The folder has none, or several.
-    #[error("{}: {found} files named *-{name}.safetensors, method {method} needs one", folder.display())]
+    #[error(
+        "{}: {found} files named *-{name}.safetensors or {name}/{TRAINED_FILE}, method {method} needs one, or {TRAINED_FILE}",
+        folder.display()
+    )]
     NotOne {
         /// The folder.
         folder: PathBuf,
@@ -27,9 +35,25 @@ pub enum WeightsChoiceError {
         /// How many there are.
         found: usize,
     },
+    /// The folder is one of a training of another method.
+    #[error("{}: trained for {trained}, and method {method} needs weights trained for {name}", file.display())]
+    OtherMethod {
+        /// The weights.
+        file: PathBuf,
+        /// The method.
+        method: Method,
+        /// The method it would be trained for.
+        name: Method,
+        /// The method that the file names.
+        trained: String,
+    },
+    /// The weights of a training cannot be read.
+    #[error(transparent)]
+    Weights(#[from] WeightsError),
 }
 
-/// The weights of a method: `path` itself, or the one file `*-METHOD.safetensors` in the folder `path`.
+/// The weights of a method: `path` itself; of the folder `path` the one file `*-METHOD.safetensors` or
+/// `METHOD/weights.safetensors`, or where it has neither, `weights.safetensors` of a training of that method.
 ///
 /// `late` exchanges what every vehicle finds alone, so it runs with the weights of `none`; so does `early` where the
 /// folder has none of its own.
@@ -58,7 +82,23 @@ pub fn weights_of(path: &Path, method: Method) -> Result<PathBuf, WeightsChoiceE
         }
     }
     let (name, found) = last;
+    let trained = path.join(TRAINED_FILE);
+    if found == 0 && trained.is_file() {
+        return trained_for(trained, method, candidates);
+    }
     Err(WeightsChoiceError::NotOne { folder: path.to_path_buf(), method, name, found })
+}
+
+/// The weights of a training, if it was one of a method that `method` can run with.
+fn trained_for(file: PathBuf, method: Method, candidates: &[Method]) -> Result<PathBuf, WeightsChoiceError> {
+    let weights = Weights::load(&file)?;
+    match weights.metadata(METHOD_KEY) {
+        Some(trained) if candidates.iter().all(|name| name.name() != trained) => {
+            let trained = trained.to_owned();
+            Err(WeightsChoiceError::OtherMethod { file, method, name: candidates[0], trained })
+        }
+        _ => Ok(file),
+    }
 }
 
 fn files_of(folder: &Path, name: Method) -> Result<Vec<PathBuf>, WeightsChoiceError> {
@@ -71,11 +111,19 @@ fn files_of(folder: &Path, name: Method) -> Result<Vec<PathBuf>, WeightsChoiceEr
             files.push(entry.path());
         }
     }
+    let trained = folder.join(name.name()).join(TRAINED_FILE);
+    files.extend(trained.is_file().then_some(trained));
     Ok(files)
 }
 
 #[cfg(test)]
 mod tests {
+    use std::collections::BTreeMap;
+
+    use agent::weights::{Precision, save};
+    use tch::Device;
+    use tch::nn::{Init, VarStore};
+
     use super::*;
 
     #[test]
@@ -93,5 +141,43 @@ mod tests {
         assert!(of(Method::Max).unwrap_err().to_string().contains("2 files named *-max.safetensors"));
         assert!(of(Method::Attention).unwrap_err().to_string().contains("0 files"));
         assert_eq!(weights_of(Path::new("w.safetensors"), Method::Late).unwrap(), Path::new("w.safetensors"));
+    }
+
+    /// A training's folder with weights that say what they were trained for.
+    fn write_trained(folder: &Path, method: Method) {
+        std::fs::create_dir_all(folder).unwrap();
+        let variables = VarStore::new(Device::Cpu);
+        let _ = variables.root().var("weight", &[2], Init::Const(1.0));
+        let about = BTreeMap::from([(METHOD_KEY.to_owned(), method.name().to_owned())]);
+        save(&folder.join(TRAINED_FILE), &variables, &about, Precision::Single).unwrap();
+    }
+
+    #[test]
+    fn the_folder_of_a_training_serves_the_method_it_was_trained_for() {
+        let folder = tempfile::tempdir().unwrap();
+        write_trained(folder.path(), Method::None);
+        let of = |method| weights_of(folder.path(), method);
+        for method in [Method::None, Method::Late, Method::Early] {
+            assert!(of(method).unwrap().ends_with(TRAINED_FILE), "{method}");
+        }
+        let refused = of(Method::Attention).unwrap_err().to_string();
+        assert!(
+            refused.contains("trained for none, and method attention needs weights trained for attention"),
+            "{refused}"
+        );
+    }
+
+    #[test]
+    fn trainings_side_by_side_are_found_by_the_names_of_their_methods() {
+        let folder = tempfile::tempdir().unwrap();
+        for method in [Method::None, Method::Max] {
+            write_trained(&folder.path().join(method.name()), method);
+        }
+        let of = |method| weights_of(folder.path(), method);
+        assert_eq!(of(Method::Max).unwrap(), folder.path().join("max").join(TRAINED_FILE));
+        assert_eq!(of(Method::Late).unwrap(), folder.path().join("none").join(TRAINED_FILE));
+        assert!(of(Method::Attention).unwrap_err().to_string().contains("attention/weights.safetensors"));
+        std::fs::write(folder.path().join("lean-max.safetensors"), b"").unwrap();
+        assert!(of(Method::Max).unwrap_err().to_string().contains("2 files"), "two that could be meant");
     }
 }

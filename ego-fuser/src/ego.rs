@@ -21,7 +21,7 @@ use tch::{Kind, TchError, Tensor, no_grad};
 use crate::fusion::{AlignedMaps, EarlierMaps, FusionStage, SentMaps, StageError, ViewFacts};
 use crate::history::{History, KeptMap};
 use crate::method::{Exchange, Method};
-use crate::model::{METHOD_KEY, SCORE_THRESHOLD};
+use crate::model::METHOD_KEY;
 use crate::numbers;
 use crate::samples::merge_points;
 use crate::trust::{Belief, Trust, TrustConfig};
@@ -63,10 +63,11 @@ pub struct Ego {
     history: History,
     trust: Option<Trust>,
     limits: PostprocessConfig,
+    comm_range_m: f64,
 }
 
 impl Ego {
-    /// The communication range of OPV2V and its relatives, metres.
+    /// The communication range of OPV2V and its relatives, metres: what holds unless another is asked for.
     pub const COMM_RANGE_M: f64 = 70.0;
 
     /// Reads the weights; `method` overrides the one that the file names.
@@ -96,9 +97,14 @@ impl Ego {
 
     fn assembled(detector: Detector, method: Method, fusion: FusionStage) -> Self {
         let limits = PostprocessConfig::for_detector(detector.config());
-        let limits = PostprocessConfig { score_threshold: SCORE_THRESHOLD, ..limits };
         let history = History::new(fusion.frames());
-        Self { method, detector, fusion, history, trust: None, limits }
+        Self { method, detector, fusion, history, trust: None, limits, comm_range_m: Self::COMM_RANGE_M }
+    }
+
+    /// The same with another communication range: neighbours farther away, metres in the plane, have no part.
+    #[must_use]
+    pub fn with_comm_range(self, comm_range_m: f64) -> Self {
+        Self { comm_range_m, ..self }
     }
 
     /// The same leaving out neighbours whose words do not fit what the ego sees itself.
@@ -187,7 +193,7 @@ impl Ego {
         let world_from_ego = own.pose.world_from_cav().ok_or(no_pose)?;
         let world_from_cav = view.pose.world_from_cav().ok_or(no_pose)?;
         let [dx, dy] = [0, 1].map(|axis| world_from_cav.translation_m[axis] - world_from_ego.translation_m[axis]);
-        if dx.hypot(dy) > Self::COMM_RANGE_M {
+        if dx.hypot(dy) > self.comm_range_m {
             return Err(Skipped::Unusable(DropReason::OutOfRange));
         }
         let fits = match &view.content {
@@ -202,10 +208,11 @@ impl Ego {
 
     fn is_own_shape(&self, map: &DecodedFeatures) -> bool {
         let DecodedFeatures { features, sent } = map;
-        let [channels, ..] = self.detector.map_shape();
+        let [channels, ..] = self.detector.sent_shape();
         let cells = features.grid.cells();
         features.grid == self.detector.grid()
             && i64::from(features.channels) == channels
+            && features.code_of == self.detector.code_of()
             && features.values.len() == cells * features.channels as usize
             && sent.as_ref().is_none_or(|sent| sent.len() == cells)
     }
@@ -249,7 +256,7 @@ impl Ego {
 
     /// A map `[1, C, H, W]` and what was sent of it `[1, 1, H, W]`.
     fn tensors(&self, map: &DecodedFeatures, is_ego: bool) -> Result<(Tensor, Tensor), EgoError> {
-        let [channels, height, width] = self.detector.map_shape();
+        let [channels, height, width] = self.detector.sent_shape();
         if !self.is_own_shape(map) {
             return Err(EgoError::OwnMap {
                 channels: map.features.channels,
@@ -258,8 +265,7 @@ impl Ego {
                 expected: self.detector.grid(),
             });
         }
-        let values = Tensor::f_from_slice(&map.features.values)?.f_view([1, channels, height, width])?;
-        Ok((values, sent_cells(map, is_ego, [height, width])?))
+        Ok((self.detector.received(map)?, sent_cells(map, is_ego, [height, width])?))
     }
 
     /// The kept maps of the vehicles that take part, and where they belong now. An ego that does not know where it is

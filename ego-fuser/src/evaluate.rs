@@ -7,6 +7,7 @@
 mod error;
 mod sent;
 pub mod stepped;
+mod sweeps;
 
 use std::collections::VecDeque;
 use std::ops::ControlFlow;
@@ -21,10 +22,11 @@ use agent::rate::RateConfig;
 use agent::weights::Weights;
 use protocol::message::{Detections, FusedNeighbour, SkippedNeighbour};
 use protocol::{Box3d, CavId, CodecConfig, Ledger, PoseEstimate, Stamp};
-use sim_replay::dataset::{LoadOptions, Scenario};
+use sim_replay::class_set::ClassSet;
+use sim_replay::dataset::{LeftOut, LoadOptions, Scenario};
+use sim_replay::evaluation_protocol::EvaluationProtocol;
 use sim_replay::frame::Frame;
 use sim_replay::ground_truth::{self, GroundTruthRule};
-use tch::Tensor;
 
 use crate::ego::{Ego, EgoOutput, Skipped, View, own_content};
 use crate::feature_store::MapSource;
@@ -34,6 +36,7 @@ use crate::trust::{TrustConfig, heard};
 pub use error::EvaluateError;
 use sent::{Sent, stamp, view};
 use stepped::{RemoteCrew, SteppedConfig, VehicleConfig};
+use sweeps::Sweep;
 
 /// What to evaluate.
 #[derive(Debug, Clone)]
@@ -48,8 +51,9 @@ pub struct EvaluateConfig {
     pub codec: CodecConfig,
     /// What neighbours fit theirs to. There is no queue to watch here.
     pub rate: RateConfig,
-    /// Which objects count; absent: those wholly over the area of the network, of all vehicles within 70 m.
-    pub rule: Option<GroundTruthRule>,
+    /// Whose messages and annotations count, and which objects; absent: vehicles wholly over the area of the network,
+    /// of all agents within 70 m.
+    pub protocol: Option<EvaluationProtocol>,
     /// How long messages of neighbours are under way, nanoseconds: the ego fuses the newest that are at least so old.
     pub delay_nanos: u64,
     /// Neighbours that lie; absent: none.
@@ -67,12 +71,19 @@ pub struct EvaluatedFrame {
     pub stamp: Stamp,
     /// What the ego would have published.
     pub result: Detections,
-    /// The frames of all vehicles, the ego first: true poses and annotations.
+    /// The frames of all vehicles that take part, the ego first: true poses and annotations.
     pub frames: Vec<Frame>,
     /// Where each of them believes to be.
     pub poses: Vec<PoseEstimate>,
     /// The objects that count, in the ego's LiDAR frame.
     pub objects: Vec<Box3d>,
+}
+
+/// What all neighbours sent at one tick; nothing where none takes part.
+#[derive(Debug)]
+struct SentAtOnce {
+    capture_nanos: u64,
+    sent: Vec<Sent>,
 }
 
 /// Evaluates scenarios one after another.
@@ -83,13 +94,17 @@ pub struct Evaluator {
     ego: Ego,
     rule: GroundTruthRule,
     /// What the neighbours have sent, oldest first; the first is what has arrived last, or has not arrived yet.
-    under_way: VecDeque<Vec<Sent>>,
+    under_way: VecDeque<SentAtOnce>,
     maps: Option<MapSource>,
     /// How messages cross the air; absent: at once, or after a fixed delay.
     stepped: Option<SteppedConfig>,
     /// Who computes what the vehicles see; absent: this process.
     remote: Option<RemoteCrew>,
     ledger: Ledger,
+    /// Data that could not be used.
+    left_out: LeftOut,
+    /// Bytes of all that neighbours handed to the air.
+    sent_bytes: u64,
 }
 
 impl Evaluator {
@@ -99,12 +114,28 @@ impl Evaluator {
     /// [`EvaluateError`] names the file and what is wrong with it.
     pub fn new(config: EvaluateConfig) -> Result<Self, EvaluateError> {
         let ego = Ego::load(&config.weights, config.method)?.with_trust(config.trust)?;
-        let rule = config.rule.unwrap_or_else(|| rule_of(ego.detector()));
+        let area = ego.detector().config();
+        let rule = config
+            .protocol
+            .as_ref()
+            .map_or_else(|| rule_for(area), |protocol| protocol.rule_within(area.lidar_range_m));
+        let ego = ego.with_comm_range(rule.comm_range_m);
         let codec = CodecConfig { gate: config.codec.gate.or(ego.method().gate()), ..config.codec };
         let config = EvaluateConfig { codec, ..config };
         let weights = Weights::load(&config.weights)?;
-        let (under_way, ledger) = (VecDeque::new(), Ledger::default());
-        Ok(Self { weights, ego, rule, config, under_way, maps: None, stepped: None, remote: None, ledger })
+        Ok(Self {
+            weights,
+            ego,
+            rule,
+            config,
+            under_way: VecDeque::new(),
+            maps: None,
+            stepped: None,
+            remote: None,
+            ledger: Ledger::default(),
+            left_out: LeftOut::default(),
+            sent_bytes: 0,
+        })
     }
 
     /// The same with messages that cross the emulated air, in virtual time.
@@ -127,6 +158,12 @@ impl Evaluator {
         &self.ledger
     }
 
+    /// Bytes of all that neighbours handed to the air so far, poses and headers included; 0 without one.
+    #[must_use]
+    pub fn sent_bytes(&self) -> u64 {
+        self.sent_bytes
+    }
+
     /// The same with maps that its encoder made before, kept as exactly as messages say them or more: those say the same
     /// then.
     #[must_use]
@@ -140,16 +177,24 @@ impl Evaluator {
         &self.ego
     }
 
+    /// The protocol with the ground-truth rule as it is applied to this network; absent where none was asked for.
+    #[must_use]
+    pub fn protocol(&self) -> Option<EvaluationProtocol> {
+        let protocol = self.config.protocol.clone()?;
+        Some(EvaluationProtocol { ground_truth: self.rule, ..protocol })
+    }
+
     /// Which objects count.
     #[must_use]
     pub fn rule(&self) -> &GroundTruthRule {
         &self.rule
     }
 
-    /// Runs over a scenario, its first agent being the ego; `on_frame` may end it.
+    /// Runs over a scenario, its first agent being the ego; `on_frame` may end it. Frames that cannot be read are left out
+    /// and counted ([`Self::left_out`]): a neighbour's as if it were absent, the ego's with its whole tick.
     ///
     /// # Errors
-    /// [`EvaluateError`] at the first frame that cannot be read.
+    /// [`EvaluateError`] when the pipeline refuses.
     pub fn run(
         &mut self,
         scenario: &Scenario,
@@ -166,12 +211,13 @@ impl Evaluator {
         for cav in &scenario.agents {
             agents.push(self.agent(scenario, cav, agents.is_empty(), None)?);
         }
+        let places: Vec<usize> = (0..agents.len()).collect();
         for tick in 0..scenario.ticks.len() {
-            let frames: Result<Vec<Frame>, _> =
-                (0..agents.len()).map(|agent| scenario.load(agent, tick, &load)).collect();
-            let maps = self.maps_at(scenario, tick)?;
-            let frame = self.frame(&mut agents, frames?, &maps, tick)?;
-            if on_frame(frame).is_break() {
+            let sweeps = self.sweeps(scenario, tick, &places, &load, |_| true)?;
+            if sweeps.first().is_none_or(|ego| ego.place != 0) {
+                continue;
+            }
+            if on_frame(self.frame(&mut agents, sweeps, tick)?).is_break() {
                 return Ok(ControlFlow::Break(()));
             }
         }
@@ -210,39 +256,28 @@ impl Evaluator {
         self.maps.is_none() || shares_points || self.config.pose_source.looks_at_sweeps()
     }
 
-    /// The kept maps of all vehicles at a tick, in the order of the scenario's agents; none where none are kept.
-    fn maps_at(&mut self, scenario: &Scenario, tick: usize) -> Result<Vec<Tensor>, EvaluateError> {
-        let maps = (0..scenario.agents.len()).map(|agent| self.map_of(scenario, agent, tick));
-        Ok(maps.collect::<Result<Vec<_>, _>>()?.into_iter().flatten().collect())
-    }
-
-    /// The kept map of a vehicle's sweep; none where none are kept.
-    fn map_of(&mut self, scenario: &Scenario, agent: usize, tick: usize) -> Result<Option<Tensor>, EvaluateError> {
-        let Some(maps) = &mut self.maps else { return Ok(None) };
-        let Some(index) = maps.index_of(&scenario.name) else { return Ok(None) };
-        Ok(Some(maps.map(index, scenario, agent, tick).map_err(Box::new)?))
-    }
-
     fn frame(
         &mut self,
         agents: &mut [Agent],
-        frames: Vec<Frame>,
-        maps: &[Tensor],
+        sweeps: Vec<Sweep>,
         tick: usize,
     ) -> Result<EvaluatedFrame, EvaluateError> {
         let exchange = own_content(self.ego.method());
-        let mut sent = Vec::with_capacity(frames.len());
-        for (index, (agent, frame)) in agents.iter_mut().zip(&frames).enumerate() {
+        let mut sent = Vec::with_capacity(sweeps.len());
+        let mut frames = Vec::with_capacity(sweeps.len());
+        for Sweep { place, frame, map } in sweeps {
             // Without an exchange, neighbours have nothing to encode; where they are is still asked.
-            let is_needed = index == 0 || self.ego.method() != Method::None;
-            let codec = if index == 0 { of_the_ego(self.config.codec) } else { self.config.codec };
+            let is_needed = place == 0 || self.ego.method() != Method::None;
+            let codec = if place == 0 { of_the_ego(self.config.codec) } else { self.config.codec };
+            let agent = &mut agents[place];
             agent.overhear(|| sent.last().map(Sent::overheard).unwrap_or_default());
-            sent.push(view(agent, frame, maps.get(index), is_needed.then_some(exchange), &codec)?);
+            sent.push(view(agent, &frame, map.as_ref(), is_needed.then_some(exchange), &codec)?);
+            frames.push(frame);
         }
         let poses = sent.iter().map(|sent| sent.pose).collect();
         let own = sent.remove(0);
         let own = own.view().expect("the ego is needed by every method");
-        self.under_way.push_back(sent);
+        self.under_way.push_back(SentAtOnce { capture_nanos: own.capture_nanos, sent });
         let (neighbours, bytes): (Vec<View>, Vec<_>) =
             self.arrived(own.capture_nanos).iter().filter_map(Sent::heard).unzip();
         let output = self.ego.detect(&own, &neighbours)?;
@@ -295,23 +330,15 @@ impl Evaluator {
     /// What the neighbours sent last of all that has arrived; nothing where all is still under way.
     fn arrived(&mut self, now_nanos: u64) -> &[Sent] {
         let delay_nanos = self.config.delay_nanos;
-        let has_arrived = |sent: &Vec<Sent>| {
-            sent.iter().all(|sent| sent.capture_nanos.saturating_add(delay_nanos) <= now_nanos) && !sent.is_empty()
-        };
+        let has_arrived = |tick: &SentAtOnce| tick.capture_nanos.saturating_add(delay_nanos) <= now_nanos;
         while self.under_way.get(1).is_some_and(has_arrived) {
             self.under_way.pop_front();
         }
-        self.under_way.front().filter(|sent| has_arrived(sent)).map_or(&[], Vec::as_slice)
+        self.under_way.front().filter(|tick| has_arrived(tick)).map_or(&[], |tick| tick.sent.as_slice())
     }
 }
 
-/// The objects of all vehicles within 70 m that lie wholly over the area of a detector.
-#[must_use]
-pub fn rule_of(detector: &Detector) -> GroundTruthRule {
-    rule_for(detector.config())
-}
-
-/// The same by its numbers.
+/// The vehicles that lie wholly over the area of a detector, as annotated by all agents within 70 m.
 #[must_use]
 pub fn rule_for(config: &DetectorConfig) -> GroundTruthRule {
     let [x_low, y_low, z_low, x_high, y_high, z_high] = config.lidar_range_m;
@@ -321,6 +348,7 @@ pub fn rule_for(config: &DetectorConfig) -> GroundTruthRule {
         z_m: [z_low, z_high],
         comm_range_m: Ego::COMM_RANGE_M,
         min_corners: 8,
+        classes: ClassSet::VEHICLES,
     }
 }
 

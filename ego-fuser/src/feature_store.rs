@@ -150,10 +150,15 @@ impl FeatureStore {
                 if self.bytes() >= limit_bytes {
                     return Ok(());
                 }
-                let frame =
-                    scenario.load(sweep / self.ticks[index], sweep % self.ticks[index], &LoadOptions::default())?;
-                let map = detector.encode(&frame.points)?.features;
-                let message = self.packed(detector.to_message(&map)?)?;
+                let (agent, tick) = (sweep / self.ticks[index], sweep % self.ticks[index]);
+                // A sweep that is absent or cannot be read has an empty place.
+                let message = match scenario.load(agent, tick, &LoadOptions::default()) {
+                    Ok(frame) => {
+                        let map = detector.encode(&frame.points)?.features;
+                        self.packed(detector.to_kept(&map)?)?
+                    }
+                    Err(_) => Vec::new(),
+                };
                 let length = u32::try_from(message.len()).map_err(|_| self.io(io::ErrorKind::FileTooLarge.into()))?;
                 let record = [&length.to_le_bytes()[..], &message].concat();
                 self.file.write_all(&record).map_err(|source| self.io(source))?;
@@ -177,7 +182,8 @@ impl FeatureStore {
         encode().map_err(|source| FeatureStoreError::Wire { path: self.path.clone(), source })
     }
 
-    /// The map of a sweep, `[1, C, H, W]`, by scenario, agent and tick; nothing where it did not fit.
+    /// The map of a sweep, `[1, C, H, W]`, by scenario, agent and tick; nothing where it did not fit or the sweep could
+    /// not be read.
     ///
     /// # Errors
     /// [`FeatureStoreError`] when the file cannot be read or was changed.
@@ -187,6 +193,9 @@ impl FeatureStore {
             return Ok(None);
         };
         let start = start + LENGTH_BYTES;
+        if start == end {
+            return Ok(None);
+        }
         let mut bytes = vec![0; (end - start) as usize];
         self.file.read_exact_at(&mut bytes, start).map_err(|source| self.io(source))?;
         let decode = || -> Result<_, WireError> {

@@ -26,9 +26,6 @@ use crate::warp::WarpError;
 /// Metadata key of the method that weights were trained with.
 pub const METHOD_KEY: &str = "method";
 
-/// Detections below this score are not decoded.
-pub const SCORE_THRESHOLD: f32 = 0.1;
-
 /// Why a model cannot be built, loaded or run.
 #[derive(Debug, thiserror::Error)]
 pub enum ModelError {
@@ -275,7 +272,7 @@ impl CooperativeModel {
     /// The limits of the clean-up that go with this network: boxes lie wholly over its area.
     #[must_use]
     pub fn limits(&self) -> PostprocessConfig {
-        PostprocessConfig { score_threshold: SCORE_THRESHOLD, ..PostprocessConfig::for_detector(self.config()) }
+        PostprocessConfig::for_detector(self.config())
     }
 
     /// What finds the targets of a frame among the anchors of the head.

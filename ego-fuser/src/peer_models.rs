@@ -7,7 +7,7 @@ use std::collections::BTreeMap;
 
 use agent::detector::Detector;
 use protocol::message::{Descriptor, ModelHash};
-use protocol::{BevFeatures, BevGrid, CavId, WireError};
+use protocol::{BevGrid, CavId, EncodedFeatures, WireError};
 
 /// A network that is not the ego's: the field that tells, and both values.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -26,7 +26,9 @@ pub(crate) enum OtherModel {
 /// The ego's network, and the agents known to run another one. An agent of which nothing was heard is not among them.
 pub(crate) struct PeerModels {
     grid: BevGrid,
+    /// As they cross the air.
     channels: u32,
+    code_of: Option<u32>,
     model_hash: ModelHash,
     others: BTreeMap<CavId, OtherModel>,
 }
@@ -36,25 +38,19 @@ impl PeerModels {
     pub(crate) fn new(own: &Detector) -> Self {
         Self {
             grid: own.grid(),
-            channels: u32::try_from(own.map_shape()[0]).unwrap_or(u32::MAX),
+            channels: u32::try_from(own.sent_shape()[0]).unwrap_or(u32::MAX),
+            code_of: own.code_of(),
             model_hash: own.model_hash(),
             others: BTreeMap::new(),
         }
     }
 
-    /// Whether a map lies on the lattice of the ego's network.
+    /// Whether a map has the lattice and the channels of the ego's network.
     ///
     /// # Errors
     /// [`WireError`] names what differs.
-    pub(crate) fn check(&self, map: &BevFeatures) -> Result<(), WireError> {
-        if map.grid != self.grid {
-            return Err(WireError::Grid { expected: self.grid.to_string(), found: map.grid.to_string() });
-        }
-        if map.channels != self.channels {
-            let (expected, found) = (self.channels.into(), map.channels.into());
-            return Err(WireError::Shape { what: "channels", expected, found });
-        }
-        Ok(())
+    pub(crate) fn check(&self, map: &EncodedFeatures) -> Result<(), WireError> {
+        map.check_shape(&self.grid, self.channels, self.code_of)
     }
 
     /// Takes in what an agent says of itself; how its network differs, when that is news.
@@ -104,7 +100,7 @@ mod tests {
     fn another_network_is_news_once_and_until_it_is_the_egos() {
         let grid = BevGrid { x_min_m: -51.2, y_min_m: -38.4, cell_m: 0.8, width: 128, height: 96 };
         let own = ModelHash([7; 32]);
-        let mut models = PeerModels { grid, channels: 64, model_hash: own, others: BTreeMap::new() };
+        let mut models = PeerModels { grid, channels: 64, code_of: None, model_hash: own, others: BTreeMap::new() };
         let cav = CavId::new("20").unwrap();
         let same = Descriptor { model_hash: own, grid, channels: 64, dtype: Dtype::I8, streams: vec![Stream::Bev] };
         assert_eq!(models.hear(&cav, &same), None);

@@ -131,7 +131,7 @@ impl ResidualMeter {
         let Some(world_from_ego) = ego.world_from_lidar else { return Ok(Vec::new()) };
         let own = self.map(&ego.points)?;
         let mut pairs = Vec::new();
-        for agent in 1..scenario.agents.len() {
+        for agent in scenario.present_agents(tick).skip(1) {
             let frame = scenario.load(agent, tick, &LoadOptions::default())?;
             let Some(world_from_cav) = frame.world_from_lidar else { continue };
             let ego_from_cav = world_from_ego.from_world(&world_from_cav);

@@ -21,7 +21,7 @@ fn features(kib: usize) -> BevFeatures {
         state = state.wrapping_mul(1_664_525).wrapping_add(1_013_904_223);
         ((state >> 8) as f32 / 8_388_608.0 - 1.0).max(0.0)
     });
-    BevFeatures { grid, channels, values: values.take(64 * cells).collect() }
+    BevFeatures { grid, channels, code_of: None, values: values.take(64 * cells).collect() }
 }
 
 fn confidence(cells: usize) -> Vec<f32> {

@@ -85,6 +85,9 @@ pub struct BevFeatures {
     pub grid: BevGrid,
     /// Number of channels `C`.
     pub channels: u32,
+    /// Channels of the map that the sender's network has squeezed into these, and the receiver's widens again; absent: this
+    /// is the map.
+    pub code_of: Option<u32>,
     /// `C * H * W` values.
     pub values: Vec<f32>,
 }

@@ -12,7 +12,7 @@
 //! # fn main() -> Result<(), Box<dyn std::error::Error>> {
 //! // An agent: half precision, at most 2,000 bytes, the most confident cells first.
 //! let grid = BevGrid { x_min_m: -51.2, y_min_m: -38.4, cell_m: 0.8, width: 32, height: 24 };
-//! let features = BevFeatures { grid, channels: 4, values: vec![0.5; 4 * 24 * 32] };
+//! let features = BevFeatures { grid, channels: 4, code_of: None, values: vec![0.5; 4 * 24 * 32] };
 //! let config = CodecConfig { dtype: Dtype::F16, budget_bytes: Some(2_000), ..CodecConfig::default() };
 //! let confidence: Vec<f32> = (0..24 * 32).map(|cell| cell as f32 / 768.0).collect();
 //! let message = Bev {
@@ -29,7 +29,7 @@
 //! // The ego: the payload may lie in any number of pieces.
 //! let (header, bev) = wire::decode::<Bev>(encoded.pieces(), &Limits::DEFAULT)?;
 //! header.check_sender(&"4279".parse()?)?;
-//! bev.features.check_shape(&grid, 4)?;
+//! bev.features.check_shape(&grid, 4, None)?;
 //! let received = bev.features.decode(&Limits::DEFAULT)?;
 //! let sent_cells = received.sent.expect("not all cells fit").iter().filter(|sent| **sent).count();
 //! assert_eq!(sent_cells, (2_000 - 24 * 32 / 8) / (4 * 2));

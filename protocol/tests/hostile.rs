@@ -101,7 +101,7 @@ fn absurd_lengths_in_the_header_are_refused() {
 
 fn absurd_map(grid: BevGrid, channels: u32, selection: Selection, packing: Packing) -> WireError {
     let codec = Codec { dtype: Dtype::I8, selection, packing };
-    let features = EncodedFeatures { grid, channels, codec, rate: None, body: Body::Bytes(vec![0; 15]) };
+    let features = EncodedFeatures { grid, channels, code_of: None, codec, rate: None, body: Body::Bytes(vec![0; 15]) };
     features.decode(&Limits::DEFAULT).unwrap_err()
 }
 
@@ -123,6 +123,23 @@ fn absurd_shapes_in_the_metadata_are_refused() {
         for cell_m in [0.0, -1.0, f64::NAN, f64::INFINITY] {
             let error = absurd_map(BevGrid { cell_m, ..grid }, 1, none, packing);
             assert!(matches!(error, WireError::Value { what: "grid cell_m", .. }), "{error}");
+        }
+    }
+}
+
+#[test]
+fn a_code_stands_for_a_map_of_no_fewer_channels_and_no_more_than_are_taken() {
+    for (widened, is_right) in [(2, false), (3, true), (1024, true), (1025, false), (u32::MAX, false)] {
+        let mut bev = sample::squeezed_bev();
+        bev.features.code_of = Some(widened);
+        // What no sender writes, a forger does.
+        let encoded = wire::encode(&sample::stamp(), bev);
+        assert_eq!(encoded.is_ok(), widened > 2, "{widened}");
+        let Ok(encoded) = encoded else { continue };
+        match decode(&encoded.to_vec()) {
+            Ok((_, Message::Bev(bev))) => assert!(is_right && bev.features.code_of == Some(widened), "{widened}"),
+            Ok(other) => panic!("{other:?}"),
+            Err(error) => assert!(!is_right && error.drop_reason() == DropReason::Shape, "{error}"),
         }
     }
 }

@@ -23,7 +23,7 @@ fn resident(field: &str) -> u64 {
 fn largest_map(dtype: Dtype, selection: Selection, packing: Packing, body: Vec<u8>) -> EncodedFeatures {
     let grid = BevGrid { width: 64, height: 32, ..sample::grid() };
     let codec = Codec { dtype, selection, packing };
-    EncodedFeatures { grid, channels: 1024, codec, rate: None, body: Body::Bytes(body) }
+    EncodedFeatures { grid, channels: 1024, code_of: None, codec, rate: None, body: Body::Bytes(body) }
 }
 
 /// A zstd frame of zeros, written in small parts so that making it takes no memory.

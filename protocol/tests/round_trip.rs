@@ -103,13 +103,13 @@ proptest! {
 
     #[test]
     fn any_map_survives_its_codec((features, confidence, config) in any_map()) {
-        let BevFeatures { grid, channels, values } = features.clone();
+        let BevFeatures { grid, channels, code_of, values } = features.clone();
         let encoded = encode_features(features, &config, Some(&confidence)).unwrap();
         if let Some(budget) = config.budget_bytes {
             prop_assert!(encoded.body.len() as u64 <= budget);
         }
         let DecodedFeatures { features: back, sent } = encoded.decode(&Limits::DEFAULT).unwrap();
-        prop_assert_eq!((back.grid, back.channels), (grid, channels));
+        prop_assert_eq!((back.grid, back.channels, back.code_of), (grid, channels, code_of));
 
         let cells = grid.cells();
         let sent = sent.unwrap_or_else(|| vec![true; cells]);

@@ -35,7 +35,7 @@ fn features(kib: usize) -> BevFeatures {
     let cells = kib * 1024 / 4 / CHANNELS;
     let grid = BevGrid { x_min_m: -51.2, y_min_m: -38.4, cell_m: 0.8, width: 32, height: cells as u32 / 32 };
     let values = (0..CHANNELS * cells).map(|index| (index % 1013) as f32 * 0.01).collect();
-    BevFeatures { grid, channels: CHANNELS as u32, values }
+    BevFeatures { grid, channels: CHANNELS as u32, code_of: None, values }
 }
 
 /// Puts a payload of `values`' bytes; how long until the subscriber's callback has it, and until its bytes lie together,

@@ -75,13 +75,21 @@ impl CarlaPose {
     #[must_use]
     pub fn from_pose(pose: &Pose) -> Self {
         let rotation = mirrored_rotation(pose.isometry().rotation.to_rotation_matrix().matrix());
+        Self::from_parts(mirrored_point(pose.translation_m), &rotation)
+    }
+
+    /// The numbers for which [`Self::left_handed_matrix`] is the matrix of a pose of ours, nothing mirrored: V2V4Real and
+    /// V2X-Real use the formula in right-handed axes.
+    #[must_use]
+    pub fn from_right_handed(pose: &Pose) -> Self {
+        Self::from_parts(pose.translation_m, pose.isometry().rotation.to_rotation_matrix().matrix())
+    }
+
+    fn from_parts(position_m: [f64; 3], rotation: &Matrix3<f64>) -> Self {
         let pitch = rotation[(2, 0)].clamp(-1.0, 1.0).asin();
         let roll = (-rotation[(2, 1)]).atan2(rotation[(2, 2)]);
         let yaw = rotation[(1, 0)].atan2(rotation[(0, 0)]);
-        Self {
-            position_m: mirrored_point(pose.translation_m),
-            roll_yaw_pitch_deg: [roll, yaw, pitch].map(f64::to_degrees),
-        }
+        Self { position_m, roll_yaw_pitch_deg: [roll, yaw, pitch].map(f64::to_degrees) }
     }
 }
 
@@ -127,6 +135,13 @@ mod tests {
             for (ours, theirs) in back.into_iter().zip(<[f64; 6]>::from(pose)) {
                 prop_assert!((ours - theirs).abs() < 1e-6, "{back:?} {pose:?}");
             }
+        }
+
+        #[test]
+        fn the_matrix_of_right_handed_numbers_is_that_of_the_pose(pose in any_pose()) {
+            let ours = pose.to_pose();
+            let matrix = CarlaPose::from_right_handed(&ours).left_handed_matrix();
+            prop_assert!((matrix - ours.isometry().to_homogeneous()).amax() < 1e-9);
         }
     }
 

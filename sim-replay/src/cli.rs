@@ -13,9 +13,9 @@ use crate::command;
 #[derive(Debug, Parser)]
 #[command(
     version,
-    after_help = "Exit codes: 0 done, 1 failed, 2 bad usage or input, 3 finished but data was lost (stream: frames that \
-                  cannot be read, ticks that are not answered; record and recover: messages that are missing; link: \
-                  messages that never arrive)."
+    after_help = "Exit codes: 0 done, 1 failed, 2 bad usage or input, 3 finished but data was lost (convert, stream: frames \
+                  that cannot be read; stream: ticks that are not answered; record and recover: messages that are \
+                  missing; link: messages that never arrive)."
 )]
 pub(crate) struct Cli {
     #[command(subcommand)]
@@ -24,6 +24,7 @@ pub(crate) struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
+    Convert(command::convert::Args),
     Inspect(command::inspect::Args),
     Link(command::link::Args),
     Record(command::record::Args),
@@ -46,6 +47,7 @@ pub(crate) enum Outcome {
 /// Runs what was asked for and prints the chain of causes where it failed.
 pub(crate) fn run(cli: Cli) -> ExitCode {
     let outcome = match cli.command {
+        Command::Convert(args) => command::convert::run(&args),
         Command::Inspect(args) => command::inspect::run(&args),
         Command::Link(args) => command::link::run(&args),
         Command::Record(args) => command::record::run(&args),

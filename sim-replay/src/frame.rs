@@ -2,8 +2,12 @@
 //!
 //! Every layout is read into this one frame: right-handed, metres, radians, nanoseconds (see [`protocol`]).
 
+use std::str::FromStr;
+
 use protocol::{CavId, Handedness, PointCloud, Pose};
 use serde::{Deserialize, Serialize};
+
+use crate::dataset::Problem;
 
 /// What an annotated object is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
@@ -26,12 +30,46 @@ pub enum ObjectClass {
 }
 
 impl ObjectClass {
-    /// Whether detection counts the object: all but pedestrians are one class (the rule of V2V4Real).
+    /// Every class.
+    pub const ALL: [Self; 7] =
+        [Self::Car, Self::Van, Self::Truck, Self::Bus, Self::TwoWheeler, Self::Pedestrian, Self::Other];
+    /// Classes of motor vehicles with at least three wheels: the default targets of detection.
+    pub const VEHICLES: [Self; 4] = [Self::Car, Self::Van, Self::Truck, Self::Bus];
+
+    /// True for [`Self::VEHICLES`]. An object of unknown type is no vehicle.
     #[must_use]
-    pub fn is_detection_target(self) -> bool {
-        self != Self::Pedestrian
+    pub fn is_vehicle(self) -> bool {
+        Self::VEHICLES.contains(&self)
+    }
+
+    /// Its name in files and options: `car`, `two_wheeler`.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Car => "car",
+            Self::Van => "van",
+            Self::Truck => "truck",
+            Self::Bus => "bus",
+            Self::TwoWheeler => "two_wheeler",
+            Self::Pedestrian => "pedestrian",
+            Self::Other => "other",
+        }
     }
 }
+
+impl FromStr for ObjectClass {
+    type Err = UnknownClass;
+
+    /// Reads [`ObjectClass::name`].
+    fn from_str(text: &str) -> Result<Self, UnknownClass> {
+        Self::ALL.into_iter().find(|class| class.name() == text).ok_or_else(|| UnknownClass(text.to_owned()))
+    }
+}
+
+/// A text that names no class.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{0:?} is no class: expected vehicle, car, van, truck, bus, two_wheeler, pedestrian or other")]
+pub struct UnknownClass(String);
 
 /// An annotated object.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -71,6 +109,8 @@ pub struct Frame {
     pub speed_mps: Option<f64>,
     /// What this CAV's annotation lists. A CAV never lists itself.
     pub objects: Vec<Object>,
+    /// Parts of the frame that were left out: an object without a sound box, a field that cannot be read.
+    pub problems: Vec<Problem>,
     /// Which way the axes of the recording turned.
     pub source_handedness: Handedness,
 }
@@ -90,6 +130,7 @@ impl Frame {
             gnss_world_from_vehicle: None,
             speed_mps: None,
             objects: Vec::new(),
+            problems: Vec::new(),
             source_handedness,
         }
     }
@@ -100,5 +141,19 @@ impl Frame {
         let gnss = self.gnss_world_from_vehicle?.isometry();
         let vehicle_from_lidar = self.world_from_vehicle?.isometry().inv_mul(&self.world_from_lidar?.isometry());
         Some((gnss * vehicle_from_lidar).into())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_of_classes_are_those_of_files_and_are_read_back() {
+        for class in ObjectClass::ALL {
+            assert_eq!(class.name().parse(), Ok(class));
+            assert_eq!(serde_json::to_value(class).unwrap(), class.name());
+        }
+        assert!(!ObjectClass::Other.is_vehicle() && !ObjectClass::TwoWheeler.is_vehicle());
     }
 }

@@ -9,11 +9,13 @@ use std::collections::HashSet;
 
 use nalgebra::{Isometry3, Vector3};
 use protocol::Box3d;
+use serde::{Deserialize, Serialize};
 
+use crate::class_set::ClassSet;
 use crate::frame::{Frame, Object};
 
 /// Where objects count, and whose annotations.
-#[derive(Debug, Clone, Copy, PartialEq)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 pub struct GroundTruthRule {
     /// Lower and upper end of x in the ego's LiDAR frame, metres, both included.
     pub x_m: [f64; 2],
@@ -25,15 +27,29 @@ pub struct GroundTruthRule {
     pub comm_range_m: f64,
     /// How many of a box's 8 corners must lie within x, y and z.
     pub min_corners: usize,
+    /// Classes of the objects that count.
+    pub classes: ClassSet,
 }
 
 impl GroundTruthRule {
     /// OPV2V and V2XSet: x within 140 m, y within 40 m, z -3..1 m, all corners, 70 m of communication.
-    pub const OPV2V: Self =
-        Self { x_m: [-140.0, 140.0], y_m: [-40.0, 40.0], z_m: [-3.0, 1.0], comm_range_m: 70.0, min_corners: 8 };
+    pub const OPV2V: Self = Self {
+        x_m: [-140.0, 140.0],
+        y_m: [-40.0, 40.0],
+        z_m: [-3.0, 1.0],
+        comm_range_m: 70.0,
+        min_corners: 8,
+        classes: ClassSet::VEHICLES,
+    };
     /// V2V4Real: x within 100 m, y within 40 m, z -5..3 m, two corners, 70 m of communication.
-    pub const V2V4REAL: Self =
-        Self { x_m: [-100.0, 100.0], y_m: [-40.0, 40.0], z_m: [-5.0, 3.0], comm_range_m: 70.0, min_corners: 2 };
+    pub const V2V4REAL: Self = Self {
+        x_m: [-100.0, 100.0],
+        y_m: [-40.0, 40.0],
+        z_m: [-5.0, 3.0],
+        comm_range_m: 70.0,
+        min_corners: 2,
+        classes: ClassSet::ALL_BUT_PEDESTRIANS,
+    };
 
     /// Whether enough corners lie in range, and all of them in x and y.
     #[must_use]
@@ -61,7 +77,7 @@ pub fn merge(frames_of_tick: &[&Frame], ego_index: usize, rule: &GroundTruthRule
     let mut seen = HashSet::new();
     let mut merged = Vec::new();
     for index in contributors(frames_of_tick, ego_index, rule.comm_range_m) {
-        for object in frames_of_tick[index].objects.iter().filter(|object| object.class.is_detection_target()) {
+        for object in frames_of_tick[index].objects.iter().filter(|object| rule.classes.contains(object.class)) {
             let box3d = upright_box(object, &ego_from_world);
             if rule.keeps(&box3d) && seen.insert(object.id) {
                 merged.push((object.id, box3d));

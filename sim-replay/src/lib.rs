@@ -9,7 +9,9 @@
 pub mod bounded;
 pub mod bus;
 pub mod carla_pose;
+pub mod class_set;
 pub mod dataset;
+pub mod evaluation_protocol;
 pub mod frame;
 pub mod ground_truth;
 pub mod inspect;

@@ -33,7 +33,7 @@ fn features(mib: u32) -> BevFeatures {
     let width = (f64::from(cells).sqrt() as u32).next_power_of_two();
     let grid = BevGrid { x_min_m: -51.2, y_min_m: -38.4, cell_m: 0.8, width, height: cells / width };
     let values = (0..channels * cells).map(|index| (index % 1009) as f32 * 0.01).collect();
-    BevFeatures { grid, channels, values }
+    BevFeatures { grid, channels, code_of: None, values }
 }
 
 /// Our way.

@@ -9,6 +9,8 @@ use ego_fuser::Method;
 use ego_fuser::loss::LossConfig;
 use ego_fuser::samples::{SampleConfig, SampleKind};
 use ego_fuser::train::{Accuracy, Observer, StepReport, TrainConfig};
+use sim_replay::dataset::OpenOptions;
+use sim_replay::evaluation_protocol::ProtocolConfig;
 
 /// libtorch has one generator of random numbers per process: who begins a training has it alone.
 pub fn alone() -> MutexGuard<'static, ()> {
@@ -60,6 +62,7 @@ pub fn config(data: &Path, out: &Path, method: Method, steps: u64) -> TrainConfi
     TrainConfig {
         data: vec![data.to_owned()],
         validation: vec![],
+        open: OpenOptions::default(),
         method,
         detector: small(),
         init: None,
@@ -73,6 +76,7 @@ pub fn config(data: &Path, out: &Path, method: Method, steps: u64) -> TrainConfi
         },
         validate_every: 1_000,
         validation_frames: 1,
+        protocol: ProtocolConfig::default(),
         samples: SampleConfig::training(SampleKind::Single),
         loss: LossConfig::default(),
     }

@@ -183,7 +183,7 @@ fn with_number(mut bytes: Vec<u8>, old: [f64; 2], new: f64) -> Vec<u8> {
 fn bomb(stamp: &Stamp, pose: PoseEstimate, grid: BevGrid) -> Vec<u8> {
     let zeros = zstd::bulk::compress(&vec![0; 64 << 20], 1).unwrap();
     let codec = Codec { dtype: Dtype::F32, selection: Selection::Dense, packing: Packing::Zstd };
-    let features = EncodedFeatures { grid, channels: 1, codec, rate: None, body: Body::Bytes(zeros) };
+    let features = EncodedFeatures { grid, channels: 1, code_of: None, codec, rate: None, body: Body::Bytes(zeros) };
     wire::encode(stamp, Bev { pose, features }).unwrap().to_vec()
 }
 

@@ -141,10 +141,16 @@ fn golden_converted_networks_detect_offline_in_either_world() {
             let Some(converted) = convert(&state, &["--model", model, "--y-axis", y_axis]) else { return };
             let mut detector = OfflineDetector::load(&converted.unwrap().0).unwrap();
             let frames = frames(mirrored);
-            let (together, others) = detector.detect(&frames).unwrap();
-            assert_eq!(others, 1, "{name}");
-            let (alone, others) = detector.detect(&frames[..1]).unwrap();
-            assert_eq!(others, 0, "{name}");
+            let (together, bytes) = detector.detect(&frames).unwrap();
+            // 16 channels on 16 x 32 cells in `f32`; where cells are left out, a bit for each beside those that are not.
+            let whole = 4 * 16 * 16 * 32;
+            let fewest = if model == "point_pillar_where2comm" { 64 } else { whole };
+            assert!(
+                bytes.len() == 1 && (fewest..=whole).contains(&bytes[0]) && bytes[0] % 64 == 0,
+                "{name}: {bytes:?}"
+            );
+            let (alone, bytes) = detector.detect(&frames[..1]).unwrap();
+            assert!(bytes.is_empty(), "{name}");
             assert!(!together.is_empty() && together != alone, "{name}: {} boxes", together.len());
             found.push(together);
         }
@@ -166,6 +172,7 @@ fn state_of(folder: &Path, method: Method, fusion: &FusionConfig) -> (PathBuf, B
         num_filters: vec![8, 12, 16],
         num_upsample_filters: vec![8; 3],
         shrink: Some(ShrinkConfig::DoubleConv { channels: 16, stride: 2 }),
+        compress_ratio: Some(4),
         ..DetectorConfig::full()
     };
     let model = CooperativeModel::with_fusion(&detector, method, fusion, Device::Cpu).unwrap();
@@ -192,7 +199,7 @@ fn hypes(model: &str, more: Value) -> Value {
         "voxel_size": [0.4, 0.4, 4],
         "lidar_range": [-12.8, -6.4, -3, 12.8, 6.4, 1],
         "anchor_number": 2,
-        "compression": 0,
+        "compression": 4,
         "pillar_vfe": {"use_norm": true, "num_filters": [64]},
         "base_bev_backbone": {
             "layer_nums": [1, 1, 1], "layer_strides": [2, 2, 2], "num_filters": [8, 12, 16],
@@ -249,7 +256,8 @@ fn fusions_with_parameters_come_back_with_every_one() {
         std::fs::write(&config, hypes.to_string()).unwrap();
         let arguments = ["--config", config.to_str().unwrap(), "--y-axis", "left"];
         let Some(converted) = convert(&state, &arguments) else { return };
-        let (path, _) = converted.unwrap();
+        let (path, said) = converted.unwrap();
+        assert!(said.contains("4 of 16 channels"), "{said}");
         let weights = Weights::load(&path).unwrap();
         assert_eq!(weights.metadata_json::<FusionConfig>("fusion").unwrap(), fusion, "{method}");
         let detector: DetectorConfig = weights.config().unwrap();
@@ -260,7 +268,9 @@ fn fusions_with_parameters_come_back_with_every_one() {
         for (name, found) in model.variables.variables() {
             assert!(name == "steering.weight" || found.equal(&variables[&name]), "{method}: {name}");
         }
-        assert_eq!(Ego::load(&path, None).unwrap().method(), method);
+        let ego = Ego::load(&path, None).unwrap();
+        let (sent, code_of) = (ego.detector().sent_shape(), ego.detector().code_of());
+        assert_eq!((ego.method(), sent, code_of), (method, [4, 8, 16], Some(16)));
     }
 }
 
@@ -276,10 +286,12 @@ fn what_is_not_understood_is_refused_with_its_name() {
     };
     let empty = b"\x02\0\0\0\0\0\0\0{}";
     let Some(message) = with(&hypes("point_pillar_fpvrcnn", json!({})), empty) else { return };
-    assert!(message.contains("broken.safetensors") && message.contains("point_pillar_fpvrcnn"), "{message}");
+    assert!(message.contains("config.json") && message.contains("point_pillar_fpvrcnn"), "{message}");
     let message = with(&hypes("point_pillar", json!({})), empty).unwrap();
     assert!(message.contains("pillar encoder"), "{message}");
     let message = with(&hypes("point_pillar", json!({})), &[255; 12]).unwrap();
+    assert!(message.contains("broken.safetensors") && message.contains("neither torch nor safetensors"), "{message}");
+    let message = with(&hypes("point_pillar", json!({})), b"\xff\xff\xff\x7f\0\0\0\0{}").unwrap();
     assert!(message.contains("claims"), "{message}");
     let message = with(&json!({"model": {"core_method": "x"}}), empty).unwrap();
     assert!(message.contains("args"), "{message}");

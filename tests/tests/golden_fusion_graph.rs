@@ -280,7 +280,7 @@ fn golden_c6_e2e_where2comm_single() {
 fn through_the_codec(map: &Tensor, confidence: &Tensor, gate: &ConfidenceGate) -> (Tensor, f64) {
     let (channels, height, width) = map.size3().unwrap();
     let grid = BevGrid { x_min_m: 0.0, y_min_m: 0.0, cell_m: 0.4, width: width as u32, height: height as u32 };
-    let features = BevFeatures { grid, channels: channels as u32, values: values(map) };
+    let features = BevFeatures { grid, channels: channels as u32, code_of: None, values: values(map) };
     let codec = CodecConfig { gate: Some(*gate), ..CodecConfig::default() };
     let dense = features.values.len() * 4;
     let encoded = encode_features(features, &codec, Some(&values(confidence))).unwrap();

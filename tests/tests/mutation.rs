@@ -4,6 +4,7 @@
 use std::sync::{Mutex, PoisonError};
 
 use peak_alloc::PeakAlloc;
+use sim_replay::pcd;
 use tests::mutation::readers::all as all_readers;
 use tests::mutation::run::{Report, files, formats, messages};
 use tests::mutation::scratch;
@@ -52,6 +53,26 @@ fn every_format_has_a_fuzz_target_with_sound_seeds() {
             let reader = readers.iter().find(|reader| reader.name == name);
             let is_sound = reader.map_or_else(|| wire_target::read(&bytes), |reader| reader.try_read(&bytes));
             assert!(is_sound, "{target} {number}");
+        }
+    }
+}
+
+#[test]
+fn a_cloud_takes_memory_by_its_bytes_and_not_by_its_header() {
+    let _alone = ALONE.lock().unwrap_or_else(PoisonError::into_inner);
+    for data in ["ascii", "binary", "binary_compressed"] {
+        for (sizes, counts) in [("1 1 1 1", "1 1 1 0"), ("4 4 4 8", "1 1 1 65536")] {
+            let mut file =
+                format!("FIELDS x y z _\nSIZE {sizes}\nTYPE U U U U\nCOUNT {counts}\nWIDTH 50000000\nDATA {data}\n")
+                    .into_bytes();
+            // Lengths of what is packed, should it be: a few bytes that claim to become 150 MB.
+            file.extend(8_u32.to_le_bytes());
+            file.extend(150_000_000_u32.to_le_bytes());
+            file.extend([0; 8]);
+            MEMORY.reset_peak_usage();
+            let held = MEMORY.current_usage();
+            assert!(pcd::decode(&file).is_err());
+            assert!(MEMORY.peak_usage() - held < 65_536, "{data}: {} bytes", MEMORY.peak_usage() - held);
         }
     }
 }

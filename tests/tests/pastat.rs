@@ -56,7 +56,7 @@ fn evaluate(weights: &Path, data: &Path, poses: PoseSourceConfig, delay_nanos: u
         pose_source: poses,
         codec,
         rate: RateConfig::default(),
-        rule: None,
+        protocol: None,
         delay_nanos,
         attack: None,
         trust: None,

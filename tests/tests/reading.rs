@@ -2,7 +2,8 @@
 
 use std::collections::HashSet;
 
-use sim_replay::dataset::{self, Dataset, Layout, LoadOptions};
+use sim_replay::dataset::{self, Dataset, Layout, LoadOptions, OpenOptions};
+use sim_replay::evaluation_protocol::ProtocolConfig;
 use sim_replay::frame::{Frame, Object, ObjectClass};
 use sim_replay::ground_truth::{self, GroundTruthRule};
 use sim_replay::inspect::{TickReport, inspect};
@@ -214,7 +215,7 @@ fn binary_pcd_pair_overlaps_by_its_relative_pose() {
 #[test]
 fn inspect_counts_21_and_26_and_finds_nothing_wrong() {
     let Some(dir) = data("v2xset-scene") else { return };
-    let report = inspect(&dir, &|_, _| {});
+    let report = inspect(&dir, &OpenOptions::default(), &ProtocolConfig::default(), &|_, _| {});
     assert!(report.problems.is_empty(), "{:?}", report.problems);
     let merged = |agents: &[&str]| {
         let of_agents = |tick: &&TickReport| tick.agents.iter().map(|id| id.as_str()).eq(agents.iter().copied());

@@ -55,7 +55,7 @@ fn evaluate_with(
         pose_source: PoseSourceConfig::Recorded,
         codec,
         rate: RateConfig::default(),
-        rule: None,
+        protocol: None,
         delay_nanos: 0,
         attack: None,
         trust: None,

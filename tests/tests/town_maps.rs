@@ -46,11 +46,12 @@ fn maps_are_read_as_their_readme_counts_them() {
             roads.map(|road| road.length_m).sum()
         };
         assert_eq!((network.roads.len(), network.junctions.len()), (expected.roads, expected.junctions));
+        assert_eq!(network.findings, [], "{}", expected.file);
         assert!((length(false) - expected.length_m).abs() < 1.0, "{}: {}", expected.file, length(false));
         assert!((length(true) - expected.outside_junctions_m).abs() < 1.0, "{}: {}", expected.file, length(true));
         check_reference_lines(expected.file, &network);
         let (graph, counts) = lane_graph(&network);
-        assert_eq!(counts.refused, 0, "{}", expected.file);
+        assert_eq!((counts.refused, counts.findings), (0, vec![]), "{}", expected.file);
         check_links(expected.file, &graph);
         let highest = graph.lanes.iter().flat_map(|lane| &lane.centerline).map(|p| p[2]).fold(0.0, f64::max);
         assert!((highest - expected.highest_m).abs() < 0.1, "{}: highest lane at {highest} m", expected.file);

@@ -31,8 +31,8 @@ fn evaluate(weights: PathBuf, scene: &Path, method: Method, dtype: Dtype) -> Vec
     let pose_source = PoseSourceConfig::Recorded;
     let rate = RateConfig::default();
     let method = Some(method);
-    let (rule, delay_nanos, attack, trust) = (None, 0, None, None);
-    let config = EvaluateConfig { weights, method, pose_source, codec, rate, rule, delay_nanos, attack, trust };
+    let (protocol, delay_nanos, attack, trust) = (None, 0, None, None);
+    let config = EvaluateConfig { weights, method, pose_source, codec, rate, protocol, delay_nanos, attack, trust };
     let mut evaluator = Evaluator::new(config).unwrap();
     let mut frames = Vec::new();
     for scenario in &dataset::open(scene).unwrap().scenarios {

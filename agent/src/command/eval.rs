@@ -6,7 +6,7 @@ use std::sync::Arc;
 use agent::chart;
 use agent::localizer::confidence::{CONFIDENCE_KEY, Confidence, ConfidenceModel, FitReport, check_good_loss};
 use agent::localizer::evaluation::{
-    EvaluatedSweep, EvaluationError, EvaluationOptions, LocalizationSummary, evaluate, evaluate_source,
+    Evaluated, EvaluatedSweep, EvaluationError, EvaluationOptions, LocalizationSummary, evaluate, evaluate_source,
     reliability_charts, write_csv, write_error_table,
 };
 use agent::localizer::pose_solver::{PoseSolver, Solver};
@@ -20,11 +20,12 @@ use agent::weights::annotate;
 use anyhow::Context;
 use clap::ValueEnum;
 use indicatif::{ProgressBar, ProgressStyle};
+use sim_replay::dataset::LeftOut;
 use sim_replay::output;
 use tch::Device;
 
 use super::town_heads::{TownHead, by_head};
-use crate::cli::BadInput;
+use crate::cli::{BadInput, Outcome};
 
 /// Localise recorded sweeps and compare with their true poses.
 #[derive(Debug, clap::Args)]
@@ -127,7 +128,7 @@ enum Subject {
 }
 
 /// Localises, fits, writes and prints.
-pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
+pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     tch::set_num_threads(i32::from(args.threads));
     check_good_loss(args.good_loss).map_err(|error| BadInput(anyhow::anyhow!("--good-loss: {error}")))?;
     let groups = by_head(&args.head, &args.scene)?;
@@ -135,9 +136,11 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         let count = groups.len();
         return Err(BadInput(anyhow::anyhow!("--fit-confidence fits one head, and {count} are asked for")).into());
     }
-    let mut sweeps = Vec::new();
+    let (mut sweeps, mut left_out) = (Vec::new(), LeftOut::default());
     for (head, scenes) in &groups {
-        sweeps.extend(args.evaluate(args.subject(head)?, scenes)?);
+        let evaluated = args.evaluate(args.subject(head)?, scenes)?;
+        sweeps.extend(evaluated.sweeps);
+        left_out.merge(&evaluated.left_out);
     }
     if let ([(head, _)], true) = (&groups[..], args.fit_confidence) {
         let report = args.fit(head, &mut sweeps)?;
@@ -150,7 +153,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     } else {
         output::text(table(&summary))?;
     }
-    Ok(())
+    Ok(Outcome::of(&left_out))
 }
 
 impl Args {
@@ -191,7 +194,7 @@ impl Args {
         self.encoder.clone().unwrap_or_else(|| head.with_file_name("pgc-encoder.safetensors"))
     }
 
-    fn evaluate(&self, subject: Subject, scenes: &[PathBuf]) -> anyhow::Result<Vec<EvaluatedSweep>> {
+    fn evaluate(&self, subject: Subject, scenes: &[PathBuf]) -> anyhow::Result<Evaluated> {
         let count = |number: u32| usize::try_from(number).unwrap_or(usize::MAX);
         let options = EvaluationOptions {
             scenes: scenes.to_vec(),
@@ -211,7 +214,7 @@ impl Args {
         };
         bar.finish_and_clear();
         match evaluated {
-            Ok(sweeps) => Ok(sweeps),
+            Ok(evaluated) => Ok(evaluated),
             Err(error @ EvaluationError::Localizer(_)) => Err(error.into()),
             Err(error) => Err(BadInput(error.into()).into()),
         }

@@ -6,11 +6,11 @@ use agent::pose_source::sanity::SanityConfig;
 use agent::pose_source::{LocalizedPose, PgcConfig, PoseInput, PoseRow, PoseSource, PoseTable};
 use indicatif::{ProgressBar, ProgressStyle};
 use protocol::PoseEstimate;
-use sim_replay::dataset::{self, LoadOptions, Scenario};
+use sim_replay::dataset::{self, LeftOut, LoadOptions, Problem, Scenario};
 use sim_replay::output;
 
 use super::town_heads::{TownHead, head_of};
-use crate::cli::BadInput;
+use crate::cli::{BadInput, Outcome};
 
 /// Localise every sweep of scenes once and write poses and confidences as a table, for trainings and evaluations.
 ///
@@ -35,7 +35,7 @@ pub(crate) struct Args {
 }
 
 /// Localises what the table does not have yet.
-pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
+pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     tch::set_num_threads(i32::from(args.threads));
     let done = if args.out.exists() { PoseTable::read(&args.out).map_err(bad)? } else { PoseTable::default() };
     let mut scenarios = Vec::new();
@@ -45,7 +45,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     scenarios.retain(|scenario| !done.has(&scenario.name));
     // Which head each needs is known before any is computed with.
     let heads: Vec<&Path> = scenarios.iter().map(|scenario| head_of(&args.head, scenario)).collect::<Result<_, _>>()?;
-    let sweeps: usize = scenarios.iter().map(|scenario| scenario.agents.len() * scenario.ticks.len()).sum();
+    let sweeps: usize = scenarios.iter().map(frames).sum();
     if sweeps == 0 && done.is_empty() {
         let scenes: Vec<String> = args.scene.iter().map(|scene| scene.display().to_string()).collect();
         return Err(bad(anyhow::anyhow!("there is no sweep in {}", scenes.join(", "))));
@@ -53,8 +53,9 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let bar = ProgressBar::new(sweeps as u64)
         .with_style(ProgressStyle::with_template("{bar:30} {pos}/{len} sweeps  {eta} left")?);
     let mut found = 0;
+    let mut left_out = LeftOut::default();
     for (scenario, head) in scenarios.iter().zip(heads) {
-        found += args.localize(scenario, head, &bar)?;
+        found += args.localize(scenario, head, &mut left_out, &bar)?;
     }
     bar.finish_and_clear();
     output::line(format_args!(
@@ -62,28 +63,45 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         done.len(),
         args.out.display()
     ))?;
-    Ok(())
+    Ok(Outcome::of(&left_out))
 }
 
 impl Args {
     /// Localises a scenario, vehicle by vehicle in the order of time, and appends it; how many sweeps have a pose.
-    fn localize(&self, scenario: &Scenario, head: &Path, bar: &ProgressBar) -> anyhow::Result<usize> {
+    fn localize(
+        &self,
+        scenario: &Scenario,
+        head: &Path,
+        left_out: &mut LeftOut,
+        bar: &ProgressBar,
+    ) -> anyhow::Result<usize> {
         let sanity = SanityConfig::default();
         let config = PgcConfig { encoder: self.encoder.clone(), head: head.to_owned(), sanity };
         let mut rows: Vec<PoseRow<'_>> = Vec::new();
         for (agent, cav) in scenario.agents.iter().enumerate() {
             let mut source = LocalizedPose::pgc(&config).map_err(bad)?;
-            for tick in 0..scenario.ticks.len() {
-                let frame = scenario.load(agent, tick, &LoadOptions::default()).map_err(bad)?;
+            for tick in (0..scenario.ticks.len()).filter(|&tick| scenario.is_present(agent, tick)) {
+                bar.inc(1);
+                let frame = match scenario.load(agent, tick, &LoadOptions::default()) {
+                    Ok(frame) => frame,
+                    Err(error) => {
+                        left_out.add_unreadable(agent, Problem::from(&error));
+                        continue;
+                    }
+                };
                 let capture_nanos = frame.capture_nanos;
                 let input = PoseInput { cav, capture_nanos, cloud: &frame.points, measured: None };
                 rows.push(PoseRow { cav, capture_nanos, estimate: source.estimate(&input) });
-                bar.inc(1);
             }
         }
         PoseTable::append(&self.out, &scenario.name, &rows)?;
         Ok(rows.iter().filter(|row| matches!(row.estimate, PoseEstimate::Pose { .. })).count())
     }
+}
+
+/// Frames that there are in a scenario.
+fn frames(scenario: &Scenario) -> usize {
+    scenario.agents.len() * scenario.ticks.len() - scenario.absent_frames()
 }
 
 fn bad(error: impl Into<anyhow::Error>) -> anyhow::Error {

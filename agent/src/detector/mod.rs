@@ -7,9 +7,9 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use protocol::message::ModelHash;
-use protocol::{BevFeatures, BevGrid, PointCloud};
+use protocol::{BevFeatures, BevGrid, DecodedFeatures, PointCloud};
 use tch::nn::VarStore;
-use tch::{Device, Tensor};
+use tch::{Device, Kind, Tensor};
 
 pub use error::DetectorError;
 pub(crate) use error::first_line;
@@ -118,11 +118,24 @@ impl Detector {
         self.config.feature_grid()
     }
 
-    /// Channels, height and width of its maps.
+    /// Channels, height and width of its maps, as they are fused.
     #[must_use]
     pub fn map_shape(&self) -> [i64; 3] {
         let grid = self.grid();
         [self.config.feature_channels(), i64::from(grid.height), i64::from(grid.width)]
+    }
+
+    /// The same as they cross the air: with a compressor, of the code.
+    #[must_use]
+    pub fn sent_shape(&self) -> [i64; 3] {
+        let [_, height, width] = self.map_shape();
+        [self.config.sent_channels(), height, width]
+    }
+
+    /// Channels of the map that the code stands for, where there is a compressor: [`BevFeatures::code_of`] of its messages.
+    #[must_use]
+    pub fn code_of(&self) -> Option<u32> {
+        self.compressor.as_ref().and_then(|_| u32::try_from(self.config.feature_channels()).ok())
     }
 
     /// Encodes one sweep.
@@ -180,17 +193,61 @@ impl Detector {
         Ok(Encoded { features, points: self.cropped.len(), pillars: pillars.len(), times })
     }
 
-    /// What is left of an encoded map `[1, C, H, W]` behind the compressor, as head and fusion have learnt it; the map itself
-    /// where the configuration has none.
-    ///
-    /// Maps are encoded and kept without: whoever shares, fuses or reads one calls this once.
+    /// What crosses the air of an encoded map `[1, C, H, W]`: the compressor's code `[1, C / ratio, H, W]`; the map itself where
+    /// the configuration has none.
     ///
     /// # Errors
     /// [`DetectorError::Shape`] when there is a compressor and the map is not one of this detector's.
-    pub fn through_compressor(&self, features: &Tensor) -> Result<Tensor, DetectorError> {
+    pub fn squeezed(&self, features: &Tensor) -> Result<Tensor, DetectorError> {
         let Some(compressor) = &self.compressor else { return Ok(features.shallow_clone()) };
-        let map = self.one_map(features)?;
-        Ok(tch::no_grad(|| compressor.decode(&compressor.encode(&map, false), false)))
+        let map = one_map(features, self.map_shape())?;
+        Ok(tch::no_grad(|| compressor.encode(&map, false).f_contiguous())?)
+    }
+
+    /// What head and fusion have learnt to read, `[1, C, H, W]`, of what crossed the air.
+    ///
+    /// # Errors
+    /// [`DetectorError::Shape`] when there is a compressor and it is no code of this detector's.
+    pub fn widened(&self, sent: &Tensor) -> Result<Tensor, DetectorError> {
+        let Some(compressor) = &self.compressor else { return Ok(sent.shallow_clone()) };
+        let code = one_map(sent, self.sent_shape())?;
+        Ok(tch::no_grad(|| compressor.decode(&code, false).f_contiguous())?)
+    }
+
+    /// What is left of an encoded map `[1, C, H, W]` behind the compressor: squeezed and widened again.
+    ///
+    /// Maps are encoded and kept without: whoever reads one that has not crossed the air calls this once.
+    ///
+    /// # Errors
+    /// As [`Self::squeezed`].
+    pub fn through_compressor(&self, features: &Tensor) -> Result<Tensor, DetectorError> {
+        self.widened(&self.squeezed(features)?)
+    }
+
+    /// The map `[1, C, H, W]` of a message, widened where it is a code, and zero where nothing was sent.
+    ///
+    /// # Errors
+    /// [`DetectorError::Shape`] when it is not one of this detector's; its lattice is the caller's affair.
+    pub fn received(&self, message: &DecodedFeatures) -> Result<Tensor, DetectorError> {
+        let DecodedFeatures { features: BevFeatures { grid, channels, values, .. }, sent } = message;
+        let [expected, height, width] = self.sent_shape();
+        let found = [*channels, grid.height, grid.width].map(i64::from);
+        if found != self.sent_shape() || values.len() as i64 != expected * height * width {
+            return Err(DetectorError::Shape {
+                what: "map of a message",
+                found: found.into(),
+                expected: self.sent_shape(),
+            });
+        }
+        let widened = self.widened(&Tensor::f_from_slice(values)?.f_view([1, expected, height, width])?)?;
+        match (sent, &self.compressor) {
+            // Widening spreads what was sent to its neighbours, and the bias everywhere.
+            (Some(sent), Some(_)) => {
+                let sent = Tensor::f_from_slice(sent)?.f_to_kind(Kind::Float)?.f_view([1, 1, height, width])?;
+                Ok(widened.f_mul(&sent)?)
+            }
+            _ => Ok(widened),
+        }
     }
 
     /// Scores, offsets and confidence of a map `[1, C, H, W]` or `[C, H, W]`, own or fused.
@@ -198,20 +255,8 @@ impl Detector {
     /// # Errors
     /// [`DetectorError::Shape`] when the map is not one of this detector's.
     pub fn heads(&self, features: &Tensor) -> Result<Heads, DetectorError> {
-        let map = self.one_map(features)?;
+        let map = one_map(features, self.map_shape())?;
         tch::no_grad(|| Heads::new(&self.head.forward(&map)?))
-    }
-
-    /// A map `[1, C, H, W]` or `[C, H, W]` of this detector as `[1, C, H, W]`.
-    fn one_map(&self, features: &Tensor) -> Result<Tensor, DetectorError> {
-        let expected = self.map_shape();
-        let found = features.size();
-        if found != expected && found.split_first() != Some((&1, expected.as_slice())) {
-            return Err(DetectorError::Shape { what: "feature map", found, expected });
-        }
-        let [channels, height, width] = expected;
-        // One memory layout, or the same values would give other last bits.
-        Ok(features.f_contiguous()?.f_view([1, channels, height, width])?)
     }
 
     /// Boxes above a score, in the frame of the vehicle whose map it is, not yet suppressed.
@@ -228,19 +273,36 @@ impl Detector {
         Ok(boxes)
     }
 
-    /// The map as it is sent.
+    /// The message of what crosses the air, see [`Self::squeezed`].
+    ///
+    /// # Errors
+    /// [`DetectorError::Shape`] when the tensor is not one of this detector.
+    pub fn to_message(&self, sent: &Tensor) -> Result<BevFeatures, DetectorError> {
+        let sent = one_map(sent, self.sent_shape())?;
+        let channels = self.config.sent_channels() as u32;
+        Ok(BevFeatures { grid: self.grid(), channels, code_of: self.code_of(), values: flat(&sent)? })
+    }
+
+    /// An encoded map `[1, C, H, W]` as it is kept, before the compressor.
     ///
     /// # Errors
     /// [`DetectorError::Shape`] when the tensor is not a map of this detector.
-    pub fn to_message(&self, features: &Tensor) -> Result<BevFeatures, DetectorError> {
-        let [channels, height, width] = self.map_shape();
-        if features.numel() != (channels * height * width) as usize {
-            let expected = self.map_shape();
-            return Err(DetectorError::Shape { what: "feature map", found: features.size(), expected });
-        }
-        let values = flat(features)?;
-        Ok(BevFeatures { grid: self.grid(), channels: channels as u32, values })
+    pub fn to_kept(&self, features: &Tensor) -> Result<BevFeatures, DetectorError> {
+        let map = one_map(features, self.map_shape())?;
+        let channels = self.config.feature_channels() as u32;
+        Ok(BevFeatures { grid: self.grid(), channels, code_of: None, values: flat(&map)? })
     }
+}
+
+/// A map `[1, C, H, W]` or `[C, H, W]` of the expected shape as `[1, C, H, W]`.
+fn one_map(features: &Tensor, expected: [i64; 3]) -> Result<Tensor, DetectorError> {
+    let found = features.size();
+    if found != expected && found.split_first() != Some((&1, expected.as_slice())) {
+        return Err(DetectorError::Shape { what: "feature map", found, expected });
+    }
+    let [channels, height, width] = expected;
+    // One memory layout, or the same values would give other last bits.
+    Ok(features.f_contiguous()?.f_view([1, channels, height, width])?)
 }
 
 /// Time from lap to lap.
@@ -262,8 +324,6 @@ impl StageClock {
 #[cfg(test)]
 mod tests {
     use std::collections::BTreeMap;
-
-    use tch::Kind;
 
     use super::*;
     use crate::pillar_batch::PillarBatch;
@@ -336,6 +396,28 @@ mod tests {
         assert!(matches!(detector.through_compressor(&other), Err(DetectorError::Shape { .. })));
         let plain = Detector::from_network(network().1);
         assert!(plain.through_compressor(&encoded).unwrap().equal(&encoded), "there is nothing to lose");
+        assert_eq!((plain.sent_shape(), plain.code_of()), (plain.map_shape(), None));
+    }
+
+    #[test]
+    fn the_code_crosses_the_air_and_its_receiver_widens_it_to_the_same_bits() {
+        let (_store, pillars) = network_of(&DetectorConfig { compress_ratio: Some(16), ..config() });
+        let mut detector = Detector::from_network(pillars);
+        let encoded = detector.encode(&cloud()).unwrap().features;
+        let features = detector.to_message(&detector.squeezed(&encoded).unwrap()).unwrap();
+        let cells = detector.grid().cells();
+        assert_eq!((features.channels, features.code_of, features.values.len()), (4, Some(64), 4 * cells));
+        let whole = detector.through_compressor(&encoded).unwrap();
+        let received = |sent| detector.received(&DecodedFeatures { features: features.clone(), sent }).unwrap();
+        assert!(received(None).equal(&whole));
+        let half = received(Some((0..cells).map(|cell| cell < cells / 2).collect()));
+        let values: Vec<f32> = Vec::try_from(half.view([-1])).unwrap();
+        assert!(values.chunks(cells).all(|channel| channel[cells / 2..].iter().all(|value| *value == 0.0)));
+        assert_eq!(&values[..10], &Vec::<f32>::try_from(whole.view([-1])).unwrap()[..10]);
+        let map = DecodedFeatures { features: detector.to_kept(&encoded).unwrap(), sent: None };
+        let message = detector.received(&map).unwrap_err().to_string();
+        assert!(message.contains("[64, 16, 32]") && message.contains("[4, 16, 32]"), "{message}");
+        assert!(detector.to_message(&encoded).is_err());
     }
 
     #[test]

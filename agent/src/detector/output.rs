@@ -21,8 +21,8 @@ pub struct EncodeTimes {
 /// What the encoder makes of one sweep.
 #[derive(Debug)]
 pub struct Encoded {
-    /// `[1, C, H, W]` `f32`, contiguous, before the compressor where there is one: with
-    /// [`Detector::through_compressor`](super::Detector::through_compressor) it is what crosses the air.
+    /// `[1, C, H, W]` `f32`, contiguous, before the compressor where there is one:
+    /// [`Detector::squeezed`](super::Detector::squeezed) makes of it what crosses the air.
     pub features: Tensor,
     /// Points inside the area.
     pub points: usize,

@@ -69,7 +69,7 @@ pub fn read_map(folders: &[impl AsRef<Path>], spacing_m: f64, config: &IcpConfig
         for scenario in dataset::open(folder.as_ref())?.scenarios {
             for agent in 0..scenario.agents.len() {
                 let mut last: Option<Isometry3<f64>> = None;
-                for tick in 0..scenario.ticks.len() {
+                for tick in (0..scenario.ticks.len()).filter(|&tick| scenario.is_present(agent, tick)) {
                     let without_points = LoadOptions { points: false, ..LoadOptions::default() };
                     let Some(pose) = scenario.load(agent, tick, &without_points)?.world_from_lidar else { continue };
                     let pose = pose.isometry();

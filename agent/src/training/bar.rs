@@ -7,8 +7,12 @@ use std::time::{Duration, Instant};
 use indicatif::{ProgressBar, ProgressStyle};
 use sim_replay::output;
 
+use super::run_config::Length;
+
 /// Plain lines come no more often than this.
 const LINE_EVERY: Duration = Duration::from_secs(10);
+/// So long sweeps are encoded before it is foretold how long all of them take.
+const FORETOLD_AFTER: Duration = Duration::from_secs(3);
 /// Resolution of the bar.
 const TICKS: u64 = 10_000;
 
@@ -19,6 +23,8 @@ pub struct TrainingBar {
     is_watched: bool,
     last_line: Cell<Option<Instant>>,
     encoding: Cell<Option<Encoding>>,
+    /// What follows the encoding.
+    length: Option<Length>,
 }
 
 /// How the sweeps of one data set are being encoded.
@@ -28,6 +34,8 @@ struct Encoding {
     /// So many were encoded when it began: maps that an earlier run has kept are there at once.
     first: usize,
     latest: usize,
+    /// Whether it has been said how long it will take.
+    is_foretold: bool,
 }
 
 impl Default for TrainingBar {
@@ -37,11 +45,17 @@ impl Default for TrainingBar {
         if let Ok(style) = ProgressStyle::with_template("{wide_bar} {percent}% {elapsed} eta {eta} {msg}") {
             bar.set_style(style);
         }
-        Self { bar, is_watched, last_line: Cell::new(None), encoding: Cell::new(None) }
+        Self { bar, is_watched, last_line: Cell::new(None), encoding: Cell::new(None), length: None }
     }
 }
 
 impl TrainingBar {
+    /// A bar for a training of this length, which it foretells where sweeps have to be encoded first.
+    #[must_use]
+    pub fn of(length: Length) -> Self {
+        Self { length: Some(length), ..Self::default() }
+    }
+
     /// Says how far it is: `share_done` 0..1 after `seconds`, and how it goes.
     pub fn report(&self, share_done: f64, seconds: f64, text: &str) {
         self.show(share_done, remaining_s(share_done, 1.0 - share_done, seconds), text);
@@ -49,11 +63,17 @@ impl TrainingBar {
 
     /// Says that `done` of `all` sweeps of a data set are encoded; fewer than before are of the next one.
     pub fn encoded(&self, done: usize, all: usize) {
-        let fresh = Encoding { began: Instant::now(), first: done, latest: done };
-        let Encoding { began, first, .. } = self.encoding.get().filter(|known| known.latest <= done).unwrap_or(fresh);
-        self.encoding.set(Some(Encoding { began, first, latest: done }));
+        let fresh = Encoding { began: Instant::now(), first: done, latest: done, is_foretold: false };
+        let mut encoding = self.encoding.get().filter(|known| known.latest <= done).unwrap_or(fresh);
+        encoding.latest = done;
         let left = all.saturating_sub(done) as f64;
-        let remaining_s = remaining_s((done - first) as f64, left, began.elapsed().as_secs_f64());
+        let passed = encoding.began.elapsed();
+        let remaining_s = remaining_s((done - encoding.first) as f64, left, passed.as_secs_f64());
+        if let Some(remaining_s) = remaining_s.filter(|_| !encoding.is_foretold && passed >= FORETOLD_AFTER) {
+            self.say(&foretold(all, passed.as_secs_f64() + remaining_s, self.length));
+            encoding.is_foretold = true;
+        }
+        self.encoding.set(Some(encoding));
         self.show(done as f64 / all.max(1) as f64, remaining_s, &format!("{done} of {all} sweeps encoded"));
     }
 
@@ -79,6 +99,22 @@ impl TrainingBar {
     }
 }
 
+/// What is to come: the encoding of all sweeps, and then the training.
+fn foretold(sweeps: usize, seconds: f64, length: Option<Length>) -> String {
+    let then = match length {
+        Some(Length::Time(time)) => format!(", then {} of training", minutes(time.as_secs_f64())),
+        Some(Length::Steps(steps)) => format!(", then {steps} steps of training"),
+        Some(Length::Epochs(epochs)) => format!(", then {epochs} passes of training"),
+        None => String::new(),
+    };
+    format!("encoding {sweeps} sweeps takes {}{then}", minutes(seconds))
+}
+
+/// A time as people give it.
+fn minutes(seconds: f64) -> String {
+    if seconds < 90.0 { format!("{seconds:.0} s") } else { format!("{:.0} min", seconds / 60.0) }
+}
+
 /// How long what is `left` will take when `done` took `seconds`; not known before anything is done.
 fn remaining_s(done: f64, left: f64, seconds: f64) -> Option<f64> {
     (done > 0.0).then(|| seconds * left / done)
@@ -93,6 +129,15 @@ mod tests {
         assert_eq!(remaining_s(0.25, 0.75, 20.0), Some(60.0));
         assert_eq!(remaining_s(1.0, 0.0, 20.0), Some(0.0));
         assert_eq!(remaining_s(0.0, 1.0, 20.0), None);
+    }
+
+    #[test]
+    fn the_encoding_and_what_follows_it_are_foretold() {
+        let training = |length| foretold(600, 540.0, length);
+        let time = Some(Length::Time(Duration::from_secs(1200)));
+        assert_eq!(training(time), "encoding 600 sweeps takes 9 min, then 20 min of training");
+        assert_eq!(training(Some(Length::Steps(50))), "encoding 600 sweeps takes 9 min, then 50 steps of training");
+        assert_eq!(foretold(20, 42.4, None), "encoding 20 sweeps takes 42 s");
     }
 
     #[test]

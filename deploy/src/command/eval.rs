@@ -11,6 +11,7 @@ use agent::pose_source::{
 use agent::rate::RateConfig;
 use clap::ValueEnum;
 use deploy::evaluation::{EvaluationOptions, Part, evaluate, frame_count};
+use deploy::metrics::Metrics;
 use deploy::report;
 use deploy::table::{self, TableObserver, TableSpec};
 use ego_fuser::Method;
@@ -20,6 +21,9 @@ use ego_fuser::pairing::PairingConfig;
 use ego_fuser::trust::TrustConfig;
 use indicatif::{ProgressBar, ProgressStyle};
 use protocol::{CodecConfig, ConfidenceGate, Dtype};
+use sim_replay::dataset::IntensityScale;
+use sim_replay::dataset::LeftOut;
+use sim_replay::evaluation_protocol::ProtocolConfig;
 use sim_replay::link::LinkConfig;
 use sim_replay::output;
 
@@ -33,7 +37,8 @@ pub(crate) struct Arguments {
     /// Fusion methods, as `ego-fuser methods` lists them; several give one table.
     #[arg(long, value_name = "NAME", value_delimiter = ',', required_unless_present = "table")]
     method: Vec<Method>,
-    /// Weights of the detector, or a folder with a file *-METHOD.safetensors for each method.
+    /// Weights of the detector; or a folder with *-METHOD.safetensors or METHOD/weights.safetensors for each method; or the
+    /// folder of a training.
     #[arg(long, value_name = "FILE", required_unless_present = "table")]
     weights: Option<PathBuf>,
     /// Instead: a file of tables, rows of methods and columns of conditions; cells that are done are kept in --out.
@@ -84,7 +89,7 @@ pub(crate) struct Arguments {
     /// Oldest map that is still fused, by capture time, milliseconds (--link).
     #[arg(long, value_name = "MS", default_value_t = 300, requires = "link")]
     max_age: u64,
-    /// Compute time of pose, map and fusion, milliseconds, for example 20,60,30 (--link).
+    /// Compute time of pose, map and fusion, milliseconds, for example 20,60,30; without it no latency is told (--link).
     #[arg(long, value_name = "MS,MS,MS", value_delimiter = ',', num_args = 1, default_values_t = [0.0; 3], requires = "link")]
     compute: Vec<f64>,
     /// Lets neighbours lie: to see what that does to the ego.
@@ -126,9 +131,14 @@ pub(crate) struct Arguments {
     /// Scenarios to judge at most, evenly spread [default: all].
     #[arg(long, value_parser = clap::value_parser!(u64).range(1..))]
     scenarios: Option<u64>,
+    /// Number that stored intensities are divided by [default: auto; `sim-replay inspect --help` says by what].
+    #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
+    intensity_scale: IntensityScale,
     /// Threads to compute with.
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
     threads: u16,
+    #[command(flatten)]
+    protocol: ProtocolConfig,
     /// Print JSON in the shape of metrics.json (a list of them for several methods) instead of a table.
     #[arg(long)]
     json: bool,
@@ -203,9 +213,14 @@ impl Arguments {
         match (self.json, &all[..]) {
             (true, [one]) => output::line(serde_json::to_string_pretty(one)?)?,
             (true, several) => output::line(serde_json::to_string_pretty(several)?)?,
-            (false, several) => output::text(report::table(several))?,
+            (false, several) => {
+                output::text(report::table(several))?;
+                if let Some(protocol) = several.iter().find_map(|metrics| metrics.protocol.as_ref()) {
+                    output::line(protocol)?;
+                }
+            }
         }
-        Ok(Outcome::Done)
+        Ok(left_out(&all))
     }
 
     fn options(&self) -> Result<EvaluationOptions, BadInput> {
@@ -249,7 +264,8 @@ impl Arguments {
             }),
             frames: self.frames.map(at_most),
             stepped: self.link.as_deref().map(|link| self.stepped(link)).transpose()?,
-            part: Part { scenarios: self.scenarios.map(at_most), ticks: None },
+            part: Part { scenarios: self.scenarios.map(at_most), ticks: None, intensity_scale: self.intensity_scale },
+            protocol: self.protocol.clone(),
         })
     }
 
@@ -311,6 +327,19 @@ impl Arguments {
             },
         }
     }
+}
+
+/// Prints what the evaluations left out, each finding once.
+fn left_out(all: &[Metrics]) -> Outcome {
+    let mut sum = LeftOut::default();
+    all.iter().for_each(|metrics| sum.merge(&metrics.left_out));
+    for problem in sum.problems() {
+        output::note(format_args!("left out: {}", problem.message));
+    }
+    if let Some(one) = all.iter().map(|metrics| &metrics.left_out).find(|one| **one != LeftOut::default()) {
+        output::note(one);
+    }
+    Outcome::of(!sum.is_nothing())
 }
 
 /// Fills tables and prints them.

@@ -16,6 +16,9 @@ pub enum FleetError {
     /// The scene cannot be read.
     #[error("scene: {0}")]
     Scene(#[from] ReadError),
+    /// The evaluation protocol is not known or contradicts itself.
+    #[error("protocol: {0}")]
+    Protocol(String),
     /// The data set has no scenario at all.
     #[error("scene {}: there is no scenario in it", .0.display())]
     Empty(PathBuf),

@@ -21,6 +21,8 @@ use sim_replay::bus::InboxLimits;
 pub use error::ScenarioError;
 pub use vehicle::{AgentOverrides, AgentSettings, Launch, NoiseMode, PoseNoise, PoseSource, Publish};
 
+use sim_replay::evaluation_protocol::ProtocolConfig;
+
 use crate::fingerprint::Provenance;
 
 /// A deployment: which scene, which vehicles, which method, which network.
@@ -38,6 +40,9 @@ pub struct Scenario {
     /// What a run in virtual time is told; only with `clock: stepped`.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub stepped: Option<Stepped>,
+    /// Whose messages and annotations count, and which objects. Agents and ego are chosen by `scene.agents` and `ego.id`.
+    #[serde(default, skip_serializing_if = "is_default_protocol")]
+    pub protocol: ProtocolConfig,
     /// The networks.
     pub models: Models,
     /// How the ego fuses.
@@ -70,6 +75,10 @@ pub struct Scenario {
     /// What a run was made of: written into the run folder, not read.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub provenance: Option<Provenance>,
+}
+
+fn is_default_protocol(protocol: &ProtocolConfig) -> bool {
+    *protocol == ProtocolConfig::default()
 }
 
 /// The recording that drives the fleet, and how it is played.

@@ -3,15 +3,16 @@
 use std::collections::BTreeMap;
 
 use ego_fuser::average_precision::{Ordering, Scorer};
-use protocol::{Box3d, CavId, Detections, DropReason, Pose, PoseEstimate, Stamp, Truth};
+use protocol::{Box3d, CavId, Detection, Detections, DropReason, Pose, PoseEstimate, Stamp, Truth};
 use sim_replay::ground_truth::GroundTruthRule;
 
 use super::frame_record::{FrameRecord, JudgedFrame};
+use super::live_precision::{LivePrecision, TickTruth, by_iou};
 use super::neighbours::{self, NeighbourRecord};
 use super::open_ticks::{OpenTicks, Part, Tick};
 use super::stage_stamps::StageStamps;
 use super::true_boxes::true_boxes;
-use crate::metrics::{ByIou, Communication, Latencies, Percentiles, PoseError, PoseErrors};
+use crate::metrics::{Answered, ByIou, Communication, Latencies, Percentiles, PoseError, PoseErrors};
 
 /// Overlap from which a detection counts as found in `frames.csv`.
 const FOUND_IOU: f64 = 0.5;
@@ -26,6 +27,7 @@ pub struct Board {
     nominal_values: u64,
     open: OpenTicks,
     scorer: Scorer,
+    live: LivePrecision,
     records: Vec<FrameRecord>,
     pose_errors: Vec<PoseError>,
     no_pose: u64,
@@ -47,6 +49,7 @@ impl Board {
             nominal_values,
             open: OpenTicks::default(),
             scorer: Scorer::default(),
+            live: LivePrecision::default(),
             records: Vec::new(),
             pose_errors: Vec::new(),
             no_pose: 0,
@@ -61,6 +64,7 @@ impl Board {
     /// Goes on with the results of another vehicle: in another scenario.
     pub fn change_ego(&mut self, ego: &CavId) {
         self.ego.clone_from(ego);
+        self.live.forget();
     }
 
     /// What was there at a tick.
@@ -106,14 +110,19 @@ impl Board {
     /// Average precision, ordered by score over all frames, and ordered by frame.
     #[must_use]
     pub fn average_precision(&self) -> (ByIou, ByIou) {
-        let objects = self.scorer.tallies().first().map_or(0, |tally| tally.objects);
-        let by_iou = |ordering| match self.scorer.average_precisions(ordering)[..] {
-            [at_30, at_50, at_70] if objects > 0 => {
-                ByIou { at_30: Some(at_30), at_50: Some(at_50), at_70: Some(at_70) }
-            }
-            _ => ByIou::default(),
-        };
-        (by_iou(Ordering::Global), by_iou(Ordering::Frame))
+        (by_iou(&self.scorer, Ordering::Global), by_iou(&self.scorer, Ordering::Frame))
+    }
+
+    /// Average precision over all ticks, answered or not; none where results have no time of publication.
+    #[must_use]
+    pub fn answered(&self) -> Option<Answered> {
+        self.live.answered()
+    }
+
+    /// Who is judged.
+    #[must_use]
+    pub fn ego(&self) -> &CavId {
+        &self.ego
     }
 
     /// Errors of all vehicles' poses.
@@ -166,11 +175,18 @@ impl Board {
         let world_from_lidar: Vec<(CavId, Pose)> =
             truth.agents.iter().map(|agent| (agent.cav.clone(), agent.world_from_lidar)).collect();
         self.judge_poses(&tick.poses, &world_from_lidar);
+        let is_there = world_from_lidar.iter().any(|(cav, _)| *cav == self.ego);
+        if tick.result.is_none() && !is_there && !world_from_lidar.is_empty() {
+            // The ego takes no part at this tick, so nothing is missed.
+            return;
+        }
+        let boxes = true_boxes(&truth, &self.ego, &self.rule);
+        let answer = tick.result.as_ref().map(|(done_nanos, result)| (*done_nanos, &result.detections[..]));
+        self.judge_live(began_nanos, &world_from_lidar, &boxes, answer);
         let Some((done_nanos, result)) = tick.result else {
             self.missed += 1;
             return;
         };
-        let boxes = true_boxes(&truth, &self.ego, &self.rule);
         let ego = tick.poses.iter().position(|(cav, _)| *cav == self.ego);
         let posed_nanos = ego.and_then(|ego| tick.posed_nanos.get(ego).copied());
         let stamps = StageStamps::of(began_nanos, posed_nanos, done_nanos, &result.stages);
@@ -190,7 +206,25 @@ impl Board {
     ) {
         self.judge_poses(poses, &world_from_lidar);
         let stamps = StageStamps { detected_ms: latency_ms, ..StageStamps::default() };
+        if let Some(latency_ms) = latency_ms {
+            let done_nanos = capture_nanos.saturating_add((latency_ms * 1e6) as u64);
+            self.judge_live(capture_nanos, &world_from_lidar, &boxes, Some((done_nanos, &result.detections)));
+        }
         self.judge_result((tick, capture_nanos), stamps, result, boxes, world_from_lidar);
+    }
+
+    /// Judges a tick by what was known when it began, answered or not.
+    fn judge_live(
+        &mut self,
+        began_nanos: u64,
+        world_from_lidar: &[(CavId, Pose)],
+        boxes: &[Box3d],
+        answer: Option<(u64, &[Detection])>,
+    ) {
+        let world_from_ego = true_pose(world_from_lidar, &self.ego).copied();
+        let ([x_low, x_high], [y_low, y_high]) = (self.rule.x_m, self.rule.y_m);
+        let area_m = [x_low, y_low, x_high, y_high];
+        self.live.add(&TickTruth { began_nanos, world_from_ego, boxes, area_m }, answer);
     }
 
     fn judge_result(

@@ -2,6 +2,7 @@
 
 mod board;
 mod frame_record;
+mod live_precision;
 mod neighbours;
 mod node;
 mod numbered_results;

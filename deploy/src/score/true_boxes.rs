@@ -1,6 +1,6 @@
 //! What an ego is expected to find.
 
-use protocol::{AgentTruth, Box3d, CavId, Handedness, PointCloud, Truth};
+use protocol::{AgentTruth, Box3d, CavId, Handedness, Truth};
 use sim_replay::frame::{Frame, Object, ObjectClass};
 use sim_replay::ground_truth::{self, GroundTruthRule};
 
@@ -24,16 +24,8 @@ fn as_frame(agent: &AgentTruth) -> Frame {
         speed_mps: object.speed_mps,
     });
     Frame {
-        cav: agent.cav.clone(),
-        capture_nanos: 0,
-        points: PointCloud::default(),
-        dropped_points: 0,
-        radar: None,
         world_from_lidar: Some(agent.world_from_lidar),
-        world_from_vehicle: None,
-        gnss_world_from_vehicle: None,
-        speed_mps: None,
         objects: objects.collect(),
-        source_handedness: Handedness::Right,
+        ..Frame::empty(agent.cav.clone(), 0, Handedness::Right)
     }
 }

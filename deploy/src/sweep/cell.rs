@@ -15,6 +15,7 @@ use ego_fuser::feature_store::KeptMaps;
 use protocol::{Counts, DropReason, Dtype, Stream, Topic};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
+use sim_replay::evaluation_protocol::ProtocolConfig;
 use sim_replay::link::LinkConfig;
 use sim_replay::whole_file;
 
@@ -37,6 +38,9 @@ pub struct CellKey {
     pub trace_sha256: Option<String>,
     /// When the ego fuses what.
     pub ego: EgoRule,
+    /// The protocol that was asked for.
+    #[serde(default)]
+    pub protocol: ProtocolConfig,
     /// How long everyone computes.
     pub compute: ComputeTimes,
     /// Where poses come from.
@@ -155,6 +159,7 @@ impl Hashes {
             link,
             trace_sha256,
             ego: experiment.ego,
+            protocol: experiment.protocol.clone(),
             compute: experiment.compute,
             poses,
             poses_sha256,
@@ -170,7 +175,7 @@ pub(super) fn options(experiment: &Experiment, point: &Point, maps: &Path) -> Re
     let weights = weights_of(&experiment.weights, point.method)?;
     let read = Weights::load(&weights).map_err(EvaluateError::from).map_err(boxed)?;
     let config: DetectorConfig = read.config().map_err(EvaluateError::from).map_err(boxed)?;
-    let channels = u64::try_from(config.feature_channels()).unwrap_or(0);
+    let channels = u64::try_from(config.sent_channels()).unwrap_or(0);
     Ok(EvaluationOptions {
         dataset: experiment.dataset.clone(),
         weights,
@@ -180,6 +185,7 @@ pub(super) fn options(experiment: &Experiment, point: &Point, maps: &Path) -> Re
         maps: (point.method.exchange() != Exchange::Points).then(|| kept_maps(experiment, maps)),
         stepped: Some(grid::stepped(point.link(experiment)?, point, experiment.ego, experiment.compute)),
         part: experiment.part(),
+        protocol: experiment.protocol.clone(),
         ..EvaluationOptions::default()
     })
 }

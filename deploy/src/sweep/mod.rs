@@ -121,7 +121,7 @@ impl Sweep {
         let experiment = Experiment::read(file)?;
         generate(&experiment)?;
         let part = experiment.part();
-        let all = part.open(&experiment.dataset)?;
+        let all = part.open(&experiment.dataset, &experiment.protocol).map_err(Box::new)?.scenarios;
         let scenarios: Vec<Scenario> = part.chosen(&all).cloned().collect();
         let spec = |problem| SweepError::Spec { path: file.to_owned(), problem };
         if scenarios.iter().all(|scenario| scenario.ticks.is_empty()) {

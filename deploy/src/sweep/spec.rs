@@ -9,6 +9,7 @@ use ego_fuser::evaluate::stepped::ComputeTimes;
 use protocol::Dtype;
 use serde::{Deserialize, Serialize};
 use sim_replay::bounded;
+use sim_replay::evaluation_protocol::ProtocolConfig;
 use sim_replay::link::LinkConfig;
 
 use super::SweepError;
@@ -35,6 +36,9 @@ pub struct Experiment {
     /// The first so many ticks of each; all where absent.
     #[serde(default)]
     pub ticks: Option<usize>,
+    /// Whose messages and annotations count, and which objects.
+    #[serde(default)]
+    pub protocol: ProtocolConfig,
     /// Weights, or a folder with a file `*-METHOD.safetensors` for each method, relative to the file.
     pub weights: PathBuf,
     /// Where poses come from, unless the grid has pose noise.
@@ -215,6 +219,6 @@ impl Experiment {
     /// The part of the data set that is looked at.
     #[must_use]
     pub fn part(&self) -> crate::evaluation::Part {
-        crate::evaluation::Part { scenarios: self.scenarios, ticks: self.ticks }
+        crate::evaluation::Part { scenarios: self.scenarios, ticks: self.ticks, ..Default::default() }
     }
 }

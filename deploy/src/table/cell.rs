@@ -9,6 +9,7 @@ use ego_fuser::Method;
 use ego_fuser::trust::TrustConfig;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
+use sim_replay::evaluation_protocol::ProtocolConfig;
 use sim_replay::whole_file;
 
 use super::TableError;
@@ -43,8 +44,17 @@ pub struct CellKey {
     /// When the ego leaves out neighbours that it does not trust.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub trust: Option<TrustConfig>,
+    /// The protocol that was asked for.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub protocol: ProtocolConfig,
+    /// Boxes at or below this score are not judged.
+    pub score_threshold: f32,
     /// Version of the program.
     pub version: String,
+}
+
+fn is_default(protocol: &ProtocolConfig) -> bool {
+    *protocol == ProtocolConfig::default()
 }
 
 /// A cell that is done.

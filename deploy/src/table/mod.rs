@@ -12,6 +12,7 @@ use std::io;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
+use agent::postprocess::SCORE_THRESHOLD;
 use agent::rate::RateConfig;
 use sim_replay::dataset::{self, ReadError};
 
@@ -152,6 +153,8 @@ impl Run<'_> {
             scenarios: table.scenarios,
             attack: column.attack,
             trust: column.trust.then(TrustConfig::default),
+            protocol: self.spec.protocol.clone(),
+            score_threshold: SCORE_THRESHOLD,
             version: env!("CARGO_PKG_VERSION").to_owned(),
         };
         let known = Cell::read(&key, &self.cells)?;
@@ -174,7 +177,8 @@ impl Run<'_> {
                 limit_bytes: (self.spec.maps_limit_gb.max(0.0) * 1e9) as u64,
             }),
             frames: self.spec.frames,
-            part: Part { scenarios: table.scenarios, ticks: None },
+            part: Part { scenarios: table.scenarios, ..Part::default() },
+            protocol: self.spec.protocol.clone(),
             ..EvaluationOptions::default()
         };
         let metrics = evaluate(&options, row.method, &mut || observer.frame()).map_err(Box::new)?;

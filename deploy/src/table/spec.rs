@@ -8,6 +8,7 @@ use ego_fuser::Method;
 use protocol::{CodecConfig, Dtype};
 use serde::Deserialize;
 use sim_replay::bounded;
+use sim_replay::evaluation_protocol::ProtocolConfig;
 
 use super::TableError;
 use crate::weights_choice::weights_of;
@@ -18,6 +19,9 @@ use crate::weights_choice::weights_of;
 pub struct TableSpec {
     /// Data set, split or scenario; the first vehicle of each scenario is the ego.
     pub dataset: PathBuf,
+    /// Whose messages and annotations count, and which objects.
+    #[serde(default)]
+    pub protocol: ProtocolConfig,
     /// Folder with a file `*-METHOD.safetensors` for each method, for rows that name no weights.
     #[serde(default)]
     pub weights: Option<PathBuf>,

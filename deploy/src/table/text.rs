@@ -150,7 +150,7 @@ mod tests {
 
     use super::super::CellKey;
     use super::*;
-    use crate::metrics::{Communication, Latencies, Messages, Metrics, Percentiles, PoseErrors};
+    use crate::metrics::{Communication, Contribution, Latencies, Messages, Metrics, Percentiles, PoseErrors};
 
     fn cell(method: Method, at_50: f64) -> Cell {
         let ap = ByIou { at_30: Some(0.9), at_50: Some(at_50), at_70: None };
@@ -161,6 +161,8 @@ mod tests {
             method: method.name().into(),
             pose_source: "recorded".into(),
             ap_global: ap,
+            answered: None,
+            contribution: Contribution::default(),
             ap_frame_order: ap,
             pose: PoseErrors::default(),
             latency_ms: Latencies::default(),
@@ -185,6 +187,7 @@ mod tests {
             scenarios: None,
             attack: None,
             trust: None,
+            score_threshold: 0.1,
             version: "1".into(),
         };
         Cell { key, weights: "w.safetensors".into(), commit: "abc".into(), metrics }

@@ -6,6 +6,7 @@ use agent::agent::Agent;
 use nalgebra::Isometry3;
 use protocol::message::Message;
 use protocol::{Box3d, HEADER_LEN, Stamp, wire};
+use sim_replay::class_set::ClassSet;
 use sim_replay::dataset::{LoadOptions, Scenario};
 use sim_replay::frame::Frame;
 use sim_replay::ground_truth;
@@ -65,7 +66,7 @@ pub fn run(
 ) -> Result<(), AlignError> {
     approaches.iter_mut().for_each(|approach| approach.begin());
     for tick in ticks {
-        let frames = (0..scenario.agents.len())
+        let frames = (scenario.present_agents(tick))
             .map(|agent| Ok(scenario.load(agent, tick, &LoadOptions::default())?))
             .collect::<Result<Vec<Frame>, AlignError>>()?;
         let truth = (frames.iter().map(|frame| true_pose(frame, scenario, tick))).collect::<Result<Vec<_>, _>>()?;
@@ -148,7 +149,7 @@ fn boxes(source: &mut BoxSource, frame: &Frame, world_from_lidar: &Isometry3<f64
         }
         BoxSource::Annotated => {
             let lidar_from_world = world_from_lidar.inverse();
-            let targets = frame.objects.iter().filter(|object| object.class.is_detection_target());
+            let targets = frame.objects.iter().filter(|object| ClassSet::VEHICLES.contains(object.class));
             let mut found: Vec<Box3d> =
                 targets.map(|object| ground_truth::upright_box(object, &lidar_from_world)).collect();
             // Nearest first: as good a guess as any of what is seen best.

@@ -14,7 +14,7 @@ use ego_fuser::alignment::compare::{self, BoxSource};
 use ego_fuser::alignment::table::{Row, Tally, markdown};
 use ego_fuser::alignment::{Approach, BoxIcp, CloudIcp, FreeAlign, Measured, Poses};
 use protocol::CavId;
-use sim_replay::dataset::Scenario;
+use sim_replay::dataset::{IntensityScale, Scenario};
 use sim_replay::output;
 
 use super::{BadInput, progress, scenarios};
@@ -28,6 +28,9 @@ pub(crate) struct Arguments {
     /// Datasets, splits or scenarios with true poses.
     #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
     data: Vec<PathBuf>,
+    /// Number that stored intensities are divided by [default: auto; `sim-replay inspect --help` says by what].
+    #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
+    intensity_scale: IntensityScale,
     /// Approaches; none named: all but icp-map.
     #[arg(long, num_args = 1.., value_enum)]
     method: Vec<Method>,
@@ -110,7 +113,7 @@ impl Arguments {
     /// Compares, and prints the table.
     pub(crate) fn run(self) -> Result<()> {
         tch::set_num_threads(i32::from(self.threads.max(1)));
-        let scenarios = scenarios(&self.data)?;
+        let scenarios = scenarios(&self.data, self.intensity_scale)?;
         let mut approaches = self.approaches()?;
         let mut boxes = self.box_source(&approaches)?;
         let rows = self.compare(&mut approaches, &mut boxes, &scenarios)?;

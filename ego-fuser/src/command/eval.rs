@@ -13,7 +13,7 @@ use ego_fuser::evaluate::{EvaluateConfig, EvaluatedFrame, Evaluator};
 use ego_fuser::multi_scale::{MULTI_SCALE_KIND, OfflineDetector};
 use protocol::CodecConfig;
 use serde_json::json;
-use sim_replay::dataset::{LoadOptions, Scenario};
+use sim_replay::dataset::{IntensityScale, LoadOptions, Scenario};
 use sim_replay::frame::Frame;
 use sim_replay::ground_truth;
 use sim_replay::output;
@@ -26,6 +26,9 @@ pub(crate) struct Arguments {
     /// Datasets, splits or scenarios.
     #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
     data: Vec<PathBuf>,
+    /// Number that stored intensities are divided by [default: auto; `sim-replay inspect --help` says by what].
+    #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
+    intensity_scale: IntensityScale,
     /// Weights of encoder and head.
     #[arg(long, value_name = "FILE")]
     weights: PathBuf,
@@ -47,7 +50,7 @@ impl Arguments {
     /// Evaluates and prints a line per method.
     pub(crate) fn run(self) -> Result<()> {
         tch::set_num_threads(i32::from(self.threads.max(1)));
-        let scenarios = scenarios(&self.data)?;
+        let scenarios = scenarios(&self.data, self.intensity_scale)?;
         if kind_of(&self.weights)?.as_deref() == Some(MULTI_SCALE_KIND) {
             return self.run_multi_scale(&scenarios);
         }
@@ -61,7 +64,7 @@ impl Arguments {
                 pose_source: PoseSourceConfig::Recorded,
                 codec: CodecConfig::default(),
                 rate: RateConfig::default(),
-                rule: None,
+                protocol: None,
                 delay_nanos: 0,
                 attack: None,
                 trust: None,
@@ -87,14 +90,15 @@ impl Arguments {
         let mut tally = Tally::default();
         for scenario in scenarios {
             for tick in 0..scenario.ticks.len().min(frames) {
-                let agents = 0..scenario.agents.len();
-                let frames: Vec<Frame> = agents
+                let frames: Vec<Frame> = (scenario.present_agents(tick))
                     .map(|agent| scenario.load(agent, tick, &LoadOptions::default()))
                     .collect::<Result<_, _>>()?;
                 let objects = ground_truth::merge(&frames.iter().collect::<Vec<_>>(), 0, &rule);
                 let objects: Vec<_> = objects.into_iter().map(|(_, object)| object).collect();
                 tally.frames += 1;
-                tally.scorer.add(&detector.detect(&frames)?.0, &objects);
+                let (detections, sent_bytes) = detector.detect(&frames)?;
+                tally.scorer.add(&detections, &objects);
+                tally.payload_bytes.extend(sent_bytes);
             }
         }
         let row = tally.row("multi_scale");

@@ -15,7 +15,7 @@ use agent::process;
 use anyhow::Context;
 use indicatif::{ProgressBar, ProgressStyle};
 use sim_replay::bus::BusError;
-use sim_replay::dataset::{self, Scenario};
+use sim_replay::dataset::{self, IntensityScale, OpenOptions, Scenario};
 
 /// What `ego-fuser` can be asked to do.
 #[derive(Debug, clap::Subcommand)]
@@ -61,10 +61,11 @@ pub(crate) fn exit_code(error: &anyhow::Error) -> ExitCode {
 }
 
 /// All scenarios of some datasets.
-fn scenarios(folders: &[PathBuf]) -> anyhow::Result<Vec<Scenario>> {
+fn scenarios(folders: &[PathBuf], intensity_scale: IntensityScale) -> anyhow::Result<Vec<Scenario>> {
+    let options = OpenOptions { intensity_scale, ..OpenOptions::default() };
     let mut scenarios = Vec::new();
     for folder in folders {
-        scenarios.extend(dataset::open(folder).map_err(|error| BadInput(error.to_string()))?.scenarios);
+        scenarios.extend(dataset::open_with(folder, &options).map_err(|error| BadInput(error.to_string()))?.scenarios);
     }
     Ok(scenarios)
 }

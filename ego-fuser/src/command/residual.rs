@@ -5,6 +5,7 @@ use std::path::PathBuf;
 use agent::weights::Weights;
 use anyhow::Result;
 use ego_fuser::residual::{Offset, ResidualMeter};
+use sim_replay::dataset::IntensityScale;
 use sim_replay::output;
 
 use super::{BadInput, scenarios};
@@ -15,6 +16,9 @@ pub(crate) struct Arguments {
     /// Datasets, splits or scenarios; the first vehicle of each scenario is the ego.
     #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
     data: Vec<PathBuf>,
+    /// Number that stored intensities are divided by [default: auto; `sim-replay inspect --help` says by what].
+    #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
+    intensity_scale: IntensityScale,
     /// Weights of a method that aligns maps itself, as pastat does.
     #[arg(long, value_name = "FILE")]
     weights: PathBuf,
@@ -48,7 +52,7 @@ impl Arguments {
         let offsets: Vec<Offset> = shifts.chain(turns).collect();
         let weights = Weights::load(&self.weights).map_err(|error| BadInput(error.to_string()))?;
         let mut meter = ResidualMeter::load(&weights).map_err(|error| BadInput(error.to_string()))?;
-        let found = meter.measure(&scenarios(&self.data)?, self.every, &offsets, self.seed)?;
+        let found = meter.measure(&scenarios(&self.data, self.intensity_scale)?, self.every, &offsets, self.seed)?;
         if self.json {
             output::line(serde_json::to_string_pretty(&found)?)?;
             return Ok(());

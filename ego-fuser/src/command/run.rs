@@ -39,6 +39,9 @@ pub(crate) struct Arguments {
     /// "discover": all agents that are found; or the ids of those that may take part.
     #[arg(long, value_delimiter = ',', default_value = "discover", allow_hyphen_values = true)]
     neighbours: Vec<String>,
+    /// Neighbours farther away than this have no part, metres in the plane.
+    #[arg(long, value_name = "M", default_value_t = Ego::COMM_RANGE_M)]
+    comm_range: f64,
     /// Hear neighbours behind the emulated air (`sim-replay link`) and not directly.
     #[arg(long)]
     over_link: bool,
@@ -65,6 +68,7 @@ impl Arguments {
         tch::set_num_threads(i32::from(self.threads));
         let options = self.options()?;
         let ego = Ego::load(&self.weights, self.method).map_err(|error| BadInput(format!("weights: {error}")))?;
+        let ego = ego.with_comm_range(self.comm_range);
         let ego = ego.with_trust(self.trust.then(TrustConfig::default))?;
         let stop = self.bus.stop().context("installing signal handlers")?;
         let bus = self.bus.join(Role::Ego, &self.ego)?;

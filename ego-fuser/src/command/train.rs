@@ -17,6 +17,8 @@ use ego_fuser::model::ModelError;
 use ego_fuser::samples::{Augmentation, Moments, SampleConfig, SampleKind, SamplePoses};
 use ego_fuser::train::{self, Accuracy, Observer, StepReport, TrainConfig, TrainError};
 use protocol::Dtype;
+use sim_replay::dataset::{IntensityScale, Layout, OpenOptions};
+use sim_replay::evaluation_protocol::ProtocolConfig;
 
 use super::BadInput;
 
@@ -29,6 +31,9 @@ pub(crate) struct Arguments {
     /// Datasets to measure AP on; none: no validation.
     #[arg(long, num_args = 1.., value_name = "DIR")]
     validation: Vec<PathBuf>,
+    /// Number that stored intensities are divided by [default: auto; `sim-replay inspect --help` says by what].
+    #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
+    intensity_scale: IntensityScale,
     /// Method: none, early or one that exchanges feature maps; `ego-fuser methods` lists them.
     #[arg(long, default_value = "none")]
     method: Method,
@@ -101,9 +106,9 @@ pub(crate) struct Arguments {
     /// Largest turn of a vehicle's frame in training, degrees.
     #[arg(long, default_value_t = 45.0)]
     turn: f64,
-    /// Vehicles of a sample at most.
-    #[arg(long, default_value_t = 5)]
-    max_agents: usize,
+    /// Of the protocol's options, `--max-agents` is of a sample [default: 5]; the order of average precision has no effect.
+    #[command(flatten)]
+    protocol: ProtocolConfig,
     /// Learn what an ego can find that nobody helps: samples of one vehicle, which is to find what its neighbours have annotated
     /// as well [default for none: what itself has annotated].
     #[arg(long)]
@@ -126,11 +131,23 @@ impl Arguments {
     /// Trains and says what came of it.
     pub(crate) fn run(&self) -> Result<()> {
         let config = self.config()?;
-        let mut bar = Progress::default();
+        let mut bar = Progress(TrainingBar::of(config.run.length));
+        if let Some(hint) = self.hint() {
+            bar.0.say(hint);
+        }
         let summary = train::run(&config, &mut bar).map_err(blamed)?;
         bar.0.finish();
         self.options.print(&summary.trained, &serde_json::json!({"accuracy": summary.accuracy}))?;
         Ok(())
+    }
+
+    /// What is faster where a training from scratch was not meant.
+    fn hint(&self) -> Option<&'static str> {
+        // Merged points are encoded together, by an encoder that learns with the rest.
+        (self.init.is_none() && self.method != Method::Early).then_some(
+            "training from scratch, encoder and all; --init deploy/weights/lean-max.safetensors --freeze-encoder learns \
+             fusion and head alone, several times faster",
+        )
     }
 
     fn config(&self) -> Result<TrainConfig> {
@@ -143,12 +160,15 @@ impl Arguments {
                 .map_err(|error| BadInput(format!("{}: {error}", folder.display())))
                 .context("datasets")?;
         }
+        let rule = self.protocol.resolve(Layout::Opv2v).map_err(BadInput)?.ground_truth;
         let samples = SampleConfig {
             augmentation: Augmentation { turn_rad: self.turn.to_radians(), ..Augmentation::default() },
             drop_neighbour: self.drop_neighbour,
             poses: self.poses()?,
             moments: Moments { frames: 1, gap: self.gap, max_delay_nanos: self.max_delay * 1_000_000 },
-            max_agents: self.max_agents.max(1),
+            max_agents: self.protocol.max_agents.unwrap_or(5),
+            comm_range_m: rule.comm_range_m,
+            classes: rule.classes,
             merged_truth: self.alone,
             ..SampleConfig::training(SampleKind::Single)
         };
@@ -157,6 +177,8 @@ impl Arguments {
         Ok(TrainConfig {
             data: self.data.clone(),
             validation: self.validation.clone(),
+            protocol: self.protocol.clone(),
+            open: OpenOptions { intensity_scale: self.intensity_scale, ..OpenOptions::default() },
             method: self.method,
             detector: self.config.clone(),
             init: self.init.clone(),
@@ -246,7 +268,6 @@ enum Mode {
 }
 
 /// Shows on standard error how it goes.
-#[derive(Default)]
 struct Progress(TrainingBar);
 
 impl Observer for Progress {
@@ -262,7 +283,7 @@ impl Observer for Progress {
 
     fn stepped(&mut self, report: &StepReport) {
         let text = format!(
-            "step {} epoch {:.2} loss {:.3} = {:.3} + {:.3} lr {:.1e} {:.1} samples/s, {:.0} % waiting",
+            "step {} epoch {:.2} loss {:.3} = scores {:.3} + boxes {:.3} lr {:.1e} {:.1} samples/s, {:.0} % waiting",
             report.step,
             report.epoch,
             report.score_loss + report.box_loss,

@@ -12,6 +12,10 @@ use tch::Tensor;
 use crate::alignment::pose_graph::{Observer, PoseGraphConfig, correct};
 use crate::fusion::ViewFacts;
 
+/// Boxes at or below this score are no landmarks: the reference's threshold for boxes that poses are corrected by. It has
+/// nothing to do with which boxes are judged.
+const LANDMARK_SCORE: f32 = 0.2;
+
 /// Corrects the poses in `facts` by what each map `[1, C, H, W]` shows; the ego's stays.
 pub(super) fn correct_by_boxes(
     facts: &mut [ViewFacts],
@@ -34,7 +38,8 @@ pub(super) fn correct_by_boxes(
 
 /// What a vehicle detects alone, in its own frame.
 fn boxes_in(map: &Tensor, detector: &Detector) -> Result<Vec<Detection>, DetectorError> {
-    let limits = PostprocessConfig::for_late_fusion(detector.config());
+    let limits =
+        PostprocessConfig { score_threshold: LANDMARK_SCORE, ..PostprocessConfig::for_late_fusion(detector.config()) };
     let boxes = detector.boxes(&detector.heads(map)?, limits.score_threshold)?;
     let own = AgentBoxes { boxes: &boxes, output_from_agent: Isometry3::identity() };
     Ok(postprocess(&[own], &limits).iter().map(|candidate| candidate.detection(None)).collect())

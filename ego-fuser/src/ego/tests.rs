@@ -7,6 +7,7 @@ use tch::Device;
 use tch::nn::VarStore;
 
 use super::*;
+use crate::average_precision::{Ordering, Scorer};
 
 /// Capture time of all sweeps but those that say otherwise.
 const NOW: u64 = 5_000_000_000;
@@ -19,6 +20,12 @@ fn detector() -> Detector {
 }
 
 fn detector_with(compress_ratio: Option<i64>) -> Detector {
+    // A small weight of the head, so that scores are spread rather than all close to one.
+    detector_of(compress_ratio, 0.3, 0.01)
+}
+
+/// The same with scores around the sigmoid of `logit`; `weight` spreads them.
+fn detector_of(compress_ratio: Option<i64>, logit: f64, weight: f64) -> Detector {
     tch::set_num_threads(1);
     let lidar_range_m = [-12.8, -6.4, -3.0, 12.8, 6.4, 1.0];
     let config = DetectorConfig { lidar_range_m, compress_ratio, ..DetectorConfig::lean() };
@@ -30,9 +37,8 @@ fn detector_with(compress_ratio: Option<i64>) -> Detector {
         let wave = (Tensor::arange(count, (Kind::Float, Device::Cpu)) * 0.7).sin().view(variable.size().as_slice());
         let new = match name.as_str() {
             name if name.contains("running") || name.ends_with("norm.weight") => continue,
-            "cls_head.bias" => wave * 0.1 + 0.3,
-            // Small, so that scores are spread rather than all close to one.
-            "cls_head.weight" => wave * 0.01,
+            "cls_head.bias" => wave * 0.1 + logit,
+            "cls_head.weight" => wave * weight,
             // Boxes are the anchors themselves, which the clean-up takes for vehicles.
             "reg_head.weight" | "reg_head.bias" => wave * 0.0,
             _ if variable.dim() > 1 => wave * (2.0 / (count as f64 / variable.size()[0] as f64).sqrt()),
@@ -136,6 +142,46 @@ fn with_none_left_the_maps_of_every_method_are_those_of_the_ego_alone() {
     }
 }
 
+/// Methods whose fusion leaves the map of an ego without neighbours as it is, trained or not; others make a map of their own.
+fn leaves_one_map_as_it_is(method: Method) -> bool {
+    match method {
+        Method::None | Method::Late | Method::Early | Method::Max | Method::Attention => true,
+        Method::Where2comm | Method::CoAlign | Method::DiscoNet => true,
+        Method::V2vNet | Method::V2xVit | Method::Cobevt | Method::Ermvp | Method::TrafAlign | Method::Pastat => false,
+    }
+}
+
+/// AP@0.3, 0.5 and 0.7 of one frame.
+fn average_precisions(detections: &[Detection], objects: &[protocol::Box3d]) -> Vec<f64> {
+    let mut scorer = Scorer::new(&[0.3, 0.5, 0.7]);
+    scorer.add(detections, objects);
+    scorer.average_precisions(Ordering::Global)
+}
+
+#[test]
+fn alone_every_method_is_judged_as_none_down_to_the_same_score() {
+    // Most scores lie between 0.1 and 0.2: judged from there on, hardly anything would be left.
+    let unsure = || detector_of(None, -1.8, 1e-4);
+    let alone = |method| {
+        let own = view_by(unsure(), "a", HERE, method, 0.0);
+        Ego::new(unsure(), method).unwrap().detect(&own, &[]).unwrap().detections
+    };
+    let expected = alone(Method::None);
+    let scores: Vec<f32> = expected.iter().map(|found| found.score).collect();
+    assert!(scores.iter().any(|score| (0.1..0.2).contains(score)), "{scores:?}");
+    let objects: Vec<_> = expected.iter().step_by(2).map(|found| found.box3d).collect();
+    for method in Method::ALL.into_iter().filter(|method| leaves_one_map_as_it_is(*method)) {
+        let found = alone(method);
+        assert_eq!(found.len(), expected.len(), "{method}");
+        for (found, expected) in found.iter().zip(&expected) {
+            assert_eq!(found.score, expected.score, "{method}");
+            let apart = (0..3).map(|axis| (found.box3d.center_m[axis] - expected.box3d.center_m[axis]).abs());
+            assert!(apart.fold(0.0, f64::max) < 1e-9, "{method}: {found:?} is not {expected:?}");
+        }
+        assert_eq!(average_precisions(&found, &objects), average_precisions(&expected, &objects), "{method}");
+    }
+}
+
 #[test]
 fn an_ego_without_pose_goes_on_alone() {
     let own = view("a", HERE, Method::Max, 0.0);
@@ -202,6 +248,33 @@ fn maps_of_another_network_are_left_out_and_named_where_they_are_the_egos_own() 
     let boxes = View { content: Content::Boxes(vec![]), ..own.clone() };
     assert!(matches!(ego.detect(&boxes, &[]), Err(EgoError::OwnContent { .. })));
     assert_eq!(ego.detect(&own, &[boxes]).unwrap().skipped, [(0, Skipped::Unusable(DropReason::Shape))]);
+}
+
+#[test]
+fn codes_are_fused_as_the_maps_that_they_stand_for_and_no_others() {
+    let squeezed = |ratio| detector_with(Some(ratio));
+    let own = view_by(squeezed(4), "a", HERE, Method::Max, 0.0);
+    let other = view_by(squeezed(4), "b", near(), Method::Max, 0.1);
+    let Content::Features(map) = &other.content else { panic!("max exchanges maps") };
+    assert_eq!((map.features.channels, map.features.code_of), (16, Some(64)));
+    let mut ego = Ego::new(squeezed(4), Method::Max).unwrap();
+    let together = ego.detect(&own, std::slice::from_ref(&other)).unwrap();
+    assert_eq!(together.fused, [0]);
+    // The same network with nothing to widen is told the maps behind the compressor.
+    let widened = |view: &View| {
+        let Content::Features(map) = &view.content else { panic!("max exchanges maps") };
+        let features = detector().to_message(&squeezed(4).received(map).unwrap()).unwrap();
+        View { content: Content::Features(DecodedFeatures { features, sent: None }), ..view.clone() }
+    };
+    let mut plain = Ego::new(detector(), Method::Max).unwrap();
+    assert_eq!(plain.detect(&widened(&own), &[widened(&other)]).unwrap().detections, together.detections);
+    // As many channels, but of another map; and a map where a code is expected.
+    let mut of_another = other.clone();
+    let Content::Features(map) = &mut of_another.content else { panic!("max exchanges maps") };
+    map.features.code_of = Some(128);
+    let strangers = [of_another, widened(&other), view_by(squeezed(8), "b", near(), Method::Max, 0.1)];
+    let skipped = ego.detect(&own, &strangers).unwrap().skipped;
+    assert_eq!(skipped, [0, 1, 2].map(|index| (index, Skipped::Unusable(DropReason::Shape))));
 }
 
 #[test]

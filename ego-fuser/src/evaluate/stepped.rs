@@ -27,6 +27,7 @@ pub use compute::ComputeTimes;
 pub use remote::{RemoteCrew, RemoteError};
 
 use super::sent::{Sent, stamp, view};
+use super::sweeps::Sweep;
 use super::{EvaluateError, EvaluatedFrame, Evaluator, of_the_ego};
 use crate::ego::{Skipped, View, own_content};
 use crate::method::{Exchange, Method};
@@ -91,7 +92,7 @@ pub(super) fn run(
     let mut run = Run::open(evaluator, config, scenario)?;
     let mut flow = ControlFlow::Continue(());
     for tick in run.next..run.end {
-        let frame = run.decide(tick)?;
+        let Some(frame) = run.decide(tick)? else { continue };
         flow = on_frame(frame);
         if flow.is_break() {
             break;
@@ -118,8 +119,11 @@ enum Pipeline {
 
 /// A tick whose sweeps are computed.
 struct Computed {
-    own: View,
-    /// Of all vehicles, the ego first.
+    /// Absent where the ego's sweep cannot be read.
+    own: Option<View>,
+    /// Neighbours that sent something.
+    senders: Vec<CavId>,
+    /// Of all vehicles that take part, the ego first.
     frames: Vec<Frame>,
     poses: Vec<PoseEstimate>,
 }
@@ -195,40 +199,50 @@ impl<'a> Run<'a> {
         self.next += 1;
         let method = self.evaluator.ego.method();
         let load = self.load_options();
-        let load_frame = |member: &Member| self.scenario.load(member.place, tick, &load);
-        let mut frames: Vec<Frame> = self.crew.iter().map(load_frame).collect::<Result<_, _>>()?;
-        let mut poses = Vec::with_capacity(self.crew.len());
-        let mut own = None;
-        for (place, sent) in self.perceive(tick, &frames)?.into_iter().enumerate() {
+        let places: Vec<usize> = self.crew.iter().map(|member| member.place).collect();
+        let ego_place = places.first().copied();
+        // Without an exchange, neighbours have nothing to encode; where they are is still asked.
+        let is_needed = |place: usize| Some(place) == ego_place || method != Method::None;
+        let is_here = self.evaluator.remote.is_none();
+        let with_maps = |place| is_here && is_needed(place);
+        let sweeps = self.evaluator.sweeps(self.scenario, tick, &places, &load, with_maps)?;
+        if sweeps.first().map(|ego| ego.place) != ego_place {
+            self.computed.push_back(Computed { own: None, senders: vec![], frames: vec![], poses: vec![] });
+            return Ok(());
+        }
+        let all = self.perceive(&sweeps)?;
+        let mut frames: Vec<Frame> = sweeps.into_iter().map(|sweep| sweep.frame).collect();
+        let (mut poses, mut senders, mut own) = (Vec::with_capacity(all.len()), Vec::new(), None);
+        for (place, sent) in all.into_iter().enumerate() {
             poses.push(sent.pose);
             if place == 0 {
                 own = sent.view();
             } else if sent.content.is_some() && method != Method::None {
+                senders.push(sent.cav.clone());
                 let distance_m = distance_m(&frames[0], &frames[place]);
                 post(&mut self.courier, &self.config.compute, tick, sent, distance_m);
             }
         }
         let blind = LoadOptions { points: false, ..load };
-        for &place in &self.witnesses {
-            frames.push(self.scenario.load(place, tick, &blind)?);
-        }
-        let own = own.expect("the ego is needed by every method");
-        self.computed.push_back(Computed { own, frames, poses });
+        let witnesses = self.scenario.load_tick(tick, self.witnesses.iter().copied(), &blind);
+        self.evaluator.left_out.add_tick(&witnesses);
+        frames.extend(witnesses.frames.into_iter().map(|(_, frame)| frame));
+        self.computed.push_back(Computed { own, senders, frames, poses });
         Ok(())
     }
 
     /// What everyone makes of the sweeps of a tick.
-    fn perceive(&mut self, tick: usize, frames: &[Frame]) -> Result<Vec<Sent>, EvaluateError> {
+    fn perceive(&mut self, sweeps: &[Sweep]) -> Result<Vec<Sent>, EvaluateError> {
         if let Some(remote) = &self.evaluator.remote {
-            return Ok(remote.ask(frames).map_err(Box::new)?);
+            let frames: Vec<&Frame> = sweeps.iter().map(|sweep| &sweep.frame).collect();
+            return Ok(remote.ask(&frames).map_err(Box::new)?);
         }
         let method = self.evaluator.ego.method();
-        let mut all: Vec<Sent> = Vec::with_capacity(frames.len());
-        for (member, frame) in self.crew.iter_mut().zip(frames) {
-            // Without an exchange, neighbours have nothing to encode; where they are is still asked.
+        let mut all: Vec<Sent> = Vec::with_capacity(sweeps.len());
+        for Sweep { place, frame, map } in sweeps {
             let is_needed = all.is_empty() || method != Method::None;
-            let map = if is_needed { self.evaluator.map_of(self.scenario, member.place, tick)? } else { None };
             let exchange = is_needed.then(|| own_content(method));
+            let Some(member) = self.crew.iter_mut().find(|member| member.place == *place) else { continue };
             if let Pipeline::Here(agent, codec) = &mut member.pipeline {
                 agent.overhear(|| all.last().map(Sent::overheard).unwrap_or_default());
                 all.push(view(agent, frame, map.as_ref(), exchange, codec)?);
@@ -243,8 +257,8 @@ impl<'a> Run<'a> {
         LoadOptions { points, lidar_variant: self.config.lidar_variant.clone(), ..LoadOptions::default() }
     }
 
-    /// Fuses a tick.
-    fn decide(&mut self, tick: usize) -> Result<EvaluatedFrame, EvaluateError> {
+    /// Fuses a tick; nothing where the ego's sweep cannot be read.
+    fn decide(&mut self, tick: usize) -> Result<Option<EvaluatedFrame>, EvaluateError> {
         let capture_nanos = self.scenario.ticks[tick].capture_nanos;
         let compute = self.config.compute;
         let ready_nanos = capture_nanos.saturating_add(compute.agent_nanos());
@@ -255,11 +269,12 @@ impl<'a> Run<'a> {
         for arrived in self.courier.until(closes_nanos) {
             self.take_in(arrived);
         }
-        let Computed { own, frames, poses } = self.computed.pop_front().expect("a tick closes after it began");
-        let decided_nanos = self.complete_nanos(capture_nanos).unwrap_or(closes_nanos).max(ready_nanos);
+        let computed = self.computed.pop_front().expect("a tick closes after it began");
+        let Computed { own: Some(own), senders, frames, poses } = computed else { return Ok(None) };
+        let decided_nanos = self.complete_nanos(capture_nanos, &senders).unwrap_or(closes_nanos).max(ready_nanos);
         let done_nanos = decided_nanos.max(self.ego_free_nanos).saturating_add(compute.fuse_nanos());
         self.ego_free_nanos = done_nanos;
-        let mut result = self.fuse(tick, &own)?;
+        let mut result = self.fuse(tick, &own, &senders)?;
         // Measured times would be another every time.
         let stage = |name: &str, nanos| StageTiming { stage: name.into(), nanos };
         result.stages = vec![
@@ -271,7 +286,7 @@ impl<'a> Run<'a> {
         let objects = ground_truth::merge(&frames.iter().collect::<Vec<_>>(), 0, &self.evaluator.rule);
         let objects = objects.into_iter().map(|(_, object)| object).collect();
         let stamp = protocol::Stamp { publish_nanos: done_nanos, ..stamp(&own.cav, capture_nanos) };
-        Ok(EvaluatedFrame { tick, stamp, result, frames, poses, objects })
+        Ok(Some(EvaluatedFrame { tick, stamp, result, frames, poses, objects }))
     }
 
     /// Lays a message where it waits for its tick.
@@ -288,21 +303,21 @@ impl<'a> Run<'a> {
         }
     }
 
-    /// When the last neighbour's message of a tick had come; none where one is missing.
-    fn complete_nanos(&self, capture_nanos: u64) -> Option<u64> {
+    /// When the last of the senders' messages of a tick had come; none where one is missing.
+    fn complete_nanos(&self, capture_nanos: u64, senders: &[CavId]) -> Option<u64> {
         if self.evaluator.ego.method() == Method::None {
             return Some(capture_nanos);
         }
         let of_tick = |(time, _): &&(u64, u64)| time.abs_diff(capture_nanos) <= self.config.pairing.max_lead_nanos;
         let mut complete_nanos = capture_nanos;
-        for member in &self.crew[1..] {
-            let arrivals = self.arrivals.get(&member.cav)?;
+        for cav in senders {
+            let arrivals = self.arrivals.get(cav)?;
             complete_nanos = complete_nanos.max(arrivals.iter().filter(of_tick).map(|(_, nanos)| *nanos).min()?);
         }
         Some(complete_nanos)
     }
 
-    fn fuse(&mut self, tick: usize, own: &View) -> Result<protocol::Detections, EvaluateError> {
+    fn fuse(&mut self, tick: usize, own: &View, senders: &[CavId]) -> Result<protocol::Detections, EvaluateError> {
         let (paired, dropped) = self.pairing.pair(own.capture_nanos);
         let (mut views, mut bytes, mut first_uses) = (Vec::new(), Vec::new(), Vec::new());
         for Paired { is_first_use, message, .. } in paired {
@@ -324,8 +339,7 @@ impl<'a> Run<'a> {
         }
         let mut result = self.evaluator.report(tick - self.config.ticks.start, own, &views, &bytes, output);
         if self.evaluator.ego.method() != Method::None {
-            let silent = self.crew[1..].iter().map(|member| &member.cav);
-            for cav in silent.filter(|cav| views.iter().all(|view| view.cav != **cav)) {
+            for cav in senders.iter().filter(|cav| views.iter().all(|view| view.cav != **cav)) {
                 let reason = dropped.iter().rev().find(|lost| lost.cav == *cav).map(|lost| lost.reason);
                 result.skipped.push(SkippedNeighbour { cav: cav.clone(), reason });
             }
@@ -341,6 +355,7 @@ impl<'a> Run<'a> {
             self.courier.close(cav, waiting);
         }
         self.evaluator.ledger.merge(self.courier.ledger());
+        self.evaluator.sent_bytes += self.courier.sent_bytes();
     }
 }
 

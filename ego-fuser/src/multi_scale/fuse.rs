@@ -60,7 +60,7 @@ pub fn fuse_levels(backbone: &BevBackbone, canvas: &Tensor, levels: &Levels<'_>)
 }
 
 /// A mask of another level, read between its cells.
-fn resized(mask: &Tensor, size: [i64; 2]) -> Result<Tensor, TchError> {
+pub(super) fn resized(mask: &Tensor, size: [i64; 2]) -> Result<Tensor, TchError> {
     let (_, _, height, width) = mask.size4()?;
     if [height, width] == size {
         return Ok(mask.shallow_clone());

@@ -2,9 +2,10 @@
 //! here, offline.
 //!
 //! Every level's maps are fused on their way to the up-sampling branch, while each agent's own go on down; so an agent
-//! would have to send the maps of all levels, or the ego to run the rest of the backbone for everyone. A live agent sends
-//! one map. What runs live of these methods is the same fusion at a single scale ([`crate::fusion::where2comm`],
-//! [`crate::fusion::coalign`]), with weights that were trained for it.
+//! would have to send its first level's map, and the ego to run the rest of the backbone for everyone. That map is what
+//! their bytes are counted by ([`MultiScaleOutput::sent_bytes`]); a live agent sends its last. What runs live of these
+//! methods is the same fusion at a single scale ([`crate::fusion::where2comm`], [`crate::fusion::coalign`]), with weights
+//! that were trained for it.
 
 mod fuse;
 mod network;

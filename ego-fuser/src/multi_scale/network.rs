@@ -11,7 +11,7 @@ use serde::{Deserialize, Serialize};
 use tch::nn::VarStore;
 use tch::{Device, Kind, TchError, Tensor};
 
-use super::fuse::{Levels, Placement, fuse_levels};
+use super::fuse::{Levels, Placement, fuse_levels, resized};
 use crate::fusion::FUSION_KEY;
 use crate::fusion::where2comm::{Aggregation, Communication, CommunicationConfig};
 use crate::model::ModelError;
@@ -64,6 +64,9 @@ pub struct MultiScaleOutput {
     pub heads: HeadOutput,
     /// Share of their cells that agents send, the ego's own counted as if it sent; 1 where all do.
     pub rate: f64,
+    /// What each agent has to send, bytes: the map of its first level in `f32`, from which the others follow; where it leaves
+    /// cells out, those that it sends and a mask of them.
+    pub sent_bytes: Vec<u64>,
 }
 
 impl MultiScaleNetwork {
@@ -125,13 +128,32 @@ impl MultiScaleNetwork {
             }
             None => (None, 1.0),
         };
+        let sent_bytes = self.sent_bytes(sent.as_ref(), samples)?;
         let levels = Levels { samples, aggregation: self.config.aggregation, sent: sent.as_ref() };
         let fused = fuse_levels(&network.backbone, &canvas, &levels)?;
         let fused = match &network.shrink {
             Some(shrink) => shrink.forward(&fused, false),
             None => fused,
         };
-        Ok(MultiScaleOutput { heads: network.heads(&fused)?, rate })
+        Ok(MultiScaleOutput { heads: network.heads(&fused)?, rate, sent_bytes })
+    }
+
+    /// Bytes of the first level's map of each agent.
+    fn sent_bytes(&self, sent: Option<&Tensor>, samples: &[Placement]) -> Result<Vec<u64>, TchError> {
+        let (lattice, config) = (self.network.lattice(), &self.network.config);
+        let stride = config.layer_strides[0];
+        let [height, width] = [lattice.height, lattice.width].map(|extent| extent as u64);
+        let [height, width] = [height, width].map(|extent| extent.div_ceil(stride.unsigned_abs()));
+        let (cells, cell_bytes) = (height * width, 4 * config.num_filters[0].unsigned_abs());
+        let agents = samples.iter().map(|sample| sample.agents).sum::<i64>();
+        let Some(sent) = sent else { return Ok(vec![cells * cell_bytes; agents.unsigned_abs() as usize]) };
+        let selected = resized(sent, [height as i64, width as i64])?.f_gt(0.0)?;
+        let selected: Vec<i64> =
+            Vec::try_from(&selected.f_sum_dim_intlist([1i64, 2, 3].as_slice(), false, Kind::Int64)?)?;
+        let bytes = |selected: u64| {
+            if selected == cells { cells * cell_bytes } else { cells.div_ceil(8) + selected * cell_bytes }
+        };
+        Ok(selected.into_iter().map(|selected| bytes(selected.unsigned_abs())).collect())
     }
 
     /// The masks with those at one everywhere who send all.

@@ -15,10 +15,10 @@ use sim_replay::frame::Frame;
 use sim_replay::ground_truth::GroundTruthRule;
 use tch::{Device, no_grad};
 
-use super::{MultiScaleNetwork, Placement};
+use super::{MultiScaleNetwork, MultiScaleOutput, Placement};
 use crate::ego::Ego;
 use crate::evaluate::rule_for;
-use crate::model::{ModelError, SCORE_THRESHOLD, flat};
+use crate::model::{ModelError, flat};
 use crate::samples::merge_points;
 
 /// Detects in the recorded sweeps of several vehicles, by their recorded poses.
@@ -39,12 +39,11 @@ impl OfflineDetector {
     pub fn load(path: &Path) -> Result<Self, ModelError> {
         let network = MultiScaleNetwork::load(path, Device::Cpu)?;
         let config = &network.network().config;
-        let limits = PostprocessConfig { score_threshold: SCORE_THRESHOLD, ..PostprocessConfig::for_detector(config) };
         Ok(Self {
             crop: Crop::for_detector(config),
             voxeliser: Voxeliser::for_detector(config),
             anchors: Anchors::for_detector(config),
-            limits,
+            limits: PostprocessConfig::for_detector(config),
             network,
         })
     }
@@ -61,13 +60,13 @@ impl OfflineDetector {
         rule_for(&self.network.network().config)
     }
 
-    /// Detections in the frame of the first vehicle, and the number of others that took part: those with a pose, in
-    /// reach.
+    /// Detections in the frame of the first vehicle, and what each of the others that took part had to send, bytes: those
+    /// with a pose, in reach.
     ///
     /// # Errors
     /// [`ModelError`] when the tensor library refuses.
-    pub fn detect(&mut self, frames: &[Frame]) -> Result<(Vec<Detection>, usize), ModelError> {
-        let Some((ego, others)) = frames.split_first() else { return Ok((Vec::new(), 0)) };
+    pub fn detect(&mut self, frames: &[Frame]) -> Result<(Vec<Detection>, Vec<u64>), ModelError> {
+        let Some((ego, others)) = frames.split_first() else { return Ok((Vec::new(), Vec::new())) };
         let placed = |frame: &Frame| {
             let pose = ego.world_from_lidar?.from_world(&frame.world_from_lidar?);
             let [x, y, _] = pose.translation_m;
@@ -81,7 +80,7 @@ impl OfflineDetector {
                 poses.push(pose);
             }
         }
-        Ok((self.boxes(&sweeps, &poses)?, poses.len() - 1))
+        self.boxes(&sweeps, &poses)
     }
 
     /// The pillars of a vehicle's sweep, in the frame that its network encodes in.
@@ -100,7 +99,7 @@ impl OfflineDetector {
         self.network.network().config.y_axis == YAxis::Right
     }
 
-    fn boxes(&self, sweeps: &[Pillars], poses: &[Pose]) -> Result<Vec<Detection>, ModelError> {
+    fn boxes(&self, sweeps: &[Pillars], poses: &[Pose]) -> Result<(Vec<Detection>, Vec<u64>), ModelError> {
         let network = self.network.network();
         let batch = PillarBatch::new(&sweeps.iter().collect::<Vec<_>>(), network.lattice());
         let mirrored: Vec<Pose> = poses.iter().map(Pose::mirrored_y).collect();
@@ -110,7 +109,7 @@ impl OfflineDetector {
         } else {
             Placement::of_poses(poses, &network.config.feature_grid())?
         };
-        let heads = no_grad(|| self.network.forward(&batch, &[placement]))?.heads;
+        let MultiScaleOutput { heads, sent_bytes, .. } = no_grad(|| self.network.forward(&batch, &[placement]))?;
         let (scores, offsets) = (flat(&heads.scores, 0)?, flat(&heads.offsets, 0)?);
         let mut boxes = decode(&scores, &offsets, &self.anchors, self.limits.score_threshold)?;
         if self.is_mirrored() {
@@ -119,6 +118,9 @@ impl OfflineDetector {
             }
         }
         let own = AgentBoxes { boxes: &boxes, output_from_agent: Isometry3::identity() };
-        Ok(postprocess(&[own], &self.limits).iter().map(|candidate| candidate.detection(None)).collect())
+        let found = postprocess(&[own], &self.limits);
+        // What the ego has itself does not cross the air.
+        let sent_bytes = sent_bytes.into_iter().skip(1).collect();
+        Ok((found.iter().map(|candidate| candidate.detection(None)).collect(), sent_bytes))
     }
 }

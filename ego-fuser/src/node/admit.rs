@@ -109,7 +109,8 @@ impl Node<'_> {
             }
             _ => {
                 let Bev { pose, features } = self.inbox.decode(arrival, limits)?;
-                let decoded = features.decode(limits).and_then(|map| self.models.check(&map.features).map(|()| map));
+                let fits = self.models.check(&features);
+                let decoded = features.decode(limits).and_then(|map| fits.map(|()| map));
                 match decoded {
                     Ok(features) => Some((pose, Content::Features(features))),
                     Err(error) => {

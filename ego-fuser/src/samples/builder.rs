@@ -6,8 +6,9 @@ use agent::crop::Crop;
 use agent::model_config::DetectorConfig;
 use agent::pillars::{Pillars, Voxeliser};
 use nalgebra::Point3;
-use protocol::{Box3d, PointCloud, Pose, PoseEstimate};
+use protocol::{Box3d, NoPoseReason, PointCloud, Pose, PoseEstimate};
 use rand::Rng;
+use sim_replay::class_set::ClassSet;
 use sim_replay::frame::Frame;
 use sim_replay::ground_truth::{self, GroundTruthRule};
 use tch::Tensor;
@@ -49,6 +50,8 @@ pub struct SampleConfig {
     pub max_agents: usize,
     /// Vehicles farther away do not take part, metres in the plane.
     pub comm_range_m: f64,
+    /// Classes of the objects that are to be found.
+    pub classes: ClassSet,
     /// Whether a single vehicle is also to find what only its neighbours have annotated: the rule of the evaluation. A
     /// training by it is of single vehicles, whatever their method shares; a neighbour that is dropped has annotated nothing.
     pub merged_truth: bool,
@@ -66,6 +69,7 @@ impl SampleConfig {
             moments: Moments::default(),
             max_agents: 5,
             comm_range_m: 70.0,
+            classes: ClassSet::VEHICLES,
             merged_truth: false,
         }
     }
@@ -152,8 +156,16 @@ impl SampleBuilder {
     /// # Errors
     /// [`SampleError`] when a file is missing or malformed, or nothing is known of a vehicle's pose.
     pub fn build(&mut self, tick: TickRef, rng: &mut impl Rng) -> Result<Sample, SampleError> {
-        let frames = self.scenes.annotations(tick)?;
-        let ego = rng.random_range(0..frames.len());
+        let frames = self.scenes.annotations(tick);
+        let present: Vec<usize> = (0..frames.len()).filter(|&agent| frames[agent].is_some()).collect();
+        if present.is_empty() {
+            return Err(SampleError::Empty(format!(
+                "no readable frame at tick {} of scenario {}",
+                tick.tick,
+                self.scenes.scenario(tick).name
+            )));
+        }
+        let ego = present[rng.random_range(0..present.len())];
         let agents = self.choose_agents(tick, &frames, ego, rng)?;
         let single = self.config.kind == SampleKind::Single;
         let annotators = if single && !self.config.merged_truth { &agents[..1] } else { &agents[..] };
@@ -226,8 +238,11 @@ impl SampleBuilder {
         place: [usize; 2],
         error: &DrawnError,
     ) -> Result<[PoseEstimate; 2], SampleError> {
-        let frames = self.scenes.annotations(tick)?;
-        let frame = &frames[agent];
+        let frames = self.scenes.annotations(tick);
+        let Some(frame) = &frames[agent] else {
+            let absent = PoseEstimate::NoPose { reason: NoPoseReason::NoSource, inlier_count: 0 };
+            return Ok([absent; 2]);
+        };
         let found = self.config.poses.found(&self.scenes.scenario(tick).name, frame)?;
         Ok([found, error.added(found, &frame.cav, frame.capture_nanos, place)])
     }
@@ -260,13 +275,14 @@ impl SampleBuilder {
     fn choose_agents(
         &self,
         tick: TickRef,
-        frames: &[Frame],
+        frames: &[Option<Frame>],
         ego: usize,
         rng: &mut impl Rng,
     ) -> Result<Vec<usize>, SampleError> {
         let mut agents = vec![ego];
-        let [ego_x, ego_y, _] = self.world_from_lidar(tick, &frames[ego])?.translation_m;
-        for (agent, frame) in frames.iter().enumerate() {
+        let Some(ego_frame) = &frames[ego] else { return Ok(agents) };
+        let [ego_x, ego_y, _] = self.world_from_lidar(tick, ego_frame)?.translation_m;
+        for (agent, frame) in frames.iter().enumerate().filter_map(|(agent, frame)| Some((agent, frame.as_ref()?))) {
             let [x, y, _] = self.world_from_lidar(tick, frame)?.translation_m;
             let in_reach = (x - ego_x).hypot(y - ego_y) <= self.config.comm_range_m;
             let dropped = rng.random_bool(self.config.drop_neighbour);
@@ -286,7 +302,7 @@ impl SampleBuilder {
     }
 
     /// What `annotators`, the ego first, have annotated, in the changed ego frame, on the lattice.
-    fn objects(&self, frames: &[Frame], annotators: &[usize], ego_view: &ViewAugment) -> Vec<Box3d> {
+    fn objects(&self, frames: &[Option<Frame>], annotators: &[usize], ego_view: &ViewAugment) -> Vec<Box3d> {
         let range = self.detector.lidar_range_m;
         let rule = GroundTruthRule {
             x_m: ANYWHERE_M,
@@ -294,8 +310,9 @@ impl SampleBuilder {
             z_m: [range[2], range[5]],
             comm_range_m: self.config.comm_range_m,
             min_corners: 8,
+            classes: self.config.classes,
         };
-        let views: Vec<&Frame> = annotators.iter().map(|&agent| &frames[agent]).collect();
+        let views: Vec<&Frame> = annotators.iter().filter_map(|&agent| frames[agent].as_ref()).collect();
         let on_lattice =
             |object: &Box3d| (0..2).all(|axis| (range[axis]..range[axis + 3]).contains(&object.center_m[axis]));
         let merged = ground_truth::merge(&views, 0, &rule);

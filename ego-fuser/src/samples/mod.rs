@@ -30,6 +30,9 @@ pub enum SampleError {
     /// A file of a dataset is missing or malformed.
     #[error(transparent)]
     Read(#[from] ReadError),
+    /// The evaluation protocol is not known or contradicts itself.
+    #[error("evaluation protocol: {0}")]
+    Protocol(String),
     /// A dataset has nothing to learn from.
     #[error("{0}")]
     Empty(String),

@@ -1,12 +1,13 @@
 //! Datasets as one list of ticks, with poses and annotations kept in memory.
 
-use std::collections::HashMap;
+use std::collections::{BTreeSet, HashMap};
 use std::path::PathBuf;
-use std::sync::{Arc, Mutex, OnceLock, PoisonError};
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
 
 use agent::training::DataListing;
 use protocol::PointCloud;
-use sim_replay::dataset::{self, LoadOptions, Scenario};
+use sim_replay::dataset::{self, LoadOptions, OpenOptions, Scenario};
+use sim_replay::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
 use sim_replay::frame::Frame;
 
 use super::SampleError;
@@ -30,21 +31,26 @@ pub struct SceneSet {
     ticks: Vec<TickRef>,
     /// What was wrong with the datasets and could be left out.
     problems: Vec<String>,
-    known: Mutex<HashMap<TickRef, Arc<Vec<Frame>>>>,
+    known: Mutex<HashMap<TickRef, Arc<Vec<Option<Frame>>>>>,
+    /// Frames that could not be read, as they were met.
+    unreadable: Mutex<BTreeSet<String>>,
     /// Hash of the contents, once someone has asked: it reads a little of every file.
     sha256: OnceLock<String>,
 }
 
 impl SceneSet {
-    /// Opens datasets, splits or scenarios.
+    /// Opens datasets, splits or scenarios, with the agents of the protocol, however many.
     ///
     /// # Errors
-    /// [`SampleError::Read`] when a folder cannot be read, [`SampleError::Empty`] when there is no tick in any of them.
-    pub fn open(folders: &[PathBuf]) -> Result<Self, SampleError> {
+    /// [`SampleError::Read`] when a folder cannot be read, [`SampleError::Protocol`] when the protocol contradicts
+    /// itself, [`SampleError::Empty`] when there is no tick in any of them.
+    pub fn open(folders: &[PathBuf], options: &OpenOptions, protocol: &ProtocolConfig) -> Result<Self, SampleError> {
         let (mut scenarios, mut problems) = (Vec::new(), Vec::new());
         for folder in folders {
-            let dataset = dataset::open(folder)?;
-            scenarios.extend(dataset.scenarios);
+            let dataset = dataset::open_with(folder, options)?;
+            let protocol = protocol.resolve(dataset.layout).map_err(SampleError::Protocol)?;
+            let protocol = EvaluationProtocol { max_agents: usize::MAX, ..protocol };
+            scenarios.extend(dataset.scenarios.iter().filter_map(|scenario| protocol.arrange(scenario)));
             problems.extend(dataset.problems.iter().map(ToString::to_string));
         }
         let set = Self { problems, ..Self::new(scenarios) };
@@ -61,7 +67,14 @@ impl SceneSet {
             (0..found.ticks.len()).map(move |tick| TickRef { scenario, tick }).collect::<Vec<_>>()
         };
         let ticks = scenarios.iter().enumerate().flat_map(of_scenario).collect();
-        Self { scenarios, ticks, problems: Vec::new(), known: Mutex::default(), sha256: OnceLock::new() }
+        Self {
+            scenarios,
+            ticks,
+            problems: Vec::new(),
+            known: Mutex::default(),
+            unreadable: Mutex::default(),
+            sha256: OnceLock::new(),
+        }
     }
 
     /// All ticks, scenario after scenario.
@@ -82,22 +95,26 @@ impl SceneSet {
         &self.scenarios
     }
 
-    /// Poses and annotations of all agents at a tick, without points, in the order of the scenario's agents.
-    ///
-    /// # Errors
-    /// [`SampleError::Read`] when a file is missing or malformed.
-    pub fn annotations(&self, tick: TickRef) -> Result<Arc<Vec<Frame>>, SampleError> {
-        let known = |set: &Self| set.known.lock().unwrap_or_else(PoisonError::into_inner).get(&tick).cloned();
+    /// Poses and annotations of all agents at a tick, without points, in the order of the scenario's agents; nothing of
+    /// those that are absent or whose file cannot be read.
+    #[must_use]
+    pub fn annotations(&self, tick: TickRef) -> Arc<Vec<Option<Frame>>> {
+        let known = |set: &Self| lock(&set.known).get(&tick).cloned();
         if let Some(frames) = known(self) {
-            return Ok(frames);
+            return frames;
         }
         let options = LoadOptions { points: false, ..LoadOptions::default() };
         let scenario = self.scenario(tick);
-        let frames: Result<Vec<Frame>, _> =
-            (0..scenario.agents.len()).map(|agent| scenario.load(agent, tick.tick, &options)).collect();
-        let frames = Arc::new(frames?);
-        self.known.lock().unwrap_or_else(PoisonError::into_inner).insert(tick, Arc::clone(&frames));
-        Ok(frames)
+        let loaded = scenario.load_tick(tick.tick, 0..scenario.agents.len(), &options);
+        let mut frames: Vec<Option<Frame>> = scenario.agents.iter().map(|_| None).collect();
+        for (agent, frame) in loaded.frames {
+            lock(&self.unreadable).extend(frame.problems.iter().map(|problem| problem.message.clone()));
+            frames[agent] = Some(frame);
+        }
+        lock(&self.unreadable).extend(loaded.unreadable.into_iter().map(|(_, problem)| problem.message));
+        let frames = Arc::new(frames);
+        lock(&self.known).insert(tick, Arc::clone(&frames));
+        frames
     }
 
     /// The sweep of one agent.
@@ -112,6 +129,11 @@ impl SceneSet {
     #[must_use]
     pub fn data(&self) -> DataListing {
         let sha256 = self.sha256.get_or_init(|| dataset::content_sha256(&self.scenarios)).clone();
-        DataListing { sha256, problems: self.problems.clone(), without_pose: 0 }
+        let problems = self.problems.iter().chain(lock(&self.unreadable).iter()).cloned().collect();
+        DataListing { sha256, problems, without_pose: 0 }
     }
+}
+
+fn lock<T>(shared: &Mutex<T>) -> MutexGuard<'_, T> {
+    shared.lock().unwrap_or_else(PoisonError::into_inner)
 }

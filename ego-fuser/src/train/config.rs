@@ -4,12 +4,14 @@ use std::path::PathBuf;
 
 use agent::model_config::DetectorConfig;
 use agent::training::RunConfig;
+use sim_replay::dataset::OpenOptions;
 
 use crate::feature_store::KeptMaps;
 use crate::fusion::FusionConfig;
 use crate::loss::LossConfig;
 use crate::method::Method;
 use crate::samples::SampleConfig;
+use sim_replay::evaluation_protocol::ProtocolConfig;
 
 /// What to train, on what, for how long.
 #[derive(Debug, Clone)]
@@ -18,6 +20,10 @@ pub struct TrainConfig {
     pub data: Vec<PathBuf>,
     /// Datasets to validate on; without any, AP is not measured.
     pub validation: Vec<PathBuf>,
+    /// Which agents take part. Range and classes stand in `samples`.
+    pub protocol: ProtocolConfig,
+    /// What these datasets do not say of themselves.
+    pub open: OpenOptions,
     /// The method.
     pub method: Method,
     /// The network, where `init` does not say.

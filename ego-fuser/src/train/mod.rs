@@ -83,12 +83,15 @@ impl<'a> Training<'a> {
         let samples = SampleConfig { kind, ..frozen::sample_config(config, &model) };
         samples.poses.validate().map_err(SampleError::from)?;
         model.set_precision(run.precision);
-        let scenes = Arc::new(SceneSet::open(&config.data)?);
+        let scenes = Arc::new(SceneSet::open(&config.data, &config.open, &config.protocol)?);
         let assigner = Arc::new(model.assigner().map_err(SampleError::from)?);
         let mut builder = SampleBuilder::new(Arc::clone(&scenes), samples.clone(), model.config().clone(), assigner);
         let mut validator = match config.validation.as_slice() {
             [] => None,
-            folders => Some(Validator::open(folders, &samples, &model, config.validation_frames)?),
+            folders => {
+                let scenes = SceneSet::open(folders, &config.open, &config.protocol)?;
+                Some(Validator::open(scenes, &samples, &model, config.validation_frames)?)
+            }
         };
         if let Some(frozen) = &frozen {
             builder = builder.with_maps(frozen.maps(&scenes, observer)?);

@@ -1,6 +1,5 @@
 //! How good a model is in the middle of its training, on frames that it does not learn from.
 
-use std::path::PathBuf;
 use std::sync::Arc;
 
 use agent::postprocess::is_within;
@@ -14,6 +13,7 @@ use super::TrainError;
 use crate::average_precision::{Ordering, Scorer};
 use crate::feature_store::MapSource;
 use crate::model::CooperativeModel;
+
 use crate::samples::{Augmentation, Batch, Moments, SampleBuilder, SampleConfig, SampleError, SceneSet, TickRef};
 
 /// AP over the frames of a validation.
@@ -36,17 +36,17 @@ pub struct Validator {
 }
 
 impl Validator {
-    /// Opens `folders` and chooses `frames` ticks evenly spread.
+    /// Chooses `frames` ticks of `scenes`, evenly spread.
     ///
     /// # Errors
     /// [`TrainError::Sample`] when a folder cannot be read.
     pub fn open(
-        folders: &[PathBuf],
+        scenes: SceneSet,
         samples: &SampleConfig,
         model: &CooperativeModel,
         frames: usize,
     ) -> Result<Self, TrainError> {
-        let scenes = Arc::new(SceneSet::open(folders)?);
+        let scenes = Arc::new(scenes);
         let all = scenes.ticks();
         let frames = frames.clamp(1, all.len());
         let ticks = (0..frames).map(|frame| all[frame * all.len() / frames]).collect();

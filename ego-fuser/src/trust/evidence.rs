@@ -153,7 +153,7 @@ impl Evidence {
 
     /// Whether one of the two sees the other where it says to be: within 35 m an honest one is always seen with more than
     /// 0.06 and hardly ever with less than 0.15, of liars four of five are not. Further away something may well stand
-    /// between. Boxes begin at 0.2.
+    /// between. Boxes that are evidence begin at 0.2.
     fn seeing(&self, sure: f32) -> f64 {
         let blind = sure < if self.boxes_only { 0.01 } else { EMPTY };
         match (sure, self.distance_m) {

@@ -4,13 +4,16 @@ use agent::detector::{Detector, DetectorError};
 use agent::model_config::YAxis;
 use agent::postprocess::{AgentBoxes, PostprocessConfig, postprocess};
 use nalgebra::Isometry3;
-use protocol::{BevGrid, DecodedFeatures};
+use protocol::BevGrid;
 use tch::Tensor;
 
 use crate::ego::Content;
 
 /// Boxes below this score say nothing about who sent them.
 const SURE: f32 = 0.3;
+/// Boxes at or below this score are no evidence for or against who sent them. It has nothing to do with which boxes are
+/// judged.
+const EVIDENT: f32 = 0.2;
 /// Values of a map that are compared to tell copies, spread over it.
 const PRINT_VALUES: usize = 4096;
 /// How far a detector looks, where there is no map to say so, metres.
@@ -39,16 +42,15 @@ impl Seen {
     /// Looks at a message; `empty` is the map of an empty world, `[C, H, W]`. Points are encoded for it.
     pub(super) fn in_message(content: &Content, detector: &mut Detector, empty: &[f32]) -> Result<Self, DetectorError> {
         match content {
-            Content::Features(map) => Self::in_map(map, detector, empty),
+            Content::Features(map) => Self::in_map(&detector.received(map)?, map.sent.as_deref(), detector, empty),
             Content::Boxes(found) => {
                 let at = |[x, y, _]: [f64; 3]| [x, y];
-                let all: Vec<_> = found.iter().map(|found| (at(found.box3d.center_m), found.score)).collect();
-                Ok(Self::of_boxes(all))
+                let evident = found.iter().filter(|found| found.score > EVIDENT);
+                Ok(Self::of_boxes(evident.map(|found| (at(found.box3d.center_m), found.score)).collect()))
             }
             Content::Points(points) => {
                 let encoded = detector.encode(points)?.features;
-                let features = detector.to_message(&detector.through_compressor(&encoded)?)?;
-                let seen = Self::in_map(&DecodedFeatures { features, sent: None }, detector, empty)?;
+                let seen = Self::in_map(&detector.through_compressor(&encoded)?, None, detector, empty)?;
                 Ok(Self { is_blind: seen.vehicles.is_empty(), ..seen })
             }
         }
@@ -60,13 +62,12 @@ impl Seen {
         Self { vehicles, sure: Sure::Boxes(all), print, is_blind: false }
     }
 
-    fn in_map(map: &DecodedFeatures, detector: &Detector, empty: &[f32]) -> Result<Self, DetectorError> {
-        let DecodedFeatures { features, sent } = map;
-        let grid = features.grid;
-        let tensor = Tensor::f_from_slice(&features.values)?.f_view(detector.map_shape())?;
-        let heads = detector.heads(&tensor)?;
+    /// In a map `[1, C, H, W]`, of which the `sent` cells came; all where absent.
+    fn in_map(map: &Tensor, sent: Option<&[bool]>, detector: &Detector, empty: &[f32]) -> Result<Self, DetectorError> {
+        let grid = detector.grid();
+        let heads = detector.heads(map)?;
         // What was left out has no features that a head could make sense of.
-        let was_sent = |cell: usize| sent.as_ref().is_none_or(|sent| sent[cell]);
+        let was_sent = |cell: usize| sent.is_none_or(|sent| sent[cell]);
         let limits =
             PostprocessConfig { score_threshold: SURE, ..PostprocessConfig::for_late_fusion(detector.config()) };
         let boxes = detector.boxes(&heads, SURE)?;
@@ -76,7 +77,8 @@ impl Seen {
             cell_of(&grid, x, y).is_none_or(was_sent).then_some(([x, y], found.score))
         });
         let found: Vec<_> = found.collect();
-        let print = features.values.iter().zip(empty).step_by((empty.len() / PRINT_VALUES).max(1));
+        let values: Vec<f32> = Vec::try_from(&map.f_contiguous()?.f_view([-1])?)?;
+        let print = values.iter().zip(empty).step_by((empty.len() / PRINT_VALUES).max(1));
         let print = print.map(|(value, nothing)| value - nothing).collect();
         if detector.config().y_axis == YAxis::Right {
             // The cells of a mirrored world lie elsewhere; its boxes do not.
@@ -137,6 +139,11 @@ pub(super) fn likeness(one: &[f32], other: &[f32]) -> f64 {
 
 #[cfg(test)]
 mod tests {
+    use agent::model_config::DetectorConfig;
+    use agent::point_pillars::PointPillars;
+    use protocol::{Box3d, Detection};
+    use tch::nn::VarStore;
+
     use super::*;
 
     #[test]
@@ -152,6 +159,22 @@ mod tests {
         assert_eq!(seen.sure_at([1.0, 0.5], 1.0), Some(0.8));
         assert_eq!(seen.sure_at([-2.0, 0.5], 1.0), Some(0.0));
         assert_eq!(seen.sure_at([20.0, 0.5], 1.0), None);
+    }
+
+    #[test]
+    fn boxes_that_are_judged_but_hardly_seen_are_no_evidence() {
+        let network = VarStore::new(tch::Device::Cpu);
+        let config = DetectorConfig { lidar_range_m: [-12.8, -6.4, -3.0, 12.8, 6.4, 1.0], ..DetectorConfig::lean() };
+        let mut detector = Detector::from_network(PointPillars::new(&network.root(), &config).unwrap());
+        let found = [(4.0, 0.7), (8.0, 0.25), (12.0, 0.15)].map(|(x, score)| Detection {
+            box3d: Box3d { center_m: [x, 0.0, -1.0], size_m: [4.4, 1.9, 1.6], heading_rad: 0.0 },
+            score,
+            source: None,
+        });
+        let seen = Seen::in_message(&Content::Boxes(found.to_vec()), &mut detector, &[]).unwrap();
+        assert_eq!(seen.vehicles, [[4.0, 0.0]]);
+        assert_eq!((seen.sure_at([8.0, 0.0], 1.0), seen.sure_at([12.0, 0.0], 1.0)), (Some(0.25), Some(0.0)));
+        assert_eq!(seen.print.len(), 2 * 3);
     }
 
     #[test]

@@ -87,6 +87,8 @@ pub struct EncodedFeatures {
     pub grid: BevGrid,
     /// Number of channels `C`.
     pub channels: u32,
+    /// As in [`BevFeatures`].
+    pub code_of: Option<u32>,
     /// What the body is.
     pub codec: Codec,
     /// Why it is that, where the message had to keep within a limit.
@@ -122,16 +124,17 @@ pub fn encode_features(
     config: &CodecConfig,
     confidence: Option<&[f32]>,
 ) -> Result<EncodedFeatures, WireError> {
-    let BevFeatures { grid, channels, values } = features;
+    let BevFeatures { grid, channels, .. } = features;
     let dense = Codec { dtype: config.dtype, selection: Selection::Dense, packing: Packing::Raw };
     let layout = Layout::new(&grid, channels, &dense, &Limits::SENDER)?;
     let expected = layout.cells * channels as usize;
-    if values.len() != expected {
-        return Err(WireError::Shape { what: "features", expected: expected as u64, found: values.len() as u64 });
+    let found = features.values.len();
+    if found != expected {
+        return Err(WireError::Shape { what: "features", expected: expected as u64, found: found as u64 });
     }
     let budget = config.budget_bytes.filter(|budget| *budget < layout.len() as u64);
     if config.gate.is_none() && budget.is_none() {
-        return encode_selected(grid, channels, dense, values, None, config.zstd_level);
+        return encode_selected(features, dense, None, config.zstd_level);
     }
     let confidence = confidence.ok_or(WireError::NoConfidence { cells: layout.cells as u64 })?;
     selection::check_confidence(confidence, layout.cells)?;
@@ -141,22 +144,21 @@ pub fn encode_features(
             selection::within_budget(confidence, gated.as_deref(), channels, config.dtype, budget)?
         }
         (Some(gated), None) if gated.len() < layout.cells => gated,
-        _ => return encode_selected(grid, channels, dense, values, None, config.zstd_level),
+        _ => return encode_selected(features, dense, None, config.zstd_level),
     };
     let codec = Codec { selection: Selection::TopK { cells: selected.len() as u32 }, ..dense };
-    let values = selection::gather(&values, layout.cells, &selected);
-    encode_selected(grid, channels, codec, values, Some(&selected), config.zstd_level)
+    let values = selection::gather(&features.values, layout.cells, &selected);
+    encode_selected(BevFeatures { values, ..features }, codec, Some(&selected), config.zstd_level)
 }
 
 /// Writes the values of the selected cells, `[C, K]`. Dense `f32` that is not packed is checked by its receiver.
 fn encode_selected(
-    grid: BevGrid,
-    channels: u32,
+    features: BevFeatures,
     codec: Codec,
-    values: Vec<f32>,
     selected: Option<&[u32]>,
     zstd_level: Option<i32>,
 ) -> Result<EncodedFeatures, WireError> {
+    let BevFeatures { grid, channels, code_of, values } = features;
     let is_sent_as_it_is = codec.dtype == Dtype::F32 && selected.is_none();
     if !is_sent_as_it_is || zstd_level.is_some() {
         check_values("feature", &values, Limits::SENDER.max_abs_value)?;
@@ -167,13 +169,11 @@ fn encode_selected(
         Body::Bytes(unpacked_body(&grid, channels, &codec, &values, selected)?)
     };
     let packed = zstd_level.map(|level| compression::pack(body.as_bytes(), level)).transpose()?.flatten();
-    Ok(match packed {
-        Some(packed) => {
-            let codec = Codec { packing: Packing::Zstd, ..codec };
-            EncodedFeatures { grid, channels, codec, rate: None, body: Body::Bytes(packed) }
-        }
-        None => EncodedFeatures { grid, channels, codec, rate: None, body },
-    })
+    let (codec, body) = match packed {
+        Some(packed) => (Codec { packing: Packing::Zstd, ..codec }, Body::Bytes(packed)),
+        None => (codec, body),
+    };
+    Ok(EncodedFeatures { grid, channels, code_of, codec, rate: None, body })
 }
 
 /// Scales, mask and values one after the other.
@@ -215,18 +215,23 @@ impl EncodedFeatures {
         })
     }
 
-    /// Checks the map against what its sender announced.
+    /// Checks the map against what its sender announced, or its receiver's network makes.
     ///
     /// # Errors
     /// [`WireError::Grid`] and [`WireError::Shape`] name both.
-    pub fn check_shape(&self, grid: &BevGrid, channels: u32) -> Result<(), WireError> {
+    pub fn check_shape(&self, grid: &BevGrid, channels: u32, code_of: Option<u32>) -> Result<(), WireError> {
         if self.grid != *grid {
             return Err(WireError::Grid { expected: grid.to_string(), found: self.grid.to_string() });
         }
-        if self.channels == channels {
-            return Ok(());
+        let widened = |channels: u32, code_of: Option<u32>| u64::from(code_of.unwrap_or(channels));
+        if self.channels != channels {
+            return Err(WireError::Shape { what: "channels", expected: channels.into(), found: self.channels.into() });
         }
-        Err(WireError::Shape { what: "channels", expected: channels.into(), found: self.channels.into() })
+        if self.code_of != code_of {
+            let (expected, found) = (widened(channels, code_of), widened(self.channels, self.code_of));
+            return Err(WireError::Shape { what: "channels of the map behind the compressor", expected, found });
+        }
+        Ok(())
     }
 
     /// Decodes the map. Dense `f32` moves the values; all others are converted, cells that were not sent are zero.
@@ -235,7 +240,7 @@ impl EncodedFeatures {
     /// [`WireError`] when sizes exceed `limits`, the body is not what shape and codec demand, or a value or scale is not
     /// finite. The values of a dense `f32` body were checked when it was received.
     pub fn decode(self, limits: &Limits) -> Result<DecodedFeatures, WireError> {
-        let Self { grid, channels, codec, rate: _, body } = self;
+        let Self { grid, channels, code_of, codec, rate: _, body } = self;
         let layout = Layout::new(&grid, channels, &codec, limits)?;
         let body = match (body, codec) {
             (Body::Floats(values), Codec { dtype: Dtype::F32, selection: Selection::Dense, packing: Packing::Raw }) => {
@@ -243,7 +248,7 @@ impl EncodedFeatures {
                 if expected != found {
                     return Err(WireError::Shape { what: "features", expected, found });
                 }
-                return Ok(DecodedFeatures { features: BevFeatures { grid, channels, values }, sent: None });
+                return Ok(DecodedFeatures { features: BevFeatures { grid, channels, code_of, values }, sent: None });
             }
             (body, _) => body,
         };
@@ -260,7 +265,7 @@ impl EncodedFeatures {
                 (map, Some(sent))
             }
         };
-        Ok(DecodedFeatures { features: BevFeatures { grid, channels, values }, sent })
+        Ok(DecodedFeatures { features: BevFeatures { grid, channels, code_of, values }, sent })
     }
 }
 
@@ -287,7 +292,7 @@ mod tests {
     const GRID: BevGrid = BevGrid { x_min_m: 0.0, y_min_m: 0.0, cell_m: 1.0, width: 4, height: 2 };
 
     fn map(values: Vec<f32>) -> BevFeatures {
-        BevFeatures { grid: GRID, channels: values.len() as u32 / 8, values }
+        BevFeatures { grid: GRID, channels: values.len() as u32 / 8, code_of: None, values }
     }
 
     #[test]
@@ -372,7 +377,7 @@ mod tests {
 
     #[test]
     fn a_map_must_fill_its_lattice() {
-        let features = BevFeatures { grid: GRID, channels: 2, values: vec![0.0; 8] };
+        let features = BevFeatures { grid: GRID, channels: 2, code_of: None, values: vec![0.0; 8] };
         let error = encode_features(features, &CodecConfig::default(), None).unwrap_err();
         assert_eq!(error, WireError::Shape { what: "features", expected: 16, found: 8 });
     }
@@ -380,10 +385,10 @@ mod tests {
     #[test]
     fn a_map_of_another_shape_than_announced_is_named() {
         let encoded = encode_features(map(vec![0.0; 16]), &CodecConfig::default(), None).unwrap();
-        assert_eq!(encoded.check_shape(&GRID, 2), Ok(()));
-        assert!(matches!(encoded.check_shape(&GRID, 3), Err(WireError::Shape { expected: 3, found: 2, .. })));
+        assert_eq!(encoded.check_shape(&GRID, 2, None), Ok(()));
+        assert!(matches!(encoded.check_shape(&GRID, 3, None), Err(WireError::Shape { expected: 3, found: 2, .. })));
         let other = BevGrid { cell_m: 0.5, ..GRID };
-        let message = encoded.check_shape(&other, 2).unwrap_err().to_string();
+        let message = encoded.check_shape(&other, 2, None).unwrap_err().to_string();
         assert!(message.contains("4 x 2 cells of 1 m") && message.contains("4 x 2 cells of 0.5 m"), "{message}");
     }
 }

@@ -175,7 +175,7 @@ mod tests {
     fn map() -> (BevFeatures, Vec<f32>) {
         let values = (0..8 * 192).map(|n| (n as f32 * 0.37).sin()).collect();
         let confidence = (0..192).map(|cell| ((cell * 89) % 192) as f32 / 192.0).collect();
-        (BevFeatures { grid: GRID, channels: 8, values }, confidence)
+        (BevFeatures { grid: GRID, channels: 8, code_of: None, values }, confidence)
     }
 
     fn encode(config: &CodecConfig, bytes: u64) -> Result<EncodedFeatures, WireError> {

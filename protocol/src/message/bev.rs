@@ -25,6 +25,8 @@ pub struct BevMetadata {
     pub grid: BevGrid,
     /// Channels of the map.
     pub channels: u32,
+    /// Channels of the map that these are the code of, where a learnt compressor has squeezed them.
+    pub code_of: Option<u32>,
     /// What the body is.
     pub codec: Codec,
     /// Why it is that, where the message had to keep within a limit.
@@ -38,17 +40,31 @@ impl Payload for Bev {
     type Metadata = BevMetadata;
 
     fn into_parts(self) -> (BevMetadata, Body) {
-        let Self { pose, features: EncodedFeatures { grid, channels, codec, rate, body } } = self;
-        (BevMetadata { pose, grid, channels, codec, rate }, body)
+        let Self { pose, features: EncodedFeatures { grid, channels, code_of, codec, rate, body } } = self;
+        (BevMetadata { pose, grid, channels, code_of, codec, rate }, body)
     }
 
     fn check(metadata: &BevMetadata, limits: &Limits) -> Result<BodyShape, WireError> {
         metadata.pose.check_values(limits)?;
+        check_code(metadata.channels, metadata.code_of, limits)?;
         EncodedFeatures::body_shape(&metadata.grid, metadata.channels, &metadata.codec, limits)
     }
 
     fn from_parts(metadata: BevMetadata, body: Body) -> Result<Self, WireError> {
-        let BevMetadata { pose, grid, channels, codec, rate } = metadata;
-        Ok(Self { pose, features: EncodedFeatures { grid, channels, codec, rate, body } })
+        let BevMetadata { pose, grid, channels, code_of, codec, rate } = metadata;
+        Ok(Self { pose, features: EncodedFeatures { grid, channels, code_of, codec, rate, body } })
     }
+}
+
+/// A code has no more channels than the map that it stands for, and that has no more than are taken.
+fn check_code(channels: u32, code_of: Option<u32>, limits: &Limits) -> Result<(), WireError> {
+    let Some(widened) = code_of else { return Ok(()) };
+    if widened > limits.max_channels {
+        return Err(WireError::Limit { what: "channels", max: limits.max_channels.into(), found: widened.into() });
+    }
+    if channels > widened {
+        let (expected, found) = (widened.into(), channels.into());
+        return Err(WireError::Shape { what: "channels of a code", expected, found });
+    }
+    Ok(())
 }

@@ -87,13 +87,15 @@ pub(crate) fn any_map() -> impl Strategy<Value = (BevFeatures, Vec<f32>, CodecCo
         ConfidenceGate { threshold, smoothing }
     });
     let dtype = select(vec![Dtype::F32, Dtype::F16, Dtype::I8]);
-    (grid, 1..6u32, dtype, option::of(80..3000u64), option::of(1..4i32), option::of(gate)).prop_flat_map(
-        |(grid, channels, dtype, budget_bytes, zstd_level, gate)| {
+    let shape = (grid, 1..6u32, option::of(6..64u32));
+    (shape, dtype, option::of(80..3000u64), option::of(1..4i32), option::of(gate)).prop_flat_map(
+        |((grid, channels, code_of), dtype, budget_bytes, zstd_level, gate)| {
             let cells = grid.cells();
             let values = vec(prop_oneof![Just(0f32), -100f32..100.0], cells * channels as usize);
             let config = CodecConfig { dtype, gate, budget_bytes, zstd_level };
-            (values, vec(0f32..1.0, cells))
-                .prop_map(move |(values, confidence)| (BevFeatures { grid, channels, values }, confidence, config))
+            (values, vec(0f32..1.0, cells)).prop_map(move |(values, confidence)| {
+                (BevFeatures { grid, channels, code_of, values }, confidence, config)
+            })
         },
     )
 }

@@ -22,7 +22,7 @@ pub(crate) fn grid() -> BevGrid {
 /// `[3, 12, 16]` with values of both signs and different sizes per channel.
 pub(crate) fn features() -> BevFeatures {
     let values = (0..3 * 12 * 16).map(|index| ((index * 37 % 101) as f32 - 50.0) * 0.1 * (1 + index / 192) as f32);
-    BevFeatures { grid: grid(), channels: 3, values: values.collect() }
+    BevFeatures { grid: grid(), channels: 3, code_of: None, values: values.collect() }
 }
 
 pub(crate) fn confidence() -> Vec<f32> {
@@ -69,6 +69,12 @@ pub(crate) fn adapted_bev() -> Bev {
     let limit = ByteLimit { bytes: 600, by: LimitedBy::Queue };
     let features = encode_within(features(), &CodecConfig::default(), &limit, Some(&confidence())).unwrap();
     Bev { pose: pose(), features }
+}
+
+/// A code of three channels that stands for a map of 24.
+pub(crate) fn squeezed_bev() -> Bev {
+    let features = BevFeatures { code_of: Some(24), ..features() };
+    Bev { pose: pose(), features: encode_features(features, &CodecConfig::default(), None).unwrap() }
 }
 
 pub(crate) fn ledger() -> Ledger {
@@ -166,6 +172,7 @@ pub(crate) fn every_kind() -> Vec<Message> {
     ];
     messages.extend(every_codec().iter().map(|config| Message::Bev(bev(config))));
     messages.push(Message::Bev(adapted_bev()));
+    messages.push(Message::Bev(squeezed_bev()));
     let controls = [
         Control::Start { rate: 1.0 },
         Control::Pause,

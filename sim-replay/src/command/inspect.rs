@@ -1,18 +1,29 @@
 //! `sim-replay inspect`: what is in a dataset, and what is wrong with it.
 
-use std::path::PathBuf;
+use std::fmt::Display;
+use std::path::{Path, PathBuf};
 
 use indicatif::{ProgressBar, ProgressStyle};
-use sim_replay::inspect::{Report, inspect};
+use serde::Serialize;
+use sim_replay::dataset::{IntensityScale, OpenOptions, layouts_text};
+use sim_replay::evaluation_protocol::ProtocolConfig;
+use sim_replay::inspect::{Report, inspect, inspect_map};
 use sim_replay::output;
 
 use crate::cli::Outcome;
 
 /// Say what a dataset holds (agents, frames, points, rates, boxes, merged ground truth) and what is wrong with it.
 #[derive(Debug, clap::Args)]
+#[command(after_help = format!("Layouts, and the files that decide:\n{}", layouts_text()))]
 pub(crate) struct Args {
-    /// Dataset, split, scenario or sequence; the layout is found out.
+    /// Dataset, split, scenario or sequence, whose layout is found out; or an OpenDRIVE map (.xodr).
     dir: PathBuf,
+    /// Number that stored intensities are divided by [default: 255 for bytes and red; of other numbers the range of each
+    /// agent's first sweeps tells: up to 1 as they are, up to 255 by 255].
+    #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
+    intensity_scale: IntensityScale,
+    #[command(flatten)]
+    protocol: ProtocolConfig,
     /// Print JSON instead of a table.
     #[arg(long)]
     json: bool,
@@ -20,13 +31,35 @@ pub(crate) struct Args {
 
 /// Prints the findings to standard output.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
-    let report = with_progress(args);
-    if args.json {
-        output::line(serde_json::to_string_pretty(&report)?)?;
-    } else {
-        output::line(&report)?;
+    if args.dir.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("xodr")) && args.dir.is_file() {
+        return run_map(&args.dir, args.json);
     }
+    let report = with_progress(args);
+    print(&report, args.json)?;
     Ok(if report.problems.is_empty() { Outcome::Done } else { Outcome::BadInput })
+}
+
+/// Prints what a map holds to standard output.
+fn run_map(path: &Path, json: bool) -> anyhow::Result<Outcome> {
+    let report = match inspect_map(path) {
+        Ok(report) => report,
+        Err(error) => {
+            output::note(format_args!("error: {error}"));
+            return Ok(Outcome::BadInput);
+        }
+    };
+    print(&report, json)?;
+    Ok(Outcome::Done)
+}
+
+/// As JSON, or as the table that it is displayed as.
+fn print(report: &(impl Serialize + Display), json: bool) -> anyhow::Result<()> {
+    if json {
+        output::line(serde_json::to_string_pretty(report)?)?;
+    } else {
+        output::line(report)?;
+    }
+    Ok(())
 }
 
 /// Reads everything; a bar on a terminal says how far.
@@ -36,7 +69,8 @@ fn with_progress(args: &Args) -> Report {
     if let Ok(style) = ProgressStyle::with_template("{bar:40} {pos}/{len} frames, {eta} left") {
         bar.set_style(style);
     }
-    let report = inspect(&args.dir, &|done, total| {
+    let options = OpenOptions { intensity_scale: args.intensity_scale, ..OpenOptions::default() };
+    let report = inspect(&args.dir, &options, &args.protocol, &|done, total| {
         bar.set_length(total as u64);
         bar.set_position(done as u64);
     });

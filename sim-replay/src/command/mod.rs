@@ -1,5 +1,6 @@
 //! One file per sub-command: its arguments and its `run`.
 
+pub(crate) mod convert;
 pub(crate) mod inspect;
 pub(crate) mod link;
 pub(crate) mod record;

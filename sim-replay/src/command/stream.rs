@@ -7,7 +7,7 @@ use std::time::Duration;
 use anyhow::Context;
 use protocol::{CavId, DropReason, Role};
 use sim_replay::bus::{BusArgs, Route, STOP_LIMIT, log_to_stderr};
-use sim_replay::dataset::{self, LoadOptions, Scenario};
+use sim_replay::dataset::{self, IntensityScale, LoadOptions, OpenOptions, Scenario};
 use sim_replay::link::{CapacityConfig, DelayLaw, LinkConfig, LossLaw};
 use sim_replay::output;
 use sim_replay::stream::{AirReport, Replay, StreamError, StreamOptions, StreamReport};
@@ -48,6 +48,9 @@ pub(crate) struct Args {
     /// Variant of the sweeps, for example fog_0.060 [default: the plain ones].
     #[arg(long)]
     variant: Option<String>,
+    /// Number that stored intensities are divided by [default: auto; `sim-replay inspect --help` says by what].
+    #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
+    intensity_scale: IntensityScale,
     /// Publish radar sweeps too.
     #[arg(long)]
     radar: bool,
@@ -172,7 +175,8 @@ impl Args {
 }
 
 fn open(args: &Args) -> anyhow::Result<Scenario> {
-    let dataset = dataset::open(&args.dir)?;
+    let options = OpenOptions { intensity_scale: args.intensity_scale, ..OpenOptions::default() };
+    let dataset = dataset::open_with(&args.dir, &options)?;
     for problem in &dataset.problems {
         tracing::warn!("{problem}");
     }
@@ -206,6 +210,18 @@ fn print(report: &StreamReport, as_json: bool) -> anyhow::Result<()> {
     ))?;
     if let Some(AirReport { offered, arrived, dropped }) = &report.air {
         output::line(format_args!("{offered} sensor frames crossed a link: {arrived} arrived{}", by_reason(dropped)))?;
+    }
+    if report.absent_frames > 0 {
+        output::line(format_args!(
+            "{} frames do not exist: their vehicles came later or have left",
+            report.absent_frames
+        ))?;
+    }
+    if report.left_out_parts > 0 {
+        output::line(format_args!(
+            "{} objects or other parts of frames were left out, see the log",
+            report.left_out_parts
+        ))?;
     }
     if !report.unsent.is_empty() {
         let unsent: u64 = report.unsent.values().sum();

@@ -1,5 +1,6 @@
 //! `sim-replay synth`: generate scenes.
 
+use std::collections::BTreeMap;
 use std::io::{self, IsTerminal};
 use std::ops::RangeInclusive;
 use std::path::PathBuf;
@@ -7,12 +8,15 @@ use std::time::Instant;
 
 use indicatif::{ProgressBar, ProgressStyle};
 use sim_replay::output;
-use sim_replay::synth::{self, Subset, Summary, SynthError, SynthOptions, Weather};
+use sim_replay::synth::{self, SceneLayout, Subset, Summary, SynthError, SynthOptions, Weather};
 use sim_replay::town::TownSource;
 
 use crate::cli::Outcome;
 
-/// Generate scenes in the layout of OPV2V: the same arguments give the same files, byte for byte.
+/// Findings of a map that are printed one by one.
+const PRINTED_FINDINGS: usize = 20;
+
+/// Generate scenes, in the layout of OPV2V or another: the same arguments give the same files, byte for byte.
 ///
 /// Seeds 0 to 999 are for training and validation, seeds from 1000 on for measuring only.
 #[derive(Debug, clap::Args)]
@@ -26,6 +30,9 @@ pub(crate) struct Args {
     /// Folder for the scenarios; made if missing.
     #[arg(long)]
     out: PathBuf,
+    /// Layout of the files.
+    #[arg(long, value_enum, default_value_t)]
+    layout: SceneLayout,
     /// town1, town4 or an OpenDRIVE map (.xodr). By default that of the subset; v2vdet takes both in turn.
     #[arg(long, value_parser = parse_town)]
     town: Option<TownSource>,
@@ -54,7 +61,8 @@ pub(crate) struct Args {
     /// Simulated seconds from one frame to the next, a multiple of 0.05.
     #[arg(long, default_value_t = 0.1)]
     period: f64,
-    /// Write into a folder that is not empty; scenarios of the same name are replaced.
+    /// Write into a folder that is not empty; scenarios of the same name are replaced, and so is what layouts keep in common
+    /// folders for all scenarios.
     #[arg(long)]
     force: bool,
     /// Print a JSON summary.
@@ -75,6 +83,7 @@ pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
     bar.finish_and_clear();
     match result {
         Ok(summary) => {
+            print_findings(&summary);
             print(&summary, &options, start.elapsed().as_secs_f64(), json)?;
             Ok(Outcome::Done)
         }
@@ -88,6 +97,7 @@ pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
 
 fn options(args: Args) -> SynthOptions {
     SynthOptions {
+        layout: args.layout,
         town: args.town,
         town_seed: args.town_seed,
         traversals: args.traversals,
@@ -113,23 +123,41 @@ fn progress_bar(scenarios: usize) -> ProgressBar {
     bar.with_style(ProgressStyle::with_template(&template).unwrap_or_else(|_| ProgressStyle::default_bar()))
 }
 
+/// Names on standard error what was not built as the map gives it.
+fn print_findings(summary: &Summary) {
+    for finding in summary.findings.iter().take(PRINTED_FINDINGS) {
+        output::note(format_args!("map: {finding}"));
+    }
+    if let Some(further) = summary.findings.len().checked_sub(PRINTED_FINDINGS).filter(|&further| further > 0) {
+        output::note(format_args!("map: {further} further findings; all are in data_protocol.yaml of each scenario"));
+    }
+}
+
 fn print(summary: &Summary, options: &SynthOptions, seconds: f64, json: bool) -> io::Result<()> {
-    let Summary { scenarios, agent_frames, points, annotations } = *summary;
-    let per_frame = |count: usize| count as f64 / agent_frames.max(1) as f64;
+    let Summary { layout, scenarios, agent_frames, points, annotations, omitted, findings } = summary;
+    let per_frame = |count: &usize| *count as f64 / (*agent_frames).max(1) as f64;
     if json {
         let report = serde_json::json!({
-            "out": options.out, "scenarios": scenarios, "agent_frames": agent_frames,
-            "points_per_frame": per_frame(points), "vehicles_per_frame": per_frame(annotations), "seconds": seconds,
+            "out": options.out, "layout": layout.name(), "scenarios": scenarios, "agent_frames": agent_frames,
+            "points_per_frame": per_frame(points), "vehicles_per_frame": per_frame(annotations), "omitted": omitted,
+            "seconds": seconds, "map_findings": findings,
         });
         return output::line(report);
     }
-    output::line(format_args!("{}: {scenarios} scenarios, {agent_frames} agent-frames", options.out.display()))?;
+    let out = options.out.display();
+    output::line(format_args!("{out}: {scenarios} scenarios, {agent_frames} agent-frames, layout {}", layout.name()))?;
     output::line(format_args!(
         "{:.0} points and {:.1} annotated vehicles a frame",
         per_frame(points),
         per_frame(annotations)
     ))?;
-    output::line(format_args!("{seconds:.1} s, {:.0} agent-frames a second", agent_frames as f64 / seconds))
+    output::line(format_args!("{seconds:.1} s, {:.0} agent-frames a second", *agent_frames as f64 / seconds))?;
+    print_omitted(omitted)
+}
+
+/// What a layout had no place for.
+pub(super) fn print_omitted(omitted: &BTreeMap<&'static str, u64>) -> io::Result<()> {
+    omitted.iter().try_for_each(|(what, count)| output::line(format_args!("not in this layout: {count} {what}")))
 }
 
 fn parse_town(text: &str) -> Result<TownSource, String> {

@@ -1,18 +1,19 @@
-//! The folders of the OPV2V family: `<root>/<split>/<scenario>/<agent>/<frame>.{yaml,pcd}`, entered at any level.
+//! The folders of the OPV2V family: `<root>/<split>/<scenario>/<agent>/<frame>.yaml` with a sweep beside it, entered at any
+//! level.
 
-use std::collections::{BTreeMap, BTreeSet};
+use std::collections::{BTreeMap, BTreeSet, HashSet};
 use std::path::{Path, PathBuf};
 
 use protocol::CavId;
 
+use super::files::Listing;
+use super::frame_files::{AgentFolder, BIN, PCD, RADAR, holds_pairs};
+use super::points::{SweepStorage, Sweeps};
 use super::yaml::{self, Field};
-use super::{MissingFrame, ReadError, Tick, files};
+use super::{MissingFrame, OpenOptions, ReadError, Tick, files};
 
 /// How far below the opened folder scenarios are looked for.
 const MAX_DEPTH: usize = 3;
-/// Text in the names of YAML files that are no frames (OpenCOOD, V2V4Real).
-const NOT_FRAMES: [&str; 2] = ["additional", "camera_gt"];
-const RADAR: &str = "radar";
 
 /// A scenario's folder and what lies in it.
 #[derive(Debug)]
@@ -20,99 +21,120 @@ pub(super) struct ScenarioFolder {
     pub(super) dir: PathBuf,
     /// Ego first, roadside units last.
     pub(super) agents: Vec<CavId>,
-    /// Stems that every agent has.
+    /// Stems that any agent has.
     pub(super) stems: Vec<String>,
     /// Stems that some agent has and this one has not.
     pub(super) missing: Vec<MissingFrame>,
     /// Suffixes of point files beside the plain one and the radar's.
     pub(super) variants: Vec<String>,
     pub(super) has_radar: bool,
+    /// Suffix of the sweeps.
+    pub(super) suffix: &'static str,
     /// Agents that have sweeps and nothing else.
     pub(super) without_yaml: BTreeSet<CavId>,
 }
 
-/// What lies in an agent's folder.
-#[derive(Debug, Default)]
-struct AgentFolder {
-    /// Stems with both YAML and PCD; with PCD alone where there is no YAML at all.
-    stems: BTreeSet<String>,
-    is_without_yaml: bool,
-    variants: BTreeSet<String>,
-    has_radar: bool,
-}
-
-/// Folders of scenarios at or below `dir`.
-pub(super) fn find(dir: &Path) -> Result<Vec<PathBuf>, ReadError> {
+/// Folders of scenarios at or below `dir`. Folders below that cannot be listed are left out.
+pub(super) fn find(dir: &Path, problems: &mut Vec<ReadError>) -> Result<Vec<PathBuf>, ReadError> {
     let mut found = Vec::new();
-    find_below(dir, MAX_DEPTH, &mut found)?;
+    find_below(dir, &files::list(dir)?, MAX_DEPTH, &mut found, problems);
     Ok(found)
 }
 
-fn find_below(dir: &Path, depth: usize, found: &mut Vec<PathBuf>) -> Result<(), ReadError> {
-    let folders = files::list(dir)?.folders;
-    let mut agents = folders.iter().filter(|name| is_agent_name(name));
-    if agents.any(|name| files::list(&dir.join(name)).is_ok_and(|listing| holds_frames(&listing))) {
+fn find_below(dir: &Path, listing: &Listing, depth: usize, found: &mut Vec<PathBuf>, problems: &mut Vec<ReadError>) {
+    let below: Vec<(PathBuf, Listing)> = files::list_below(dir, listing, problems);
+    if below.iter().any(|(folder, listing)| is_agent_folder(folder, listing)) {
         found.push(dir.to_owned());
-        return Ok(());
-    }
-    if depth > 0 {
-        for folder in &folders {
-            find_below(&dir.join(folder), depth - 1, found)?;
+    } else if depth > 0 {
+        for (folder, listing) in &below {
+            find_below(folder, listing, depth - 1, found, problems);
         }
     }
-    Ok(())
 }
 
-/// Whether a folder is an agent's: the likely mistake of opening one level too deep.
+/// True where a folder is an agent's: the likely mistake of opening one level too deep.
 pub(super) fn is_agent(dir: &Path) -> bool {
-    let name = dir.file_name().and_then(|name| name.to_str());
-    name.is_some_and(is_agent_name) && files::list(dir).is_ok_and(|listing| holds_frames(&listing))
+    files::list(dir).is_ok_and(|listing| is_agent_folder(dir, &listing))
 }
 
-/// Agents are named by CARLA's actor id; roadside units are negative.
-fn is_agent_name(name: &str) -> bool {
+/// CARLA's actor ids with any frame, negative ones for roadside units; other names where a frame is whole and no folder
+/// below has any: a scenario may hold a stray one.
+fn is_agent_folder(dir: &Path, listing: &Listing) -> bool {
+    let name = dir.file_name().and_then(|name| name.to_str()).unwrap_or_default();
+    if is_number(name) {
+        return listing.files.iter().any(|name| name.ends_with(".yaml") || name.ends_with(PCD));
+    }
+    let is_whole = |listing: &Listing| holds_pairs(listing, PCD) || holds_pairs(listing, BIN);
+    let holds_agents = || {
+        let mut below = listing.folders.iter().filter_map(|folder| files::list(&dir.join(folder)).ok());
+        below.any(|listing| is_whole(&listing))
+    };
+    is_whole(listing) && !holds_agents()
+}
+
+fn is_number(name: &str) -> bool {
     name.parse::<i64>().is_ok()
 }
 
-fn holds_frames(listing: &files::Listing) -> bool {
-    listing.files.iter().any(|name| name.ends_with(".yaml") || name.ends_with(".pcd"))
+/// The agents of a scenario with what their folders hold. Copies of folders such as `650 (1)` or `650_old` are none.
+fn agents_in(dir: &Path, problems: &mut Vec<ReadError>) -> Result<Vec<(CavId, Listing)>, ReadError> {
+    let mut below = files::list_below(dir, &files::list(dir)?, problems);
+    let name = |folder: &Path| folder.file_name().unwrap_or_default().to_string_lossy().into_owned();
+    below.retain(|(folder, listing)| is_number(&name(folder)) || is_agent_folder(folder, listing));
+    let are_numbers =
+        below.iter().any(|(folder, listing)| is_number(&name(folder)) && is_agent_folder(folder, listing));
+    let mut agents = Vec::new();
+    for (folder, listing) in below {
+        let name = name(&folder);
+        let reason = match CavId::new(&name) {
+            Ok(_) if are_numbers && !is_number(&name) => "no number as the other agents' are".to_owned(),
+            Ok(id) => {
+                agents.push((id, listing));
+                continue;
+            }
+            Err(error) => error.to_string(),
+        };
+        let reason = format!("it holds frames, but its name is no agent's: {reason}: the folder is left out");
+        problems.push(ReadError::malformed(&folder, reason));
+    }
+    Ok(agents)
 }
 
 impl ScenarioFolder {
     /// Looks into every agent's folder. What has to be left out goes to `problems`.
     pub(super) fn scan(dir: &Path, problems: &mut Vec<ReadError>) -> Result<Self, ReadError> {
+        let listed = agents_in(dir, problems)?;
+        let has = |suffix: &str| listed.iter().any(|(_, listing)| holds_pairs(listing, suffix));
+        let suffix = if !has(PCD) && has(BIN) { BIN } else { PCD };
         let mut by_agent = BTreeMap::new();
-        for name in files::list(dir)?.folders.into_iter().filter(|name| is_agent_name(name)) {
-            let agent_dir = dir.join(&name);
-            let id = CavId::new(&name).map_err(|error| ReadError::malformed(&agent_dir, error.to_string()))?;
-            let agent = AgentFolder::scan(&agent_dir, problems)?;
+        for (id, listing) in &listed {
+            let agent_dir = dir.join(id.as_str());
+            let agent = AgentFolder::new(&agent_dir, listing, suffix, problems);
             if agent.stems.is_empty() {
-                problems
-                    .push(ReadError::malformed(&agent_dir, "no frame with both YAML and PCD: the agent is left out"));
+                let reason = format!("no frame with both YAML and {}: the agent is left out", &suffix[1..]);
+                problems.push(ReadError::malformed(&agent_dir, reason));
             } else {
-                by_agent.insert(id, agent);
+                by_agent.insert(id.clone(), agent);
             }
         }
         let agents = in_order(by_agent.keys());
         let all: BTreeSet<&String> = by_agent.values().flat_map(|agent| &agent.stems).collect();
-        let (mut stems, mut missing) = (Vec::new(), Vec::new());
-        for stem in all {
-            let without = agents.iter().filter(|id| !by_agent[id].stems.contains(stem));
-            let before = missing.len();
-            missing.extend(without.map(|id| MissingFrame { agent: id.clone(), stem: stem.clone() }));
-            if missing.len() == before {
-                stems.push(stem.clone());
-            }
+        let mut missing = Vec::new();
+        for stem in &all {
+            let without = agents.iter().filter(|id| !by_agent[id].stems.contains(*stem));
+            missing.extend(without.map(|id| MissingFrame { agent: id.clone(), stem: (*stem).clone() }));
         }
+        let mut stems: Vec<String> = all.into_iter().cloned().collect();
+        problems.extend(without_common_frame(dir, &agents, &by_agent));
         if stems.iter().all(|stem| stem.parse::<u64>().is_ok()) {
             stems.sort_by_key(|stem| stem.parse::<u64>().unwrap_or(u64::MAX));
         }
         let variants: BTreeSet<String> = by_agent.values().flat_map(|agent| agent.variants.iter().cloned()).collect();
         let has_radar = by_agent.values().any(|agent| agent.has_radar);
-        let without_yaml =
-            by_agent.iter().filter(|(_, agent)| agent.is_without_yaml).map(|(id, _)| id.clone()).collect();
         let variants = variants.into_iter().collect();
-        Ok(Self { dir: dir.to_owned(), agents, stems, missing, variants, has_radar, without_yaml })
+        let bare = by_agent.iter().filter(|(_, agent)| agent.is_without_yaml);
+        let without_yaml = bare.map(|(id, _)| id.clone()).collect();
+        Ok(Self { dir: dir.to_owned(), agents, stems, missing, variants, has_radar, suffix, without_yaml })
     }
 
     /// The metadata file of a frame.
@@ -120,10 +142,27 @@ impl ScenarioFolder {
         self.dir.join(agent.as_str()).join(format!("{stem}.yaml"))
     }
 
+    /// True where the sweeps are bare floats, as V2X-Real stores them.
+    pub(super) fn has_bare_floats(&self) -> bool {
+        self.suffix == BIN
+    }
+
     /// The plain sweep of a frame, or a variant of it.
     pub(super) fn pcd(&self, agent: &CavId, stem: &str, variant: Option<&str>) -> PathBuf {
         let suffix = variant.map(|variant| format!("_{variant}")).unwrap_or_default();
-        self.dir.join(agent.as_str()).join(format!("{stem}{suffix}.pcd"))
+        self.dir.join(agent.as_str()).join(format!("{stem}{suffix}{}", self.suffix))
+    }
+
+    /// The reader of all agents' sweeps.
+    pub(super) fn sweeps(&self, options: &OpenOptions) -> Sweeps {
+        let missing: HashSet<(&CavId, &str)> =
+            self.missing.iter().map(|frame| (&frame.agent, frame.stem.as_str())).collect();
+        let of_agent = |agent: &CavId| {
+            let stems = self.stems.iter().filter(|stem| !missing.contains(&(agent, stem.as_str())));
+            stems.map(|stem| self.pcd(agent, stem, None)).take(Sweeps::MOST_TRIED).collect::<Vec<_>>()
+        };
+        let sweeps = Sweeps::new(SweepStorage::ByName, options);
+        self.agents.iter().fold(sweeps, |sweeps, agent| sweeps.with_agent(agent.clone(), of_agent(agent)))
     }
 
     /// The radar's points of a frame.
@@ -131,7 +170,7 @@ impl ScenarioFolder {
         self.pcd(agent, stem, Some(RADAR))
     }
 
-    /// Capture times. Stems count simulator ticks, they are no clock: where `data_protocol.yaml` gives the length of a
+    /// Capture times of all stems. Stems count simulator ticks, they are no clock: where `data_protocol.yaml` gives the length of a
     /// tick, time is tick times length; else the smallest step between stems is one `period_nanos`, from 0 on.
     pub(super) fn ticks(&self, period_nanos: u64, problems: &mut Vec<ReadError>) -> Vec<Tick> {
         let tick_nanos = self.tick_nanos().unwrap_or_else(|error| {
@@ -169,55 +208,38 @@ impl ScenarioFolder {
     }
 }
 
+/// One problem for every agent that never has a frame at the ego's ticks: odd stems beside even ones, for example.
+fn without_common_frame(
+    dir: &Path,
+    agents: &[CavId],
+    by_agent: &BTreeMap<CavId, AgentFolder>,
+) -> impl Iterator<Item = ReadError> {
+    let stems = |id: &CavId| by_agent.get(id).map(|agent| &agent.stems);
+    let first = |id: &CavId| stems(id).and_then(BTreeSet::first).cloned().unwrap_or_default();
+    let ego = agents.first().cloned();
+    let strangers = agents.iter().skip(1).filter(|id| {
+        let ego = ego.as_ref().and_then(stems);
+        ego.zip(stems(id)).is_some_and(|(ego, own)| ego.is_disjoint(own))
+    });
+    let problem = |id: &CavId| {
+        let ego = ego.as_ref().map(|ego| (ego.to_string(), first(ego))).unwrap_or_default();
+        let reason = format!(
+            "no frame of agent {id} (first {}) at a tick of the ego {} (first {}): it takes no part",
+            first(id),
+            ego.0,
+            ego.1
+        );
+        ReadError::malformed(&dir.join(id.as_str()), reason)
+    };
+    strangers.map(problem).collect::<Vec<_>>().into_iter()
+}
+
 /// Text order, as OpenCOOD sorts: `1045` before `650`. Roadside units (negative ids) go last, so that no unit is the ego
 /// where there is a vehicle; OpenCOOD moves the first of them only.
 fn in_order<'a>(ids: impl Iterator<Item = &'a CavId>) -> Vec<CavId> {
     let (units, mut agents): (Vec<CavId>, Vec<CavId>) = ids.cloned().partition(|id| id.as_str().starts_with('-'));
     agents.extend(units);
     agents
-}
-
-impl AgentFolder {
-    fn scan(dir: &Path, problems: &mut Vec<ReadError>) -> Result<Self, ReadError> {
-        let listing = files::list(dir)?;
-        let is_frame = |stem: &&str| !NOT_FRAMES.iter().any(|text| stem.contains(text));
-        let mut yamls: BTreeSet<&str> = files::stems(&listing.files, ".yaml").into_iter().filter(is_frame).collect();
-        let mut agent = Self { is_without_yaml: yamls.is_empty(), ..Self::default() };
-        if agent.is_without_yaml {
-            // Sweeps alone are frames without poses and boxes.
-            yamls.extend(files::stems(&listing.files, ".pcd").into_iter().filter(|stem| !stem.contains('_')));
-        }
-        let mut without_yaml = BTreeSet::new();
-        for name in files::stems(&listing.files, ".pcd") {
-            if yamls.contains(name) {
-                agent.stems.insert(name.to_owned());
-                continue;
-            }
-            match name.split_once('_') {
-                Some((stem, RADAR)) if yamls.contains(stem) => agent.has_radar = true,
-                Some((stem, variant)) if yamls.contains(stem) => {
-                    agent.variants.insert(variant.to_owned());
-                }
-                Some((stem, _)) => {
-                    without_yaml.insert(stem);
-                }
-                None => {
-                    without_yaml.insert(name);
-                }
-            }
-        }
-        for stem in without_yaml {
-            let path = dir.join(format!("{stem}.yaml"));
-            problems
-                .push(ReadError::malformed(&path, format!("does not exist beside {stem}.pcd: the frame is left out")));
-        }
-        for stem in yamls.into_iter().filter(|stem| !agent.stems.contains(*stem)) {
-            let path = dir.join(format!("{stem}.pcd"));
-            problems
-                .push(ReadError::malformed(&path, format!("does not exist beside {stem}.yaml: the frame is left out")));
-        }
-        Ok(agent)
-    }
 }
 
 #[cfg(test)]
@@ -250,7 +272,7 @@ mod tests {
         let dir = tempfile::tempdir().unwrap();
         touch(dir.path(), &["test/a/1/0.yaml", "test/b/1/0.pcd", "train/c/1/0.yaml", "README.md", "empty/x"]);
         let names = |below: &str| {
-            let found = find(&dir.path().join(below)).unwrap();
+            let found = find(&dir.path().join(below), &mut Vec::new()).unwrap();
             found.iter().map(|found| files::name_below(dir.path(), found)).collect::<Vec<_>>()
         };
         assert_eq!(names(""), ["test/a", "test/b", "train/c"]);
@@ -270,13 +292,13 @@ mod tests {
     }
 
     #[test]
-    fn frame_lists_are_intersected_and_what_is_missing_is_said() {
+    fn frames_are_listed_and_so_are_missing_ones() {
         let dir = tempfile::tempdir().unwrap();
         touch(dir.path(), &["1/000068.yaml", "1/000068.pcd", "1/000070.yaml", "1/000070.pcd"]);
         touch(dir.path(), &["2/000070.yaml", "2/000070.pcd", "2/000072.yaml", "2/000074.pcd", "2/000076_radar.pcd"]);
         touch(dir.path(), &["3/000070.yaml"]);
         let (folder, problems) = scan(dir.path());
-        assert_eq!((ids(&folder), folder.stems.as_slice()), (vec!["1", "2"], ["000070".to_owned()].as_slice()));
+        assert_eq!((ids(&folder), folder.stems.len()), (vec!["1", "2"], 2));
         assert_eq!(folder.missing, [MissingFrame { agent: CavId::new("2").unwrap(), stem: "000068".into() }]);
         assert_eq!(
             problems,
@@ -285,9 +307,20 @@ mod tests {
                 "/2/000076.yaml: does not exist beside 000076.pcd: the frame is left out",
                 "/2/000072.pcd: does not exist beside 000072.yaml: the frame is left out",
                 "/3/000070.pcd: does not exist beside 000070.yaml: the frame is left out",
-                "/3: no frame with both YAML and PCD: the agent is left out",
+                "/3: no frame with both YAML and pcd: the agent is left out",
             ]
         );
+    }
+
+    #[test]
+    fn an_agent_without_a_common_tick_is_named() {
+        let dir = tempfile::tempdir().unwrap();
+        touch(dir.path(), &["1/000068.yaml", "1/000068.pcd", "1/000070.yaml", "1/000070.pcd"]);
+        touch(dir.path(), &["2/000069.yaml", "2/000069.pcd"]);
+        let (folder, problems) = scan(dir.path());
+        assert_eq!((folder.agents.len(), folder.stems.len()), (2, 3));
+        let expected = "/2: no frame of agent 2 (first 000069) at a tick of the ego 1 (first 000068): it takes no part";
+        assert_eq!(problems, [expected]);
     }
 
     #[test]

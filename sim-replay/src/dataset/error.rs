@@ -34,6 +34,16 @@ pub enum ReadError {
         /// What was found and what was expected.
         reason: String,
     },
+    /// The agent takes no part at the tick: it came later, has left, or its files are missing.
+    #[error("scenario {scenario}: agent {agent} has no frame at tick {tick}")]
+    Absent {
+        /// The scenario.
+        scenario: String,
+        /// The agent.
+        agent: String,
+        /// Stem of the tick.
+        tick: String,
+    },
     /// The caller asked for an agent, a tick or a variant that the scenario does not have.
     #[error("scenario {scenario}: {what} {asked} does not exist ({available})")]
     NoSuch {
@@ -59,13 +69,28 @@ impl ReadError {
         Self::Io { path: path.to_owned(), source }
     }
 
+    /// The same with what follows from it at the end of the reason.
+    #[must_use]
+    pub fn with_consequence(mut self, consequence: &str) -> Self {
+        if let Self::Malformed { reason, .. } | Self::Layout { reason, .. } = &mut self {
+            *reason = format!("{reason}: {consequence}");
+        }
+        self
+    }
+
     /// The file or folder at fault, if the error is about one.
     #[must_use]
     pub fn path(&self) -> Option<&Path> {
         match self {
             Self::Io { path, .. } | Self::Layout { path, .. } | Self::Malformed { path, .. } => Some(path),
-            Self::NoSuch { .. } => None,
+            Self::NoSuch { .. } | Self::Absent { .. } => None,
         }
+    }
+
+    /// Whether nothing is wrong but that the agent is not there at the tick.
+    #[must_use]
+    pub fn is_absence(&self) -> bool {
+        matches!(self, Self::Absent { .. })
     }
 
     /// The line at fault, from 1.

@@ -15,7 +15,8 @@ pub(super) struct Listing {
     pub(super) files: Vec<String>,
 }
 
-/// Lists a folder. Names that are not UTF-8 are none of ours and are left out.
+/// Lists a folder. Names that are not UTF-8 are none of ours and are left out; so are links to nothing, which are files
+/// that are not there.
 pub(super) fn list(dir: &Path) -> Result<Listing, ReadError> {
     let mut listing = Listing::default();
     for entry in fs::read_dir(dir).map_err(|error| ReadError::io(dir, error))? {
@@ -24,15 +25,28 @@ pub(super) fn list(dir: &Path) -> Result<Listing, ReadError> {
             continue;
         };
         // Data often lies behind symbolic links, so these are followed.
-        match fs::metadata(entry.path()) {
-            Ok(metadata) if metadata.is_dir() => listing.folders.push(name),
-            Ok(_) => listing.files.push(name),
-            Err(error) => return Err(ReadError::io(&entry.path(), error)),
+        let kind = entry.file_type().ok().filter(|kind| !kind.is_symlink());
+        match kind.or_else(|| fs::metadata(entry.path()).ok().map(|metadata| metadata.file_type())) {
+            Some(kind) if kind.is_dir() => listing.folders.push(name),
+            Some(_) => listing.files.push(name),
+            None => {}
         }
     }
     listing.folders.sort_unstable();
     listing.files.sort_unstable();
     Ok(listing)
+}
+
+/// The folders below one with their contents; one that cannot be listed is left out.
+pub(super) fn list_below(dir: &Path, listing: &Listing, problems: &mut Vec<ReadError>) -> Vec<(PathBuf, Listing)> {
+    let mut below = Vec::with_capacity(listing.folders.len());
+    for path in listing.folders.iter().map(|folder| dir.join(folder)) {
+        match list(&path) {
+            Ok(listing) => below.push((path, listing)),
+            Err(error) => problems.push(error),
+        }
+    }
+    below
 }
 
 /// Reads a file of at most `max_bytes`.
@@ -43,9 +57,15 @@ pub(super) fn read_limited(path: &Path, max_bytes: u64) -> Result<Vec<u8>, ReadE
     })
 }
 
-/// Reads a text file of at most `max_bytes`.
+/// Reads a text file of at most `max_bytes`. Bytes that are no UTF-8 become marks that no number has.
 pub(super) fn read_text(path: &Path, max_bytes: u64) -> Result<String, ReadError> {
-    String::from_utf8(read_limited(path, max_bytes)?).map_err(|_| ReadError::malformed(path, "the text is not UTF-8"))
+    let bytes = read_limited(path, max_bytes)?;
+    Ok(String::from_utf8(bytes).unwrap_or_else(|error| String::from_utf8_lossy(error.as_bytes()).into_owned()))
+}
+
+/// True where a folder has a file whose name ends in `suffix`.
+pub(super) fn holds(dir: &Path, suffix: &str) -> bool {
+    list(dir).is_ok_and(|listing| listing.files.iter().any(|name| name.ends_with(suffix)))
 }
 
 /// The stems of the files that end in `suffix`, in the order given.
@@ -85,6 +105,23 @@ mod tests {
         fs::create_dir(dir.path().join("4279")).unwrap();
         let listing = list(dir.path()).unwrap();
         assert_eq!((listing.files, listing.folders), (vec!["a.yaml".into(), "b.yaml".into()], vec!["4279".into()]));
+    }
+
+    #[test]
+    fn links_are_followed_and_those_to_nothing_are_not_there() {
+        let dir = tempfile::tempdir().unwrap();
+        let link = |target: &Path, name: &str| std::os::unix::fs::symlink(target, dir.path().join(name)).unwrap();
+        fs::create_dir(dir.path().join("4279")).unwrap();
+        fs::write(dir.path().join("a.yaml"), "").unwrap();
+        link(&dir.path().join("4279"), "4288");
+        link(&dir.path().join("a.yaml"), "b.yaml");
+        link(Path::new("/nowhere.png"), "a_camera0.png");
+        link(Path::new("loop"), "loop");
+        let listing = list(dir.path()).unwrap();
+        assert_eq!(
+            (listing.files, listing.folders),
+            (vec!["a.yaml".into(), "b.yaml".into()], vec!["4279".into(), "4288".into()])
+        );
     }
 
     #[test]

@@ -10,6 +10,7 @@ use hdf5_reader::{Dataset, Datatype, Hdf5File, OpenOptions};
 use nalgebra::Matrix4;
 use protocol::Pose;
 
+use super::faults::Faults;
 use super::{ReadError, files};
 
 /// Largest HDF5 file, and largest dataset in it, that is read, bytes: a million poses.
@@ -26,13 +27,22 @@ pub(super) enum RowOrder {
     RotationFirst,
 }
 
-/// Poses by time stamp in microseconds, in the axes of the file.
-pub(super) fn read(path: &Path, order: RowOrder) -> Result<BTreeMap<u64, Pose>, ReadError> {
+/// Poses by time stamp in microseconds, in the axes of the file. Entries that cannot be right are left out and named.
+pub(super) fn read(
+    path: &Path,
+    order: RowOrder,
+    problems: &mut Vec<ReadError>,
+) -> Result<BTreeMap<u64, Pose>, ReadError> {
     let bytes = files::read_limited(path, MAX_BYTES as u64)?;
-    parse(path, bytes, order)
+    parse(path, bytes, order, problems)
 }
 
-fn parse(path: &Path, bytes: Vec<u8>, order: RowOrder) -> Result<BTreeMap<u64, Pose>, ReadError> {
+fn parse(
+    path: &Path,
+    bytes: Vec<u8>,
+    order: RowOrder,
+    problems: &mut Vec<ReadError>,
+) -> Result<BTreeMap<u64, Pose>, ReadError> {
     let options = OpenOptions::default().with_max_read_bytes(MAX_BYTES).with_max_chunk_bytes(MAX_BYTES);
     let file = Hdf5File::from_vec_with_options(bytes, options)
         .map_err(|error| ReadError::malformed(path, format!("no sound HDF5: {error}")))?;
@@ -46,14 +56,17 @@ fn parse(path: &Path, bytes: Vec<u8>, order: RowOrder) -> Result<BTreeMap<u64, P
     }
     let (rows, _) = poses.as_chunks::<12>();
     let kept = TRIMMED..stamps.len().saturating_sub(TRIMMED);
+    let mut faults = Faults::default();
     let mut by_time = BTreeMap::new();
     for (index, (stamp, row)) in stamps.iter().zip(rows).enumerate().filter(|(index, _)| kept.contains(index)) {
         if !(0.0..=1e18).contains(stamp) {
-            return Err(wrong(path, "valid_timestamps", format!("entry {index}: {stamp} are no microseconds")));
+            faults.push(wrong(path, "valid_timestamps", format!("entry {index}: {stamp} are no microseconds")));
+            continue;
         }
-        let pose = pose(row, order).map_err(|error| wrong(path, "poses", format!("entry {index}: {error}")))?;
-        by_time.insert(*stamp as u64, pose);
+        let pose = pose(row, order).map_err(|error| wrong(path, "poses", format!("entry {index}: {error}")));
+        by_time.extend(faults.take(pose).map(|pose| (*stamp as u64, pose)));
     }
+    faults.report("row", problems);
     Ok(by_time)
 }
 
@@ -102,79 +115,13 @@ pub(super) mod tests {
     use proptest::prelude::*;
 
     use super::*;
-
-    /// A message of an object header: type, and data padded to 8 bytes.
-    fn message(kind: u16, mut data: Vec<u8>) -> Vec<u8> {
-        data.resize(data.len().next_multiple_of(8), 0);
-        let mut message = [kind.to_le_bytes(), (data.len() as u16).to_le_bytes()].concat();
-        message.extend([0; 4]);
-        message.extend(data);
-        message
-    }
-
-    fn object_header(messages: &[Vec<u8>]) -> Vec<u8> {
-        let body = messages.concat();
-        let mut header = vec![1, 0];
-        header.extend((messages.len() as u16).to_le_bytes());
-        header.extend(1u32.to_le_bytes());
-        header.extend((body.len() as u32).to_le_bytes());
-        header.extend([0; 4]);
-        header.extend(body);
-        header
-    }
-
-    fn dataset_header(shape: &[u64], datatype: &[u8], address: usize, bytes: usize) -> Vec<u8> {
-        let mut space = vec![1, shape.len() as u8, 0, 0, 0, 0, 0, 0];
-        space.extend(shape.iter().flat_map(|size| size.to_le_bytes()));
-        let mut layout = vec![3, 1];
-        layout.extend((address as u64).to_le_bytes());
-        layout.extend((bytes as u64).to_le_bytes());
-        object_header(&[message(1, space), message(3, datatype.to_vec()), message(8, layout)])
-    }
-
-    fn link(name: &str, address: usize) -> Vec<u8> {
-        let mut link = vec![1, 0, name.len() as u8];
-        link.extend(name.bytes());
-        link.extend((address as u64).to_le_bytes());
-        message(6, link)
-    }
-
-    /// A file of LightLoc's two datasets, built by hand: version 0 superblock, version 1 headers, contiguous data.
-    pub(in crate::dataset) fn file(stamps: &[i64], poses: &[[f64; 12]]) -> Vec<u8> {
-        const I64: [u8; 12] = [0x10, 0x08, 0, 0, 8, 0, 0, 0, 0, 0, 64, 0];
-        const F64: [u8; 20] = [0x11, 0x20, 0x3f, 0, 8, 0, 0, 0, 0, 0, 64, 0, 52, 11, 0, 52, 0xff, 0x03, 0, 0];
-        const UNDEFINED: [u8; 8] = [0xff; 8];
-        let stamp_bytes: Vec<u8> = stamps.iter().flat_map(|stamp| stamp.to_le_bytes()).collect();
-        let pose_bytes: Vec<u8> = poses.iter().flatten().flat_map(|value| value.to_le_bytes()).collect();
-        let link_info = message(2, [&[0, 0][..], &UNDEFINED, &UNDEFINED].concat());
-        let root_of = |a, b| object_header(&[link_info.clone(), link("valid_timestamps", a), link("poses", b)]);
-        let stamp_header = |data| dataset_header(&[stamps.len() as u64], &I64, data, stamp_bytes.len());
-        let pose_header = |data| dataset_header(&[poses.len() as u64, 12], &F64, data, pose_bytes.len());
-        let root = 96;
-        let first = root + root_of(0, 0).len();
-        let second = first + stamp_header(0).len();
-        let data = second + pose_header(0).len();
-        let end = data + stamp_bytes.len() + pose_bytes.len();
-
-        let mut file = b"\x89HDF\r\n\x1a\n".to_vec();
-        file.extend([0, 0, 0, 0, 0, 8, 8, 0, 4, 0, 16, 0, 0, 0, 0, 0]);
-        file.extend(0u64.to_le_bytes());
-        file.extend(UNDEFINED);
-        file.extend((end as u64).to_le_bytes());
-        file.extend(UNDEFINED);
-        file.extend(0u64.to_le_bytes());
-        file.extend((root as u64).to_le_bytes());
-        file.extend([0; 24]);
-        file.extend(root_of(first, second));
-        file.extend(stamp_header(data));
-        file.extend(pose_header(data + stamp_bytes.len()));
-        file.extend(stamp_bytes);
-        file.extend(pose_bytes);
-        file
-    }
+    pub(in crate::dataset) use crate::synth::layout::poses_file as file;
 
     fn parse(bytes: Vec<u8>, order: RowOrder) -> Result<BTreeMap<u64, Pose>, ReadError> {
-        super::parse(Path::new("a.h5"), bytes, order)
+        let mut problems = Vec::new();
+        let poses = super::parse(Path::new("a.h5"), bytes, order, &mut problems);
+        assert!(problems.is_empty(), "{problems:?}");
+        poses
     }
 
     const MATRIX: [f64; 12] = [0.0, -1.0, 0.0, 4.0, 1.0, 0.0, 0.0, 5.0, 0.0, 0.0, 1.0, 6.0];
@@ -196,10 +143,26 @@ pub(super) mod tests {
     fn what_is_wrong_is_named() {
         let message = |bytes, order| parse(bytes, order).unwrap_err().to_string();
         let stamps: Vec<i64> = (0..11).collect();
-        let scaled = file(&stamps, &[MATRIX.map(|value| 2.0 * value); 11]);
-        assert!(message(scaled, RowOrder::Matrix).starts_with("a.h5: poses: entry 5: pose matrix is not a rotation"));
         assert!(message(file(&stamps, &[MATRIX; 10]), RowOrder::Matrix).contains("shape [10, 12], expected [11, 12]"));
         assert!(message(b"no".to_vec(), RowOrder::Matrix).starts_with("a.h5: no sound HDF5"));
+    }
+
+    #[test]
+    fn a_bad_entry_is_left_out_and_named() {
+        let stamps: Vec<i64> = (0..13).collect();
+        for (value, expected) in [
+            (7.0, "a.h5: poses: entry 6: pose matrix is not a rotation"),
+            (f64::NAN, "a.h5: poses: entry 6: pose component NaN"),
+        ] {
+            let mut rows = [MATRIX; 13];
+            rows[6][0] = value;
+            let mut problems = Vec::new();
+            let poses = super::parse(Path::new("a.h5"), file(&stamps, &rows), RowOrder::Matrix, &mut problems).unwrap();
+            assert_eq!(poses.keys().copied().collect::<Vec<_>>(), [5, 7]);
+            let message = problems[0].to_string();
+            assert!(message.starts_with(expected) && message.ends_with("the row is left out"), "{message}");
+            assert_eq!(problems.len(), 1);
+        }
     }
 
     #[test]
@@ -217,7 +180,7 @@ pub(super) mod tests {
             let mut bytes = file(&(0..12).collect::<Vec<i64>>(), &[MATRIX; 12]);
             let at = at.index(bytes.len());
             bytes[at] = byte;
-            let _ = parse(bytes, RowOrder::Matrix);
+            let _ = super::parse(Path::new("a.h5"), bytes, RowOrder::Matrix, &mut Vec::new());
         }
     }
 }

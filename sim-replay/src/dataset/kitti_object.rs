@@ -8,34 +8,49 @@ use std::sync::Arc;
 use nalgebra::{Isometry3, Matrix3, Point3, Rotation3, UnitQuaternion};
 use protocol::{CavId, Handedness, Pose};
 
+use super::frame_files::{named_once, usual_stems};
 use super::kitti_text::{self, Calibration};
-use super::{FrameSource, Layout, OpenOptions, ReadError, Scenario, Tick, files, points, single_vehicle};
+use super::points::{SweepStorage, Sweeps};
+use super::{FrameSource, Layout, OpenOptions, Problem, ReadError, Scenario, Tick, classes, files, single_vehicle};
 use crate::frame::{Frame, Object, ObjectClass};
 use crate::pcd::PcdCloud;
 
 /// Numbers behind the type in a line of labels; detections have a score as well.
 const LABEL_NUMBERS: usize = 14;
+/// Largest size of an object, metres.
+const MAX_SIZE_M: f64 = 100.0;
 
 /// A split.
 #[derive(Debug)]
 struct Split {
     dir: PathBuf,
     has_labels: bool,
+    sweeps: Sweeps,
 }
 
-/// Whether a folder is a split.
+/// True for a folder with sweeps and a folder of calibrations. DAIR-V2X has the same folders, with PCD files.
 pub(super) fn is_split(dir: &Path) -> bool {
-    dir.join("velodyne").is_dir() && dir.join("calib").is_dir()
+    dir.join("calib").is_dir() && files::holds(&dir.join("velodyne"), ".bin")
 }
 
 /// Opens a split.
-pub(super) fn open(root: &Path, dir: &Path, options: &OpenOptions) -> Result<Scenario, ReadError> {
-    let listing = files::list(&dir.join("velodyne"))?;
-    let stems = files::stems(&listing.files, ".bin");
+pub(super) fn open(
+    root: &Path,
+    dir: &Path,
+    options: &OpenOptions,
+    problems: &mut Vec<ReadError>,
+) -> Result<Scenario, ReadError> {
+    let velodyne = dir.join("velodyne");
+    let listing = files::list(&velodyne)?;
+    let (stems, strays) = usual_stems(files::stems(&listing.files, ".bin").into_iter().collect());
+    let strays: Vec<String> = strays.into_iter().map(|stem| format!("{stem}.bin")).collect();
+    problems.extend(named_once(&velodyne, &strays));
     let times = (0u64..).map(|index| options.period_nanos.saturating_mul(index));
     let tick = |(stem, capture_nanos): (&str, u64)| Tick { stem: stem.to_owned(), capture_nanos };
-    let ticks = stems.into_iter().zip(times).map(tick).collect();
-    let source = Split { dir: dir.to_owned(), has_labels: dir.join("label_2").is_dir() };
+    let ticks: Vec<Tick> = stems.into_iter().zip(times).map(tick).collect();
+    let files = ticks.iter().map(|tick| velodyne.join(format!("{}.bin", tick.stem)));
+    let sweeps = Sweeps::of_single_vehicle(SweepStorage::ByName, files, options);
+    let source = Split { dir: dir.to_owned(), has_labels: dir.join("label_2").is_dir(), sweeps };
     Ok(single_vehicle(files::name_below(root, dir), Layout::KittiObject, ticks, Arc::new(source)))
 }
 
@@ -47,13 +62,13 @@ impl FrameSource for Split {
             let calibration = Calibration::read(&self.dir.join("calib").join(format!("{}.txt", tick.stem)))?;
             let rectified = calibration.rotation("R0_rect")?.isometry();
             let camera_from_lidar = rectified * calibration.transform("Tr_velo_to_cam")?.isometry();
-            frame.objects = objects(&self.labels(tick), &camera_from_lidar.inverse())?;
+            (frame.objects, frame.problems) = objects(&self.labels(tick), &camera_from_lidar.inverse())?;
         }
         Ok(frame)
     }
 
     fn points(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> Result<PcdCloud, ReadError> {
-        points::read_interleaved(&self.points_path(agent, tick, variant))
+        self.sweeps.read(agent, &self.points_path(agent, tick, variant))
     }
 
     fn annotation_path(&self, _agent: &CavId, tick: &Tick) -> Option<PathBuf> {
@@ -71,34 +86,54 @@ impl Split {
     }
 }
 
-/// The labelled objects in the LiDAR frame. `DontCare` regions have no box and are left out.
-fn objects(path: &Path, lidar_from_camera: &Isometry3<f64>) -> Result<Vec<Object>, ReadError> {
-    let mut objects = Vec::new();
+/// The labelled objects in the LiDAR frame, and what was left out. `DontCare` regions have no box and are not counted.
+fn objects(path: &Path, lidar_from_camera: &Isometry3<f64>) -> Result<(Vec<Object>, Vec<Problem>), ReadError> {
+    let (mut objects, mut problems) = (Vec::new(), Vec::new());
     for (line, text) in kitti_text::lines(path)? {
         let (kind, numbers) = text.trim().split_once(' ').unwrap_or((text.trim(), ""));
         if kind == "DontCare" {
             continue;
         }
-        let count = numbers.split_ascii_whitespace().count();
-        // A score may follow.
-        let numbers = if count == LABEL_NUMBERS + 1 {
-            numbers.trim().rsplit_once(' ').map_or(numbers, |(n, _)| n)
-        } else {
-            numbers
-        };
-        let values: [f64; LABEL_NUMBERS] = kitti_text::numbers(path, line, Some(kind), numbers)?;
-        let [.., height, width, length, x, y, z, rotation_y] = values;
-        let size_m = [length, width, height];
-        if size_m.iter().any(|size| !(0.0..=200.0).contains(size)) {
-            return Err(kitti_text::malformed(path, line, Some(kind), format!("{size_m:?} are no sizes in metres")));
+        match object((path, line), kind, numbers, objects.len() as i64, lidar_from_camera) {
+            Ok(object) => {
+                if classes::of_name(kind).is_none() {
+                    let dir = path.parent().unwrap_or(path);
+                    let name: String = kind.chars().take(40).collect();
+                    problems.push(classes::unknown(dir, "type", &format!("{name:?}")));
+                }
+                objects.push(object);
+            }
+            Err(error) => problems.push(Problem::from(&error.with_consequence("the object is left out"))),
         }
-        let camera_from_object = camera_from_object([x, y, z], height, rotation_y);
-        let pose: Pose = (lidar_from_camera * camera_from_object).into();
-        pose.validate().map_err(|error| kitti_text::malformed(path, line, Some(kind), error.to_string()))?;
-        let id = objects.len() as i64;
-        objects.push(Object { id, class: class(kind), world_from_object: pose, size_m, speed_mps: None });
     }
-    Ok(objects)
+    Ok((objects, problems))
+}
+
+fn object(
+    (path, line): (&Path, u64),
+    kind: &str,
+    numbers: &str,
+    id: i64,
+    lidar_from_camera: &Isometry3<f64>,
+) -> Result<Object, ReadError> {
+    // Not every file's first word is short.
+    let field: String = kind.chars().take(40).collect();
+    let malformed = |reason: String| kitti_text::malformed(path, line, Some(&field), reason);
+    let count = numbers.split_ascii_whitespace().count();
+    // A score may follow.
+    let has_score = count == LABEL_NUMBERS + 1;
+    let numbers = numbers.trim().rsplit_once(' ').filter(|_| has_score).map_or(numbers, |(numbers, _)| numbers);
+    let values: [f64; LABEL_NUMBERS] = kitti_text::numbers(path, line, Some(&field), numbers)?;
+    let [.., height, width, length, x, y, z, rotation_y] = values;
+    let size_m = [length, width, height];
+    if size_m.iter().any(|&size| size <= 0.0 || size > MAX_SIZE_M) {
+        return Err(malformed(format!("{size_m:?} m, expected sizes above 0 and up to {MAX_SIZE_M} m")));
+    }
+    let class = classes::of_name(kind).unwrap_or(ObjectClass::Other);
+    let camera_from_object = camera_from_object([x, y, z], height, rotation_y);
+    let world_from_object: Pose = (lidar_from_camera * camera_from_object).into();
+    world_from_object.validate().map_err(|error| malformed(error.to_string()))?;
+    Ok(Object { id, class, world_from_object, size_m, speed_mps: None })
 }
 
 /// The label's place is the middle of the bottom face in the camera frame (x right, y down, z forward); `rotation_y`
@@ -110,18 +145,6 @@ fn camera_from_object(bottom: [f64; 3], height: f64, rotation_y: f64) -> Isometr
     let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(rotation));
     let [x, y, z] = bottom;
     Isometry3::from_parts(Point3::new(x, y - height / 2.0, z).coords.into(), rotation)
-}
-
-fn class(kind: &str) -> ObjectClass {
-    match kind {
-        "Car" => ObjectClass::Car,
-        "Van" => ObjectClass::Van,
-        "Truck" => ObjectClass::Truck,
-        "Tram" => ObjectClass::Bus,
-        "Cyclist" => ObjectClass::TwoWheeler,
-        "Pedestrian" | "Person_sitting" => ObjectClass::Pedestrian,
-        _ => ObjectClass::Other,
-    }
 }
 
 #[cfg(test)]
@@ -168,10 +191,54 @@ mod tests {
     }
 
     #[test]
-    fn a_bad_label_names_line_and_field() {
-        let dir = build("Car 0 0 0 0 0 0 0 1.5 1.6 4.0 2.0 1.7 9.7 0\nVan 0 0 0\n");
-        let error = dataset::open(dir.path()).unwrap().scenarios[0].load(0, 0, &LoadOptions::default()).unwrap_err();
-        assert_eq!((error.line(), error.field()), (Some(2), Some("Van")));
-        assert!(error.to_string().ends_with("3 numbers, expected 14"), "{error}");
+    fn a_bad_label_loses_its_object_alone_and_names_line_and_field() {
+        let sound = "Car 0 0 0 0 0 0 0 1.5 1.6 4.0 2.0 1.7 9.7 0\n";
+        for (bad, field, expected) in [
+            ("Van 0 0 0", "Van", "3 numbers, expected 14: the object is left out"),
+            (
+                "Car 0 0 0 0 0 0 0 1.5 nan 4.0 2.0 1.7 9.7 0",
+                "Car",
+                "\"nan\" is no finite number: the object is left out",
+            ),
+            (
+                "Car 0 0 0 0 0 0 0 1.5 0 4.0 2.0 1.7 9.7 0",
+                "Car",
+                "expected sizes above 0 and up to 100 m: the object is left out",
+            ),
+            ("Car 0 0 0 0 0 0 0 1.5 1.6 4.0 2.0 1e9 9.7 0", "Car", "within 1e7: the object is left out"),
+            ("\u{fffd}\u{1}", "\u{fffd}\u{1}", "0 numbers, expected 14: the object is left out"),
+        ] {
+            let dir = build(&format!("{sound}{bad}\n{sound}"));
+            let frame = dataset::open(dir.path()).unwrap().scenarios[0].load(0, 0, &LoadOptions::default()).unwrap();
+            assert_eq!((frame.objects.len(), frame.problems.len()), (2, 1), "{bad}");
+            let problem = &frame.problems[0];
+            assert_eq!((problem.line, problem.field.as_deref()), (Some(2), Some(field)));
+            assert!(problem.message.ends_with(expected), "{problem:?}");
+        }
+    }
+
+    #[test]
+    fn an_unknown_type_is_named_and_counts_as_other() {
+        let dir = build("Ufo 0 0 0 0 0 0 0 1.5 1.6 4.0 2.0 1.7 9.7 0\n");
+        let frame = dataset::open(dir.path()).unwrap().scenarios[0].load(0, 0, &LoadOptions::default()).unwrap();
+        assert_eq!(frame.objects[0].class, ObjectClass::Other);
+        assert!(frame.problems[0].message.contains("type: \"Ufo\" is no known type of object"), "{:?}", frame.problems);
+    }
+
+    #[test]
+    fn copies_are_no_sweeps() {
+        let dir = build("");
+        fs::write(dir.path().join("training/velodyne/000000 (1).bin"), "").unwrap();
+        let dataset = dataset::open(dir.path()).unwrap();
+        assert_eq!((dataset.scenarios[0].ticks.len(), dataset.problems.len()), (1, 1));
+        assert!(dataset.problems[0].to_string().ends_with("first: 000000 (1).bin"), "{:?}", dataset.problems);
+    }
+
+    #[test]
+    fn a_folder_without_sweeps_is_no_split() {
+        let dir = build("");
+        fs::rename(dir.path().join("training/velodyne/000000.bin"), dir.path().join("training/velodyne/000000.pcd"))
+            .unwrap();
+        assert!(dataset::open(dir.path()).unwrap_err().to_string().contains("no known layout"));
     }
 }

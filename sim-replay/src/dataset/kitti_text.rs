@@ -5,6 +5,7 @@ use std::path::{Path, PathBuf};
 use nalgebra::Matrix4;
 use protocol::Pose;
 
+use super::faults::Faults;
 use super::{ReadError, files};
 
 /// Largest text file that is read, bytes: poses of a hundred thousand scans.
@@ -23,6 +24,15 @@ pub(super) fn lines(path: &Path) -> Result<Vec<(u64, String)>, ReadError> {
     let text = files::read_text(path, MAX_BYTES)?;
     let numbered = (1..).zip(text.lines()).filter(|(_, line)| !line.trim().is_empty());
     Ok(numbered.map(|(number, line)| (number, line.to_owned())).collect())
+}
+
+/// One value per line; a line that cannot be read has none and goes to `faults`.
+pub(super) fn rows<T>(
+    path: &Path,
+    faults: &mut Faults,
+    read: impl Fn(u64, &str) -> Result<T, ReadError>,
+) -> Result<Vec<Option<T>>, ReadError> {
+    Ok(lines(path)?.into_iter().map(|(line, text)| faults.take(read(line, &text))).collect())
 }
 
 pub(super) fn malformed(path: &Path, line: u64, field: Option<&str>, reason: String) -> ReadError {

@@ -25,7 +25,8 @@ use protocol::{CavId, Handedness, Pose};
 use super::hdf5_poses::{self, RowOrder};
 use super::kitti_text::{lines, numbers};
 use super::nclt_ground_truth::{self, GroundTruth};
-use super::{FrameSource, Layout, ReadError, Scenario, Tick, files, points, single_vehicle};
+use super::points::{SweepStorage, Sweeps};
+use super::{FrameSource, Layout, OpenOptions, ReadError, Scenario, Tick, files, single_vehicle};
 use crate::frame::Frame;
 use crate::pcd::PcdCloud;
 
@@ -33,8 +34,6 @@ use crate::pcd::PcdCloud;
 const CONVERTED: &str = "velodyne_left";
 /// NCLT's own.
 const RAW: &str = "velodyne_sync";
-/// Intensities are bytes of the sensor, also where they are stored as floats.
-const MAX_INTENSITY: f32 = 255.0;
 
 /// How the points of a sequence are stored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -44,25 +43,36 @@ enum Storage {
     Oxford,
 }
 
+impl Storage {
+    fn of_sweeps(self) -> SweepStorage {
+        match self {
+            Self::NcltRaw => SweepStorage::NcltRaw,
+            Self::NcltConverted => SweepStorage::ByName,
+            Self::Oxford => SweepStorage::Planar,
+        }
+    }
+}
+
 #[derive(Debug)]
 struct Sequence {
     points_dir: PathBuf,
-    storage: Storage,
     /// By microseconds; empty where no file has any.
     world_from_lidar: BTreeMap<u64, Pose>,
+    sweeps: Sweeps,
 }
 
 /// Whether a folder is a sequence.
 pub(super) fn is_sequence(dir: &Path) -> bool {
-    [CONVERTED, RAW].iter().any(|name| holds_sweeps(&dir.join(name)))
-}
-
-fn holds_sweeps(dir: &Path) -> bool {
-    files::list(dir).is_ok_and(|listing| listing.files.iter().any(|name| name.ends_with(".bin")))
+    [CONVERTED, RAW].iter().any(|name| files::holds(&dir.join(name), ".bin"))
 }
 
 /// Opens a sequence. Sweeps without pose and poses without sweep are left out, the latter with a problem.
-pub(super) fn open(root: &Path, dir: &Path, problems: &mut Vec<ReadError>) -> Result<Scenario, ReadError> {
+pub(super) fn open(
+    root: &Path,
+    dir: &Path,
+    options: &OpenOptions,
+    problems: &mut Vec<ReadError>,
+) -> Result<Scenario, ReadError> {
     let storage = storage(dir);
     let points_dir = dir.join(if storage == Storage::NcltRaw { RAW } else { CONVERTED });
     let mut stamps = BTreeMap::new();
@@ -75,7 +85,10 @@ pub(super) fn open(root: &Path, dir: &Path, problems: &mut Vec<ReadError>) -> Re
             }
         }
     }
-    let poses = poses(dir, storage, &stamps)?;
+    let poses = poses(dir, storage, &stamps, problems).unwrap_or_else(|error| {
+        problems.push(error.with_consequence("the sequence is read without poses"));
+        None
+    });
     if let Some(poses) = &poses {
         for micros in poses.keys().filter(|micros| !stamps.contains_key(micros)) {
             let path = points_dir.join(format!("{micros}.bin"));
@@ -88,16 +101,18 @@ pub(super) fn open(root: &Path, dir: &Path, problems: &mut Vec<ReadError>) -> Re
         }
     }
     let tick = |(micros, stem): (u64, String)| Tick { stem, capture_nanos: micros.saturating_mul(1000) };
-    let ticks = stamps.into_iter().map(tick).collect();
+    let ticks: Vec<Tick> = stamps.into_iter().map(tick).collect();
     let layout = if storage == Storage::Oxford { Layout::Oxford } else { Layout::Nclt };
-    let source = Sequence { points_dir, storage, world_from_lidar: poses.unwrap_or_default() };
+    let files = ticks.iter().map(|tick| points_dir.join(format!("{}.bin", tick.stem)));
+    let sweeps = Sweeps::of_single_vehicle(storage.of_sweeps(), files, options);
+    let source = Sequence { points_dir, world_from_lidar: poses.unwrap_or_default(), sweeps };
     Ok(single_vehicle(files::name_below(root, dir), layout, ticks, Arc::new(source)))
 }
 
 /// NCLT's sequences are named by the day (`2012-01-22`), Oxford's by day and time and more.
 fn storage(dir: &Path) -> Storage {
     let is_nclt = dir.join(RAW).is_dir() || own_name(dir).len() == "2012-01-22".len();
-    match (is_nclt, holds_sweeps(&dir.join(CONVERTED))) {
+    match (is_nclt, files::holds(&dir.join(CONVERTED), ".bin")) {
         (true, true) => Storage::NcltConverted,
         (true, false) => Storage::NcltRaw,
         (false, _) => Storage::Oxford,
@@ -109,8 +124,9 @@ fn poses(
     dir: &Path,
     storage: Storage,
     stamps: &BTreeMap<u64, String>,
+    problems: &mut Vec<ReadError>,
 ) -> Result<Option<BTreeMap<u64, Pose>>, ReadError> {
-    let Some((scene, mut poses)) = poses_as_stored(dir, storage, stamps)? else { return Ok(None) };
+    let Some((scene, mut poses)) = poses_as_stored(dir, storage, stamps, problems)? else { return Ok(None) };
     let middle = Isometry3::from(middle_m(dir, scene)?);
     let turn = half_turn();
     for pose in poses.values_mut() {
@@ -127,19 +143,20 @@ fn poses_as_stored(
     dir: &Path,
     storage: Storage,
     stamps: &BTreeMap<u64, String>,
+    problems: &mut Vec<ReadError>,
 ) -> Result<Option<StoredPoses>, ReadError> {
     let is_nclt = storage != Storage::Oxford;
     let aligned = dir.join("velodyne_left_calibrateFalse.h5");
     if aligned.is_file() {
-        return Ok(Some(("QEOxford", hdf5_poses::read(&aligned, RowOrder::RotationFirst)?)));
+        return Ok(Some(("QEOxford", hdf5_poses::read(&aligned, RowOrder::RotationFirst, problems)?)));
     }
     let plain = dir.join("velodyne_left_False.h5");
     if plain.is_file() {
         let scene = if is_nclt { "NCLT" } else { "Oxford" };
-        return Ok(Some((scene, hdf5_poses::read(&plain, RowOrder::Matrix)?)));
+        return Ok(Some((scene, hdf5_poses::read(&plain, RowOrder::Matrix, problems)?)));
     }
     let Some(path) = is_nclt.then(|| nclt_ground_truth::find(dir, &own_name(dir))).flatten() else { return Ok(None) };
-    let truth = GroundTruth::read(&path)?;
+    let truth = GroundTruth::read(&path, problems)?;
     let at = |&micros: &u64| Some((micros, Pose::from(truth.at(micros)?)));
     Ok(Some(("NCLT", stamps.keys().filter_map(at).collect())))
 }
@@ -150,10 +167,24 @@ fn middle_m(dir: &Path, scene: &str) -> Result<Translation3<f64>, ReadError> {
     let Some(path) = files::above(dir).map(|above| above.join(&name)).find(|path| path.is_file()) else {
         return Ok(Translation3::identity());
     };
-    // Three numbers, one a line.
-    let text: Vec<String> = lines(&path)?.into_iter().map(|(_, line)| line).collect();
-    let [x, y, z] = numbers::<3>(&path, 1, None, &text.join(" "))?;
+    let [x, y, z] = first_row(&path)?;
     Ok(Translation3::new(x, y, z))
+}
+
+/// The mean of positions: LightLoc writes three numbers, one a line; SGLoc, LiSA, DiffLoc and others a row of three, and
+/// their standard deviation as a second row.
+fn first_row(path: &Path) -> Result<[f64; 3], ReadError> {
+    let mut lines = lines(path)?;
+    lines.retain(|(_, text)| !text.trim_start().starts_with('#'));
+    let first = lines.first().map(|(line, text)| (*line, text.clone()));
+    let count = |text: &str| text.split_ascii_whitespace().count();
+    match (first, lines.len()) {
+        (Some((line, text)), 1 | 2) if lines.iter().all(|(_, row)| count(row) == 3) => numbers(path, line, None, &text),
+        (first, _) => {
+            let all: Vec<String> = lines.into_iter().map(|(_, text)| text).collect();
+            numbers(path, first.map_or(1, |(line, _)| line), None, &all.join(" "))
+        }
+    }
 }
 
 fn own_name(dir: &Path) -> String {
@@ -177,15 +208,9 @@ impl FrameSource for Sequence {
     }
 
     fn points(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> Result<PcdCloud, ReadError> {
-        let path = self.points_path(agent, tick, variant);
-        let mut cloud = match self.storage {
-            Storage::NcltRaw => points::read_nclt_raw(&path)?,
-            Storage::NcltConverted => points::read_interleaved(&path)?,
-            Storage::Oxford => points::read_planar(&path)?,
-        };
-        for [_, y, z, intensity] in &mut cloud.points.xyzi {
+        let mut cloud = self.sweeps.read(agent, &self.points_path(agent, tick, variant))?;
+        for [_, y, z, _] in &mut cloud.points.xyzi {
             (*y, *z) = (-*y, -*z);
-            *intensity /= MAX_INTENSITY;
         }
         Ok(cloud)
     }
@@ -316,9 +341,23 @@ mod tests {
         // What lies above the folder does not depend on how that is called.
         let same = open(&dir.path().join("2012-01-15/velodyne_sync/.."));
         assert_eq!(same.scenarios[0].load(0, 0, &LoadOptions::default()).unwrap().world_from_lidar, Some(moved));
-        write(dir.path(), "NCLT_pose_stats.txt", b"100.0\n-50.0000000\n");
-        let message = dataset::open(dir.path()).unwrap_err().to_string();
-        assert!(message.contains("NCLT_pose_stats.txt") && message.contains("2 numbers, expected 3"), "{message}");
+        // Others write a row of three, and their deviation below it.
+        for rows in ["100.0 -50.0 -4.0\n", "100.0 -50.0 -4.0\n3 4 5\n", "# mean, deviation\n100 -50 -4\n3 4 nan\n"] {
+            write(dir.path(), "NCLT_pose_stats.txt", rows.as_bytes());
+            assert_eq!(load().world_from_lidar, Some(moved), "{rows}");
+        }
+        for (rows, expected) in [
+            ("100.0\n-50.0000000\n", "NCLT_pose_stats.txt:1: 2 numbers, expected 3"),
+            ("1 2 3\n4 5 6\n7 8 9\n", "NCLT_pose_stats.txt:1: 9 numbers, expected 3"),
+            ("1 2 nan\n4 5 6\n", "NCLT_pose_stats.txt:1: \"nan\" is no finite number"),
+        ] {
+            write(dir.path(), "NCLT_pose_stats.txt", rows.as_bytes());
+            let dataset = open(dir.path());
+            let message = dataset.problems[0].to_string();
+            assert!(message.contains(expected) && message.ends_with("the sequence is read without poses"), "{message}");
+            let frame = dataset.scenarios[0].load(0, 0, &LoadOptions::default()).unwrap();
+            assert_eq!(frame.world_from_lidar, None, "not counted from elsewhere");
+        }
     }
 
     #[test]

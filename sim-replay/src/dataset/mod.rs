@@ -13,12 +13,18 @@
 //! ```
 
 mod agent_folders;
+mod annotations;
+mod classes;
 mod error;
+mod faults;
 mod files;
+mod frame_files;
 mod hdf5_poses;
 mod kitti_object;
 mod kitti_odometry;
 mod kitti_text;
+mod layouts;
+mod left_out;
 mod listing;
 mod localization;
 mod nclt_ground_truth;
@@ -27,8 +33,12 @@ mod open;
 mod opv2v;
 mod points;
 mod poses;
+mod presence;
+mod problem;
 mod recorded;
+mod unfinished;
 mod v2v4real;
+mod written_pose;
 mod yaml;
 
 use std::path::PathBuf;
@@ -38,31 +48,19 @@ use protocol::{CavId, Handedness};
 use serde::Serialize;
 
 pub use error::ReadError;
+pub use layouts::{LAYOUTS, Layout, LayoutDescription, layouts_text};
+pub use left_out::LeftOut;
 pub use listing::{content_sha256, listing_sha256};
 pub use open::{OpenOptions, open, open_with};
+pub(crate) use points::Plausibility;
+pub use points::{IntensityScale, IntensityScaleError};
+pub use presence::LoadedTick;
+pub use problem::Problem;
+pub use unfinished::UNFINISHED;
 
 use crate::frame::Frame;
 use crate::pcd::PcdCloud;
-
-/// The layouts that are known here.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Layout {
-    /// OPV2V, V2XSet, V2X-R, V2VDet and generated scenes: a folder per agent, YAML and PCD per frame, left-handed.
-    Opv2v,
-    /// V2V4Real: the same folders, with pose matrices and objects in the LiDAR frame, right-handed.
-    V2v4Real,
-    /// Localization sequences of NCLT, as recorded or as converted by LightLoc.
-    Nclt,
-    /// Localization sequences of Oxford and QEOxford, as converted by LightLoc.
-    Oxford,
-    /// KITTI odometry.
-    KittiOdometry,
-    /// KITTI object detection.
-    KittiObject,
-    /// A recording of a live run ([`crate::recording`]).
-    Recording,
-}
+use presence::Absences;
 
 /// A dataset, or the part of one that was opened.
 #[derive(Debug)]
@@ -100,10 +98,12 @@ pub struct Scenario {
     pub name: String,
     /// The agents, ego first: in text order, a roadside unit that would come first last.
     pub agents: Vec<CavId>,
-    /// The moments that every agent has, in order.
+    /// The ego's moments, in order. Other agents take part where they have a frame, see [`Self::is_present`].
     pub ticks: Vec<Tick>,
-    /// Frames that some agents have and others lack; their moments are not among `ticks`.
+    /// Frames that some agents have and others lack. Where the ego lacks one there is no tick.
     pub missing: Vec<MissingFrame>,
+    /// Those of `agents` that stand beside the road.
+    pub roadside_units: Vec<CavId>,
     /// Variants of the LiDAR sweep beside the plain one, for example `fog_0.060`.
     pub lidar_variants: Vec<String>,
     /// Whether there are 4D radar points.
@@ -112,6 +112,7 @@ pub struct Scenario {
     pub layout: Layout,
     /// Which way the axes of the recording turned.
     pub source_handedness: Handedness,
+    absences: Absences,
     source: Arc<dyn FrameSource>,
 }
 
@@ -168,9 +169,18 @@ impl Scenario {
             (frame.points, frame.dropped_points) = (cloud.points, cloud.dropped);
         }
         if options.radar && self.has_radar {
-            frame.radar = Some(self.source.radar(agent, tick)?.points);
+            frame.radar = Some(self.load_radar(agent_index, tick_index)?.points);
         }
         Ok(frame)
+    }
+
+    /// Reads the radar's points alone.
+    ///
+    /// # Errors
+    /// As [`Self::load`].
+    pub fn load_radar(&self, agent_index: usize, tick_index: usize) -> Result<PcdCloud, ReadError> {
+        let (agent, tick) = self.frame_of(agent_index, tick_index)?;
+        self.source.radar(agent, tick)
     }
 
     /// Reads the LiDAR's points alone: the plain sweep, or a variant of [`Self::lidar_variants`].
@@ -213,6 +223,13 @@ impl Scenario {
         let agent =
             self.agents.get(agent_index).ok_or_else(|| self.no_such("agent", agent_index, self.agents.len()))?;
         let tick = self.ticks.get(tick_index).ok_or_else(|| self.no_such("tick", tick_index, self.ticks.len()))?;
+        if !self.is_present(agent_index, tick_index) {
+            return Err(ReadError::Absent {
+                scenario: self.name.clone(),
+                agent: agent.to_string(),
+                tick: tick.stem.clone(),
+            });
+        }
         Ok((agent, tick))
     }
 
@@ -222,17 +239,24 @@ impl Scenario {
     }
 }
 
+/// The vehicle of a layout that does not name it.
+fn single_vehicle_id() -> CavId {
+    CavId::new("0").expect("a digit is an identifier")
+}
+
 /// A scenario of a layout that knows one vehicle and does not name it.
 fn single_vehicle(name: String, layout: Layout, ticks: Vec<Tick>, source: Arc<dyn FrameSource>) -> Scenario {
     Scenario {
         name,
-        agents: vec![CavId::new("0").expect("a digit is an identifier")],
+        agents: vec![single_vehicle_id()],
         ticks,
         missing: Vec::new(),
+        roadside_units: Vec::new(),
         lidar_variants: Vec::new(),
         has_radar: false,
         layout,
         source_handedness: Handedness::Right,
+        absences: Absences::default(),
         source,
     }
 }

@@ -7,6 +7,7 @@ use std::path::{Path, PathBuf};
 
 use nalgebra::{Isometry3, Translation3, UnitQuaternion};
 
+use super::faults::Faults;
 use super::{ReadError, files};
 
 /// Largest file that is read, bytes: some two million rows.
@@ -33,20 +34,31 @@ pub(super) fn find(dir: &Path, name: &str) -> Option<PathBuf> {
 }
 
 impl GroundTruth {
-    pub(super) fn read(path: &Path) -> Result<Self, ReadError> {
-        Self::parse(path, &files::read_text(path, MAX_BYTES)?)
+    /// Reads a file. Rows that cannot be read, or whose time is not between their neighbours', are left out and named.
+    pub(super) fn read(path: &Path, problems: &mut Vec<ReadError>) -> Result<Self, ReadError> {
+        Ok(Self::parse(path, &files::read_text(path, MAX_BYTES)?, problems))
     }
 
-    fn parse(path: &Path, text: &str) -> Result<Self, ReadError> {
-        let mut poses: Vec<(u64, Isometry3<f64>)> = Vec::new();
+    fn parse(path: &Path, text: &str, problems: &mut Vec<ReadError>) -> Self {
+        let mut faults = Faults::default();
+        let mut rows = Vec::new();
         for (number, line) in (1..).zip(text.lines()).filter(|(_, line)| !line.trim().is_empty()) {
-            let Some((micros, pose)) = row(path, number, line)? else { continue };
-            if let Some((before, _)) = poses.last().filter(|(before, _)| *before >= micros) {
-                return Err(wrong(path, number, 0, format!("{micros} is not after {before}")));
-            }
-            poses.push((micros, pose));
+            let row = faults.take(row(path, number, line)).flatten();
+            rows.extend(row.map(|(micros, pose)| (number, micros, pose)));
         }
-        Ok(Self { poses })
+        let times: Vec<u64> = rows.iter().map(|(_, micros, _)| *micros).collect();
+        let in_order = longest_increasing(&times);
+        let mut poses = Vec::with_capacity(in_order.len());
+        let mut in_order = in_order.into_iter().peekable();
+        for (index, (number, micros, pose)) in rows.into_iter().enumerate() {
+            if in_order.next_if_eq(&index).is_some() {
+                poses.push((micros, pose));
+            } else {
+                faults.push(wrong(path, number, 0, format!("{micros} is not between the times around it")));
+            }
+        }
+        faults.report("row", problems);
+        Self { poses }
     }
 
     /// The pose at a time, evenly between the rows around it; `None` before the first, after the last and in gaps.
@@ -62,6 +74,25 @@ impl GroundTruth {
         // Half a turn within a gap has no middle.
         (gap <= MAX_GAP_MICROS).then(|| last.try_lerp_slerp(next, share, 1e-9)).flatten()
     }
+}
+
+/// Indices of the longest selection of values that increase.
+fn longest_increasing(values: &[u64]) -> Vec<usize> {
+    // Of the selections of each length, the index of the smallest last value; and what comes before each value.
+    let mut ends: Vec<usize> = Vec::new();
+    let mut before: Vec<Option<usize>> = Vec::with_capacity(values.len());
+    for (index, value) in values.iter().enumerate() {
+        let length = ends.partition_point(|&end| values[end] < *value);
+        before.push(length.checked_sub(1).map(|shorter| ends[shorter]));
+        if length == ends.len() {
+            ends.push(index);
+        } else if *value < values[ends[length]] {
+            ends[length] = index;
+        }
+    }
+    let mut selection: Vec<usize> = std::iter::successors(ends.last().copied(), |&index| before[index]).collect();
+    selection.reverse();
+    selection
 }
 
 /// Time and pose of a row; `None` where it holds no pose.
@@ -101,8 +132,16 @@ mod tests {
 
     const T0: u64 = 1_326_652_795_000_000;
 
-    fn parse(text: &str) -> Result<GroundTruth, ReadError> {
-        GroundTruth::parse(Path::new("groundtruth_2012-01-15.csv"), text)
+    fn parse(text: &str) -> (GroundTruth, Vec<String>) {
+        let mut problems = Vec::new();
+        let truth = GroundTruth::parse(Path::new("groundtruth_2012-01-15.csv"), text, &mut problems);
+        (truth, problems.iter().map(ToString::to_string).collect())
+    }
+
+    fn sound(text: &str) -> GroundTruth {
+        let (truth, problems) = parse(text);
+        assert!(problems.is_empty(), "{problems:?}");
+        truth
     }
 
     #[test]
@@ -112,7 +151,7 @@ mod tests {
             T0 - 10_000,
             (T0 + 100_000) as f64
         );
-        let truth = parse(&text).unwrap();
+        let truth = sound(&text);
         assert_eq!(truth.at(T0 - 5_000), None);
         assert_eq!(truth.at(T0).unwrap().translation.vector.as_slice(), [10.0, 20.0, -1.0]);
         let middle = truth.at(T0 + 25_000).unwrap();
@@ -125,7 +164,7 @@ mod tests {
 
     #[test]
     fn angles_turn_about_z_then_y_then_x() {
-        let truth = parse(&format!("{T0},0,0,0,0.1,0.2,0.3")).unwrap();
+        let truth = sound(&format!("{T0},0,0,0,0.1,0.2,0.3"));
         let axis = |axis, angle| UnitQuaternion::from_axis_angle(&axis, angle);
         let (x, y, z) = (nalgebra::Vector3::x_axis(), nalgebra::Vector3::y_axis(), nalgebra::Vector3::z_axis());
         let expected = axis(z, 0.3) * axis(y, 0.2) * axis(x, 0.1);
@@ -134,18 +173,37 @@ mod tests {
 
     #[test]
     fn nothing_is_known_in_gaps() {
-        let truth = parse(&format!("{T0},0,0,0,0,0,0\n{},9,0,0,0,0,0\n", T0 + 1_000_001)).unwrap();
+        let truth = sound(&format!("{T0},0,0,0,0,0,0\n{},9,0,0,0,0,0\n", T0 + 1_000_001));
         assert_eq!(truth.at(T0 + 500_000), None);
         assert!(truth.at(T0 + 1_000_001).is_some());
     }
 
     #[test]
-    fn what_is_wrong_is_named_with_its_line() {
-        let message = |text: &str| parse(text).unwrap_err().to_string();
-        assert_eq!(message("1,0,0,0,0,0,0\n2,0,0"), "groundtruth_2012-01-15.csv:2: 3 columns, expected 7");
-        assert_eq!(message("1,0,up,0,0,0,0"), "groundtruth_2012-01-15.csv:1: y: \"up\" is no number");
-        assert!(message("5,0,0,0,0,0,0\n5,0,0,0,0,0,0").ends_with(":2: utime: 5 is not after 5"));
-        assert!(message("-5,0,0,0,0,0,0").contains("-5 are no microseconds"));
-        assert!(parse("").unwrap().at(0).is_none());
+    fn a_bad_row_is_left_out_and_named_with_its_line() {
+        let row = |micros: u64, x: u64| format!("{micros},{x},0,0,0,0,0\n");
+        for (bad, expected) in [
+            ("2,0,0\n".to_owned(), ":2: 3 columns, expected 7: the row is left out"),
+            (format!("{},0,up,0,0,0,0\n", T0 + 10), ":2: y: \"up\" is no number: the row is left out"),
+            ("-5,0,0,0,0,0,0\n".into(), ":2: utime: -5 are no microseconds: the row is left out"),
+            (row(T0, 99), ":2: utime: 1326652795000000 is not between the times around it: the row is left out"),
+            (row(T0 + 999, 99), ":2: utime: 1326652795000999 is not between the times around it: the row is left out"),
+        ] {
+            let (truth, problems) = parse(&(row(T0, 1) + &bad + &row(T0 + 20, 3) + &row(T0 + 30, 4)));
+            assert_eq!(problems, [format!("groundtruth_2012-01-15.csv{expected}")], "{bad}");
+            // The first of two rows of one time may be the one that is left out.
+            assert_eq!(truth.at(T0 + 20).unwrap().translation.vector.x, 3.0);
+            assert_eq!(truth.poses.len(), 3);
+        }
+        let (_, problems) = parse("a\nb\n1,2,3,4,5,6,7\n");
+        let expected = "groundtruth_2012-01-15.csv:1: 1 columns, expected 7: 2 rows are left out, this is the first";
+        assert_eq!(problems, [expected]);
+        assert!(sound("").at(0).is_none());
+    }
+
+    #[test]
+    fn the_longest_increasing_selection_is_found() {
+        assert_eq!(longest_increasing(&[]), Vec::<usize>::new());
+        assert_eq!(longest_increasing(&[5, 1, 2, 9, 3, 3, 4]), [1, 2, 4, 6]);
+        assert_eq!(longest_increasing(&[3, 2, 1]), [2]);
     }
 }

@@ -6,9 +6,10 @@ use std::sync::Arc;
 
 use protocol::{CavId, Gnss, Handedness, Lidar, Limits, Payload, Radar, Stamp, Stream, Topic, Truth, wire};
 
+use super::presence::Absences;
 use super::{Dataset, FrameSource, Layout, MissingFrame, ReadError, Scenario, Tick};
 use crate::frame::{Frame, Object, ObjectClass};
-use crate::pcd::PcdCloud;
+use crate::pcd::{IntensityKind, IntensityOrigin, PcdCloud};
 use crate::recording::{Entry, Recording, RecordingError};
 
 /// Name of the recording in a run folder.
@@ -33,6 +34,8 @@ pub(super) fn open(file: &Path) -> Result<Dataset, ReadError> {
     let (ticks, missing) = source.ticks();
     let scenario = Scenario {
         name,
+        absences: Absences::new(&agents, &ticks, &missing),
+        roadside_units: agents.iter().filter(|id| id.as_str().starts_with('-')).cloned().collect(),
         has_radar: source.sensors.keys().any(|(_, _, stream)| *stream == Stream::Radar),
         agents,
         ticks,
@@ -107,7 +110,7 @@ impl Recorded {
         agents
     }
 
-    /// The moments of which everyone's sweep was recorded, and the sweeps that are missing at others.
+    /// The moments of which the ego's sweep was recorded, and the sweeps that are missing at any moment.
     fn ticks(&self) -> (Vec<Tick>, Vec<MissingFrame>) {
         let mut captures: Vec<u64> =
             self.sensors.keys().filter(|(_, _, stream)| *stream == Stream::Lidar).map(|(at, _, _)| *at).collect();
@@ -117,11 +120,10 @@ impl Recorded {
             let stem = capture_nanos.to_string();
             let lacks = |cav: &&CavId| !self.sensors.contains_key(&(capture_nanos, (*cav).clone(), Stream::Lidar));
             let lacking: Vec<&CavId> = self.agents.iter().filter(lacks).collect();
-            if lacking.is_empty() {
+            let frame = |cav: &&CavId| MissingFrame { agent: (*cav).clone(), stem: stem.clone() };
+            missing.extend(lacking.iter().map(frame));
+            if lacking.first() != self.agents.first().as_ref() {
                 ticks.push(Tick { stem, capture_nanos });
-            } else {
-                let frame = |cav: &CavId| MissingFrame { agent: cav.clone(), stem: stem.clone() };
-                missing.extend(lacking.into_iter().map(frame));
             }
         }
         (ticks, missing)
@@ -151,12 +153,13 @@ impl FrameSource for Recorded {
 
     fn points(&self, agent: &CavId, tick: &Tick, _: Option<&str>) -> Result<PcdCloud, ReadError> {
         let Lidar { points } = self.sensor(agent, tick, Stream::Lidar)?;
-        Ok(PcdCloud { points, labels: None, dropped: 0, first_dropped: None })
+        let intensity = Some(IntensityOrigin::stored("intensity", IntensityKind::Number));
+        Ok(PcdCloud { points, intensity, form: "recorded message", ..PcdCloud::default() })
     }
 
     fn radar(&self, agent: &CavId, tick: &Tick) -> Result<PcdCloud, ReadError> {
         let Radar { points } = self.sensor(agent, tick, Stream::Radar)?;
-        Ok(PcdCloud { points, labels: None, dropped: 0, first_dropped: None })
+        Ok(PcdCloud { points, ..PcdCloud::default() })
     }
 
     fn points_path(&self, _: &CavId, _: &Tick, _: Option<&str>) -> PathBuf {

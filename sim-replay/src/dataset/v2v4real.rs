@@ -1,21 +1,19 @@
 //! Frames of V2V4Real.
 //!
-//! The folders are OPV2V's. Different are: right-handed axes, pose matrices (pickled NumPy arrays; nested lists and
-//! six numbers are read too), objects in the frame of the agent's own LiDAR, and ids that associate objects across
-//! agents.
+//! The folders are OPV2V's. Different are: right-handed axes, pose matrices (pickled NumPy arrays or lists), objects in the
+//! frame of the agent's own LiDAR, and ids that associate objects across agents.
 
 use std::path::PathBuf;
 
-use nalgebra::{Matrix4, RowVector4};
 use protocol::{CavId, Handedness, Pose};
 
 use super::agent_folders::ScenarioFolder;
-use super::numpy_tags::{self, NumpyArray};
-use super::opv2v::{object_entries, object_id, object_pose, object_size, speed_mps};
+use super::annotations::{Annotations, speed_mps};
+use super::points::Sweeps;
+use super::written_pose::{WrittenPose, rigid};
 use super::yaml::{self, Field};
-use super::{FrameSource, ReadError, Tick, points};
-use crate::carla_pose::CarlaPose;
-use crate::frame::{Frame, Object, ObjectClass};
+use super::{FrameSource, ReadError, Tick};
+use crate::frame::Frame;
 use crate::pcd::PcdCloud;
 
 /// Objects without partner get this times the agent's id added, so that ids of two agents do not meet.
@@ -23,121 +21,84 @@ const UNMATCHED_STEP: i64 = 100;
 
 /// A scenario of V2V4Real.
 #[derive(Debug)]
-pub(super) struct V2v4Real(pub(super) ScenarioFolder);
+pub(super) struct V2v4Real {
+    pub(super) folder: ScenarioFolder,
+    pub(super) sweeps: Sweeps,
+}
 
 impl FrameSource for V2v4Real {
     fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame, ReadError> {
-        let path = self.0.yaml(agent, &tick.stem);
+        let path = self.folder.yaml(agent, &tick.stem);
         let node = yaml::read(&path)?;
-        frame_without_points(agent, tick, &Field::root(&path, &node))
+        self.frame_without_points(agent, tick, Field::root(&path, &node))
     }
 
     fn points(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> Result<PcdCloud, ReadError> {
-        points::read_pcd(&self.points_path(agent, tick, variant))
+        self.sweeps.read(agent, &self.points_path(agent, tick, variant))
     }
 
     fn annotation_path(&self, agent: &CavId, tick: &Tick) -> Option<PathBuf> {
-        Some(self.0.yaml(agent, &tick.stem))
+        Some(self.folder.yaml(agent, &tick.stem))
     }
 
     fn points_path(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> PathBuf {
-        self.0.pcd(agent, &tick.stem, variant)
+        self.folder.pcd(agent, &tick.stem, variant)
     }
 }
 
-fn frame_without_points(agent: &CavId, tick: &Tick, root: &Field<'_>) -> Result<Frame, ReadError> {
-    let world_from_lidar = pose(&root.required("lidar_pose")?)?;
-    let optional_pose = |key| root.optional(key)?.map(|field| pose(&field)).transpose();
-    Ok(Frame {
-        world_from_lidar: Some(world_from_lidar),
-        world_from_vehicle: optional_pose("true_ego_pos")?,
-        gnss_world_from_vehicle: optional_pose("predicted_ego_pos")?,
-        speed_mps: root.optional("ego_speed")?.map(|speed| number_or_scalar(&speed)).transpose()?,
-        objects: objects(agent, root, &world_from_lidar)?,
-        ..Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Right)
-    })
-}
-
-fn number_or_scalar(field: &Field<'_>) -> Result<f64, ReadError> {
-    if numpy_tags::is_python(field) { Ok(numpy_tags::scalar(field)? / 3.6) } else { speed_mps(field) }
-}
-
-/// A pose in whichever of the three forms it is written.
-fn pose(field: &Field<'_>) -> Result<Pose, ReadError> {
-    let array = if numpy_tags::is_python(field) { numpy_tags::array(field)? } else { nested_list(field)? };
-    match array.shape[..] {
-        [4, 4] => rigid(&Matrix4::from_row_slice(&array.values), field),
-        // The reference's formula for six numbers, in the right-handed axes of this dataset: nothing is mirrored.
-        [6] => {
-            let values = std::array::from_fn::<f64, 6, _>(|index| array.values[index]);
-            rigid(&CarlaPose::from(values).left_handed_matrix(), field)
-        }
-        ref shape => Err(field.error(format!("shape {shape:?}, expected a 4x4 matrix or 6 numbers"))),
-    }
-}
-
-fn nested_list(field: &Field<'_>) -> Result<NumpyArray, ReadError> {
-    let rows = field.items()?;
-    if rows.len() == 4 {
-        let rows: Vec<[f64; 4]> = rows.iter().map(Field::numbers::<4>).collect::<Result<_, _>>()?;
-        return Ok(NumpyArray { shape: vec![4, 4], values: rows.concat() });
-    }
-    if rows.len() == 6 {
-        return Ok(NumpyArray { shape: vec![6], values: field.numbers::<6>()?.to_vec() });
-    }
-    Err(field.error(format!("a list of {}, expected 4 rows of a matrix or 6 numbers", rows.len())))
-}
-
-fn rigid(matrix: &Matrix4<f64>, field: &Field<'_>) -> Result<Pose, ReadError> {
-    let mut matrix = *matrix;
-    let last = RowVector4::new(0.0, 0.0, 0.0, 1.0);
-    // Inverting and multiplying matrices leaves rounding in the last row.
-    if (matrix.row(3) - last).amax() < 1e-8 {
-        matrix.set_row(3, &last);
-    }
-    Pose::from_matrix(&matrix).map_err(|error| field.error(error.to_string()))
-}
-
-fn objects(agent: &CavId, root: &Field<'_>, world_from_lidar: &Pose) -> Result<Vec<Object>, ReadError> {
-    object_entries(root)?
-        .into_iter()
-        .map(|(key, field)| {
-            let lidar_from_object = rigid(&object_pose(&field)?.left_handed_matrix(), &field)?;
-            Ok(Object {
-                id: associated_id(agent, object_id(key, &field)?, &field)?,
-                class: class(&field)?,
-                world_from_object: (world_from_lidar.isometry() * lidar_from_object.isometry()).into(),
-                size_m: object_size(&field)?,
-                speed_mps: field.optional("speed")?.map(|speed| number_or_scalar(&speed)).transpose()?,
-            })
+impl V2v4Real {
+    fn frame_without_points(&self, agent: &CavId, tick: &Tick, root: Field<'_>) -> Result<Frame, ReadError> {
+        let world_from_lidar = lidar_pose(&root.required("lidar_pose")?)?;
+        let mut annotations = Annotations::new(root);
+        let objects = annotations.objects(
+            |id, field| self.associated_id(agent, id, field),
+            |place| {
+                let lidar_from_object = Pose::from_matrix(&place.left_handed_matrix())?;
+                let pose: Pose = (world_from_lidar.isometry() * lidar_from_object.isometry()).into();
+                pose.validate().map(|()| pose)
+            },
+        );
+        Ok(Frame {
+            world_from_lidar: Some(world_from_lidar),
+            world_from_vehicle: annotations.optional(&["true_ego_pos", "true_ego_pose"], pose),
+            gnss_world_from_vehicle: annotations.optional(&["predicted_ego_pos", "predicted_ego_pose"], pose),
+            speed_mps: annotations.optional(&["ego_speed"], speed_mps),
+            objects,
+            problems: annotations.into_problems(),
+            ..Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Right)
         })
-        .collect()
-}
+    }
 
-/// `ass_id` is the id that both agents share; -1 says that only this agent has the object.
-fn associated_id(agent: &CavId, object_id: i64, field: &Field<'_>) -> Result<i64, ReadError> {
-    match field.optional("ass_id")?.map(|id| id.integer()).transpose()? {
-        None => Ok(object_id),
-        Some(-1) => {
-            // Folder names are integers, or the scenario would not have been found.
-            let agent = agent.as_str().parse::<i64>().unwrap_or(0);
-            Ok(object_id.saturating_add(UNMATCHED_STEP.saturating_mul(agent)))
+    /// `ass_id` is the id that both agents share; -1 says that only this agent has the object.
+    fn associated_id(&self, agent: &CavId, listed_id: i64, field: &Field<'_>) -> Result<i64, ReadError> {
+        match field.optional("ass_id")?.map(|id| id.integer()).transpose()? {
+            None => Ok(listed_id),
+            Some(-1) => {
+                // Agents with names count by their place.
+                let place = || self.folder.agents.iter().position(|id| id == agent).unwrap_or(0) as i64;
+                let agent = agent.as_str().parse::<i64>().unwrap_or_else(|_| place());
+                Ok(listed_id.saturating_add(UNMATCHED_STEP.saturating_mul(agent)))
+            }
+            Some(shared) => Ok(shared),
         }
-        Some(shared) => Ok(shared),
     }
 }
 
-fn class(field: &Field<'_>) -> Result<ObjectClass, ReadError> {
-    let Some(kind) = field.optional("obj_type")? else { return Ok(ObjectClass::Car) };
-    Ok(match kind.text()? {
-        "Car" => ObjectClass::Car,
-        "Van" => ObjectClass::Van,
-        "Truck" | "ConcreteTruck" => ObjectClass::Truck,
-        "Bus" => ObjectClass::Bus,
-        "Pedestrian" => ObjectClass::Pedestrian,
-        "ScooterRider" | "BicycleRider" | "Scooter" => ObjectClass::TwoWheeler,
-        _ => ObjectClass::Other,
-    })
+fn lidar_pose(field: &Field<'_>) -> Result<Pose, ReadError> {
+    match WrittenPose::read(field)? {
+        WrittenPose::Matrix(matrix) => rigid(&matrix, field),
+        WrittenPose::SixNumbers(_) => Err(field.error(
+            "6 numbers as in OPV2V, but the scenario's first frame has a lidar_pose of 4x4 numbers as in V2V4Real",
+        )),
+    }
+}
+
+/// A matrix, or six numbers by the reference's formula in the right-handed axes of this dataset: nothing is mirrored.
+fn pose(field: &Field<'_>) -> Result<Pose, ReadError> {
+    match WrittenPose::read(field)? {
+        WrittenPose::Matrix(matrix) => rigid(&matrix, field),
+        WrittenPose::SixNumbers(place) => rigid(&place.left_handed_matrix(), field),
+    }
 }
 
 #[cfg(test)]
@@ -196,12 +157,12 @@ mod tests {
     }
 
     #[test]
-    fn nested_lists_and_six_numbers_are_poses_too() {
+    fn nested_lists_and_sixteen_numbers_are_poses_too() {
         let dir = tempfile::tempdir().unwrap();
         let object = object(1, 10.0, 4.0, "    ass_id: 1\n");
         for pose in [
             "lidar_pose: [[-1, 0, 0, 30], [0, -1, 0, 0], [0, 0, 1, 0], [0, 0, 1e-17, 1]]\n",
-            "lidar_pose: [30, 0, 0, 0, 180, 0]\n",
+            "lidar_pose: [-1, 0, 0, 30, 0, -1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]\n",
         ] {
             write(dir.path(), "0", pose, &object);
             let [x, y, z] = load(dir.path(), 0).unwrap().objects[0].world_from_object.translation_m;
@@ -212,19 +173,30 @@ mod tests {
     #[test]
     fn what_is_no_pose_is_named() {
         let dir = tempfile::tempdir().unwrap();
+        let sound = pickled_matrix(&EGO);
+        write(dir.path(), "0", &sound, "");
         let mut scaled = PARTNER;
         scaled[0] = -1.1;
         for (pose, expected) in [
             (pickled_matrix(&scaled), "000000.yaml:2: lidar_pose: pose matrix is not a rotation"),
-            (
-                "lidar_pose: [[1, 0], [0, 1]]\n".into(),
-                "lidar_pose: a list of 2, expected 4 rows of a matrix or 6 numbers",
-            ),
+            ("lidar_pose: [[1, 0], [0, 1]]\n".into(), "lidar_pose: a list of 2, expected 6 numbers or a 4x4 matrix"),
             (pickled_matrix(&EGO).replace("_reconstruct", "evil"), "is none of those that are known"),
+            ("lidar_pose: [1, 2, 3, 4, 5, 6]\n".into(), "lidar_pose: 6 numbers as in OPV2V, but the scenario's first"),
         ] {
-            write(dir.path(), "0", &pose, &object(1, 10.0, 4.0, ""));
-            let error = load(dir.path(), 0).unwrap_err().to_string();
+            write(dir.path(), "1", &pose, &object(1, 10.0, 4.0, ""));
+            let error = load(dir.path(), 1).unwrap_err().to_string();
             assert!(error.contains(expected), "{error}");
         }
+    }
+
+    #[test]
+    fn what_is_wrong_with_an_object_or_another_pose_costs_no_frame() {
+        let dir = tempfile::tempdir().unwrap();
+        let objects = object(1, 10.0, 4.0, "    ass_id: one\n") + &object(2, 1e9, 0.0, "") + &object(3, 5.0, 0.0, "");
+        write(dir.path(), "0", &(pickled_matrix(&EGO) + "predicted_ego_pos: [1, 2]\n"), &objects);
+        let frame = load(dir.path(), 0).unwrap();
+        assert_eq!((frame.objects.len(), frame.points.len()), (1, 1));
+        let fields: Vec<&str> = frame.problems.iter().filter_map(|problem| problem.field.as_deref()).collect();
+        assert_eq!(fields, ["vehicles.1.ass_id", "vehicles.2", "predicted_ego_pos"]);
     }
 }

@@ -2,17 +2,23 @@
 //!
 //! Every frame is read. What cannot be read becomes a [`Problem`] with file, line and field, and the rest goes on.
 
+mod boxes;
+mod cells;
+mod map;
 mod survey;
+mod sweeps;
 mod table;
-
-use std::path::Path;
 
 use protocol::{CavId, Handedness};
 use serde::Serialize;
 
+pub use map::{MapReport, inspect_map};
 pub use survey::inspect;
+pub use sweeps::SweepReport;
 
-use crate::dataset::{Layout, MissingFrame, ReadError};
+pub use crate::dataset::Problem;
+use crate::dataset::{Layout, MissingFrame};
+use crate::evaluation_protocol::EvaluationProtocol;
 
 /// The findings. Serializes to the JSON of `sim-replay inspect --json`, prints as its table.
 #[derive(Debug, Clone, Serialize)]
@@ -21,6 +27,8 @@ pub struct Report {
     pub path: String,
     /// Its layout, where it has one that is known.
     pub layout: Option<Layout>,
+    /// The protocol that ground truth was merged by: the one of the layout, unless another was asked for.
+    pub protocol: Option<EvaluationProtocol>,
     /// What was found in each scenario.
     pub scenarios: Vec<ScenarioReport>,
     /// Merged ground truth by tick, ego and set of agents: the ego alone, and with all in range.
@@ -38,7 +46,7 @@ pub struct ScenarioReport {
     pub layout: Layout,
     /// Which way its axes turn on disk.
     pub handedness: Handedness,
-    /// Moments that all agents have.
+    /// Moments of the ego.
     pub frames: usize,
     /// From the first moment to the last, seconds.
     pub seconds: f64,
@@ -59,9 +67,13 @@ pub struct ScenarioReport {
 pub struct AgentReport {
     /// Who.
     pub id: CavId,
+    /// Moments at which it has a sweep that can be read.
+    pub frames: usize,
     /// Points of a sweep.
     pub points: Option<Summary>,
-    /// Points left out because a number is not finite, over all sweeps.
+    /// Form and intensities of its sweeps; `None` where none has a point.
+    pub sweeps: Option<SweepReport>,
+    /// Points left out because a number is not finite, over all sweeps. Organised clouds have many.
     pub dropped_points: usize,
     /// Radar points of a frame.
     pub radar_points: Option<Summary>,
@@ -106,28 +118,4 @@ pub struct TickReport {
     pub agents: Vec<CavId>,
     /// How many objects there are.
     pub merged_boxes: usize,
-}
-
-/// Something wrong.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Serialize)]
-pub struct Problem {
-    /// The file or folder.
-    pub path: String,
-    /// The line, from 1, where the file has lines.
-    pub line: Option<u64>,
-    /// The field.
-    pub field: Option<String>,
-    /// What is wrong, with place and both values.
-    pub message: String,
-}
-
-impl From<&ReadError> for Problem {
-    fn from(error: &ReadError) -> Self {
-        Self {
-            path: error.path().unwrap_or(Path::new("")).display().to_string(),
-            line: error.line(),
-            field: error.field().map(str::to_owned),
-            message: error.to_string(),
-        }
-    }
 }

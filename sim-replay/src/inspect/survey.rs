@@ -1,25 +1,36 @@
 //! Reading everything and counting.
 
-use std::collections::BTreeSet;
+use std::collections::BTreeMap;
 use std::path::Path;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
 use protocol::{CavId, PointCloud, Pose};
 use rayon::prelude::*;
 
+use super::boxes;
+use super::cells::Cells;
+use super::sweeps::{self, SweepFindings};
 use super::{AgentReport, Problem, Report, ScenarioReport, Summary, TickReport};
-use crate::dataset::{self, Layout, Scenario};
+use crate::dataset::{self, OpenOptions, ReadError, Scenario};
+use crate::evaluation_protocol::ProtocolConfig;
 use crate::frame::{Frame, Object};
 use crate::ground_truth::{self, GroundTruthRule};
 use crate::pcd::{PcdCloud, Place};
+
+/// Largest share of points that are not finite: with more of them a sweep is lost, not full of gaps.
+const MOST_DROPPED: f64 = 0.9;
 
 /// What was found in one agent's frame.
 #[derive(Debug, Default)]
 struct FrameFindings {
     points: Option<usize>,
+    sweep: Option<SweepFindings>,
     dropped: usize,
     radar_points: Option<usize>,
     boxes: Option<usize>,
+    vehicles: usize,
+    /// Boxes of a frame whose points were read.
+    boxes_with_sweep: usize,
     boxes_without_points: usize,
     world_from_lidar: Option<Pose>,
     problems: Vec<Problem>,
@@ -32,12 +43,24 @@ struct TickFindings {
     merged: Vec<TickReport>,
 }
 
-/// Reads all of the dataset in `dir`. `progress` is told how many ticks are done and how many there are.
+/// Reads all of the data set in `dir`, its ground truth by the protocol. `progress` is told how many ticks are done and how
+/// many there are.
 #[must_use]
-pub fn inspect(dir: &Path, progress: &(dyn Fn(usize, usize) + Sync)) -> Report {
-    let mut report =
-        Report { path: dir.display().to_string(), layout: None, scenarios: vec![], ticks: vec![], problems: vec![] };
-    let dataset = match dataset::open(dir) {
+pub fn inspect(
+    dir: &Path,
+    open: &OpenOptions,
+    protocol: &ProtocolConfig,
+    progress: &(dyn Fn(usize, usize) + Sync),
+) -> Report {
+    let mut report = Report {
+        path: dir.display().to_string(),
+        layout: None,
+        protocol: None,
+        scenarios: vec![],
+        ticks: vec![],
+        problems: vec![],
+    };
+    let dataset = match dataset::open_with(dir, open) {
         Ok(dataset) => dataset,
         Err(error) => {
             report.problems.push(Problem::from(&error));
@@ -45,6 +68,14 @@ pub fn inspect(dir: &Path, progress: &(dyn Fn(usize, usize) + Sync)) -> Report {
         }
     };
     report.layout = Some(dataset.layout);
+    let protocol = match protocol.resolve(dataset.layout) {
+        Ok(protocol) => protocol,
+        Err(reason) => {
+            report.problems.push(Problem::from(&ReadError::Layout { path: dir.to_owned(), reason }));
+            return report;
+        }
+    };
+    report.protocol = Some(protocol.clone());
     report.problems.extend(dataset.problems.iter().map(Problem::from));
     let total = dataset.scenarios.iter().map(|scenario| scenario.ticks.len()).sum();
     let done = AtomicUsize::new(0);
@@ -52,32 +83,65 @@ pub fn inspect(dir: &Path, progress: &(dyn Fn(usize, usize) + Sync)) -> Report {
         let findings: Vec<TickFindings> = (0..scenario.ticks.len())
             .into_par_iter()
             .map(|tick| {
-                let findings = survey_tick(scenario, tick);
+                let findings = survey_tick(scenario, tick, &protocol.ground_truth);
                 progress(done.fetch_add(1, Ordering::Relaxed) + 1, total);
                 findings
             })
             .collect();
-        report.scenarios.push(summarize(scenario, &findings));
+        let summary = summarize(scenario, &findings);
+        report.problems.extend(box_problems(&summary, &findings));
+        report.scenarios.push(summary);
+        report.problems.extend(sweep_problems(scenario, &findings, open));
         for tick in findings {
             report.ticks.extend(tick.merged);
             report.problems.extend(tick.agents.into_iter().flat_map(|agent| agent.problems));
         }
     }
-    // A file that several frames need is wrong once.
-    report.problems = report.problems.into_iter().collect::<BTreeSet<_>>().into_iter().collect();
+    report.problems = counted(report.problems);
     report
 }
 
-fn survey_tick(scenario: &Scenario, tick: usize) -> TickFindings {
+/// Each problem once, with how often it was found: several frames may need one file, or have objects of one unknown type.
+fn counted(problems: Vec<Problem>) -> Vec<Problem> {
+    let mut counts: BTreeMap<Problem, usize> = BTreeMap::new();
+    for problem in problems {
+        *counts.entry(problem).or_default() += 1;
+    }
+    let with_count = |(problem, count): (Problem, usize)| match count {
+        1 => problem,
+        count => Problem { message: format!("{} ({count} times)", problem.message), ..problem },
+    };
+    counts.into_iter().map(with_count).collect()
+}
+
+/// Doubts about the boxes of a scenario as a whole.
+fn box_problems(scenario: &ScenarioReport, findings: &[TickFindings]) -> Vec<Problem> {
+    let frames = || findings.iter().flat_map(|tick| &tick.agents);
+    let vehicles = frames().map(|frame| frame.vehicles).sum();
+    let merged = findings.iter().flat_map(|tick| &tick.merged).map(|tick| tick.merged_boxes).sum();
+    let mut problems: Vec<Problem> =
+        boxes::without_ground_truth(&scenario.name, vehicles, merged).into_iter().collect();
+    for (index, agent) in scenario.agents.iter().enumerate() {
+        let boxes = findings.iter().map(|tick| tick.agents[index].boxes_with_sweep).sum();
+        problems.extend(boxes::mostly_empty(&scenario.name, agent, boxes));
+    }
+    problems
+}
+
+fn survey_tick(scenario: &Scenario, tick: usize, rule: &GroundTruthRule) -> TickFindings {
     let mut agents = Vec::with_capacity(scenario.agents.len());
     let mut frames = Vec::with_capacity(scenario.agents.len());
     for agent in 0..scenario.agents.len() {
+        if !scenario.is_present(agent, tick) {
+            agents.push(FrameFindings::default());
+            continue;
+        }
         let (findings, frame) = survey_frame(scenario, agent, tick);
         agents.push(findings);
         frames.extend(frame);
     }
     let frames: Vec<&Frame> = frames.iter().collect();
-    let merged = merged_counts(scenario, tick, &frames);
+    let merged = merged_counts(scenario, tick, &frames, rule);
     TickFindings { agents, merged }
 }
 
@@ -91,20 +155,21 @@ fn survey_frame(scenario: &Scenario, agent: usize, tick: usize) -> (FrameFinding
         survey_points(scenario, agent, tick, Some(variant), &mut findings);
     }
     if let Some(frame) = &frame {
+        findings.problems.extend(frame.problems.iter().cloned());
         findings.boxes = Some(frame.objects.len());
+        findings.vehicles = frame.objects.iter().filter(|object| object.class.is_vehicle()).count();
         findings.world_from_lidar = frame.world_from_lidar;
         if let Some(points) = &plain {
-            let empty = |object: &&Object| !holds_point(frame.world_from_lidar.as_ref(), object, points);
+            let cells = Cells::new(points);
+            let empty = |object: &&Object| !holds_point(frame.world_from_lidar.as_ref(), object, &cells);
+            findings.boxes_with_sweep = frame.objects.len();
             findings.boxes_without_points = frame.objects.iter().filter(empty).count();
         }
     }
     if scenario.has_radar {
-        let with_radar = dataset::LoadOptions { points: false, radar: true, ..Default::default() };
-        match scenario.load(agent, tick, &with_radar) {
-            Ok(frame) => findings.radar_points = frame.radar.map(|cloud| cloud.len()),
-            // The frame itself has been complained about already.
-            Err(error) if frame.is_some() => findings.problems.push(Problem::from(&error)),
-            Err(_) => {}
+        match scenario.load_radar(agent, tick) {
+            Ok(cloud) => findings.radar_points = Some(cloud.points.len()),
+            Err(error) => findings.problems.push(Problem::from(&error)),
         }
     }
     (findings, frame)
@@ -124,13 +189,15 @@ fn survey_points(
             return None;
         }
     };
-    if cloud.dropped > 0 {
+    // Organised clouds have a point for every ray, also where it met nothing.
+    if cloud.dropped as f64 > MOST_DROPPED * (cloud.dropped + cloud.points.len()) as f64 {
         let path = scenario.points_path(agent, tick, variant).unwrap_or_default();
         findings.problems.push(not_finite(&path, &cloud));
     }
     if variant.is_none() {
         findings.points = Some(cloud.points.len());
         findings.dropped = cloud.dropped;
+        findings.sweep = Some(SweepFindings::of(&cloud));
     }
     Some(cloud.points)
 }
@@ -147,22 +214,30 @@ fn not_finite(path: &Path, cloud: &PcdCloud) -> Problem {
     Problem { path, line, field: Some("x y z intensity".into()), message }
 }
 
-fn holds_point(world_from_lidar: Option<&Pose>, object: &Object, points: &PointCloud) -> bool {
+fn holds_point(world_from_lidar: Option<&Pose>, object: &Object, cells: &Cells) -> bool {
     let Some(world_from_lidar) = world_from_lidar else { return false };
-    let object_from_lidar = object.world_from_object.isometry().inv_mul(&world_from_lidar.isometry()).cast::<f32>();
-    let half = object.size_m.map(|size| (size / 2.0) as f32);
-    points.xyzi.iter().any(|&[x, y, z, _]| {
-        let local = object_from_lidar * nalgebra::Point3::new(x, y, z);
-        (0..3).all(|axis| local[axis].abs() <= half[axis])
-    })
+    let object_from_lidar = object.world_from_object.isometry().inv_mul(&world_from_lidar.isometry());
+    cells.holds_point(&object_from_lidar.cast::<f32>(), object.size_m.map(|size| (size / 2.0) as f32))
+}
+
+/// What is wrong with the sweeps of each agent as a whole.
+fn sweep_problems(scenario: &Scenario, findings: &[TickFindings], options: &OpenOptions) -> Vec<Problem> {
+    let of_agent = |agent: usize| {
+        let sweeps = sweeps_of(findings, agent);
+        let first = findings.iter().position(|tick| tick.agents[agent].sweep.is_some()).unwrap_or(0);
+        let path = scenario.points_path(agent, first, None).unwrap_or_default();
+        let folder = path.parent().unwrap_or(&path);
+        sweeps::problems(folder, &scenario.agents[agent], &sweeps, options.intensity_scale)
+    };
+    (0..scenario.agents.len()).flat_map(of_agent).collect()
+}
+
+fn sweeps_of(findings: &[TickFindings], agent: usize) -> Vec<&SweepFindings> {
+    findings.iter().filter_map(|tick| tick.agents[agent].sweep.as_ref()).collect()
 }
 
 /// One entry for every ego alone, and one with all in range of it, where there is anyone.
-fn merged_counts(scenario: &Scenario, tick: usize, frames: &[&Frame]) -> Vec<TickReport> {
-    let rule = match scenario.layout {
-        Layout::V2v4Real => GroundTruthRule::V2V4REAL,
-        _ => GroundTruthRule::OPV2V,
-    };
+fn merged_counts(scenario: &Scenario, tick: usize, frames: &[&Frame], rule: &GroundTruthRule) -> Vec<TickReport> {
     let report = |ego: &CavId, agents: Vec<CavId>, merged_boxes: usize| TickReport {
         scenario: scenario.name.clone(),
         tick: scenario.ticks[tick].stem.clone(),
@@ -172,12 +247,12 @@ fn merged_counts(scenario: &Scenario, tick: usize, frames: &[&Frame]) -> Vec<Tic
     };
     let mut merged = Vec::new();
     for (index, ego) in frames.iter().enumerate() {
-        let alone = ground_truth::merge(&[ego], 0, &rule).len();
+        let alone = ground_truth::merge(&[ego], 0, rule).len();
         merged.push(report(&ego.cav, vec![ego.cav.clone()], alone));
         let contributors = ground_truth::contributors(frames, index, rule.comm_range_m);
         if contributors.len() > 1 {
             let agents = contributors.iter().map(|&other| frames[other].cav.clone()).collect();
-            merged.push(report(&ego.cav, agents, ground_truth::merge(frames, index, &rule).len()));
+            merged.push(report(&ego.cav, agents, ground_truth::merge(frames, index, rule).len()));
         }
     }
     merged
@@ -220,8 +295,10 @@ fn summarize_agent(id: &CavId, frames: &[&FrameFindings]) -> AgentReport {
         points: counts(|frame| frame.points),
         dropped_points: frames.iter().map(|frame| frame.dropped).sum(),
         radar_points: counts(|frame| frame.radar_points),
+        sweeps: sweeps::summarize(&frames.iter().filter_map(|frame| frame.sweep.as_ref()).collect::<Vec<_>>()),
         boxes: counts(|frame| frame.boxes),
         boxes_without_points: frames.iter().map(|frame| frame.boxes_without_points).sum(),
+        frames: frames.iter().filter(|frame| frame.points.is_some()).count(),
         // An empty sum is -0.
         distance_m: (!positions.is_empty()).then(|| positions.windows(2).map(step).fold(0.0, |sum, step| sum + step)),
     }
@@ -250,7 +327,7 @@ mod tests {
     }
 
     fn survey(root: &Path) -> (Report, Vec<String>) {
-        let report = inspect(root, &|_, _| {});
+        let report = inspect(root, &OpenOptions::default(), &ProtocolConfig::default(), &|_, _| {});
         let root = root.to_string_lossy();
         let messages = report.problems.iter().map(|problem| problem.message.replace(&*root, "")).collect();
         (report, messages)
@@ -259,7 +336,7 @@ mod tests {
     #[test]
     fn sound_frames_are_counted() {
         let dir = tempfile::tempdir().unwrap();
-        for (stem, points) in [("000010", vec![[10.0, 0.0, -1.3, 0.5]]), ("000012", vec![[1.0, 0.0, 0.0, 0.5]; 3])] {
+        for (stem, points) in [("000010", vec![[10.0, 0.0, -1.3, 0.5]]), ("000012", vec![[1.0, 0.0, 0.0, 0.25]; 3])] {
             write(dir.path(), &format!("1/{stem}.yaml"), YAML.as_bytes());
             write(dir.path(), &format!("1/{stem}.pcd"), &sweep(&points));
         }
@@ -278,12 +355,14 @@ mod tests {
     fn all_that_is_wrong_is_said_and_the_rest_is_counted() {
         let dir = tempfile::tempdir().unwrap();
         let root = dir.path();
-        let whole = sweep(&[[10.0, 0.0, -1.3, 0.5], [1.0, 2.0, 3.0, 0.5]]);
-        // A cut sweep, a NaN, a wrong pose, a missing YAML and a sound frame.
+        let whole = sweep(&[[10.0, 0.0, -1.3, 0.25], [1.0, 2.0, 3.0, 0.5]]);
+        // A cut sweep, a NaN among others (no problem) and alone, a wrong pose, a missing YAML and a sound frame.
         write(root, "1/000010.yaml", YAML.as_bytes());
         write(root, "1/000010.pcd", &whole[..whole.len() - 3]);
         write(root, "1/000012.yaml", YAML.as_bytes());
         write(root, "1/000012.pcd", &sweep(&[[1.0, 2.0, f32::NAN, 0.5], [1.0, 2.0, 3.0, 0.5]]));
+        write(root, "1/000013.yaml", YAML.as_bytes());
+        write(root, "1/000013.pcd", &sweep(&[[f32::NAN; 4]; 2]));
         write(root, "1/000014.yaml", YAML.replace("[0, 0, 2, 0, 0, 0]", "[0, 0, 2]").as_bytes());
         write(root, "1/000014.pcd", &whole);
         write(root, "1/000016.pcd", &whole);
@@ -294,15 +373,112 @@ mod tests {
             messages,
             [
                 "/1/000010.pcd:13: intensity: \"5e\" is no number: the file is cut off here, after 1 of 2 POINTS",
-                "/1/000012.pcd: 1 of 2 points are not finite and are left out, the first in line 12",
-                "/1/000014.yaml:1: lidar_pose: a list of 3, expected 6 numbers",
+                "/1/000013.pcd: 2 of 2 points are not finite and are left out, the first in line 12",
+                "/1/000014.yaml:1: lidar_pose: a list of 3, expected 6 numbers or a 4x4 matrix",
                 "/1/000016.yaml: does not exist beside 000016.pcd: the frame is left out",
             ]
         );
         assert_eq!((report.problems[2].line, report.problems[2].field.as_deref()), (Some(1), Some("lidar_pose")));
         let agent = &report.scenarios[0].agents[0];
-        assert_eq!((agent.points, agent.dropped_points), (Summary::of(&[1, 2, 2]), 1));
-        assert_eq!(report.ticks.len(), 3, "annotations of sound YAML count even where the sweep is broken");
+        assert_eq!((agent.points, agent.dropped_points), (Summary::of(&[1, 0, 2, 2]), 3));
+        assert_eq!(report.ticks.len(), 4, "annotations of sound YAML count even where the sweep is broken");
+    }
+
+    /// Messages and table of an agent whose sweeps have these intensities.
+    fn of_intensities(sweeps: &[&[f32]]) -> (Vec<String>, String) {
+        let dir = tempfile::tempdir().unwrap();
+        for (stem, intensities) in sweeps.iter().enumerate() {
+            let points: Vec<[f32; 4]> = intensities.iter().map(|&intensity| [10.0, 0.0, -1.3, intensity]).collect();
+            write(dir.path(), &format!("1/{stem:06}.yaml"), YAML.as_bytes());
+            write(dir.path(), &format!("1/{stem:06}.pcd"), &sweep(&points));
+        }
+        let (report, messages) = survey(dir.path());
+        (messages, report.to_string())
+    }
+
+    #[test]
+    fn intensities_are_told_and_what_is_wrong_with_them_is_a_problem() {
+        let (messages, table) = of_intensities(&[&[0.0, 0.25, 1.0], &[0.5]]);
+        assert!(messages.is_empty(), "{messages:?}");
+        let line = "  sweeps of 1: PCD, ascii; intensity from intensity, divided by 1: 0.000 to 1.000, median 0.500";
+        assert!(table.contains(line), "{table}");
+        let (messages, table) = of_intensities(&[&[0.0, 51.0, 255.0]]);
+        assert!(messages.is_empty() && table.contains("divided by 255: 0.000 to 1.000, median 0.200"), "{table}");
+        let message = |sweeps: &[&[f32]]| of_intensities(sweeps).0.concat();
+        assert_eq!(
+            message(&[&[0.5], &[0.5, 0.5]]),
+            "/1: sweeps of agent 1: all 3 intensities are 0.5 (field intensity divided by 1), expected a sensor's, which \
+             differ"
+        );
+        assert_eq!(
+            message(&[&[0.5], &[1.0], &[0.25], &[200.0, 0.0]]),
+            "/1: sweeps of agent 1: 1 of 5 intensities are above 1, up to 200 (field intensity divided by 1): see \
+             --intensity-scale"
+        );
+        assert!(message(&[&[-0.5, 0.5]]).contains("1 of 2 intensities are below 0, down to -0.5"));
+        assert_eq!(
+            message(&[&[1.0, 700.0]]),
+            "/1: sweeps of agent 1: intensities reach 700, neither 0 to 1 nor 0 to 255 (field intensity divided by \
+             1023): state the scale by --intensity-scale"
+        );
+    }
+
+    #[test]
+    fn a_missing_intensity_and_implausible_points_are_problems() {
+        let dir = tempfile::tempdir().unwrap();
+        write(dir.path(), "1/000010.yaml", YAML.as_bytes());
+        let head = "FIELDS x y z ring\nSIZE 4 4 4 4\nTYPE F F F F\nWIDTH 2\nDATA ascii\n";
+        write(dir.path(), "1/000010.pcd", format!("{head}1 2 3 0\n4000 5 6 1\n").as_bytes());
+        let (_, messages) = survey(dir.path());
+        assert_eq!(
+            messages,
+            [
+                "/1: sweeps of agent 1: no field of intensity (intensity, reflectivity, remission, rgb, ...): it is 0 for \
+                 all points",
+                "/1: sweeps of agent 1: 50.0 % of the points lie within 300 m, usual are 95.0 % or more",
+            ]
+        );
+    }
+
+    #[test]
+    fn boxes_that_cannot_be_in_the_right_frame_are_a_problem() {
+        let dir = tempfile::tempdir().unwrap();
+        let car = |id: usize| format!("  {id}: {{location: [900, {id}, 0], angle: [0, 0, 0], extent: [2, 1, 0.7]}}\n");
+        let cars: String = (0..20).map(car).collect();
+        let yaml = format!("lidar_pose: [0, 0, 2, 0, 0, 0]\nvehicles:\n{cars}");
+        write(dir.path(), "scene/1/000010.yaml", yaml.as_bytes());
+        write(dir.path(), "scene/1/000010.pcd", &sweep(&[[10.0, 0.0, -1.3, 0.5], [1.0, 0.0, 0.0, 0.4]]));
+        let (_, messages) = survey(dir.path());
+        assert_eq!(
+            messages,
+            [
+                "scene: agent 1: 20 of 20 boxes (100 %) hold none of its points: frames (axes, order of the pose's \
+                 numbers) or units of the boxes may be wrong",
+                "scene: ground truth 0 for every ego and tick, though agents list 20 vehicles: frames (axes, order of \
+                 the pose's numbers) or units of the boxes may be wrong",
+            ]
+        );
+    }
+
+    #[test]
+    fn parts_that_were_left_out_are_listed_and_counted() {
+        let dir = tempfile::tempdir().unwrap();
+        let yaml = format!("{YAML}  8: {{location: [1, 2, 3]}}\n")
+            + "  9: {type: Ufo, location: [5, 0, 0], angle: [0, 0, 0], extent: [2, 1, 1]}\n";
+        for stem in ["000010", "000012"] {
+            write(dir.path(), &format!("1/{stem}.yaml"), yaml.as_bytes());
+            write(dir.path(), &format!("1/{stem}.pcd"), &sweep(&[[10.0, 0.0, -1.3, 0.5], [1.0, 0.0, 0.0, 0.4]]));
+        }
+        let (report, messages) = survey(dir.path());
+        assert_eq!(
+            messages,
+            [
+                ": type: the text \"Ufo\" is no known type of object: it counts as other, not as a vehicle (2 times)",
+                "/1/000010.yaml:4: vehicles.8.angle: missing: the object is left out",
+                "/1/000012.yaml:4: vehicles.8.angle: missing: the object is left out",
+            ]
+        );
+        assert_eq!(report.scenarios[0].agents[0].boxes, Summary::of(&[2, 2]));
     }
 
     #[test]

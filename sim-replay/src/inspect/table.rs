@@ -13,7 +13,7 @@ const MAX_PROBLEMS: usize = 50;
 
 impl fmt::Display for Report {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        let layout = self.layout.map_or("no known layout", layout_name);
+        let layout = self.layout.map_or("no known layout", Layout::name);
         let frames: usize = self.scenarios.iter().map(|scenario| scenario.frames).sum();
         writeln!(
             f,
@@ -22,6 +22,9 @@ impl fmt::Display for Report {
             count(self.scenarios.len(), "scenario"),
             count(frames, "frame")
         )?;
+        if let Some(protocol) = &self.protocol {
+            writeln!(f, "{protocol}")?;
+        }
         for scenario in &self.scenarios {
             self.write_scenario(f, scenario)?;
         }
@@ -56,18 +59,15 @@ impl Report {
         for agent in &scenario.agents {
             write_agent(f, agent)?;
         }
+        for agent in &scenario.agents {
+            if let Some(sweeps) = &agent.sweeps {
+                writeln!(f, "  sweeps of {}: {sweeps}", agent.id)?;
+            }
+        }
         if !scenario.lidar_variants.is_empty() {
             writeln!(f, "  LiDAR variants: {}", scenario.lidar_variants.join(", "))?;
         }
-        if !scenario.missing.is_empty() {
-            let first = &scenario.missing[0];
-            let missing = count(scenario.missing.len(), "frame");
-            writeln!(
-                f,
-                "  {missing} left out because an agent lacks it; first: {} of agent {}",
-                first.stem, first.agent
-            )?;
-        }
+        write_missing(f, scenario)?;
         self.write_merged(f, scenario)
     }
 
@@ -88,6 +88,18 @@ impl Report {
         }
         Ok(())
     }
+}
+
+/// A line for every agent that lacks frames which others have; at those that the ego lacks there is no tick.
+fn write_missing(f: &mut fmt::Formatter<'_>, scenario: &ScenarioReport) -> fmt::Result {
+    for (index, AgentReport { id, .. }) in scenario.agents.iter().enumerate() {
+        let lacking: Vec<_> = scenario.missing.iter().filter(|frame| frame.agent == *id).collect();
+        let (Some(first), Some(last)) = (lacking.first(), lacking.last()) else { continue };
+        let frames = count(lacking.len(), "frame");
+        let consequence = if index == 0 { "the frames of others are not used there" } else { "absent there" };
+        writeln!(f, "  agent {id} lacks {frames}, from {} to {}: {consequence}", first.stem, last.stem)?;
+    }
+    Ok(())
 }
 
 fn write_agent(f: &mut fmt::Formatter<'_>, agent: &AgentReport) -> fmt::Result {
@@ -115,16 +127,4 @@ fn shown(summary: Option<Summary>) -> String {
 
 fn count(number: usize, noun: &str) -> String {
     format!("{number} {noun}{}", if number == 1 { "" } else { "s" })
-}
-
-fn layout_name(layout: Layout) -> &'static str {
-    match layout {
-        Layout::Opv2v => "OPV2V layout",
-        Layout::V2v4Real => "V2V4Real layout",
-        Layout::Nclt => "NCLT localization sequences",
-        Layout::Oxford => "Oxford localization sequences",
-        Layout::KittiOdometry => "KITTI odometry",
-        Layout::KittiObject => "KITTI object",
-        Layout::Recording => "recording of a live run",
-    }
 }

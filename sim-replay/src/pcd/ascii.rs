@@ -1,9 +1,10 @@
 //! Points as lines of decimal numbers.
 
-use super::header::{Header, IntensitySource, Kind};
-use super::{Collector, PcdCloud, PcdError, Place, unpack_rgb};
+use super::header::{Field, Header, IntensitySource, Kind};
+use super::number::{is_separator, ordinary, unusual};
+use super::{PcdCloud, PcdError, Place, unpack_rgb};
 
-/// What to do with a column of a line.
+/// What to do with the numbers of a field.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 enum Column {
     /// Goes to this component of the point.
@@ -16,108 +17,195 @@ enum Column {
 }
 
 pub(super) fn decode(header: &Header, body: &[u8]) -> Result<PcdCloud, PcdError> {
-    let columns = columns(header);
     // A number and its separator are two bytes at least: the header cannot make us reserve more than the file's size.
-    let possible = body.len().div_ceil(2 * columns.len());
-    let labelled = matches!(header.intensity, IntensitySource::Red(_));
-    let mut collector = Collector::with_capacity(header.points.min(possible), labelled);
-    let mut read = 0;
-    for (line, text) in (header.lines + 1..).zip(body.split_inclusive(|&byte| byte == b'\n')) {
-        let mut tokens = text.split(u8::is_ascii_whitespace).filter(|token| !token.is_empty()).peekable();
-        if tokens.peek().is_none() {
-            continue;
+    let possible = body.len() / (2 * header.columns()) + 1;
+    let is_labelled = matches!(header.intensity, IntensitySource::Red(_));
+    let mut points = Vec::with_capacity(header.points.min(possible));
+    let mut labels = Vec::with_capacity(if is_labelled { points.capacity() } else { 0 });
+    let mut first_dropped = None;
+    let mut lines = Lines::new(header, body);
+    while let Some((point, label)) = lines.next_point().map_err(|error| lines.cut_off(error, points.len()))? {
+        if points.len() == header.points {
+            let reason = format!("{} stated, but here is another point", header.points);
+            return Err(PcdError::at(lines.line, "POINTS", reason));
         }
-        if read == header.points {
-            return Err(PcdError::at(line, "POINTS", format!("{} stated, but here is another point", header.points)));
+        if first_dropped.is_none() && !point.iter().all(|value| value.is_finite()) {
+            first_dropped = Some(Place::Line(lines.line));
         }
-        let is_complete = text.ends_with(b"\n");
-        let (point, label) = parse_point(header, &columns, tokens, line)
-            .map_err(|error| if is_complete { error } else { cut_off(error, read, header.points) })?;
-        collector.push(point, labelled.then_some(label), Place::Line(line));
-        read += 1;
+        points.push(point);
+        labels.extend(is_labelled.then_some(label));
     }
-    if read != header.points {
-        return Err(PcdError::of("POINTS", format!("{} stated, {read} found: the file is cut off", header.points)));
+    if points.len() != header.points {
+        let reason = format!("{} stated, {} found: the file is cut off", header.points, points.len());
+        return Err(PcdError::of("POINTS", reason));
     }
-    Ok(collector.finish())
+    Ok(PcdCloud { first_dropped, ..PcdCloud::of_finite(points, labels) })
 }
 
-/// A last line that is wrong and does not end is no typing mistake.
-fn cut_off(error: PcdError, read: usize, stated: usize) -> PcdError {
-    let reason = format!("{}: the file is cut off here, after {read} of {stated} POINTS", error.reason);
-    PcdError { reason, ..error }
+/// The lines that are left to read.
+struct Lines<'a> {
+    header: &'a Header,
+    columns: Vec<Column>,
+    rest: &'a [u8],
+    /// From the first value of the line on that was begun last.
+    begun: &'a [u8],
+    /// The line of the point that was read last, from 1.
+    line: u64,
+    colours: Colours,
+}
+
+impl<'a> Lines<'a> {
+    fn new(header: &'a Header, body: &'a [u8]) -> Self {
+        let columns = columns(header);
+        Self { header, columns, rest: body, begun: body, line: header.lines + 1, colours: Colours::default() }
+    }
+
+    /// The point of the next line that is not blank, and its label.
+    fn next_point(&mut self) -> Result<Option<([f32; 4], u8)>, PcdError> {
+        while self.is_at_end_of_line() {
+            match self.rest.split_first() {
+                None => return Ok(None),
+                Some((_, rest)) => (self.rest, self.line) = (rest, self.line + 1),
+            }
+        }
+        self.begun = self.rest;
+        let (mut point, mut label) = ([0.0; 4], 0);
+        for (index, field) in self.header.fields.iter().enumerate() {
+            for _ in 0..field.count {
+                if self.is_at_end_of_line() {
+                    return Err(self.wrong_count());
+                }
+                match self.columns[index] {
+                    Column::Ignored => drop(self.token()),
+                    Column::Component(component) => point[component] = self.float(index)?,
+                    colour => (point[3], label) = self.colour(colour, index)?,
+                }
+            }
+        }
+        if !self.is_at_end_of_line() {
+            return Err(self.wrong_count());
+        }
+        Ok(Some((point, label)))
+    }
+
+    /// Skips blanks; whether the line, or the text, ends behind them.
+    fn is_at_end_of_line(&mut self) -> bool {
+        let is_blank = |&byte: &u8| byte != b'\n' && is_separator(byte);
+        while let Some((_, rest)) = self.rest.split_first().filter(|(byte, _)| is_blank(byte)) {
+            self.rest = rest;
+        }
+        matches!(self.rest.first(), None | Some(b'\n'))
+    }
+
+    fn token(&mut self) -> &'a [u8] {
+        let end = self.rest.iter().position(|&byte| is_separator(byte)).unwrap_or(self.rest.len());
+        let (token, rest) = self.rest.split_at(end);
+        self.rest = rest;
+        token
+    }
+
+    fn float(&mut self, field: usize) -> Result<f32, PcdError> {
+        if let Some((number, len)) = ordinary(self.rest) {
+            self.rest = &self.rest[len..];
+            return Ok(number);
+        }
+        let token = self.token();
+        unusual(token).ok_or_else(|| self.no_number(field, token))
+    }
+
+    /// Red and green of a packed colour.
+    fn colour(&mut self, column: Column, field: usize) -> Result<(f32, u8), PcdError> {
+        let token = self.token();
+        if let Some(colour) = self.colours.find(token) {
+            return Ok(colour);
+        }
+        let colour = match column {
+            Column::FloatColour => unusual(token).map(|value| {
+                let (red, green) = unpack_rgb(value.to_bits());
+                // The bits of a printed NaN are lost, and the intensity with them.
+                (if value.is_nan() { f32::NAN } else { red }, green)
+            }),
+            // `TYPE I` prints colours with alpha as negative numbers; the low 32 bits are what counts.
+            _ => std::str::from_utf8(token)
+                .ok()
+                .and_then(|text| text.parse().ok())
+                .map(|value: i64| unpack_rgb(value as u32)),
+        };
+        let colour = colour.ok_or_else(|| self.no_number(field, token))?;
+        self.colours.keep(token, colour);
+        Ok(colour)
+    }
+
+    fn no_number(&self, field: usize, token: &[u8]) -> PcdError {
+        let token: String = String::from_utf8_lossy(token).chars().take(40).collect();
+        PcdError::at(self.line, &self.header.fields[field].name, format!("{token:?} is no number"))
+    }
+
+    /// The line has fewer or more values than the header states. They are counted from its start.
+    fn wrong_count(&self) -> PcdError {
+        let line = self.begun.split(|&byte| byte == b'\n').next().unwrap_or_default();
+        let found = line.split(|&byte| is_separator(byte)).filter(|token| !token.is_empty()).count();
+        let expected = self.header.columns();
+        let mut end = 0;
+        let field = self.header.fields.iter().find(|field| {
+            end += field.count;
+            found.min(expected.saturating_sub(1)) < end
+        });
+        let name = field.map_or("", |field| &field.name);
+        PcdError::at(self.line, name, format!("{found} values in the line, expected {expected}"))
+    }
+
+    /// A last line that is wrong and does not end is no typing mistake.
+    fn cut_off(&self, error: PcdError, read: usize) -> PcdError {
+        if self.begun.contains(&b'\n') {
+            return error;
+        }
+        let reason =
+            format!("{}: the file is cut off here, after {read} of {} POINTS", error.reason, self.header.points);
+        PcdError { reason, ..error }
+    }
 }
 
 fn columns(header: &Header) -> Vec<Column> {
-    let mut columns = Vec::with_capacity(header.columns());
-    for (index, field) in header.fields.iter().enumerate() {
-        let column = match header.intensity {
-            IntensitySource::Value(intensity) if intensity == index => Column::Component(3),
-            IntensitySource::Red(colour) if colour == index && field.kind == Kind::Float => Column::FloatColour,
-            IntensitySource::Red(colour) if colour == index => Column::IntegerColour,
-            _ => header.xyz.iter().position(|&xyz| xyz == index).map_or(Column::Ignored, Column::Component),
-        };
-        columns.extend(std::iter::repeat_n(column, field.count));
-    }
-    columns
+    let column = |(index, field): (usize, &Field)| match header.intensity {
+        IntensitySource::Value(intensity) if intensity == index => Column::Component(3),
+        IntensitySource::Red(colour) if colour == index && field.kind == Kind::Float => Column::FloatColour,
+        IntensitySource::Red(colour) if colour == index => Column::IntegerColour,
+        _ => header.xyz.iter().position(|&xyz| xyz == index).map_or(Column::Ignored, Column::Component),
+    };
+    header.fields.iter().enumerate().map(column).collect()
 }
 
-fn parse_point<'a>(
-    header: &Header,
-    columns: &[Column],
-    mut tokens: impl Iterator<Item = &'a [u8]>,
-    line: u64,
-) -> Result<([f32; 4], u8), PcdError> {
-    let mut point = [0.0; 4];
-    let mut label = 0;
-    for (index, column) in columns.iter().enumerate() {
-        let Some(token) = tokens.next() else {
-            return Err(wrong_count(header, line, index, columns.len()));
-        };
-        match column {
-            Column::Ignored => {}
-            Column::Component(component) => point[*component] = number(header, index, token, line)?,
-            Column::FloatColour => {
-                let value: f32 = number(header, index, token, line)?;
-                (point[3], label) = unpack_rgb(value.to_bits());
-                if value.is_nan() {
-                    // The bits of a printed NaN are lost, and the intensity with them.
-                    point[3] = f32::NAN;
-                }
-            }
-            Column::IntegerColour => {
-                let value: i64 = number(header, index, token, line)?;
-                // `TYPE I` prints colours with alpha as negative numbers; the low 32 bits are what counts.
-                (point[3], label) = unpack_rgb(value as u32);
-            }
+/// Colours that were read before, by the bytes of their tokens: a sweep has few, and they take long to parse.
+struct Colours(Vec<(u128, (f32, u8))>);
+
+impl Default for Colours {
+    fn default() -> Self {
+        // No token is without a byte.
+        Self(vec![(0, (0.0, 0)); 256])
+    }
+}
+
+impl Colours {
+    fn find(&self, token: &[u8]) -> Option<(f32, u8)> {
+        let (key, slot) = Self::place(token)?;
+        let (kept, colour) = self.0[slot];
+        (kept == key).then_some(colour)
+    }
+
+    fn keep(&mut self, token: &[u8], colour: (f32, u8)) {
+        if let Some((key, slot)) = Self::place(token) {
+            self.0[slot] = (key, colour);
         }
     }
-    match tokens.count() {
-        0 => Ok((point, label)),
-        more => Err(wrong_count(header, line, columns.len() + more, columns.len())),
+
+    fn place(token: &[u8]) -> Option<(u128, usize)> {
+        let mut bytes = [0; 16];
+        bytes.get_mut(..token.len())?.copy_from_slice(token);
+        let key = u128::from_le_bytes(bytes);
+        let mixed = ((key >> 64) as u64 ^ key as u64).wrapping_mul(0x9e37_79b9_7f4a_7c15);
+        Some((key, (mixed >> 56) as usize))
     }
-}
-
-fn number<T: std::str::FromStr>(header: &Header, column: usize, token: &[u8], line: u64) -> Result<T, PcdError> {
-    let number = std::str::from_utf8(token).ok().and_then(|text| text.parse().ok());
-    number.ok_or_else(|| {
-        let token: String = String::from_utf8_lossy(token).chars().take(40).collect();
-        PcdError::at(line, column_name(header, column), format!("{token:?} is no number"))
-    })
-}
-
-fn wrong_count(header: &Header, line: u64, found: usize, expected: usize) -> PcdError {
-    let field = column_name(header, found.min(expected.saturating_sub(1)));
-    PcdError::at(line, field, format!("{found} values in the line, expected {expected}"))
-}
-
-fn column_name(header: &Header, column: usize) -> &str {
-    let mut end = 0;
-    let field = header.fields.iter().find(|field| {
-        end += field.count;
-        column < end
-    });
-    field.map_or("", |field| &field.name)
 }
 
 #[cfg(test)]

@@ -1,7 +1,10 @@
 //! Points as little-endian numbers, plain or packed.
+//!
+//! Behind the points there may be more: PCL's writers stretch files to whole pages. So the rule for lengths is "at least",
+//! but for the unpacked one, by which fields are found.
 
 use super::header::{Field, Header, IntensitySource, Kind};
-use super::{Collector, PcdCloud, PcdError, Place, lzf, unpack_rgb};
+use super::{PcdCloud, PcdError, lzf, unpack_rgb};
 
 /// Where a field's numbers lie: that of point `i` at `first + i * step`.
 #[derive(Debug, Clone, Copy)]
@@ -14,8 +17,14 @@ struct Column {
 
 /// Points one after another.
 pub(super) fn decode(header: &Header, body: &[u8]) -> Result<PcdCloud, PcdError> {
-    check_len("POINTS", body.len(), header)?;
-    let stride = header.stride();
+    let (points, stride) = (header.points, header.stride());
+    if points.checked_mul(stride).is_none_or(|expected| body.len() < expected) {
+        let reason = format!(
+            "{points} points of {stride} bytes stated, but only {} bytes follow the header: the file is cut off",
+            body.len()
+        );
+        return Err(PcdError::of("POINTS", reason));
+    }
     let column = |index: usize| {
         let first = header.fields[..index].iter().map(|field| field.size * field.count).sum();
         column_of(&header.fields[index], first, stride)
@@ -31,16 +40,23 @@ pub(super) fn decode_compressed(header: &Header, body: &[u8]) -> Result<PcdCloud
     let [a, b, c, d, e, f, g, h] = *lengths;
     let packed_len = u32::from_le_bytes([a, b, c, d]) as usize;
     let unpacked_len = u32::from_le_bytes([e, f, g, h]) as usize;
-    if packed.len() != packed_len {
-        let reason = format!("{packed_len} packed bytes stated, {} found: the file is cut off", packed.len());
+    let Some(packed) = packed.get(..packed_len) else {
+        let reason = format!("{packed_len} packed bytes stated, but only {} follow: the file is cut off", packed.len());
+        return Err(PcdError::of("DATA", reason));
+    };
+    let (points, stride) = (header.points, header.stride());
+    let expected = points.checked_mul(stride);
+    if expected != Some(unpacked_len) {
+        let way = if expected.is_none_or(|expected| unpacked_len < expected) { "fewer" } else { "more" };
+        let reason =
+            format!("{points} points of {stride} bytes stated, but unpacked they are {unpacked_len} bytes: {way}");
         return Err(PcdError::of("DATA", reason));
     }
-    check_len("DATA", unpacked_len, header)?;
     let unpacked = lzf::decompress(packed, unpacked_len).map_err(|error| PcdError::of("DATA", error.to_string()))?;
     let column = |index: usize| {
         let field = &header.fields[index];
         let first: usize = header.fields[..index].iter().map(|field| field.size * field.count).sum();
-        column_of(field, first * header.points, field.size * field.count)
+        column_of(field, first * points, field.size * field.count)
     };
     Ok(gather(header, &unpacked, column))
 }
@@ -49,65 +65,67 @@ fn column_of(field: &Field, first: usize, step: usize) -> Column {
     Column { first, step, kind: field.kind, size: field.size }
 }
 
-fn check_len(field: &str, found: usize, header: &Header) -> Result<(), PcdError> {
-    let (points, stride) = (header.points, header.stride());
-    let expected = points.checked_mul(stride);
-    if expected == Some(found) {
-        return Ok(());
-    }
-    let fate = if expected.is_none_or(|expected| found < expected) { ": the file is cut off" } else { "" };
-    let reason = format!("{points} points of {stride} bytes stated, {found} bytes found{fate}");
-    Err(PcdError::of(field, reason))
-}
-
-/// `data` holds every number that `column` points at; [`check_len`] has seen to that.
+/// `data` holds every number that `column` points at: its length has been checked.
 fn gather(header: &Header, data: &[u8], column: impl Fn(usize) -> Column) -> PcdCloud {
-    let xyz = header.xyz.map(&column);
-    let intensity = match header.intensity {
-        IntensitySource::Value(index) | IntensitySource::Red(index) => Some(column(index)),
-        IntensitySource::None => None,
-    };
-    let labelled = matches!(header.intensity, IntensitySource::Red(_));
-    let mut collector = Collector::with_capacity(header.points, labelled);
-    for point in 0..header.points {
-        let [x, y, z] = xyz.map(|column| column.number(data, point));
-        let (fourth, label) = match intensity {
-            Some(column) if labelled => unpack_rgb(column.word(data, point)),
-            Some(column) => (column.number(data, point), 0),
-            None => (0.0, 0),
-        };
-        collector.push([x, y, z, fourth], labelled.then_some(label), Place::Point(point as u64));
+    let mut points = vec![[0.0; 4]; header.points];
+    for (component, index) in header.xyz.into_iter().enumerate() {
+        column(index).fill(data, &mut points, component);
     }
-    collector.finish()
+    let mut labels = Vec::new();
+    match header.intensity {
+        IntensitySource::Value(index) => column(index).fill(data, &mut points, 3),
+        // The four bytes of a packed colour; whether they are called a float or an integer does not matter.
+        IntensitySource::Red(index) => {
+            labels.reserve_exact(points.len());
+            column(index).each(data, &mut points, |point, bytes| {
+                let (red, label) = unpack_rgb(u32::from_le_bytes(bytes));
+                point[3] = red;
+                labels.push(label);
+            });
+        }
+        IntensitySource::None => {}
+    }
+    PcdCloud::of_finite(points, labels)
 }
 
 impl Column {
-    fn bytes<const N: usize>(self, data: &[u8], point: usize) -> [u8; N] {
-        let start = self.first + point * self.step;
-        let mut bytes = [0; N];
-        bytes.copy_from_slice(&data[start..start + N]);
-        bytes
-    }
-
-    /// A number as `f32`. Integers beyond 2^24 and doubles are rounded.
-    fn number(self, data: &[u8], point: usize) -> f32 {
+    /// Sets one component of all points. Integers beyond 2^24 and doubles are rounded.
+    fn fill(self, data: &[u8], points: &mut [[f32; 4]], component: usize) {
         match (self.kind, self.size) {
-            (Kind::Float, 4) => f32::from_le_bytes(self.bytes(data, point)),
-            (Kind::Float, _) => f64::from_le_bytes(self.bytes(data, point)) as f32,
-            (Kind::Unsigned, 1) => f32::from(u8::from_le_bytes(self.bytes(data, point))),
-            (Kind::Unsigned, 2) => f32::from(u16::from_le_bytes(self.bytes(data, point))),
-            (Kind::Unsigned, 4) => u32::from_le_bytes(self.bytes(data, point)) as f32,
-            (Kind::Unsigned, _) => u64::from_le_bytes(self.bytes(data, point)) as f32,
-            (Kind::Signed, 1) => f32::from(i8::from_le_bytes(self.bytes(data, point))),
-            (Kind::Signed, 2) => f32::from(i16::from_le_bytes(self.bytes(data, point))),
-            (Kind::Signed, 4) => i32::from_le_bytes(self.bytes(data, point)) as f32,
-            (Kind::Signed, _) => i64::from_le_bytes(self.bytes(data, point)) as f32,
+            (Kind::Float, 4) => self.numbers(data, points, component, f32::from_le_bytes),
+            (Kind::Float, _) => self.numbers(data, points, component, |bytes| f64::from_le_bytes(bytes) as f32),
+            (Kind::Unsigned, 1) => self.numbers(data, points, component, |[byte]| f32::from(byte)),
+            (Kind::Unsigned, 2) => self.numbers(data, points, component, |bytes| f32::from(u16::from_le_bytes(bytes))),
+            (Kind::Unsigned, 4) => self.numbers(data, points, component, |bytes| u32::from_le_bytes(bytes) as f32),
+            (Kind::Signed, 1) => self.numbers(data, points, component, |bytes| f32::from(i8::from_le_bytes(bytes))),
+            (Kind::Signed, 2) => self.numbers(data, points, component, |bytes| f32::from(i16::from_le_bytes(bytes))),
+            (Kind::Signed, 4) => self.numbers(data, points, component, |bytes| i32::from_le_bytes(bytes) as f32),
+            (Kind::Signed, _) => self.numbers(data, points, component, |bytes| i64::from_le_bytes(bytes) as f32),
+            // The header lets nothing else through.
+            (Kind::Unsigned | Kind::Other, _) => {
+                self.numbers(data, points, component, |bytes| u64::from_le_bytes(bytes) as f32);
+            }
         }
     }
 
-    /// The four bytes of a packed colour; whether they are called a float or an integer does not matter.
-    fn word(self, data: &[u8], point: usize) -> u32 {
-        u32::from_le_bytes(self.bytes(data, point))
+    fn numbers<const N: usize>(
+        self,
+        data: &[u8],
+        points: &mut [[f32; 4]],
+        component: usize,
+        number: impl Fn([u8; N]) -> f32,
+    ) {
+        self.each(data, points, |point, bytes| point[component] = number(bytes));
+    }
+
+    /// Hands over each point with its bytes.
+    fn each<const N: usize>(self, data: &[u8], points: &mut [[f32; 4]], mut take: impl FnMut(&mut [f32; 4], [u8; N])) {
+        let chunks = data.get(self.first..).unwrap_or_default().chunks(self.step);
+        for (point, chunk) in points.iter_mut().zip(chunks) {
+            if let Some(&bytes) = chunk.first_chunk() {
+                take(point, bytes);
+            }
+        }
     }
 }
 
@@ -163,10 +181,12 @@ pub(super) mod tests {
         file.extend([0; 20]);
         assert_eq!(
             decode(&file).unwrap_err().to_string(),
-            "POINTS: 2 points of 12 bytes stated, 20 bytes found: the file is cut off"
+            "POINTS: 2 points of 12 bytes stated, but only 20 bytes follow the header: the file is cut off"
         );
-        file.extend([0; 20]);
-        assert_eq!(decode(&file).unwrap_err().to_string(), "POINTS: 2 points of 12 bytes stated, 40 bytes found");
+        file.extend([0; 4]);
+        assert_eq!(decode(&file).unwrap().points.len(), 2);
+        file.extend([7; 4096]);
+        assert_eq!(decode(&file).unwrap().points.len(), 2, "more may follow");
     }
 
     #[test]
@@ -186,12 +206,18 @@ pub(super) mod tests {
         let lengths_at = file.len() - decode_packed_len(&file) - 8;
         let mut cut = file.clone();
         cut.truncate(file.len() - 1);
-        assert!(decode(&cut).unwrap_err().reason.contains("packed bytes stated"));
+        let packed = decode_packed_len(&file);
+        assert_eq!(
+            decode(&cut).unwrap_err().to_string(),
+            format!("DATA: {packed} packed bytes stated, but only {} follow: the file is cut off", packed - 1)
+        );
+        let stretched = [&file[..], &[0; 3731]].concat();
+        assert_eq!(decode(&stretched).unwrap().points, cloud);
         let mut absurd = file.clone();
         absurd[lengths_at + 4..lengths_at + 8].copy_from_slice(&u32::MAX.to_le_bytes());
         assert_eq!(
             decode(&absurd).unwrap_err().to_string(),
-            "DATA: 10 points of 16 bytes stated, 4294967295 bytes found"
+            "DATA: 10 points of 16 bytes stated, but unpacked they are 4294967295 bytes: more"
         );
     }
 

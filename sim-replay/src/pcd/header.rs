@@ -1,14 +1,24 @@
 //! The header of a PCD file: what every field is and how many points follow.
+//!
+//! Writers differ: `VERSION` is `.7`, `0.5` or not there, `FIELDS` may be called `COLUMNS`, `COUNT` (1 each), `HEIGHT`,
+//! `VIEWPOINT`, and `POINTS` or `WIDTH` may be missing, keys may be in lower case, and a field may have no numbers at all.
 
-use super::PcdError;
+mod points;
 
-/// More points than any sweep has; a header that promises more is wrong.
-const MAX_POINTS: u64 = 50_000_000;
+use super::{IntensityKind, PcdError};
+
 const MAX_FIELDS: usize = 64;
 /// Longest header line that is looked at, bytes.
 const MAX_LINE: usize = 8192;
 /// Most numbers in one field of one point.
 const MAX_COUNT: u64 = 65_536;
+/// Most bytes of one number.
+const MAX_SIZE: usize = 8;
+/// Names of intensity, the preferred first, whatever their case.
+const INTENSITY: [&str; 8] =
+    ["intensity", "i", "scalar_intensity", "reflectivity", "scalar_reflectivity", "reflectance", "remission", "signal"];
+/// Names of packed colours, whose red byte is an intensity.
+const COLOURS: [&str; 2] = ["rgb", "rgba"];
 
 /// How the points are stored.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -21,6 +31,17 @@ pub(super) enum Data {
     BinaryCompressed,
 }
 
+impl Data {
+    /// The form in words.
+    pub(super) fn name(self) -> &'static str {
+        match self {
+            Self::Ascii => "PCD, ascii",
+            Self::Binary => "PCD, binary",
+            Self::BinaryCompressed => "PCD, compressed",
+        }
+    }
+}
+
 /// What one number of a field is.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
 pub(super) enum Kind {
@@ -30,6 +51,8 @@ pub(super) enum Kind {
     Signed,
     /// `TYPE U`, 1, 2, 4 or 8 bytes.
     Unsigned,
+    /// Anything else: only fields that are not read have it.
+    Other,
 }
 
 /// One field of a point.
@@ -39,7 +62,7 @@ pub(super) struct Field {
     pub(super) kind: Kind,
     /// Bytes of one number.
     pub(super) size: usize,
-    /// Numbers per point.
+    /// Numbers per point; PCL's padding may have none.
     pub(super) count: usize,
 }
 
@@ -81,21 +104,21 @@ struct Entries<'a> {
 
 const KEYS: [&str; 10] =
     ["VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA"];
+const VERSIONS: [&str; 6] = ["0.7", ".7", "0.6", ".6", "0.5", ".5"];
 
 impl Header {
     /// Splits a file into its header and what follows it.
     pub(super) fn parse(bytes: &[u8]) -> Result<(Self, &[u8]), PcdError> {
         let mut entries = Entries::default();
-        let mut rest = bytes;
+        let mut rest = bytes.strip_prefix(b"\xef\xbb\xbf").unwrap_or(bytes);
         let mut line = 0;
         while !entries.has("DATA") {
             line += 1;
             let Some(end) = rest.iter().take(MAX_LINE).position(|&byte| byte == b'\n') else {
                 return Err(PcdError::at(line, "DATA", "the header ends before a DATA line"));
             };
-            let text = std::str::from_utf8(&rest[..end]).map_err(|_| not_text(line))?;
+            entries.add(line, without_comment(&rest[..end]))?;
             rest = &rest[end + 1..];
-            entries.add(line, text)?;
         }
         Ok((Self::from_entries(&entries, line)?, rest))
     }
@@ -105,9 +128,12 @@ impl Header {
         let fields = entries.fields()?;
         let points = entries.points()?;
         entries.check_viewpoint()?;
-        let xyz = find_xyz(&fields, entries.get("FIELDS")?.line)?;
-        let intensity = find_intensity(&fields, entries.get("FIELDS")?.line)?;
-        Ok(Self { xyz, intensity, points, data: entries.data()?, fields, lines })
+        let line = entries.get("FIELDS")?.line;
+        let xyz = find_xyz(&fields, line)?;
+        let intensity = find_intensity(&fields);
+        let header = Self { xyz, intensity, points, data: entries.data()?, fields, lines };
+        header.check_formats(entries)?;
+        Ok(header)
     }
 
     /// Numbers per point.
@@ -119,6 +145,52 @@ impl Header {
     pub(super) fn stride(&self) -> usize {
         self.fields.iter().map(|field| field.count * field.size).sum()
     }
+
+    /// Name of the field that intensity comes from, and what stores it.
+    pub(super) fn intensity_origin(&self) -> Option<(&str, IntensityKind)> {
+        match self.intensity {
+            IntensitySource::Red(index) => Some((&self.fields[index].name, IntensityKind::RedByte)),
+            IntensitySource::Value(index) => {
+                let field = &self.fields[index];
+                let is_byte = field.kind == Kind::Unsigned && field.size == 1;
+                Some((&field.name, if is_byte { IntensityKind::Byte } else { IntensityKind::Number }))
+            }
+            IntensitySource::None => None,
+        }
+    }
+
+    /// The fields that are read must be numbers; of all others the size is enough.
+    fn check_formats(&self, entries: &Entries<'_>) -> Result<(), PcdError> {
+        let intensity = match self.intensity {
+            IntensitySource::Value(index) | IntensitySource::Red(index) => Some(index),
+            IntensitySource::None => None,
+        };
+        for index in self.xyz.into_iter().chain(intensity) {
+            let Field { name, kind, size, .. } = &self.fields[index];
+            let (kinds, sizes) = (entries.get("TYPE")?, entries.get("SIZE")?);
+            let allowed: &[usize] = match kind {
+                Kind::Other => {
+                    let reason = format!("{:?} of field {name}, expected F, I or U", kinds.values[index]);
+                    return Err(PcdError::at(kinds.line, "TYPE", reason));
+                }
+                _ if self.intensity == IntensitySource::Red(index) => &[4],
+                Kind::Float => &[4, 8],
+                Kind::Signed | Kind::Unsigned => &[1, 2, 4, 8],
+            };
+            if !allowed.contains(size) {
+                let reason =
+                    format!("{size} of field {name}, expected one of {allowed:?} for TYPE {}", kinds.values[index]);
+                return Err(PcdError::at(sizes.line, "SIZE", reason));
+            }
+        }
+        Ok(())
+    }
+}
+
+/// A header line as text. Comments may be in any encoding.
+fn without_comment(line: &[u8]) -> &[u8] {
+    let starts_comment = |at: &usize| line[*at] == b'#' && (*at == 0 || line[*at - 1].is_ascii_whitespace());
+    &line[..(0..line.len()).find(starts_comment).unwrap_or(line.len())]
 }
 
 impl<'a> Entries<'a> {
@@ -126,10 +198,12 @@ impl<'a> Entries<'a> {
         self.found.iter().any(|(found, _)| *found == key)
     }
 
-    fn add(&mut self, line: u64, text: &'a str) -> Result<(), PcdError> {
+    fn add(&mut self, line: u64, text: &'a [u8]) -> Result<(), PcdError> {
+        let text = std::str::from_utf8(text).map_err(|_| not_text(line))?;
         let mut words = text.split_ascii_whitespace();
-        let Some(word) = words.next().filter(|word| !word.starts_with('#')) else { return Ok(()) };
-        let Some(key) = KEYS.into_iter().find(|key| *key == word) else {
+        let Some(word) = words.next() else { return Ok(()) };
+        let asked = if word.eq_ignore_ascii_case("COLUMNS") { "FIELDS" } else { word };
+        let Some(key) = KEYS.into_iter().find(|key| key.eq_ignore_ascii_case(asked)) else {
             let word: String = word.chars().take(40).collect();
             return Err(PcdError { line: Some(line), field: None, reason: format!("{word:?} is no PCD header key") });
         };
@@ -141,8 +215,11 @@ impl<'a> Entries<'a> {
     }
 
     fn get(&self, key: &str) -> Result<&Entry<'a>, PcdError> {
-        let found = self.found.iter().find(|(found, _)| *found == key);
-        found.map(|(_, entry)| entry).ok_or_else(|| PcdError::of(key, "missing in the header"))
+        self.find(key).ok_or_else(|| PcdError::of(key, "missing in the header"))
+    }
+
+    fn find(&self, key: &str) -> Option<&Entry<'a>> {
+        self.found.iter().find(|(found, _)| *found == key).map(|(_, entry)| entry)
     }
 
     fn single(&self, key: &str) -> Result<(u64, &'a str), PcdError> {
@@ -153,18 +230,15 @@ impl<'a> Entries<'a> {
         }
     }
 
-    fn count(&self, key: &str) -> Result<(u64, u64), PcdError> {
-        let (line, value) = self.single(key)?;
-        let number = value.parse().map_err(|_| PcdError::at(line, key, format!("{value:?} is no count")))?;
-        Ok((line, number))
-    }
-
     fn check_version(&self) -> Result<(), PcdError> {
-        let (line, version) = self.single("VERSION")?;
-        if ["0.7", ".7", "0.6", ".6"].contains(&version) {
+        if !self.has("VERSION") {
             return Ok(());
         }
-        Err(PcdError::at(line, "VERSION", format!("{version:?}, expected 0.7")))
+        let (line, version) = self.single("VERSION")?;
+        if VERSIONS.contains(&version) {
+            return Ok(());
+        }
+        Err(PcdError::at(line, "VERSION", format!("{version:?}, expected 0.7, 0.6 or 0.5")))
     }
 
     /// One value for each field, or an error with both counts.
@@ -188,37 +262,19 @@ impl<'a> Entries<'a> {
         (0..names.values.len())
             .map(|index| {
                 let name = names.values[index];
-                let (kind, size) =
-                    number_format(name, (kinds.line, kinds.values[index]), (sizes.line, sizes.values[index]))?;
+                let size = number_size(name, sizes.line, sizes.values[index])?;
                 let count = match counts {
                     Some(counts) => field_count(name, counts.line, counts.values[index])?,
                     None => 1,
                 };
-                Ok(Field { name: name.to_owned(), kind, size, count })
+                Ok(Field { name: name.to_owned(), kind: number_kind(kinds.values[index]), size, count })
             })
             .collect()
     }
 
-    fn points(&self) -> Result<usize, PcdError> {
-        let (_, width) = self.count("WIDTH")?;
-        let (_, height) = self.count("HEIGHT")?;
-        let (line, points) = if self.has("POINTS") { self.count("POINTS")? } else { (0, width.saturating_mul(height)) };
-        if width.checked_mul(height) != Some(points) {
-            let reason = format!("{points}, but WIDTH {width} x HEIGHT {height} says otherwise");
-            return Err(PcdError::at(line, "POINTS", reason));
-        }
-        if points > MAX_POINTS {
-            return Err(PcdError::at(line, "POINTS", format!("{points}, at most {MAX_POINTS} are read")));
-        }
-        usize::try_from(points).map_err(|_| PcdError::at(line, "POINTS", format!("{points} do not fit this machine")))
-    }
-
     /// The sensor's place is not applied to the points (PCL does not either), but must make sense.
     fn check_viewpoint(&self) -> Result<(), PcdError> {
-        if !self.has("VIEWPOINT") {
-            return Ok(());
-        }
-        let entry = self.get("VIEWPOINT")?;
+        let Some(entry) = self.find("VIEWPOINT") else { return Ok(()) };
         if entry.values.len() != 7 {
             return Err(PcdError::at(entry.line, "VIEWPOINT", format!("{} values, expected 7", entry.values.len())));
         }
@@ -230,12 +286,10 @@ impl<'a> Entries<'a> {
 
     fn data(&self) -> Result<Data, PcdError> {
         let (line, data) = self.single("DATA")?;
-        match data {
-            "ascii" => Ok(Data::Ascii),
-            "binary" => Ok(Data::Binary),
-            "binary_compressed" => Ok(Data::BinaryCompressed),
-            _ => Err(PcdError::at(line, "DATA", format!("{data:?}, expected ascii, binary or binary_compressed"))),
-        }
+        let kinds = [("ascii", Data::Ascii), ("binary", Data::Binary), ("binary_compressed", Data::BinaryCompressed)];
+        let found = kinds.into_iter().find(|(name, _)| name.eq_ignore_ascii_case(data));
+        let reason = || format!("{data:?}, expected ascii, binary or binary_compressed");
+        found.map(|(_, data)| data).ok_or_else(|| PcdError::at(line, "DATA", reason()))
     }
 }
 
@@ -243,122 +297,51 @@ fn not_text(line: u64) -> PcdError {
     PcdError { line: Some(line), field: None, reason: "the header is not text: is this a PCD file?".into() }
 }
 
-fn number_format(name: &str, kind: (u64, &str), size: (u64, &str)) -> Result<(Kind, usize), PcdError> {
-    let (sizes, parsed): (&[usize], Kind) = match kind.1 {
-        "F" => (&[4, 8], Kind::Float),
-        "I" => (&[1, 2, 4, 8], Kind::Signed),
-        "U" => (&[1, 2, 4, 8], Kind::Unsigned),
-        other => {
-            return Err(PcdError::at(kind.0, "TYPE", format!("{other:?} of field {name}, expected F, I or U")));
-        }
-    };
-    match size.1.parse().ok().filter(|size| sizes.contains(size)) {
-        Some(size) => Ok((parsed, size)),
-        None => {
-            let reason = format!("{:?} of field {name}, expected one of {sizes:?} for TYPE {}", size.1, kind.1);
-            Err(PcdError::at(size.0, "SIZE", reason))
-        }
+fn number_kind(kind: &str) -> Kind {
+    match kind {
+        "F" | "f" => Kind::Float,
+        "I" | "i" => Kind::Signed,
+        "U" | "u" => Kind::Unsigned,
+        _ => Kind::Other,
     }
 }
 
-fn field_count(name: &str, line: u64, value: &str) -> Result<usize, PcdError> {
-    let count = value.parse().ok().filter(|count| (1..=MAX_COUNT).contains(count));
-    count
-        .and_then(|count| usize::try_from(count).ok())
-        .ok_or_else(|| PcdError::at(line, "COUNT", format!("{value:?} of field {name}, expected 1 to {MAX_COUNT}")))
+fn number_size(name: &str, line: u64, value: &str) -> Result<usize, PcdError> {
+    let size = value.parse().ok().filter(|size| (1..=MAX_SIZE).contains(size));
+    size.ok_or_else(|| PcdError::at(line, "SIZE", format!("{value:?} of field {name}, expected 1 to {MAX_SIZE}")))
 }
 
-/// The only field of that name, which must hold one number.
-fn find(fields: &[Field], name: &str, line: u64) -> Result<Option<usize>, PcdError> {
-    let mut found = fields.iter().enumerate().filter(|(_, field)| field.name == name);
-    let Some((index, field)) = found.next() else { return Ok(None) };
+fn field_count(name: &str, line: u64, value: &str) -> Result<usize, PcdError> {
+    let count = value.parse().ok().filter(|&count: &u64| count <= MAX_COUNT);
+    count
+        .and_then(|count| usize::try_from(count).ok())
+        .ok_or_else(|| PcdError::at(line, "COUNT", format!("{value:?} of field {name}, expected 0 to {MAX_COUNT}")))
+}
+
+/// The only coordinate of that name, which must hold one number.
+fn find_coordinate(fields: &[Field], name: &str, line: u64) -> Result<usize, PcdError> {
+    let mut found = fields.iter().enumerate().filter(|(_, field)| field.name.eq_ignore_ascii_case(name));
+    let (index, field) = found.next().ok_or_else(|| PcdError::at(line, "FIELDS", format!("no field {name}")))?;
     if found.next().is_some() {
         return Err(PcdError::at(line, "FIELDS", format!("{name} stands there twice")));
     }
     if field.count != 1 {
         return Err(PcdError::at(line, "COUNT", format!("{} of field {name}, expected 1", field.count)));
     }
-    Ok(Some(index))
+    Ok(index)
 }
 
 fn find_xyz(fields: &[Field], line: u64) -> Result<[usize; 3], PcdError> {
-    let find = |name| find(fields, name, line)?.ok_or_else(|| PcdError::at(line, "FIELDS", format!("no field {name}")));
+    let find = |name| find_coordinate(fields, name, line);
     Ok([find("x")?, find("y")?, find("z")?])
 }
 
-fn find_intensity(fields: &[Field], line: u64) -> Result<IntensitySource, PcdError> {
-    if let Some(index) = find(fields, "intensity", line)? {
-        return Ok(IntensitySource::Value(index));
-    }
-    for name in ["rgb", "rgba"] {
-        let Some(index) = find(fields, name, line)? else { continue };
-        if fields[index].size != 4 {
-            let reason = format!("{} of field {name}, expected 4: a packed colour", fields[index].size);
-            return Err(PcdError::at(line, "SIZE", reason));
-        }
-        return Ok(IntensitySource::Red(index));
-    }
-    Ok(IntensitySource::None)
+/// The first field of the most preferred name that holds one number.
+fn find_intensity(fields: &[Field]) -> IntensitySource {
+    let find = |name: &&str| fields.iter().position(|field| field.count == 1 && field.name.eq_ignore_ascii_case(name));
+    let value = INTENSITY.iter().find_map(find).map(IntensitySource::Value);
+    value.or_else(|| COLOURS.iter().find_map(find).map(IntensitySource::Red)).unwrap_or(IntensitySource::None)
 }
 
 #[cfg(test)]
-mod tests {
-    use super::*;
-
-    const SOUND: &str = "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\n\
-                         WIDTH 2\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 2\nDATA ascii\n";
-
-    fn error_after(from: &str, to: &str) -> String {
-        let text = SOUND.replace(from, to);
-        assert_ne!(text, SOUND, "{from}");
-        Header::parse(text.as_bytes()).unwrap_err().to_string()
-    }
-
-    #[test]
-    fn a_sound_header_is_taken_apart() {
-        let (header, body) = Header::parse(format!("{SOUND}rest").as_bytes()).map(|(h, b)| (h, b.to_vec())).unwrap();
-        assert_eq!((header.points, header.columns(), header.stride(), header.lines), (2, 4, 16, 11));
-        assert_eq!((header.xyz, header.intensity), ([0, 1, 2], IntensitySource::Red(3)));
-        assert_eq!(body, b"rest");
-    }
-
-    #[test]
-    fn what_does_not_fit_is_named_with_line_and_both_values() {
-        let cases = [
-            ("VERSION 0.7", "VERSION 1.0", "line 2: VERSION: \"1.0\", expected 0.7"),
-            ("SIZE 4 4 4 4", "SIZE 4 4 4", "line 4: SIZE: 3 values for 4 FIELDS"),
-            ("SIZE 4 4 4 4", "SIZE 4 2 4 4", "line 4: SIZE: \"2\" of field y, expected one of [4, 8] for TYPE F"),
-            ("TYPE F F F F", "TYPE F F Q F", "line 5: TYPE: \"Q\" of field z, expected F, I or U"),
-            ("COUNT 1 1 1 1", "COUNT 1 1 0 1", "line 6: COUNT: \"0\" of field z, expected 1 to 65536"),
-            ("COUNT 1 1 1 1", "COUNT 2 1 1 1", "line 3: COUNT: 2 of field x, expected 1"),
-            ("FIELDS x y z rgb", "FIELDS x y h rgb", "line 3: FIELDS: no field z"),
-            ("FIELDS x y z rgb", "FIELDS x y z x", "line 3: FIELDS: x stands there twice"),
-            ("POINTS 2", "POINTS 3", "line 10: POINTS: 3, but WIDTH 2 x HEIGHT 1 says otherwise"),
-            ("WIDTH 2", "WIDTH two", "line 7: WIDTH: \"two\" is no count"),
-            ("WIDTH 2", "WIDTH -2", "line 7: WIDTH: \"-2\" is no count"),
-            ("HEIGHT 1\n", "", "HEIGHT: missing in the header"),
-            ("HEIGHT 1", "HEIGHT 1\nHEIGHT 1", "line 9: HEIGHT: stands here a second time"),
-            ("VIEWPOINT 0 0 0 1 0 0 0", "VIEWPOINT 0 0", "line 9: VIEWPOINT: 2 values, expected 7"),
-            ("VIEWPOINT 0 0 0 1 0 0 0", "VIEWPOINT 0 0 0 1 0 0 x", "line 9: VIEWPOINT: \"x\" is no finite number"),
-            ("DATA ascii", "DATA hex", "line 11: DATA: \"hex\", expected ascii, binary or binary_compressed"),
-            ("DATA ascii\n", "", "line 11: DATA: the header ends before a DATA line"),
-            ("VERSION 0.7", "HELLO 0.7", "line 2: \"HELLO\" is no PCD header key"),
-        ];
-        for (from, to, message) in cases {
-            assert_eq!(error_after(from, to), message);
-        }
-    }
-
-    #[test]
-    fn absurd_counts_are_refused() {
-        let absurd = SOUND.replace("WIDTH 2", "WIDTH 99999999999").replace("POINTS 2", "POINTS 99999999999");
-        assert!(Header::parse(absurd.as_bytes()).unwrap_err().reason.contains("at most 50000000"));
-        let wrapping = SOUND.replace("WIDTH 2", "WIDTH 9223372036854775808").replace("HEIGHT 1", "HEIGHT 2");
-        assert!(Header::parse(wrapping.replace("POINTS 2", "POINTS 0").as_bytes()).is_err());
-    }
-
-    #[test]
-    fn carriage_returns_are_whitespace() {
-        assert!(Header::parse(SOUND.replace('\n', "\r\n").as_bytes()).is_ok());
-    }
-}
+mod tests;

@@ -20,12 +20,17 @@ mod binary;
 mod encode;
 mod header;
 mod lzf;
+mod number;
 
 use protocol::PointCloud;
+use serde::Serialize;
 
 pub use encode::{Encoding, IntensityField, encode};
 
 use header::{Data, Header};
+
+/// Red of full intensity.
+const RED_SCALE: f32 = 255.0;
 
 /// What a PCD file holds.
 #[derive(Debug, Clone, PartialEq, Default)]
@@ -38,6 +43,33 @@ pub struct PcdCloud {
     pub dropped: usize,
     /// Where the first of these stands.
     pub first_dropped: Option<Place>,
+    /// Where the intensities come from; `None` where the file has none, and 0 stands for all.
+    pub intensity: Option<IntensityOrigin>,
+    /// Form of the file, for example `PCD` or `5 floats per point: x y z intensity ring`; empty where it is not known.
+    pub form: &'static str,
+}
+
+/// Where the intensities of a sweep come from.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct IntensityOrigin {
+    /// Name of the field.
+    pub field: String,
+    /// Number that the field stores, which tells its scale or leaves it open.
+    pub kind: IntensityKind,
+    /// Divisor that made the stored numbers what [`PcdCloud::points`] holds.
+    pub divisor: f32,
+}
+
+/// Number that stores an intensity.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum IntensityKind {
+    /// The red byte of a packed colour, 0..255.
+    RedByte,
+    /// A byte, 0..255.
+    Byte,
+    /// A wider number, whose scale its type does not tell.
+    Number,
 }
 
 /// Where in a file.
@@ -71,120 +103,67 @@ impl PcdError {
     }
 }
 
-/// Reads a PCD file that is in memory.
+/// Reads a PCD file that is in memory. Intensities are as the file stores them; the red byte of a colour is 0 to 1.
 ///
 /// # Errors
 /// [`PcdError`] names line, field and both values of what does not fit. Nothing is allocated on the word of the header
 /// alone.
 pub fn decode(bytes: &[u8]) -> Result<PcdCloud, PcdError> {
+    let mut cloud = decode_stored(bytes)?;
+    if let Some(origin) = cloud.intensity.as_mut().filter(|origin| origin.kind == IntensityKind::RedByte) {
+        origin.divisor = RED_SCALE;
+        cloud.points.xyzi.iter_mut().for_each(|point| point[3] /= RED_SCALE);
+    }
+    Ok(cloud)
+}
+
+/// [`decode`] with the red byte of a colour as it is stored too: 0 to 255.
+///
+/// # Errors
+/// As [`decode`].
+pub fn decode_stored(bytes: &[u8]) -> Result<PcdCloud, PcdError> {
     let (header, body) = Header::parse(bytes)?;
-    match header.data {
+    let cloud = match header.data {
         Data::Ascii => ascii::decode(&header, body),
         Data::Binary => binary::decode(&header, body),
         Data::BinaryCompressed => binary::decode_compressed(&header, body),
+    }?;
+    let intensity = header.intensity_origin().map(|(field, kind)| IntensityOrigin::stored(field, kind));
+    Ok(PcdCloud { intensity, form: header.data.name(), ..cloud })
+}
+
+impl IntensityOrigin {
+    /// A field whose numbers stand as they are stored.
+    pub(crate) fn stored(field: &str, kind: IntensityKind) -> Self {
+        Self { field: field.to_owned(), kind, divisor: 1.0 }
     }
 }
 
-/// Gathers points, leaving out those that are not finite.
-struct Collector {
-    cloud: PcdCloud,
-    labels: Vec<u8>,
-}
-
-impl Collector {
-    fn with_capacity(points: usize, labelled: bool) -> Self {
-        let mut cloud = PcdCloud::default();
-        cloud.points.xyzi.reserve_exact(points);
-        Self { cloud, labels: Vec::with_capacity(if labelled { points } else { 0 }) }
-    }
-
-    fn push(&mut self, point: [f32; 4], label: Option<u8>, place: Place) {
-        if point.iter().all(|value| value.is_finite()) {
-            self.cloud.points.xyzi.push(point);
-            self.labels.extend(label);
-        } else {
-            self.cloud.dropped += 1;
-            self.cloud.first_dropped.get_or_insert(place);
+impl PcdCloud {
+    /// Points without those that are not finite. `labels`: one for each point, or none.
+    pub(crate) fn of_finite(mut points: Vec<[f32; 4]>, mut labels: Vec<u8>) -> Self {
+        let is_finite = |point: &[f32; 4]| point.iter().all(|value| value.is_finite());
+        let (all, first) = (points.len(), points.iter().position(|point| !is_finite(point)));
+        if first.is_some() {
+            let mut kept = points.iter().map(is_finite);
+            labels.retain(|_| kept.next().unwrap_or(false));
+            points.retain(is_finite);
+        }
+        Self {
+            dropped: all - points.len(),
+            first_dropped: first.map(|point| Place::Point(point as u64)),
+            points: PointCloud { xyzi: points },
+            labels: labels.iter().any(|&label| label != 0).then_some(labels),
+            ..Self::default()
         }
     }
-
-    fn finish(mut self) -> PcdCloud {
-        if self.labels.iter().any(|&label| label != 0) {
-            self.cloud.labels = Some(self.labels);
-        }
-        self.cloud
-    }
 }
 
-/// Red and green of a packed `0x00RRGGBB`: intensity 0..1 and label.
+/// Red and green of a packed `0x00RRGGBB`: intensity and label.
 fn unpack_rgb(bits: u32) -> (f32, u8) {
     let [_, red, green, _] = bits.to_be_bytes();
-    (f32::from(red) / 255.0, green)
+    (f32::from(red), green)
 }
 
 #[cfg(test)]
-mod tests {
-    use proptest::prelude::*;
-
-    use super::*;
-
-    /// A file of each kind to damage.
-    fn samples() -> Vec<Vec<u8>> {
-        let cloud = PointCloud { xyzi: (0..20).map(|i| [i as f32, -1.5, 0.25, 1.0 - i as f32 / 64.0]).collect() };
-        let mut files: Vec<Vec<u8>> = [Encoding::Ascii, Encoding::Binary]
-            .into_iter()
-            .flat_map(|encoding| [IntensityField::Intensity, IntensityField::Red].map(|field| (encoding, field)))
-            .map(|(encoding, field)| encode(&cloud, encoding, field))
-            .collect();
-        files.push(binary::tests::compressed(&cloud));
-        files
-    }
-
-    #[test]
-    fn every_truncation_is_an_error_and_never_a_panic() {
-        for file in samples() {
-            decode(&file).unwrap();
-            for length in 0..file.len() {
-                let result = decode(&file[..length]);
-                // Cutting the final line break, or digits of the last number, leaves a whole file.
-                let last_token = file.len() - file.iter().rev().skip(1).position(|&b| b == b' ').unwrap_or(0);
-                assert!(result.is_err() || length >= last_token - 1, "{length} of {}", file.len());
-            }
-        }
-    }
-
-    proptest! {
-        #[test]
-        fn random_bytes_never_panic(bytes in prop::collection::vec(any::<u8>(), 0..600)) {
-            let _ = decode(&bytes);
-        }
-
-        #[test]
-        fn flipped_bytes_never_panic(which in 0..5usize, at in any::<prop::sample::Index>(), value in any::<u8>()) {
-            let mut file = samples().swap_remove(which);
-            let at = at.index(file.len());
-            file[at] = value;
-            let _ = decode(&file);
-        }
-
-        #[test]
-        fn any_body_under_a_sound_header_never_panics(
-            kind in prop::sample::select(vec!["ascii", "binary", "binary_compressed"]),
-            points in prop::sample::select(vec![0u64, 1, 7, 1 << 20, 1 << 40, u64::MAX]),
-            body in prop::collection::vec(any::<u8>(), 0..300),
-        ) {
-            let mut file = format!(
-                "VERSION 0.7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH {points}\nHEIGHT 1\n\
-                 VIEWPOINT 0 0 0 1 0 0 0\nPOINTS {points}\nDATA {kind}\n"
-            ).into_bytes();
-            file.extend(body);
-            let _ = decode(&file);
-        }
-    }
-
-    #[test]
-    fn the_message_names_line_and_field() {
-        let error = PcdError::at(9, "POINTS", "3, but WIDTH x HEIGHT is 4");
-        assert_eq!(error.to_string(), "line 9: POINTS: 3, but WIDTH x HEIGHT is 4");
-    }
-}
+mod tests;

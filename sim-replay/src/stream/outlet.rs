@@ -95,18 +95,10 @@ fn count(sent: &mut Vec<TopicCount>, topic: &Topic) {
 pub(super) fn truth_of(frame: &Frame) -> Option<AgentTruth> {
     let objects = frame.objects.iter().map(|object: &Object| TrueObject {
         id: object.id,
-        class: class_name(object),
+        class: object.class.name().to_owned(),
         world_from_object: object.world_from_object,
         size_m: object.size_m,
         speed_mps: object.speed_mps,
     });
     Some(AgentTruth { cav: frame.cav.clone(), world_from_lidar: frame.world_from_lidar?, objects: objects.collect() })
-}
-
-/// The class as it stands in every file of this program.
-fn class_name(object: &Object) -> String {
-    match serde_json::to_value(object.class) {
-        Ok(serde_json::Value::String(name)) => name,
-        _ => format!("{:?}", object.class).to_lowercase(),
-    }
 }

@@ -143,6 +143,8 @@ pub struct Replay<'a> {
     is_resumed: bool,
     reading: ReadAhead,
     schedule: Schedule,
+    /// Agents whose frames of the last tick were published.
+    present: BTreeSet<CavId>,
     clock: ReplayClock,
     outlet: Outlet,
     air: Option<SensorAir>,
@@ -199,6 +201,7 @@ impl<'a> Replay<'a> {
             is_resumed: place.is_some(),
             reading,
             schedule,
+            present: BTreeSet::new(),
             clock,
             outlet: Outlet::open(bus, &options.agents, options.load.radar, options.is_paced())?,
             _subscriptions: subscriptions.collect::<Result<_, _>>()?,
@@ -246,7 +249,7 @@ impl<'a> Replay<'a> {
             }
             self.publish(planned, due);
             last = Instant::now();
-            self.wait_for_answers(planned.capture_nanos);
+            self.wait_for_answers(&planned);
             self.note_place();
         }
         self.await_the_last();
@@ -364,12 +367,14 @@ impl<'a> Replay<'a> {
         let frames: TickFrames = self.reading.take(tick_index);
         self.reading.want(&self.schedule.ahead(READ_AHEAD));
         let mut agents = Vec::with_capacity(frames.len());
+        self.present = frames.iter().flatten().map(|frame| frame.cav.clone()).collect();
         if self.options.lockstep.is_empty() && self.options.rate > 0.0 {
             self.report.lateness.add(due.elapsed());
         }
         for (agent, frame) in frames.into_iter().enumerate() {
             match frame {
                 Ok(frame) => {
+                    self.report.parts_left_out(&frame);
                     agents.extend(truth_of(&frame));
                     match &mut self.air {
                         None => self.outlet.offer(agent, capture_nanos, frame),
@@ -379,6 +384,7 @@ impl<'a> Replay<'a> {
                         }
                     }
                 }
+                Err(error) if error.is_absence() => self.report.absent_frames += 1,
                 Err(error) => self.report.unreadable(capture_nanos, &error),
             }
         }
@@ -388,12 +394,14 @@ impl<'a> Replay<'a> {
         self.clock.published(capture_nanos, due);
     }
 
-    /// Under lockstep, waits until every ego has answered the tick.
-    fn wait_for_answers(&mut self, capture_nanos: u64) {
+    /// Under lockstep, waits until every ego that has a frame at the tick has answered.
+    fn wait_for_answers(&mut self, planned: &Planned) {
         if self.options.lockstep.is_empty() {
             return;
         }
-        let mut missing: BTreeSet<CavId> = self.options.lockstep.iter().cloned().collect();
+        let capture_nanos = planned.capture_nanos;
+        let is_asked = |ego: &&CavId| self.present.contains(ego);
+        let mut missing: BTreeSet<CavId> = self.options.lockstep.iter().filter(is_asked).cloned().collect();
         let deadline = end_of(self.options.answer_patience);
         while !missing.is_empty() {
             match self.inbox.take(deadline) {

@@ -6,6 +6,8 @@ use std::time::Duration;
 use protocol::{DropReason, Ledger, TopicCount};
 use serde::Serialize;
 
+use crate::frame::Frame;
+
 use super::sensor_air::AirReport;
 
 /// Publishing later than this counts as late.
@@ -29,6 +31,10 @@ pub struct StreamReport {
     pub lateness: Lateness,
     /// Ticks that an ego did not answer in time, under `--lockstep`.
     pub unanswered: u64,
+    /// Frames that do not exist: their vehicle came later or has left. No failure.
+    pub absent_frames: u64,
+    /// Objects and other parts of frames that were left out, because they cannot be right.
+    pub left_out_parts: u64,
     /// Frames that could not be read.
     pub unreadable_frames: u64,
     /// The first of them.
@@ -82,11 +88,18 @@ impl StreamReport {
         }
     }
 
-    /// Whether every frame could be read and every tick was answered that had to be. What newer messages took the place of
+    pub(super) fn parts_left_out(&mut self, frame: &Frame) {
+        for problem in &frame.problems {
+            tracing::warn!(cav = %frame.cav, "left out: {}", problem.message);
+        }
+        self.left_out_parts += frame.problems.len() as u64;
+    }
+
+    /// Whether every frame could be read whole and every tick was answered that had to be. What newer messages took the place of
     /// ([`Self::unsent`]) is no failure.
     #[must_use]
     pub fn is_complete(&self) -> bool {
-        self.unreadable_frames == 0 && self.unanswered == 0
+        self.unreadable_frames == 0 && self.left_out_parts == 0 && self.unanswered == 0
     }
 }
 

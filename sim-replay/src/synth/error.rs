@@ -41,6 +41,14 @@ pub enum SynthError {
         /// What the system says.
         source: std::io::Error,
     },
+    /// A layout cannot hold a scene.
+    #[error("layout {layout}: {reason}")]
+    Layout {
+        /// The layout's name.
+        layout: &'static str,
+        /// What it cannot hold.
+        reason: String,
+    },
     /// A number of the options makes no sense.
     #[error("{option} is {value}; {expected}")]
     Option {

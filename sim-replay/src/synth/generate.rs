@@ -1,32 +1,34 @@
 //! From options to folders: scenes one after another, the frames of each on several threads.
 
+use std::collections::BTreeMap;
 use std::fs;
-use std::path::Path;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicUsize, Ordering};
 
-use super::cast::Body;
+use protocol::CavId;
+
 use super::error::SynthError;
-use super::lidar::{LIDAR_MOUNT_M, Lidar, lidar_motion};
+use super::layout::{Moment, Omissions, SceneAgent, SceneHeader, SceneLayout, SceneWriter, Unfinished, make_folder};
 use super::options::{Subset, SynthOptions};
 use super::positioning::{Fix, Positioning};
-use super::protocol_file::{FILE_NAME, protocol_yaml};
-use super::radar::Radar;
+use super::protocol_file::protocol_yaml;
 use super::recording::{RecordedFrame, Recording, SceneSpec, record};
+use super::sensing::Bench;
 use super::traffic::STEP_S;
-use super::vehicle::Vehicle;
 use super::world::World;
-use super::writer::{AgentFolder, Annotation, FrameFacts, make_folder, write_file};
+use crate::frame::Frame;
 use crate::random::derive_seed;
-use crate::town::{self, Town, TownSource};
+use crate::town::{self, Finding, Town, TownSource};
 
-/// The farthest that any sensor looks, metres.
-const SIGHT_M: f64 = 152.0;
+/// Length of a step of the simulation, nanoseconds.
+const STEP_NANOS: u64 = (STEP_S * 1e9) as u64;
 
 /// What was generated.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
 pub struct Summary {
-    /// Scenario folders.
+    /// Layout of the files.
+    pub layout: SceneLayout,
+    /// Scenarios.
     pub scenarios: usize,
     /// Frames of all agents together.
     pub agent_frames: usize,
@@ -34,6 +36,10 @@ pub struct Summary {
     pub points: usize,
     /// Annotated vehicles of all agent-frames.
     pub annotations: usize,
+    /// What the layout has no place for, and how often it was left out.
+    pub omitted: BTreeMap<&'static str, u64>,
+    /// Parts of the map that were not built as its file gives them.
+    pub findings: Vec<Finding>,
 }
 
 impl Summary {
@@ -52,19 +58,27 @@ impl Summary {
 /// [`SynthError`] where an option makes no sense, the town cannot be built or a file cannot be written.
 pub fn generate(options: &SynthOptions, progress: &(dyn Fn(u64) + Sync)) -> Result<Summary, SynthError> {
     options.validate()?;
-    check_folder(options)?;
-    let mut total = Summary::default();
+    check_folder(&options.out, options.force)?;
+    let unfinished = Unfinished::mark(&options.out)?;
+    let mut writer = options.layout.writer(&options.out);
+    let omitted = Omissions::default();
+    let mut total = Summary { layout: options.layout, ..Summary::default() };
     for (place, source) in sources(options).iter().enumerate() {
         let town = town::build(source, options.town_seed)?;
+        total.findings.extend(town.findings.iter().cloned());
         let world = World::new(&town);
         let places = sources(options).len();
         for number in (place..options.scenarios()).step_by(places) {
             let before = total.scenarios as u64 * 1000;
             let spec = spec(options, &town, number);
             let scene = Scene { options, world: &world, spec };
-            total.add(&scene.write(&|thousandths| progress(before + thousandths))?);
+            let progress = |thousandths| progress(before + thousandths);
+            total.add(&scene.write(writer.as_mut(), &omitted, &progress)?);
         }
     }
+    writer.finish()?;
+    unfinished.clear()?;
+    total.omitted = omitted.into_counts();
     Ok(total)
 }
 
@@ -94,54 +108,61 @@ fn spec(options: &SynthOptions, town: &Town, number: usize) -> SceneSpec {
     }
 }
 
-fn check_folder(options: &SynthOptions) -> Result<(), SynthError> {
-    make_folder(&options.out)?;
-    let entries = fs::read_dir(&options.out);
-    let mut entries = entries.map_err(|source| SynthError::Write { path: options.out.clone(), source })?;
-    if entries.next().is_some() && !options.force {
-        return Err(SynthError::NotEmpty(options.out.clone()));
+/// Makes the folder of the output, or refuses one that holds something.
+pub(super) fn check_folder(out: &std::path::Path, force: bool) -> Result<(), SynthError> {
+    make_folder(out)?;
+    let entries = fs::read_dir(out);
+    let mut entries = entries.map_err(|source| SynthError::Write { path: out.to_owned(), source })?;
+    if entries.next().is_some() && !force {
+        return Err(SynthError::NotEmpty(out.to_owned()));
     }
     Ok(())
 }
 
 /// One scenario to be written.
-struct Scene<'a, 't> {
-    options: &'a SynthOptions,
-    world: &'a World<'t>,
-    spec: SceneSpec,
+pub(super) struct Scene<'a, 't> {
+    pub(super) options: &'a SynthOptions,
+    pub(super) world: &'a World<'t>,
+    pub(super) spec: SceneSpec,
 }
 
 /// One agent over the whole scene.
-struct Agent {
-    vehicle: usize,
-    id: i64,
-    folder: AgentFolder,
-    fixes: Vec<Fix>,
-}
-
-/// The sensors and buffers of one thread.
-#[derive(Default)]
-struct Bench {
-    lidar: Lidar,
-    radar: Radar,
+pub(super) struct Agent {
+    /// Index among the recording's vehicles.
+    pub(super) vehicle: usize,
+    pub(super) id: i64,
+    pub(super) cav: CavId,
+    /// One for each moment.
+    pub(super) fixes: Vec<Fix>,
 }
 
 impl Scene<'_, '_> {
-    fn write(&self, progress: &(dyn Fn(u64) + Sync)) -> Result<Summary, SynthError> {
+    fn write(
+        &self,
+        writer: &mut dyn SceneWriter,
+        omitted: &Omissions,
+        progress: &(dyn Fn(u64) + Sync),
+    ) -> Result<Summary, SynthError> {
         let recording = record(self.world, &self.spec)?;
-        let folder = self.options.out.join(&self.spec.name);
-        if folder.exists() {
-            fs::remove_dir_all(&folder).map_err(|source| SynthError::Write { path: folder.clone(), source })?;
-        }
-        make_folder(&folder)?;
-        write_file(&folder.join(FILE_NAME), protocol_yaml(self.options, &self.spec, self.world.town))?;
-        let agents = self.agents(&recording, &folder)?;
-        let mut summary = self.write_frames(&recording, &agents, progress)?;
+        let agents = self.agents(&recording)?;
+        writer.begin(&self.header(&recording, &agents))?;
+        let mut summary = self.write_moments(&recording, &agents, (writer, omitted), progress)?;
+        writer.end()?;
         summary.scenarios = 1;
         Ok(summary)
     }
 
-    fn agents(&self, recording: &Recording, folder: &Path) -> Result<Vec<Agent>, SynthError> {
+    fn header(&self, recording: &Recording, agents: &[Agent]) -> SceneHeader {
+        SceneHeader {
+            name: self.spec.name.clone(),
+            agents: agents.iter().map(|agent| SceneAgent { id: agent.cav.clone(), is_roadside: false }).collect(),
+            capture_nanos: recording.frames.iter().map(capture_nanos).collect(),
+            tick_nanos: STEP_NANOS,
+            origin: protocol_yaml(self.options, &self.spec, self.world.town),
+        }
+    }
+
+    fn agents(&self, recording: &Recording) -> Result<Vec<Agent>, SynthError> {
         let mut agents = Vec::new();
         for &vehicle in &recording.agents {
             // Agents are chosen among those that are present from the first frame to the last.
@@ -150,30 +171,36 @@ impl Scene<'_, '_> {
             let moving = recording.frames.iter().filter_map(|frame| frame.of(vehicle));
             let fixes =
                 moving.map(|moving| positioning.fix(&moving.motion.end, moving.speed_mps, self.options.period_s));
-            agents.push(Agent { vehicle, id, fixes: fixes.collect(), folder: AgentFolder::create(folder, id)? });
+            let cav = CavId::new(&id.to_string()).map_err(|error| SynthError::Layout {
+                layout: self.options.layout.name(),
+                reason: error.to_string(),
+            })?;
+            agents.push(Agent { vehicle, id, cav, fixes: fixes.collect() });
         }
         Ok(agents)
     }
 
-    /// Writes every frame of every agent. Each is made from the recording and a seed of its own, so the number of threads
-    /// and their order change nothing.
-    fn write_frames(
+    /// Writes every moment. Each frame is made from the recording and a seed of its own, so the number of threads and their
+    /// order change nothing.
+    fn write_moments(
         &self,
         recording: &Recording,
         agents: &[Agent],
+        (writer, omitted): (&dyn SceneWriter, &Omissions),
         progress: &(dyn Fn(u64) + Sync),
     ) -> Result<Summary, SynthError> {
-        let jobs = recording.frames.len() * agents.len();
+        let moments = recording.frames.len();
         let (next, done) = (AtomicUsize::new(0), AtomicUsize::new(0));
         let total = Mutex::new(Ok(Summary::default()));
         let work = || {
             let mut bench = Bench::default();
             loop {
-                let job = next.fetch_add(1, Ordering::Relaxed);
-                if job >= jobs {
+                let index = next.fetch_add(1, Ordering::Relaxed);
+                if index >= moments {
                     return;
                 }
-                let result = self.write_frame(recording, &agents[job % agents.len()], job / agents.len(), &mut bench);
+                let moment = self.moment(recording, agents, index, &mut bench);
+                let result = writer.write(&moment, omitted).map(|()| counts(&moment));
                 let mut total = total.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
                 match (&mut *total, result) {
                     (Ok(total), Ok(summary)) => total.add(&summary),
@@ -181,80 +208,30 @@ impl Scene<'_, '_> {
                     (Err(_), _) => return,
                 }
                 drop(total);
-                progress(1000 * (done.fetch_add(1, Ordering::Relaxed) + 1) as u64 / jobs as u64);
+                progress(1000 * (done.fetch_add(1, Ordering::Relaxed) + 1) as u64 / moments as u64);
             }
         };
         std::thread::scope(|scope| {
-            for _ in 1..self.options.threads.min(jobs) {
+            for _ in 1..self.options.threads.min(moments) {
                 scope.spawn(work);
             }
             work();
         });
         total.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner)
     }
-
-    fn write_frame(
-        &self,
-        recording: &Recording,
-        agent: &Agent,
-        number: usize,
-        bench: &mut Bench,
-    ) -> Result<Summary, SynthError> {
-        let frame = &recording.frames[number];
-        let Some(own) = frame.of(agent.vehicle) else { return Ok(Summary::default()) };
-        let here = own.motion.end.position_m;
-        let (mut bodies, seen) = vehicles_around(recording, frame, agent.vehicle);
-        self.world.standing_near(here.x, here.y, SIGHT_M, &mut bodies);
-
-        let noise = |sensor: u64| derive_seed(self.spec.seed, &[sensor, agent.id as u64, frame.tick]);
-        let ground = self.world.ground();
-        let sensor = lidar_motion(&own.motion);
-        let sweep = bench.lidar.sweep(&sensor, ground, &bodies, self.options.weather, noise(5));
-        agent.folder.write_lidar(frame.tick, None, &sweep)?;
-        let (points, hits) = (sweep.points.len(), sweep.hits.to_vec());
-        for &weather in &self.options.copies {
-            let copy = bench.lidar.again(&sensor, &bodies, weather, noise(7 + weather as u64));
-            agent.folder.write_lidar(frame.tick, weather.variant(), &copy)?;
-        }
-        let half_length_m = 0.5 * recording.vehicles[agent.vehicle].size_m[0];
-        let returns = bench.radar.returns(&own.motion, half_length_m, LIDAR_MOUNT_M, STEP_S, ground, &bodies, noise(6));
-        agent.folder.write_radar(frame.tick, returns)?;
-
-        let is_hit = |(_, hits): &(Annotation<'_>, &u32)| **hits > 0;
-        let mut annotations: Vec<Annotation<'_>> =
-            seen.into_iter().zip(&hits).filter(is_hit).map(|(annotation, _)| annotation).collect();
-        annotations.sort_unstable_by_key(|annotation| annotation.id);
-        let summary = Summary { scenarios: 0, agent_frames: 1, points, annotations: annotations.len() };
-        let facts =
-            FrameFacts { vehicle: own.motion.end, speed_mps: own.speed_mps, fix: agent.fixes[number], annotations };
-        agent.folder.write_facts(frame.tick, &facts)?;
-        Ok(summary)
-    }
 }
 
-/// All vehicles but one's own that any sensor may see, as bodies and as what an annotation would say.
-fn vehicles_around<'a>(
-    recording: &'a Recording,
-    frame: &'a RecordedFrame,
-    own: usize,
-) -> (Vec<Body<'a>>, Vec<Annotation<'a>>) {
-    let here = frame.of(own).map_or_else(Default::default, |moving| moving.motion.end.position_m);
-    let near = |motion: &super::cast::Sweep| (motion.end.position_m - here).xy().norm() < SIGHT_M + 10.0;
-    let moving = frame.moving.iter().filter(|moving| moving.vehicle != own && near(&moving.motion));
-    let moving = moving.map(|moving| {
-        let vehicle: &Vehicle = &recording.vehicles[moving.vehicle];
-        (vehicle, moving.motion, moving.id, moving.speed_mps)
-    });
-    let parked = recording
-        .parked
-        .iter()
-        .map(|parked| (&parked.vehicle, super::cast::Sweep::still(parked.placement), parked.id, 0.0));
-    let parked = parked.filter(|(_, motion, ..)| near(motion));
-    moving
-        .chain(parked)
-        .map(|(vehicle, motion, id, speed_mps)| {
-            let annotation = Annotation { id, vehicle, placement: motion.end, speed_mps };
-            (Body { shape: &vehicle.shape, motion }, annotation)
-        })
-        .unzip()
+/// When the sweeps of a moment end, on the clock of the scene.
+pub(super) fn capture_nanos(frame: &RecordedFrame) -> u64 {
+    frame.tick * STEP_NANOS
+}
+
+fn counts(moment: &Moment) -> Summary {
+    let sum = |count: fn(&Frame) -> usize| moment.frames.iter().map(|agent| count(&agent.frame)).sum();
+    Summary {
+        agent_frames: moment.frames.len(),
+        points: sum(|frame| frame.points.len()),
+        annotations: sum(|frame| frame.objects.len()),
+        ..Summary::default()
+    }
 }

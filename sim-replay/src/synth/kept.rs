@@ -7,6 +7,7 @@ use serde::Deserialize;
 
 use super::error::SynthError;
 use super::generate::{Summary, generate, sources};
+use super::layout::SceneLayout;
 use super::options::SynthOptions;
 use super::protocol_file::FILE_NAME;
 use crate::bounded;
@@ -31,6 +32,12 @@ struct Generator {
     frames: usize,
     period_seconds: f64,
     weather: String,
+    #[serde(default = "default_layout")]
+    layout: String,
+}
+
+fn default_layout() -> String {
+    SceneLayout::Opv2v.name().to_owned()
 }
 
 /// Whether scenes of these options lie in their folder already.
@@ -49,7 +56,8 @@ pub fn are_kept(options: &SynthOptions) -> Result<bool, SynthError> {
         Err(SynthError::Kept { folder, setting, found, wanted })
     };
     let towns: Vec<String> = sources(options).iter().map(TownSource::name).collect();
-    for Generator { subset, seed, town, town_seed, agents, frames, period_seconds, weather } in &scenarios {
+    for made in &scenarios {
+        let Generator { subset, seed, town, town_seed, agents, frames, period_seconds, weather, layout } = made;
         let settings = [
             ("subset", subset.clone(), options.subset.name().to_owned()),
             ("seed", seed.to_string(), options.seed.to_string()),
@@ -57,6 +65,7 @@ pub fn are_kept(options: &SynthOptions) -> Result<bool, SynthError> {
             ("period_seconds", period_seconds.to_string(), options.period_s.to_string()),
             ("weather", weather.clone(), options.weather.name().to_owned()),
             ("town_seed", town_seed.to_string(), options.town_seed.to_string()),
+            ("layout", layout.clone(), options.layout.name().to_owned()),
         ];
         if let Some((setting, found, wanted)) = settings.into_iter().find(|(_, found, wanted)| found != wanted) {
             return differs(setting, found, wanted);

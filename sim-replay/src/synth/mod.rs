@@ -1,9 +1,10 @@
 //! Scene generation: traffic in a town, and the sensors of the vehicles in it.
 //!
-//! [`generate`] writes scenes in the layout of OPV2V, which the readers of this crate read back like any other dataset.
+//! [`generate`] writes scenes in a [`SceneLayout`], by default OPV2V's, and the readers of this crate read them back like
+//! any other dataset. [`convert`] writes a dataset that was opened in such a layout.
 //! The parts, in the order in which they work: a [`crate::town`] that stands still, parked vehicles, traffic that is
 //! recorded step by step, then for each agent and frame the [`lidar`], the [`radar`] and the receivers, all of them over
-//! one ray [`cast`]er, and the writer.
+//! one ray [`cast`]er, and the writer of the layout.
 //!
 //! ```no_run
 //! use sim_replay::synth::{Subset, SynthOptions, generate};
@@ -17,9 +18,11 @@
 //! ```
 
 pub mod cast;
+mod convert;
 mod error;
 mod generate;
 mod kept;
+pub(crate) mod layout;
 pub mod lidar;
 mod options;
 mod parking;
@@ -27,16 +30,18 @@ mod positioning;
 mod protocol_file;
 pub mod radar;
 mod recording;
+mod sensing;
 mod terrain;
 mod traffic;
 pub mod vehicle;
 pub mod weather;
 mod world;
-mod writer;
 
+pub use convert::{ConvertOptions, Converted, convert};
 pub use error::SynthError;
 pub use generate::{Summary, generate};
 pub use kept::{are_kept, generate_whole};
+pub use layout::SceneLayout;
 pub use options::{Subset, SynthOptions};
 pub use weather::Weather;
 pub use world::ground_surface;

@@ -6,6 +6,7 @@ use std::path::PathBuf;
 use clap::ValueEnum;
 
 use super::error::SynthError;
+use super::layout::SceneLayout;
 use super::traffic::STEP_S;
 use super::weather::Weather;
 use crate::town::TownSource;
@@ -43,8 +44,10 @@ pub struct SynthOptions {
     pub subset: Subset,
     /// Fixes routes, lanes, speeds, traffic, parked vehicles and noise.
     pub seed: u64,
-    /// Where the scenario folders go.
+    /// Where the scenarios go.
     pub out: PathBuf,
+    /// Layout of the files.
+    pub layout: SceneLayout,
     /// The town; each subset has its own otherwise, V2VDet both in turn.
     pub town: Option<TownSource>,
     /// Fixes everything that stands still for good.
@@ -77,6 +80,7 @@ impl SynthOptions {
             subset,
             seed,
             out,
+            layout: SceneLayout::Opv2v,
             town: None,
             town_seed: 0,
             traversals: 1,
@@ -131,8 +135,21 @@ impl SynthOptions {
         let copies: Vec<&str> = self.copies.iter().map(|weather| weather.name()).collect();
         let have_names = self.copies.iter().all(|weather| weather.variant().is_some());
         check(have_names, "--copies", copies.join(","), "expected fog, snow or both")?;
+        let have_place = self.copies.is_empty() || self.layout == SceneLayout::Opv2v;
+        check(
+            have_place,
+            "--copies",
+            copies.join(","),
+            "expected none, as the layout opv2v alone has copies of sweeps",
+        )?;
         let agents = format!("{}-{}", self.agents.start(), self.agents.end());
         let is_range = *self.agents.start() >= 1 && self.agents.start() <= self.agents.end() && *self.agents.end() <= 7;
-        check(is_range, "--agents", agents, "expected a number or a range within 1-7")
+        check(is_range, "--agents", agents.clone(), "expected a number or a range within 1-7")?;
+        if !self.layout.needs_two_agents() {
+            return Ok(());
+        }
+        let subset = self.subset.name().to_owned();
+        check(self.subset == Subset::V2vdet, "--subset", subset, "expected v2vdet, as the layout needs two agents")?;
+        check(*self.agents.start() >= 2, "--agents", agents, "expected 2 or more, as the layout needs two agents")
     }
 }

@@ -56,7 +56,9 @@ fn place(spot: &ParkingSpot, vehicle: &Vehicle, random: &mut SplitMix64) -> Plac
     let yaw = spot.yaw_rad + random.between(-0.03, 0.03);
     let (sin, cos) = spot.yaw_rad.sin_cos();
     let [x, y, z] = spot.center_m;
-    Placement::level([x + along * cos - aside * sin, y + along * sin + aside * cos, z], wrapped(yaw + reversed))
+    let position_m = [x + along * cos - aside * sin, y + along * sin + aside * cos, z + aside * spot.roll_rad.tan()];
+    let roll_rad = if reversed > 0.0 { -spot.roll_rad } else { spot.roll_rad };
+    Placement { roll_rad, ..Placement::level(position_m, wrapped(yaw + reversed)) }
 }
 
 fn stands_on_a_lane(town: &Town, lanes: &LaneIndex, rectangle: &Rectangle) -> bool {

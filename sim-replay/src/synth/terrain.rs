@@ -345,6 +345,7 @@ mod tests {
                     position_m: Vector3::new(x, y, grid.height_m(x, y) + 1.95),
                     yaw_rad: random.between(-3.2, 3.2),
                     pitch_rad: random.between(-0.12, 0.12),
+                    roll_rad: random.between(-0.12, 0.12),
                 };
                 let azimuth = random.between(-3.2, 3.2);
                 let forward = (place.rotation() * Vector3::new(azimuth.cos(), azimuth.sin(), 0.0)).cast();

@@ -69,7 +69,8 @@ mod tests {
         let shape = Shape::Box { half_m: [0.3, 0.3, 0.5] };
         let solid = |y: f64, z: f64| Solid::new(SolidKind::Sign, shape, [10.0, y, z], 0.3, 0.5);
         let solids = vec![solid(0.0, 5.6), solid(1.5, 1.0), solid(2.5, 1.0), solid(0.0, -0.6)];
-        let town = Town { name: "line".into(), lanes, ground: Ground::plane(0.0), solids, parking: Vec::new() };
+        let ground = Ground::plane(0.0);
+        let town = Town { name: "line".into(), lanes, ground, solids, parking: vec![], findings: vec![] };
         assert_eq!(town.obstructions(), [(LaneId(0), 1)]);
     }
 }

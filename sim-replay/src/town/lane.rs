@@ -39,6 +39,9 @@ pub struct Lane {
     pub length_m: f64,
     /// Width at each point of the centre line, metres.
     pub widths_m: Vec<f64>,
+    /// Slope across the lane at each point of the centre line as an angle, radians; positive where the left side in
+    /// driving direction is higher. Empty where the road is level.
+    pub banks_rad: Vec<f64>,
     /// Median width, metres.
     pub width_m: f64,
     /// Speed limit, metres per second.
@@ -73,6 +76,7 @@ impl Lane {
             centerline,
             length_m,
             widths_m,
+            banks_rad: Vec::new(),
             width_m,
             speed_limit_mps,
             successors: Vec::new(),
@@ -100,6 +104,16 @@ impl Lane {
         let own = self.step_heading_rad(index);
         let turn = wrap_angle(self.step_heading_rad(neighbour) - own);
         (point, wrap_angle(own + turn * (share - 0.5).abs()))
+    }
+
+    /// Slope across the lane at `s_m`, radians; see [`Lane::banks_rad`].
+    #[must_use]
+    pub fn bank_rad(&self, s_m: f64) -> f64 {
+        let Some(last) = self.banks_rad.len().checked_sub(1).filter(|&last| last > 0) else { return 0.0 };
+        let step = (s_m / self.length_m * last as f64).clamp(0.0, last as f64);
+        let index = (step as usize).min(last - 1);
+        let share = step - index as f64;
+        self.banks_rad[index] + share * (self.banks_rad[index + 1] - self.banks_rad[index])
     }
 
     /// Heading at the start, radians.

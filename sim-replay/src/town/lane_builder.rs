@@ -2,23 +2,20 @@
 
 use super::conflicts;
 use super::lane::{JunctionId, Lane, LaneGraph, LaneId, Turn, wrap_angle};
-use super::road::{Contact, LaneKind, Road, RoadLink, RoadNetwork};
+use super::lane_links::{self, LinkCounts};
+use super::road::{Contact, LaneKind, Road, RoadNetwork};
 
 /// Distance between the points taken from the curves before they are spread evenly, metres.
 const FINE_STEP_M: f64 = 0.25;
 /// Distance between points of a centre line, about, metres.
 const STEP_M: f64 = 1.0;
-/// A link whose lanes are farther apart than this is refused, metres.
-const LINK_GAP_M: f64 = 0.5;
-/// A link whose lanes differ in heading by more than this is refused, radians.
-const LINK_TURN_RAD: f64 = 0.35;
 /// Where neither lane nor road has a speed limit, metres per second.
 const DEFAULT_LIMIT_MPS: f64 = 13.9;
 /// Lanes that change heading by more than this through a junction turn off, radians.
 const TURN_RAD: f64 = 0.52;
 
 /// Lane ids by road, section and lane id of the network.
-struct LaneTable {
+pub(super) struct LaneTable {
     /// First section of each road in `ids`.
     first_section: Vec<usize>,
     /// By section: lowest lane id, and the graph's id of each lane from there on.
@@ -27,23 +24,14 @@ struct LaneTable {
 
 /// Where a lane of the graph comes from.
 #[derive(Clone, Copy)]
-struct Origin {
-    road: usize,
-    section: usize,
-    lane: i32,
+pub(super) struct Origin {
+    pub(super) road: usize,
+    pub(super) section: usize,
+    pub(super) lane: i32,
 }
 
-/// What came out of the links of a map.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct LinkCounts {
-    /// Links made.
-    pub made: usize,
-    /// Links refused because the lanes do not meet in place and heading.
-    pub refused: usize,
-}
-
-/// Builds the driving lanes of `network` and their links. Traffic keeps right: lanes with negative ids lead along
-/// their road, the others against it.
+/// Builds the driving lanes of `network` and their links. Which lanes lead along their road and which against it is
+/// [`Road::leads_along`]'s answer: traffic keeps right or left, road by road.
 #[must_use]
 pub fn lane_graph(network: &RoadNetwork) -> (LaneGraph, LinkCounts) {
     let mut table = LaneTable { first_section: Vec::new(), ids: Vec::new() };
@@ -65,14 +53,14 @@ pub fn lane_graph(network: &RoadNetwork) -> (LaneGraph, LinkCounts) {
         }
     }
     let mut graph = LaneGraph::new(lanes);
-    link_neighbours(&mut graph, &origins, &table);
-    let counts = link_successors(&mut graph, network, &origins, &table);
+    lane_links::link_neighbours(&mut graph, network, &origins, &table);
+    let counts = lane_links::link_successors(&mut graph, network, &origins, &table);
     conflicts::find(&mut graph);
     (graph, counts)
 }
 
 impl LaneTable {
-    fn get(&self, road: usize, section: usize, lane: i32) -> Option<LaneId> {
+    pub(super) fn get(&self, road: usize, section: usize, lane: i32) -> Option<LaneId> {
         let (lowest, ids) = &self.ids[self.first_section[road] + section];
         // Ids run from the lowest upwards and leave out 0.
         let place = lane - lowest - i32::from(lane > 0);
@@ -84,7 +72,7 @@ impl LaneTable {
     }
 
     /// The section of a road at one of its ends.
-    fn end_section(&self, road: usize, contact: Contact) -> usize {
+    pub(super) fn end_section(&self, road: usize, contact: Contact) -> usize {
         match contact {
             Contact::Start => 0,
             Contact::End => self.section_count(road) - 1,
@@ -99,13 +87,14 @@ fn build_lane(road: &Road, origin: Origin, id: LaneId) -> Option<Lane> {
         return None;
     }
     let (from, to) = (section.s_m.min(road.length_m), road.section_end_m(origin.section));
-    let (centerline, widths_m, length_m) = center_line(road, origin, from, to)?;
+    let CenterLine { points, widths_m, banks_rad, length_m } = center_line(road, origin, from, to)?;
     let middle = (from + to) / 2.0;
     let limit = source.speed_limit_mps.or_else(|| road.speed_limit_mps(middle)).unwrap_or(DEFAULT_LIMIT_MPS);
     let mut sorted = widths_m.clone();
     sorted.sort_unstable_by(f64::total_cmp);
-    let mut lane = Lane::new(id, centerline, sorted[sorted.len() / 2], limit);
+    let mut lane = Lane::new(id, points, sorted[sorted.len() / 2], limit);
     (lane.widths_m, lane.length_m) = (widths_m, length_m);
+    lane.banks_rad = if road.lateral.is_level() { Vec::new() } else { banks_rad };
     lane.junction = road.junction.map(|junction| JunctionId(junction as u32));
     lane.in_junction = road.junction.is_some();
     if lane.in_junction {
@@ -119,18 +108,33 @@ fn build_lane(road: &Road, origin: Origin, id: LaneId) -> Option<Lane> {
     Some(lane)
 }
 
-/// Even points of a lane's middle in driving direction, the widths there and the length; `None` for a lane of no or of absurd length.
-fn center_line(road: &Road, origin: Origin, from: f64, to: f64) -> Option<(Vec<[f64; 3]>, Vec<f64>, f64)> {
+/// A lane's middle in driving direction.
+struct CenterLine {
+    /// Even points, metres.
+    points: Vec<[f64; 3]>,
+    /// Width at each.
+    widths_m: Vec<f64>,
+    /// Slope across at each.
+    banks_rad: Vec<f64>,
+    length_m: f64,
+}
+
+/// The middle of a lane; `None` for a lane of no or of absurd length.
+fn center_line(road: &Road, origin: Origin, from: f64, to: f64) -> Option<CenterLine> {
+    let along = road.leads_along(origin.section, origin.lane);
     let fine = ((to - from) / FINE_STEP_M).ceil().max(1.0) as usize;
-    let mut samples: Vec<([f64; 3], f64)> = (0..=fine)
+    let mut samples: Vec<([f64; 3], [f64; 2])> = (0..=fine)
         .map(|i| {
             let s = from + (to - from) * i as f64 / fine as f64;
             // Lane offsets may jump where the next section begins: stay on this side of it.
-            let [low, high] = road.lane_span_m(origin.section, origin.lane, s.min(to - 1e-6).max(from));
-            (road.point_at(s, (low + high) / 2.0), high - low)
+            let inside = s.min(to - 1e-6).max(from);
+            let [low, high] = road.lane_span_m(origin.section, origin.lane, inside);
+            let bank = road.bank_rad(origin.section, origin.lane, inside);
+            let point = road.point_at(origin.section, s, (low + high) / 2.0);
+            (point, [high - low, if along { bank } else { -bank }])
         })
         .collect();
-    if origin.lane > 0 {
+    if !along {
         samples.reverse();
     }
     let mut lengths = vec![0.0];
@@ -144,85 +148,18 @@ fn center_line(road: &Road, origin: Origin, from: f64, to: f64) -> Option<(Vec<[
         return None;
     }
     let steps = (total / STEP_M).round().max(1.0) as usize;
-    let (mut points, mut widths, mut place) = (Vec::new(), Vec::new(), 0);
+    let mut line = CenterLine { points: Vec::new(), widths_m: Vec::new(), banks_rad: Vec::new(), length_m: total };
+    let mut place = 0;
     for i in 0..=steps {
         let wanted = total * i as f64 / steps as f64;
         while place + 2 < lengths.len() && lengths[place + 1] < wanted {
             place += 1;
         }
         let share = ((wanted - lengths[place]) / (lengths[place + 1] - lengths[place]).max(1e-12)).clamp(0.0, 1.0);
-        let ((a, width_a), (b, width_b)) = (samples[place], samples[place + 1]);
-        points.push(std::array::from_fn(|axis| a[axis] + share * (b[axis] - a[axis])));
-        widths.push(width_a + share * (width_b - width_a));
+        let ((a, [width_a, bank_a]), (b, [width_b, bank_b])) = (samples[place], samples[place + 1]);
+        line.points.push(std::array::from_fn(|axis| a[axis] + share * (b[axis] - a[axis])));
+        line.widths_m.push(width_a + share * (width_b - width_a));
+        line.banks_rad.push(bank_a + share * (bank_b - bank_a));
     }
-    Some((points, widths, total))
-}
-
-fn link_neighbours(graph: &mut LaneGraph, origins: &[Origin], table: &LaneTable) {
-    for (lane, origin) in graph.lanes.iter_mut().zip(origins) {
-        // Seen in driving direction, the reference line is always to the left.
-        let inwards = origin.lane - origin.lane.signum();
-        let outwards = origin.lane + origin.lane.signum();
-        lane.left = table.get(origin.road, origin.section, inwards);
-        lane.right = table.get(origin.road, origin.section, outwards);
-    }
-}
-
-fn link_successors(graph: &mut LaneGraph, network: &RoadNetwork, origins: &[Origin], table: &LaneTable) -> LinkCounts {
-    let mut counts = LinkCounts::default();
-    for (index, &origin) in origins.iter().enumerate() {
-        let mut successors: Vec<LaneId> = Vec::new();
-        for next in candidates(network, origin, table) {
-            if successors.contains(&next) {
-                continue;
-            }
-            if meets(&graph.lanes[index], graph.lane(next)) {
-                counts.made += 1;
-                successors.push(next);
-            } else {
-                counts.refused += 1;
-            }
-        }
-        for &next in &successors {
-            graph.lanes[next.0 as usize].predecessors.push(LaneId(index as u32));
-        }
-        graph.lanes[index].successors = successors;
-    }
-    counts
-}
-
-/// Lanes that the map's links name as continuing the lane of `origin`.
-fn candidates(network: &RoadNetwork, origin: Origin, table: &LaneTable) -> Vec<LaneId> {
-    let road = &network.roads[origin.road];
-    let Some(lane) = road.sections[origin.section].lane(origin.lane) else { return Vec::new() };
-    let forward = origin.lane < 0;
-    let link = if forward { lane.successor } else { lane.predecessor };
-    let next_section = if forward { Some(origin.section + 1) } else { origin.section.checked_sub(1) };
-    if let Some(section) = next_section.filter(|&section| section < road.sections.len()) {
-        return link.and_then(|lane| table.get(origin.road, section, lane)).into_iter().collect();
-    }
-    match if forward { road.successor } else { road.predecessor } {
-        None => Vec::new(),
-        Some(RoadLink::Road { road, contact }) => {
-            let section = table.end_section(road, contact);
-            link.and_then(|lane| table.get(road, section, lane)).into_iter().collect()
-        }
-        Some(RoadLink::Junction(junction)) => {
-            let connections = network.junctions[junction].connections.iter();
-            let links = connections.filter(|connection| connection.incoming == origin.road).flat_map(|connection| {
-                let section = table.end_section(connection.connecting, connection.contact);
-                let matching = connection.lane_links.iter().filter(|&&(from, _)| from == origin.lane);
-                matching.filter_map(move |&(_, to)| table.get(connection.connecting, section, to))
-            });
-            links.collect()
-        }
-    }
-}
-
-/// Whether one lane ends where the other begins, in place and heading.
-fn meets(lane: &Lane, next: &Lane) -> bool {
-    let (end, start) = (lane.centerline[lane.centerline.len() - 1], next.centerline[0]);
-    let gap = (end[0] - start[0]).hypot(end[1] - start[1]).hypot(end[2] - start[2]);
-    let turn = wrap_angle(next.start_heading_rad() - lane.end_heading_rad());
-    gap < LINK_GAP_M && turn.abs() < LINK_TURN_RAD
+    Some(line)
 }

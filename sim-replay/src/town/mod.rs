@@ -11,14 +11,18 @@ mod clothoid;
 mod conflicts;
 mod convex;
 pub mod curve;
+mod finding;
 mod furniture;
 mod ground;
 mod lane;
 pub mod lane_builder;
+pub mod lane_links;
 mod lane_queries;
+pub mod lateral;
 mod layout;
 mod noise;
 pub mod opendrive;
+pub mod profile;
 pub mod road;
 mod solid;
 mod surface;
@@ -27,6 +31,7 @@ mod terrain;
 use std::path::{Path, PathBuf};
 
 pub use clearance::LANE_HEADROOM_M;
+pub use finding::Finding;
 pub use ground::{Ground, HeightGrid, Terrain, Triangle};
 pub use lane::{JunctionId, Lane, LaneGraph, LaneId, Turn};
 pub use lane_queries::{LaneIndex, LanePosition};
@@ -54,6 +59,8 @@ pub struct Town {
     pub solids: Vec<Solid>,
     /// Where vehicles may stand.
     pub parking: Vec<ParkingSpot>,
+    /// Parts of its map that were not built as the file gives them.
+    pub findings: Vec<Finding>,
 }
 
 /// What a town is made from.
@@ -87,6 +94,8 @@ pub struct ParkingSpot {
     pub center_m: [f64; 3],
     /// Direction a parked vehicle's bonnet points to, radians.
     pub yaw_rad: f64,
+    /// Slope across the spot as an angle, radians; positive where the left side of a parked vehicle is higher.
+    pub roll_rad: f64,
     /// Length along the heading, metres.
     pub length_m: f64,
     /// Width across the heading, metres.
@@ -142,17 +151,15 @@ pub fn build(source: &TownSource, town_seed: u64) -> Result<Town, TownError> {
         TownSource::Town1 => Ok(furnish(name, &layout::town1(town_seed), town_seed)),
         TownSource::Town4 => Ok(furnish(name, &layout::town4(town_seed), town_seed)),
         TownSource::OpenDrive(path) => {
-            let network = read_map(path)?;
-            let layout = Layout { network, islands: Vec::new() };
-            check_extent(path, &layout.network)?;
-            Ok(furnish(name, &layout, town_seed))
+            let Map { network, lanes } = read_map(path)?;
+            check_extent(path, &network, &lanes)?;
+            Ok(furnish(name, &Layout { network, islands: Vec::new() }, town_seed))
         }
     }
 }
 
 /// Refuses maps without driving lanes, and maps so large that the ground between their roads would not fit in memory.
-fn check_extent(path: &Path, network: &RoadNetwork) -> Result<(), TownError> {
-    let (graph, _) = lane_builder::lane_graph(network);
+fn check_extent(path: &Path, network: &RoadNetwork, graph: &LaneGraph) -> Result<(), TownError> {
     let points = || graph.lanes.iter().flat_map(|lane| &lane.centerline);
     let extent = |axis: usize| {
         let values = || points().map(|point| point[axis]);
@@ -168,10 +175,27 @@ fn check_extent(path: &Path, network: &RoadNetwork) -> Result<(), TownError> {
     Ok(())
 }
 
-fn read_map(path: &Path) -> Result<RoadNetwork, TownError> {
-    let text = bounded::read_text(path, opendrive::MAX_BYTES as u64);
-    let text = text.map_err(|source| TownError::Read { path: path.into(), source })?;
-    opendrive::read(&text).map_err(|source| TownError::OpenDrive { path: path.into(), source })
+/// A map as its file gives it.
+#[derive(Debug, Clone)]
+pub struct Map {
+    /// Its roads and junctions, with what was not built as the file gives it.
+    pub network: RoadNetwork,
+    /// Its driving lanes.
+    pub lanes: LaneGraph,
+}
+
+/// Reads the file of an OpenDRIVE map.
+///
+/// # Errors
+/// [`TownError::Read`] and [`TownError::OpenDrive`].
+pub fn read_map(path: &Path) -> Result<Map, TownError> {
+    let bytes = bounded::read(path, opendrive::MAX_BYTES as u64);
+    let bytes = bytes.map_err(|source| TownError::Read { path: path.into(), source })?;
+    let network = opendrive::read_bytes(&bytes);
+    let mut network = network.map_err(|source| TownError::OpenDrive { path: path.into(), source })?;
+    let (lanes, counts) = lane_builder::lane_graph(&network);
+    network.findings.extend(counts.findings);
+    Ok(Map { network, lanes })
 }
 
 fn furnish(name: String, layout: &Layout, town_seed: u64) -> Town {
@@ -179,7 +203,7 @@ fn furnish(name: String, layout: &Layout, town_seed: u64) -> Town {
     let surface = Surface::new(&layout.network);
     let ground = terrain::ground(&surface, town_seed);
     let (solids, parking) = furniture::furnish(layout, &surface, &ground, town_seed);
-    Town { name, lanes, ground, solids, parking }
+    Town { name, lanes, ground, solids, parking, findings: layout.network.findings.clone() }
 }
 
 #[cfg(test)]
@@ -207,7 +231,7 @@ mod tests {
         let error = || build(&TownSource::OpenDrive(path.clone()), 0).unwrap_err().to_string();
         assert!(error().starts_with(&path.display().to_string()), "{}", error());
         std::fs::write(&path, "<OpenDRIVE><road id=\"1\" length=\"x\"/></OpenDRIVE>").unwrap();
-        assert!(error().ends_with("line 1: <road> has length=\"x\"; expected a number"), "{}", error());
+        assert!(error().ends_with("line 1: <road> has no <planView>"), "{}", error());
         let road = |lanes: &str, length: u32| {
             format!(
                 "<OpenDRIVE><road id=\"1\" length=\"{length}\"><planView><geometry s=\"0\" x=\"0\" y=\"0\" hdg=\"0\" \

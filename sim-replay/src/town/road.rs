@@ -3,7 +3,10 @@
 //! Places along a road are `s` along its reference line, places across it `t`, positive to the left; both in metres.
 //! Lane ids count outwards from the reference line, positive to the left, negative to the right.
 
-use super::curve::{Curve, Pose2, cubic, cubic_slope};
+use super::curve::{Curve, Pose2};
+use super::finding::Finding;
+use super::lateral::LateralProfile;
+use super::profile::Profile;
 
 /// Farthest that lanes may lie beside the reference line, metres.
 pub(super) const MAX_OFFSET_M: f64 = 1000.0;
@@ -17,17 +20,8 @@ pub struct RoadNetwork {
     pub roads: Vec<Road>,
     /// The junctions; links refer to them by place.
     pub junctions: Vec<Junction>,
-    /// What the map holds and this program leaves out.
-    pub ignored: Ignored,
-}
-
-/// What a map held and was left out.
-#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
-pub struct Ignored {
-    /// Superelevation or lateral shape records that are not level.
-    pub superelevations: usize,
-    /// Lanes kept level by the map (`level="true"`) on roads that are not.
-    pub level_lanes: usize,
+    /// Parts of the map that were not built as its file gives them.
+    pub findings: Vec<Finding>,
 }
 
 /// One road.
@@ -37,6 +31,8 @@ pub struct Road {
     pub id: String,
     /// Length along the reference line, metres.
     pub length_m: f64,
+    /// Whether traffic keeps left: lanes with positive ids lead along the road. Else it keeps right.
+    pub left_hand: bool,
     /// The junction that it leads through.
     pub junction: Option<usize>,
     /// What its start meets.
@@ -47,6 +43,8 @@ pub struct Road {
     pub plan_view: Vec<Curve>,
     /// Height along the road.
     pub elevation: Profile,
+    /// Superelevation, crossfall and shape.
+    pub lateral: LateralProfile,
     /// Shift of the lanes' origin across the road.
     pub lane_offset: Profile,
     /// Lane sections, by rising `s`; at least one.
@@ -84,13 +82,6 @@ pub enum Contact {
     End,
 }
 
-/// A value along a road: cubics, each from its start on.
-#[derive(Debug, Clone, Default, PartialEq)]
-pub struct Profile {
-    /// Start `s` and coefficients a, b, c, d of each cubic, by rising `s`.
-    pub records: Vec<(f64, [f64; 4])>,
-}
-
 /// Lanes across a stretch of road.
 #[derive(Debug, Clone, Default)]
 pub struct LaneSection {
@@ -115,6 +106,18 @@ pub struct RoadLane {
     pub successor: Option<i32>,
     /// Its own speed limit, metres per second.
     pub speed_limit_mps: Option<f64>,
+    /// Whether it is level, with all lanes outside it, at the height of its inner border.
+    pub level: bool,
+    /// Whether traffic leads against the direction of its side.
+    pub reversed: bool,
+}
+
+impl RoadLane {
+    /// A lane without links and speed limit of its own.
+    #[must_use]
+    pub fn new(kind: LaneKind, width: Profile) -> Self {
+        Self { kind, width, predecessor: None, successor: None, speed_limit_mps: None, level: false, reversed: false }
+    }
 }
 
 /// What a lane is for.
@@ -139,6 +142,8 @@ pub enum LaneKind {
 pub struct Junction {
     /// Its id in the map.
     pub id: String,
+    /// Whether its connections join two roads directly, for both directions, without a road inside the junction.
+    pub direct: bool,
     /// The ways through it.
     pub connections: Vec<Connection>,
 }
@@ -148,11 +153,11 @@ pub struct Junction {
 pub struct Connection {
     /// The road that leads into the junction.
     pub incoming: usize,
-    /// The road inside the junction.
+    /// The road inside the junction; in a direct junction, the other road.
     pub connecting: usize,
     /// The end at which the connecting road is entered.
     pub contact: Contact,
-    /// Lane of the incoming road, lane of the connecting road.
+    /// Lane of the incoming road, lane of the connecting road. Empty: lanes of one id.
     pub lane_links: Vec<(i32, i32)>,
 }
 
@@ -203,46 +208,18 @@ pub struct RoadStructure {
     pub length_m: f64,
 }
 
-impl Profile {
-    /// The same value everywhere.
-    #[must_use]
-    pub fn constant(value: f64) -> Self {
-        Self { records: vec![(0.0, [value, 0.0, 0.0, 0.0])] }
-    }
-
-    /// The cubic that leads from one value and slope to another over `length` from `start` on.
-    #[must_use]
-    pub fn hermite(start: f64, length: f64, [from, slope]: [f64; 2], [to, end_slope]: [f64; 2]) -> (f64, [f64; 4]) {
-        let rise = (to - from) / length;
-        let c = (3.0 * rise - 2.0 * slope - end_slope) / length;
-        let d = (slope + end_slope - 2.0 * rise) / (length * length);
-        (start, [from, slope, c, d])
-    }
-
-    /// Value at `s`; the first cubic also holds before its start, and an empty profile is 0.
-    #[must_use]
-    pub fn at(&self, s: f64) -> f64 {
-        self.record_at(s).map_or(0.0, |(start, coefficients)| cubic(coefficients, s - start))
-    }
-
-    /// Slope at `s`.
-    #[must_use]
-    pub fn slope_at(&self, s: f64) -> f64 {
-        self.record_at(s).map_or(0.0, |(start, coefficients)| cubic_slope(coefficients, s - start))
-    }
-
-    fn record_at(&self, s: f64) -> Option<(f64, [f64; 4])> {
-        let after = self.records.partition_point(|&(start, _)| start <= s);
-        self.records.get(after.saturating_sub(1)).copied()
-    }
-}
-
 impl LaneSection {
     /// The lane of an id, if the section has it; there is none for the centre, 0.
     #[must_use]
     pub fn lane(&self, id: i32) -> Option<&RoadLane> {
         let side = if id > 0 { &self.left } else { &self.right };
         side.get((id.unsigned_abs() as usize).checked_sub(1)?)
+    }
+
+    /// Whether lanes are kept level where the road is not.
+    #[must_use]
+    pub fn has_level_lanes(&self) -> bool {
+        self.left.iter().chain(&self.right).any(|lane| lane.level)
     }
 
     /// Ids of all lanes, from the rightmost to the leftmost.
@@ -262,11 +239,64 @@ impl Road {
         curve.at((s_m - curve.s_m).clamp(0.0, curve.length_m))
     }
 
-    /// Place at `s_m`, `t_m`, on the road's surface, metres.
+    /// Place at `s_m`, `t_m` of section `section`, on the road's surface, metres.
     #[must_use]
-    pub fn point_at(&self, s_m: f64, t_m: f64) -> [f64; 3] {
-        let pose = self.pose_at(s_m).moved(0.0, t_m, 0.0);
-        [pose.x, pose.y, self.elevation.at(s_m)]
+    pub fn point_at(&self, section: usize, s_m: f64, t_m: f64) -> [f64; 3] {
+        let z_m = self.elevation.at(s_m);
+        if self.lateral.is_level() {
+            let pose = self.pose_at(s_m).moved(0.0, t_m, 0.0);
+            return [pose.x, pose.y, z_m];
+        }
+        let [aside_m, height_m] = self.aside_m(section, s_m, t_m);
+        let pose = self.pose_at(s_m).moved(0.0, aside_m, 0.0);
+        [pose.x, pose.y, z_m + height_m]
+    }
+
+    /// Distance beside the reference line (positive to the left) and height over it of the surface at `s_m`, `t_m` of
+    /// section `section`, metres. On a level road that is `t_m` and 0.
+    #[must_use]
+    pub fn aside_m(&self, section: usize, s_m: f64, t_m: f64) -> [f64; 2] {
+        if self.lateral.is_level() {
+            return [t_m, 0.0];
+        }
+        let left = t_m > 0.0;
+        match self.level_from_m(section, s_m, left) {
+            Some(edge_m) if t_m != edge_m && (t_m > edge_m) == left => {
+                let [aside_m, height_m] = self.lateral.at(s_m, edge_m);
+                [aside_m + t_m - edge_m, height_m]
+            }
+            _ => self.lateral.at(s_m, t_m),
+        }
+    }
+
+    /// Inner border of the lanes of one side that stay level, metres.
+    fn level_from_m(&self, section: usize, s_m: f64, left: bool) -> Option<f64> {
+        let lanes = self.sections.get(section).map(|section| if left { &section.left } else { &section.right })?;
+        let place = lanes.iter().position(|lane| lane.level)? as i32 + 1;
+        let [low, high] = self.lane_span_m(section, if left { place } else { -place }, s_m);
+        Some(if left { low } else { high })
+    }
+
+    /// Slope across lane `id` of section `section` at `s_m` as an angle, radians; positive where the left side of the
+    /// road (not of the lane's traffic) is higher.
+    #[must_use]
+    pub fn bank_rad(&self, section: usize, id: i32, s_m: f64) -> f64 {
+        if self.lateral.is_level() {
+            return 0.0;
+        }
+        let [low, high] = self.lane_span_m(section, id, s_m);
+        // A lane of no width yet lies as the lane around its place.
+        let half_m = (high - low).max(0.2) / 2.0;
+        let [right, left] = [-half_m, half_m].map(|offset| self.aside_m(section, s_m, (low + high) / 2.0 + offset));
+        (left[1] - right[1]).atan2(left[0] - right[0])
+    }
+
+    /// Whether traffic on lane `id` of section `section` leads along the road.
+    #[must_use]
+    pub fn leads_along(&self, section: usize, id: i32) -> bool {
+        let reversed =
+            self.sections.get(section).and_then(|section| section.lane(id)).is_some_and(|lane| lane.reversed);
+        ((id < 0) != self.left_hand) != reversed
     }
 
     /// End of section `index`, metres.
@@ -314,36 +344,21 @@ mod tests {
     use super::*;
 
     #[test]
-    fn profile_switches_cubics_and_hermite_meets_both_ends() {
-        let ramp = Profile::hermite(10.0, 20.0, [1.0, 0.0], [5.0, 0.1]);
-        let profile = Profile { records: vec![(0.0, [1.0, 0.0, 0.0, 0.0]), ramp, (30.0, [5.0, 0.1, 0.0, 0.0])] };
-        assert!((profile.at(-3.0) - 1.0).abs() < 1e-12);
-        assert!((profile.at(30.0 - 1e-9) - profile.at(30.0)).abs() < 1e-6);
-        assert!((profile.slope_at(30.0 - 1e-9) - 0.1).abs() < 1e-6);
-        assert!((profile.at(40.0) - 6.0).abs() < 1e-12);
-        assert_eq!(Profile::default().at(3.0), 0.0);
-    }
-
-    #[test]
     fn lane_spans_stack_outwards_from_the_offset() {
-        let lane = |width: f64| RoadLane {
-            kind: LaneKind::Driving,
-            width: Profile::constant(width),
-            predecessor: None,
-            successor: None,
-            speed_limit_mps: None,
-        };
+        let lane = |width: f64| RoadLane::new(LaneKind::Driving, Profile::constant(width));
         let section = LaneSection { s_m: 0.0, left: vec![lane(3.0)], right: vec![lane(3.5), lane(2.0)] };
         assert_eq!(section.lane_ids().collect::<Vec<_>>(), [-2, -1, 1]);
         assert!(section.lane(0).is_none() && section.lane(2).is_none() && section.lane(-2).is_some());
         let road = Road {
             id: "1".into(),
             length_m: 10.0,
+            left_hand: false,
             junction: None,
             predecessor: None,
             successor: None,
             plan_view: vec![],
             elevation: Profile::default(),
+            lateral: LateralProfile::default(),
             lane_offset: Profile::constant(0.5),
             sections: vec![section],
             speed_limits: vec![],

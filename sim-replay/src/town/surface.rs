@@ -8,6 +8,13 @@ use super::road::{LaneKind, Road, RoadNetwork};
 pub(crate) const STEP_M: f64 = 2.0;
 /// Edge of a cell of the index, metres.
 const CELL_M: f64 = 6.0;
+/// Width of the pieces across a road that is bent across, metres.
+const PIECE_M: f64 = 1.0;
+/// Most pieces across one strip of such a road, and of all of them together.
+const MAX_PIECES: f64 = 64.0;
+const MAX_ALL_PIECES: f64 = 2e6;
+/// How far a slope across goes on beside the road, metres.
+const BESIDE_M: f64 = 4.0;
 /// Most cells of the index that all patches together may touch: some 100 MB.
 const MAX_TOUCHED: f64 = 2e7;
 
@@ -17,7 +24,11 @@ pub(crate) struct CrossSection {
     pub s_m: f64,
     /// Place and heading of the reference line.
     pub pose: Pose2,
+    /// Height of the reference line.
     pub z_m: f64,
+    /// Two places across a road that is not level, the outermost paved ones: `t`, distance beside the reference line and
+    /// height over it, metres.
+    bank: Option<[[f64; 3]; 2]>,
     /// Lowest and highest `t` of what vehicles drive on: driving lanes, shoulders, parking lanes; metres. Equal where
     /// there is none.
     pub carriageway_m: [f64; 2],
@@ -32,8 +43,10 @@ pub(crate) struct CrossSection {
 pub(crate) struct Patch {
     /// Corners: start right, end right, end left, start left; metres.
     pub quad: Quad,
-    /// Heights of the start and the end, metres.
-    pub z_m: [f64; 2],
+    /// Heights of the corners, metres.
+    pub z_m: [f64; 4],
+    /// Highest place of the whole road between the two cross-sections, metres.
+    pub top_m: f64,
     pub road: u32,
     /// Whether vehicles drive here; else pavement or verge.
     pub carriageway: bool,
@@ -53,33 +66,85 @@ pub(crate) struct Surface {
 impl CrossSection {
     /// Place at `t`, metres.
     pub(crate) fn at(&self, t_m: f64) -> [f64; 2] {
-        let pose = self.pose.moved(0.0, t_m, 0.0);
+        let pose = self.pose.moved(0.0, self.aside_m(t_m), 0.0);
         [pose.x, pose.y]
+    }
+
+    /// Distance beside the reference line at `t`, metres; straight from one side of the road to the other.
+    pub(crate) fn aside_m(&self, t_m: f64) -> f64 {
+        self.across(t_m, 1).unwrap_or(t_m)
+    }
+
+    /// Height at `t`, metres; straight from one side of the road to the other.
+    pub(crate) fn height_m(&self, t_m: f64) -> f64 {
+        self.across(t_m, 2).map_or(self.z_m, |height| self.z_m + height)
+    }
+
+    /// Slope across, radians; positive where the left side is higher.
+    pub(crate) fn bank_rad(&self) -> f64 {
+        self.bank.map_or(0.0, |[right, left]| (left[2] - right[2]).atan2(left[1] - right[1]))
+    }
+
+    /// Lowest and highest of both paved edges, metres.
+    pub(crate) fn range_m(&self) -> [f64; 2] {
+        let [right, left] = self.paved_m.map(|t| self.height_m(t));
+        [right.min(left), right.max(left)]
+    }
+
+    fn across(&self, t_m: f64, value: usize) -> Option<f64> {
+        let [right, left] = self.bank?;
+        let share = (t_m - right[0]) / (left[0] - right[0]).max(1e-3);
+        Some(right[value] + share * (left[value] - right[value]))
     }
 }
 
 impl Patch {
     /// Height of the surface at (or beside) a place, metres.
     pub(crate) fn height_m(&self, [x, y]: [f64; 2]) -> f64 {
+        let mix = |a: [f64; 2], b: [f64; 2], share: f64| [0, 1].map(|axis| a[axis] + share * (b[axis] - a[axis]));
         let middle = |a: [f64; 2], b: [f64; 2]| [(a[0] + b[0]) / 2.0, (a[1] + b[1]) / 2.0];
         let (start, end) = (middle(self.quad[0], self.quad[3]), middle(self.quad[1], self.quad[2]));
         let (dx, dy) = (end[0] - start[0], end[1] - start[1]);
         let share = ((x - start[0]) * dx + (y - start[1]) * dy) / (dx * dx + dy * dy).max(1e-9);
-        self.z_m[0] + share.clamp(0.0, 1.0) * (self.z_m[1] - self.z_m[0])
+        let share = share.clamp(0.0, 1.0);
+        let [right_z, left_z] = [[0, 1], [3, 2]].map(|[a, b]| self.z_m[a] + share * (self.z_m[b] - self.z_m[a]));
+        if right_z == left_z {
+            return right_z;
+        }
+        // A slope across goes on beside the road, so that a grid of heights meets it up to its edge.
+        let (right, left) = (mix(self.quad[0], self.quad[1], share), mix(self.quad[3], self.quad[2], share));
+        let (dx, dy) = (left[0] - right[0], left[1] - right[1]);
+        let width_m = dx.hypot(dy).max(1e-3);
+        let across_m = ((x - right[0]) * dx + (y - right[1]) * dy) / width_m;
+        right_z + across_m.clamp(-BESIDE_M, width_m + BESIDE_M) / width_m * (left_z - right_z)
+    }
+
+    /// Lowest corner, metres.
+    pub(crate) fn low_m(&self) -> f64 {
+        self.z_m.into_iter().fold(f64::INFINITY, f64::min)
+    }
+
+    /// Highest corner, metres.
+    pub(crate) fn high_m(&self) -> f64 {
+        self.z_m.into_iter().fold(f64::NEG_INFINITY, f64::max)
     }
 }
 
 impl Surface {
     pub(crate) fn new(network: &RoadNetwork) -> Self {
         let roads: Vec<Vec<CrossSection>> = network.roads.iter().map(cross_sections).collect();
+        let most_pieces = most_pieces(network);
         let mut patches = Vec::new();
-        for (road, sections) in roads.iter().enumerate() {
+        for (place, sections) in roads.iter().enumerate() {
+            let road = &network.roads[place];
             for pair in sections.windows(2) {
                 let [from, to] = [pair[0], pair[1]];
+                let before = patches.len();
                 let mut strip = |a: [f64; 2], b: [f64; 2], carriageway| {
                     if a[1] - a[0] > 0.01 || b[1] - b[0] > 0.01 {
-                        let quad = [from.at(a[0]), to.at(b[0]), to.at(b[1]), from.at(a[1])];
-                        patches.push(Patch { quad, z_m: [from.z_m, to.z_m], road: road as u32, carriageway });
+                        strips(road, [(from, a), (to, b)], most_pieces, |quad, z_m| {
+                            patches.push(Patch { quad, z_m, top_m: f64::NAN, road: place as u32, carriageway });
+                        });
                     }
                 };
                 strip(from.carriageway_m, to.carriageway_m, true);
@@ -87,6 +152,9 @@ impl Surface {
                 let left = |c: CrossSection| [c.carriageway_m[1], c.paved_m[1]];
                 strip(right(from), right(to), false);
                 strip(left(from), left(to), false);
+                let own = &mut patches[before..];
+                let top_m = own.iter().map(Patch::high_m).fold(f64::NEG_INFINITY, f64::max);
+                own.iter_mut().for_each(|patch| patch.top_m = top_m);
             }
         }
         let corners: Vec<[f64; 2]> = patches.iter().flat_map(|patch| patch.quad).collect();
@@ -117,9 +185,42 @@ impl Surface {
         pavements: bool,
     ) -> bool {
         !self.any(rectangle, |patch| {
-            let (low, high) = (patch.z_m[0].min(patch.z_m[1]), patch.z_m[0].max(patch.z_m[1]));
+            let (low, high) = (patch.low_m(), patch.high_m());
             (pavements || patch.carriageway) && bottom_m < high + headroom_m && top_m > low - 0.05
         })
+    }
+}
+
+/// Most pieces across one strip: fewer where a map has so many roads that are not level that they would fill the memory.
+fn most_pieces(network: &RoadNetwork) -> f64 {
+    let banked = network.roads.iter().filter(|road| !road.lateral.is_level());
+    let cuts: f64 = banked.map(|road| road.length_m / STEP_M + road.sections.len() as f64).sum();
+    (MAX_ALL_PIECES / (3.0 * cuts).max(1.0)).floor().clamp(1.0, MAX_PIECES)
+}
+
+/// The pieces of a road's surface between two cross-sections and, in each, two `t`: one, or several side by side where
+/// the road is bent across. Calls `piece` with the corners in the order of [`Patch::quad`] and their heights.
+fn strips(
+    road: &Road,
+    [(from, a), (to, b)]: [(CrossSection, [f64; 2]); 2],
+    most_pieces: f64,
+    mut piece: impl FnMut(Quad, [f64; 4]),
+) {
+    if road.lateral.is_level() {
+        let quad = [from.at(a[0]), to.at(b[0]), to.at(b[1]), from.at(a[1])];
+        return piece(quad, [from.z_m, to.z_m, to.z_m, from.z_m]);
+    }
+    let is_straight = road.lateral.is_flat() && !road.sections[from.section].has_level_lanes();
+    let width_m = (a[1] - a[0]).max(b[1] - b[0]);
+    let count = if is_straight { 1 } else { (width_m / PIECE_M).ceil().clamp(1.0, most_pieces) as usize };
+    let corner = |cut: &CrossSection, range: [f64; 2], place: usize| {
+        let t_m = range[0] + (range[1] - range[0]) * place as f64 / count as f64;
+        road.point_at(cut.section, cut.s_m, t_m)
+    };
+    for place in 0..count {
+        let corners =
+            [corner(&from, a, place), corner(&to, b, place), corner(&to, b, place + 1), corner(&from, a, place + 1)];
+        piece(corners.map(|[x, y, _]| [x, y]), corners.map(|[_, _, z]| z));
     }
 }
 
@@ -170,7 +271,13 @@ fn cut(road: &Road, section: usize, s_m: f64, inside_m: f64) -> CrossSection {
     let paved = range(|kind| kind != LaneKind::Other && kind != LaneKind::Median);
     let carriageway_m = carriageway.or(driving).unwrap_or([origin; 2]);
     let paved_m = paved.unwrap_or(carriageway_m);
-    CrossSection { s_m, pose: road.pose_at(s_m), z_m: road.elevation.at(s_m), carriageway_m, paved_m, section }
+    let bank = (!road.lateral.is_level() && paved_m[1] > paved_m[0]).then(|| {
+        paved_m.map(|t_m| {
+            let [aside_m, height_m] = road.aside_m(section, inside_m, t_m);
+            [t_m, aside_m, height_m]
+        })
+    });
+    CrossSection { s_m, pose: road.pose_at(s_m), z_m: road.elevation.at(s_m), bank, carriageway_m, paved_m, section }
 }
 
 #[cfg(test)]
@@ -182,7 +289,7 @@ mod tests {
         let surface = Surface::new(&super::super::layout::town1(1).network);
         assert_eq!(cell_m(&surface.patches, CELL_M), CELL_M);
         let (right, left) = ([0.0, 0.0], [9_000.0, 9_000.0]);
-        let wide = Patch { quad: [right, right, left, left], z_m: [0.0; 2], road: 0, carriageway: true };
+        let wide = Patch { quad: [right, right, left, left], z_m: [0.0; 4], top_m: 0.0, road: 0, carriageway: true };
         let cells = (9_000.0 / cell_m(&[wide; 100], CELL_M) + 1.0).powi(2) * 100.0;
         assert!((MAX_TOUCHED / 5.0..=MAX_TOUCHED).contains(&cells), "{cells}");
     }

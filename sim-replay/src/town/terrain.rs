@@ -78,7 +78,7 @@ fn fix_under_roads(grid: &mut HeightGrid, surface: &Surface) -> Vec<bool> {
 /// Lets go of nodes that an upper road has set close to a lower one, so that bridges reach beyond the lower road's edges.
 fn open_under_bridges(grid: &mut HeightGrid, surface: &Surface) {
     for patch in &surface.patches {
-        let level = patch.z_m[0].max(patch.z_m[1]) as f32;
+        let level = patch.top_m as f32;
         for (place, _) in nodes_within(grid, &patch.quad, OPENING_M) {
             if grid.heights_m[place] > level + BRIDGE_M {
                 grid.heights_m[place] = f32::NAN;
@@ -228,8 +228,8 @@ fn decks(grid: &HeightGrid, surface: &Surface) -> Vec<Triangle> {
     let mut triangles = Vec::new();
     for patch in surface.patches.iter().filter(|patch| is_deck(patch, |x, y| grid.height_m(x, y))) {
         let [a, b, c, d] = patch.quad;
-        let [start, end] = patch.z_m;
-        let corners = [[a[0], a[1], start], [b[0], b[1], end], [c[0], c[1], end], [d[0], d[1], start]];
+        let [za, zb, zc, zd] = patch.z_m;
+        let corners = [[a[0], a[1], za], [b[0], b[1], zb], [c[0], c[1], zc], [d[0], d[1], zd]];
         for [i, j, k] in [[0, 1, 2], [0, 2, 3]] {
             let (p, q, r): ([f64; 3], [f64; 3], [f64; 3]) = (corners[i], corners[j], corners[k]);
             let area = (q[0] - p[0]) * (r[1] - p[1]) - (q[1] - p[1]) * (r[0] - p[0]);
@@ -283,7 +283,10 @@ mod tests {
         assert_eq!(empty_grid(&surface).cell_m, CELL_M);
         let (right, left) = ([0.0, 0.0], [3_000.0, 3_000.0]);
         surface.patches =
-            vec![Patch { quad: [right, right, left, left], z_m: [0.0; 2], road: 0, carriageway: true }; 500];
+            vec![
+                Patch { quad: [right, right, left, left], z_m: [0.0; 4], top_m: 0.0, road: 0, carriageway: true };
+                500
+            ];
         surface.bounds_m = [right, left];
         assert!(empty_grid(&surface).cell_m > 4.0 * CELL_M);
     }

@@ -298,7 +298,7 @@ fn map_of(rows: u32) -> BevFeatures {
     let (channels, width, height) = if rows == 0 { (64, 64, 64) } else { (64, 100, rows) };
     let grid = BevGrid { x_min_m: -51.2, y_min_m: -38.4, cell_m: 0.8, width, height };
     let values = (0..channels * width * height).map(|index| (index % 1009) as f32 * 0.01).collect();
-    BevFeatures { grid, channels, values }
+    BevFeatures { grid, channels, code_of: None, values }
 }
 
 fn say(line: &str) -> Result<()> {

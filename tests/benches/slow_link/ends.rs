@@ -215,5 +215,5 @@ fn features(bytes: usize) -> BevFeatures {
     let grid =
         BevGrid { x_min_m: -51.2, y_min_m: -38.4, cell_m: 0.8, width: width as u32, height: (cells / width) as u32 };
     let values = (0..channels * cells).map(|index| (index % 1009) as f32 * 0.01).collect();
-    BevFeatures { grid, channels: channels as u32, values }
+    BevFeatures { grid, channels: channels as u32, code_of: None, values }
 }

@@ -60,9 +60,7 @@ pub fn all(root: &Path) -> Vec<Reader> {
     fs::write(file("experiment", "links/newest-first.yaml"), seeds::LINK).expect("a writable folder");
     let mut all = vec![
         in_memory("pcd", seeds::clouds(), |_, bytes| pcd::decode(bytes).is_ok()),
-        in_memory("opendrive", text(seeds::OPENDRIVE), |_, bytes| {
-            std::str::from_utf8(bytes).is_ok_and(|text| town::opendrive::read(text).is_ok())
-        }),
+        in_memory("opendrive", text(seeds::OPENDRIVE), |_, bytes| town::opendrive::read_bytes(bytes).is_ok()),
         on_disk("mcap recording", vec![seeds::recording(root)], file("mcap", "a.mcap"), read_recording),
         on_disk("scenario", text(seeds::SCENARIO), file("scenario", "a.yaml"), |path, _| {
             // What it names is not there, which is no fault of the file.
@@ -182,11 +180,11 @@ fn drive(folder: &Path, files: &[(&str, &[u8])], names: &[&'static str]) -> Vec<
     names.iter().enumerate().filter(|(place, name)| !name.is_empty() && *place < files.len()).map(reader).collect()
 }
 
-/// Whether the first sweep of the first scenario can be read.
+/// True where the first sweep of the first scenario can be read, and nothing is left out.
 fn read_first(folder: &Path) -> bool {
-    let Ok(dataset) = dataset::open(folder) else { return false };
+    let Some(dataset) = dataset::open(folder).ok().filter(|dataset| dataset.problems.is_empty()) else { return false };
     let Some(scenario) = dataset.scenarios.first().filter(|scenario| !scenario.ticks.is_empty()) else { return false };
-    scenario.load(0, 0, &LoadOptions::default()).is_ok()
+    scenario.load(0, 0, &LoadOptions::default()).is_ok_and(|frame| frame.problems.is_empty())
 }
 
 fn read_recording(path: &Path, _: &[u8]) -> bool {

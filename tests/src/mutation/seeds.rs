@@ -20,16 +20,38 @@ pub fn messages() -> Vec<Vec<u8>> {
     all.map(|message| wire::encode_any(&sample::stamp(), message).expect("a sound message").to_vec()).collect()
 }
 
-/// Sweeps as text and as bytes, with and without colours.
+/// Sweeps as text, as bytes and packed, with and without colours, and as PCL leaves them: stretched, and padded.
 #[must_use]
 pub fn clouds() -> Vec<Vec<u8>> {
     let kinds = [Encoding::Ascii, Encoding::Binary]
         .into_iter()
         .flat_map(|encoding| [IntensityField::Intensity, IntensityField::Red].map(|field| (encoding, field)));
     let mut files: Vec<Vec<u8>> = kinds.map(|(encoding, field)| encode(&sample::points(), encoding, field)).collect();
-    files.push(compressed());
+    let packed = compressed();
+    files.push(packed.clone());
+    files.push([&packed[..], &[0; 300]].concat());
+    files.push(padded());
+    files.push(SPARSE.as_bytes().to_vec());
     files
 }
+
+/// Three points with the padding of a message, some of it of no bytes, and more bytes than stated behind them.
+fn padded() -> Vec<u8> {
+    let mut file = b"# .PCD v0.7\nVERSION .7\nFIELDS x y z _ intensity _ ring _\nSIZE 4 4 4 1 1 1 2 1\n\
+        TYPE F F F U U U U U\nCOUNT 1 1 1 4 1 0 1 9\nWIDTH 3\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 3\nDATA binary\n"
+        .to_vec();
+    for number in 0..3_u8 {
+        file.extend([1.5, -2.0, f32::from(number)].into_iter().flat_map(f32::to_le_bytes));
+        file.extend([9, 9, 9, 9, 100 * number, number, 0]);
+        file.extend([7; 9]);
+    }
+    file.extend([0; 200]);
+    file
+}
+
+/// As little of a header as there may be, and the numbers of C libraries.
+const SPARSE: &str = "# points\nCOLUMNS x y z reflectivity\nSIZE 4 4 8 2\nTYPE F F F U\nWIDTH 4\nDATA ascii\n\
+    1 2 3 4 \r\n\n-1.5e-05 68.34235382 .5 65535\nnan -nan inf 0\n1.#QNAN 0 0 0\n";
 
 /// Four points, packed by LZF as nothing but literals.
 fn compressed() -> Vec<u8> {
@@ -71,7 +93,7 @@ pub const OPV2V: &str = "lidar_pose: [1.5, -2.0, 1.9, 0.0, 90.0, 0.0]\ntrue_ego_
 
 /// The same as V2V4Real does: matrices as Python wrote them.
 pub const V2V4REAL: &str = concat!(
-    include_str!("../../../sim-replay/src/dataset/numpy_matrix.yaml"),
+    include_str!("../../../sim-replay/src/dataset/numpy_tags/numpy_matrix.yaml"),
     "true_ego_pos: [0, 0, 0, 0, 0, 0]\nego_speed: 3.6\nvehicles:\n  1:\n    angle: [0, 90, 0]\n    center: [0, 0, 0]\n    \
      extent: [2, 1, 0.75]\n    location: [10, 4, -1]\n    ass_id: 5\n    obj_type: Truck\n"
 );

@@ -41,7 +41,7 @@ fn parse_config(name: &str) -> Result<SceneEncoderConfig, String> {
 
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     let config = args.config()?;
-    let bar = TrainingBar::default();
+    let bar = TrainingBar::of(config.run.length);
     let summary = train_encoder(&config, &mut |report| tell(&bar, report))?;
     bar.finish();
     card(&config, &summary).write(&config.run.out)?;

@@ -56,7 +56,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
         },
         run: run_config(&args.options, args.batch, args.lr)?,
     };
-    let bar = TrainingBar::default();
+    let bar = TrainingBar::of(config.run.length);
     let trained = train_end_to_end(&config, &mut |report| match report {
         EndToEndReport::Encoding(done, total) => bar.encoded(*done, *total),
         EndToEndReport::Stepped { step, share_done, seconds, error_m } => {

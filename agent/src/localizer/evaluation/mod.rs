@@ -7,7 +7,7 @@ use std::path::PathBuf;
 use std::time::Instant;
 
 use protocol::{CavId, Pose, PoseEstimate};
-use sim_replay::dataset::{self, LoadOptions, ReadError, Scenario};
+use sim_replay::dataset::{self, LeftOut, LoadOptions, Problem, ReadError, Scenario};
 use sim_replay::frame::Frame;
 
 pub use summary::{CalibrationBin, LocalizationSummary, WithheldSummary, reliability_charts};
@@ -100,6 +100,15 @@ impl EvaluatedSweep {
     }
 }
 
+/// What came of all sweeps.
+#[derive(Debug, Default)]
+pub struct Evaluated {
+    /// Each in turn, vehicle by vehicle.
+    pub sweeps: Vec<EvaluatedSweep>,
+    /// Sweeps and other data that could not be used.
+    pub left_out: LeftOut,
+}
+
 /// A sweep that is there.
 struct Sweep<'a> {
     scenario: &'a Scenario,
@@ -110,12 +119,13 @@ struct Sweep<'a> {
 /// Localises every sweep of the scenes in turn; `on_sweep` is told how many there are and how many are done.
 ///
 /// # Errors
-/// [`EvaluationError`] at the first sweep that cannot be read or has no true pose.
+/// [`EvaluationError`] when a data set cannot be opened, and at the first sweep without a true pose. Sweeps that cannot be
+/// read are left out and counted.
 pub fn evaluate(
     localizer: &mut dyn Localize,
     options: &EvaluationOptions,
     on_sweep: &mut dyn FnMut(usize, usize),
-) -> Result<Vec<EvaluatedSweep>, EvaluationError> {
+) -> Result<Evaluated, EvaluationError> {
     evaluate_with(&mut |frame| localizer.localize(&frame.points), options, on_sweep)
 }
 
@@ -127,7 +137,7 @@ pub fn evaluate_source(
     source: &mut dyn PoseSource,
     options: &EvaluationOptions,
     on_sweep: &mut dyn FnMut(usize, usize),
-) -> Result<Vec<EvaluatedSweep>, EvaluationError> {
+) -> Result<Evaluated, EvaluationError> {
     let mut ask = |frame: &Frame| {
         let measured = frame.gnss_world_from_lidar();
         let Frame { cav, capture_nanos, points, .. } = frame;
@@ -143,7 +153,7 @@ fn evaluate_with(
     localize: &mut dyn FnMut(&Frame) -> Result<Localization, LocalizerError>,
     options: &EvaluationOptions,
     on_sweep: &mut dyn FnMut(usize, usize),
-) -> Result<Vec<EvaluatedSweep>, EvaluationError> {
+) -> Result<Evaluated, EvaluationError> {
     let datasets = options.scenes.iter().map(|dir| dataset::open(dir)).collect::<Result<Vec<_>, _>>()?;
     let scenarios = datasets.iter().flat_map(|dataset| &dataset.scenarios);
     let all: Vec<Sweep<'_>> = scenarios.flat_map(|scenario| sweeps_of(scenario, options.every)).collect();
@@ -152,25 +162,39 @@ fn evaluate_with(
         return Err(EvaluationError::Empty(options.scenes.clone()));
     }
     let load = LoadOptions { lidar_variant: options.variant.clone(), ..LoadOptions::default() };
-    let mut evaluated = Vec::with_capacity(count);
+    let mut evaluated = Evaluated { sweeps: Vec::with_capacity(count), left_out: LeftOut::default() };
+    datasets.iter().for_each(|dataset| evaluated.left_out.add_files(&dataset.problems));
     for place in 0..count {
         let Sweep { scenario, agent, tick } = all[place * all.len() / count];
-        let frame = scenario.load(agent, tick, &load)?;
+        on_sweep(place + 1, count);
+        let frame = match scenario.load(agent, tick, &load) {
+            Ok(frame) => frame,
+            Err(error @ ReadError::NoSuch { .. }) => return Err(error.into()),
+            Err(error) => {
+                evaluated.left_out.add_unreadable(agent, Problem::from(&error));
+                continue;
+            }
+        };
         let stem = scenario.ticks[tick].stem.clone();
         let Some(truth) = frame.world_from_lidar else {
             return Err(EvaluationError::NoTruth { scenario: scenario.name.clone(), cav: frame.cav, stem });
         };
         let localization = localize(&frame)?;
-        evaluated.push(EvaluatedSweep { scenario: scenario.name.clone(), cav: frame.cav, stem, truth, localization });
-        on_sweep(place + 1, count);
+        let scenario = scenario.name.clone();
+        evaluated.sweeps.push(EvaluatedSweep { scenario, cav: frame.cav, stem, truth, localization });
+    }
+    if evaluated.sweeps.is_empty() {
+        return Err(EvaluationError::Empty(options.scenes.clone()));
     }
     Ok(evaluated)
 }
 
 /// Vehicle by vehicle, in the order of time.
 fn sweeps_of(scenario: &Scenario, every: usize) -> impl Iterator<Item = Sweep<'_>> {
-    let ticks = move || (0..scenario.ticks.len()).step_by(every.max(1));
-    (0..scenario.agents.len()).flat_map(move |agent| ticks().map(move |tick| Sweep { scenario, agent, tick }))
+    let ticks = move |agent| {
+        (0..scenario.ticks.len()).step_by(every.max(1)).filter(move |&tick| scenario.is_present(agent, tick))
+    };
+    (0..scenario.agents.len()).flat_map(move |agent| ticks(agent).map(move |tick| Sweep { scenario, agent, tick }))
 }
 
 /// A word for what became of a sweep.

@@ -104,7 +104,8 @@ impl SweepList {
             for scenario in dataset.scenarios.into_iter().map(Arc::new) {
                 for agent in 0..scenario.agents.len() {
                     let place = |tick| Place { scenario: Arc::clone(&scenario), agent, tick, world, drive };
-                    places.extend((0..scenario.ticks.len()).map(place));
+                    let ticks = (0..scenario.ticks.len()).filter(|&tick| scenario.is_present(agent, tick));
+                    places.extend(ticks.map(place));
                     drive += 1;
                 }
                 scenarios.push(scenario);

@@ -3,8 +3,14 @@ use protocol::{AgentTruth, Detection, Doubt, FusedNeighbour, HeardNeighbour, Ski
 use super::super::open_ticks::MOST_OPEN;
 use super::*;
 
-const RULE: GroundTruthRule =
-    GroundTruthRule { x_m: [-50.0, 50.0], y_m: [-40.0, 40.0], z_m: [-3.0, 1.0], comm_range_m: 70.0, min_corners: 8 };
+const RULE: GroundTruthRule = GroundTruthRule {
+    x_m: [-50.0, 50.0],
+    y_m: [-40.0, 40.0],
+    z_m: [-3.0, 1.0],
+    comm_range_m: 70.0,
+    min_corners: 8,
+    classes: ClassSet::VEHICLES,
+};
 
 fn cav(text: &str) -> CavId {
     CavId::new(text).unwrap()

@@ -79,6 +79,9 @@ impl Evaluator {
         for tick in 0..scenario.ticks.len().min(MEASURED_TICKS) {
             let mut sent = Vec::with_capacity(agents.len());
             for (place, agent) in agents.iter_mut().enumerate() {
+                if !scenario.is_present(place, tick) {
+                    continue;
+                }
                 let frame = scenario.load(place, tick, &LoadOptions::default())?;
                 let input = AgentInput {
                     capture_nanos: frame.capture_nanos,

@@ -46,6 +46,7 @@ pub(super) struct Courier {
     /// Which stream letters take.
     stream: Stream,
     ledger: Ledger,
+    sent_bytes: u64,
 }
 
 impl Courier {
@@ -60,6 +61,7 @@ impl Courier {
             next_id: 0,
             stream: Stream::Bev,
             ledger: Ledger::default(),
+            sent_bytes: 0,
         }
     }
 
@@ -116,6 +118,7 @@ impl Courier {
         while let Some(entry) = self.posted.first_entry().filter(|entry| entry.key().0 <= nanos) {
             let parcel = entry.remove();
             self.ledger.sent(&Account::published(topic(&parcel.from, parcel.stream)));
+            self.sent_bytes += parcel.bytes;
             self.air.offer(parcel);
         }
         self.air.advance(nanos).into_iter().filter_map(|outcome| self.settle(outcome)).collect()
@@ -164,6 +167,11 @@ impl Courier {
             let under_way = self.kept.iter().filter(|(id, kept)| kept.topic == topic && !not_sent.contains(id)).count();
             self.ledger.set_in_flight(&Account::towards(topic, &self.receiver), under_way as u64 + waiting);
         }
+    }
+
+    /// Bytes of all that was sent so far, poses included.
+    pub(super) fn sent_bytes(&self) -> u64 {
+        self.sent_bytes
     }
 
     /// The books.

@@ -115,7 +115,7 @@ impl RemoteCrew {
     }
 
     /// Hands out the sweeps of a tick and waits for all answers, in the same order.
-    pub(super) fn ask(&self, frames: &[Frame]) -> Result<Vec<Sent>, RemoteError> {
+    pub(super) fn ask(&self, frames: &[&Frame]) -> Result<Vec<Sent>, RemoteError> {
         for frame in frames {
             let Some(Sensors { gnss, lidar }) = self.sensors.get(&frame.cav) else { continue };
             if let Some(world_from_lidar) = frame.world_from_lidar {

@@ -3,7 +3,7 @@
 use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion, Vector3};
 use std::f64::consts::{PI, TAU};
 
-/// A pose without roll: position in metres, heading, and pitch (positive lifts the nose), radians.
+/// A pose: position in metres, heading, pitch (positive lifts the nose) and roll (positive lifts the left side), radians.
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub struct Placement {
     /// Position in the world.
@@ -12,13 +12,15 @@ pub struct Placement {
     pub yaw_rad: f64,
     /// Upward slope of the x axis.
     pub pitch_rad: f64,
+    /// Turn about the x axis, from y towards z, before the others.
+    pub roll_rad: f64,
 }
 
 impl Placement {
     /// A level placement.
     #[must_use]
     pub fn level(position_m: [f64; 3], yaw_rad: f64) -> Self {
-        Self { position_m: position_m.into(), yaw_rad, pitch_rad: 0.0 }
+        Self { position_m: position_m.into(), yaw_rad, pitch_rad: 0.0, roll_rad: 0.0 }
     }
 
     /// `world_from_self`, the turning part.
@@ -26,7 +28,12 @@ impl Placement {
     pub fn rotation(&self) -> Matrix3<f64> {
         let (sy, cy) = self.yaw_rad.sin_cos();
         let (sp, cp) = self.pitch_rad.sin_cos();
-        Matrix3::new(cy * cp, -sy, -cy * sp, sy * cp, cy, -sy * sp, sp, 0.0, cp)
+        let rotation = Matrix3::new(cy * cp, -sy, -cy * sp, sy * cp, cy, -sy * sp, sp, 0.0, cp);
+        if self.roll_rad == 0.0 {
+            return rotation;
+        }
+        let (sr, cr) = self.roll_rad.sin_cos();
+        rotation * Matrix3::new(1.0, 0.0, 0.0, 0.0, cr, -sr, 0.0, sr, cr)
     }
 
     /// `world_from_self`.
@@ -75,6 +82,7 @@ impl Sweep {
             // Backwards from the end, so that the pose at time 1 is the end to the last bit.
             yaw_rad: self.end.yaw_rad - turn * (1.0 - time),
             pitch_rad: mix(self.start.pitch_rad, self.end.pitch_rad),
+            roll_rad: mix(self.start.roll_rad, self.end.roll_rad),
         }
     }
 
@@ -98,9 +106,21 @@ mod tests {
 
     #[test]
     fn pitch_lifts_the_nose_and_yaw_turns_left() {
-        let nose =
-            Placement { position_m: Vector3::zeros(), yaw_rad: PI / 2.0, pitch_rad: 0.1 }.rotation() * Vector3::x();
+        let turned = Placement { pitch_rad: 0.1, ..Placement::level([0.0; 3], PI / 2.0) };
+        let nose = turned.rotation() * Vector3::x();
         assert!((nose - Vector3::new(0.0, 0.1f64.cos(), 0.1f64.sin())).norm() < 1e-12);
+    }
+
+    #[test]
+    fn roll_lifts_the_left_side_and_leaves_the_nose() {
+        let level = Placement { pitch_rad: 0.1, ..Placement::level([0.0; 3], PI / 2.0) };
+        let rotation = Placement { roll_rad: 0.2, ..level }.rotation();
+        assert!((rotation * Vector3::x() - level.rotation() * Vector3::x()).norm() < 1e-12);
+        let left = rotation * Vector3::y();
+        assert!(
+            (left.z - 0.2f64.sin() * 0.1f64.cos()).abs() < 1e-12 && (left.x + 0.2f64.cos()).abs() < 1e-12,
+            "{left}"
+        );
     }
 
     #[test]
@@ -114,7 +134,8 @@ mod tests {
 
     #[test]
     fn the_rotation_is_that_of_the_isometry() {
-        let placement = Placement { position_m: Vector3::new(1.0, 2.0, 3.0), yaw_rad: 0.7, pitch_rad: -0.2 };
+        let placement =
+            Placement { position_m: Vector3::new(1.0, 2.0, 3.0), yaw_rad: 0.7, pitch_rad: -0.2, roll_rad: 0.3 };
         let difference = placement.isometry().rotation.to_rotation_matrix().into_inner() - placement.rotation();
         assert!(difference.amax() < 1e-12);
     }

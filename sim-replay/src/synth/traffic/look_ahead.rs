@@ -141,7 +141,7 @@ impl Traffic<'_> {
         if near.is_empty() {
             return None;
         }
-        let half_width_m = 0.5 * car.vehicle.size_m[1] + SIDE_ROOM_M;
+        let half_width_m = (0.5 * car.vehicle.size_m[1] + SIDE_ROOM_M) * here.roll_rad.cos();
         let mut ahead_m = car.half_length_m();
         while ahead_m < car.half_length_m() + reach_m {
             let [x, y, _] = car.path.point_m(self.roads.graph, ahead_m);

@@ -150,6 +150,24 @@ impl Path {
 
     /// The point `offset_m` ahead of (or behind) the vehicle's middle, straight on where the way is not known.
     pub(crate) fn point_m(&self, graph: &LaneGraph, offset_m: f64) -> [f64; 3] {
+        self.mixed(graph, offset_m, point_on, |from, to, share| {
+            std::array::from_fn(|axis| from[axis] + share * (to[axis] - from[axis]))
+        })
+    }
+
+    /// Slope across the way there, radians; positive where the left side is higher.
+    fn bank_rad(&self, graph: &LaneGraph, offset_m: f64) -> f64 {
+        self.mixed(graph, offset_m, Lane::bank_rad, |from, to, share| from + share * (to - from))
+    }
+
+    /// What a lane has `offset_m` ahead of the vehicle's middle; during a change, mixed from both lanes.
+    fn mixed<T>(
+        &self,
+        graph: &LaneGraph,
+        offset_m: f64,
+        on: impl Fn(&Lane, f64) -> T,
+        mix: impl Fn(T, T, f64) -> T,
+    ) -> T {
         let (mut index, mut s_m) = (self.current, self.s_m + offset_m);
         while s_m < 0.0 && index > 0 {
             index -= 1;
@@ -160,17 +178,16 @@ impl Path {
             index += 1;
         }
         let lane = graph.lane(self.lanes[index]);
-        let point = point_on(lane, s_m);
-        let Some(change) = &self.change else { return point };
+        let own = on(lane, s_m);
+        let Some(change) = &self.change else { return own };
         let share = change.share(offset_m);
         match change.left_beside(lane.id) {
             Some(left) if share < 1.0 => {
                 let left = graph.lane(left);
-                let from = point_on(left, s_m / lane.length_m * left.length_m);
-                std::array::from_fn(|axis| from[axis] + share * (point[axis] - from[axis]))
+                mix(on(left, s_m / lane.length_m * left.length_m), own, share)
             }
             // Lanes behind the change are those that the vehicle came from.
-            _ => point,
+            _ => own,
         }
     }
 
@@ -182,8 +199,12 @@ impl Path {
         let (dx, dy, dz) = (front[0] - rear[0], front[1] - rear[1], front[2] - rear[2]);
         let base = dx.hypot(dy).max(1e-6);
         let middle: [f64; 3] = std::array::from_fn(|axis| 0.5 * (front[axis] + rear[axis]));
-        let position = [middle[0] - aside_m * dy / base, middle[1] + aside_m * dx / base, middle[2]];
-        Placement { pitch_rad: dz.atan2(base), ..Placement::level(position, dy.atan2(dx)) }
+        let roll_rad = self.bank_rad(graph, drive_m);
+        let (rise, flat) = roll_rad.sin_cos();
+        let aside_flat_m = aside_m * flat;
+        let position =
+            [middle[0] - aside_flat_m * dy / base, middle[1] + aside_flat_m * dx / base, middle[2] + aside_m * rise];
+        Placement { pitch_rad: dz.atan2(base), roll_rad, ..Placement::level(position, dy.atan2(dx)) }
     }
 }
 

@@ -21,7 +21,9 @@ impl Rectangle {
     pub(crate) fn new(placement: &Placement, size_m: &[f64; 3]) -> Self {
         let (sin, cos) = placement.yaw_rad.sin_cos();
         let [x, y, z_m] = placement.position_m.into();
-        Self { center_m: [x, y], axis: [cos, sin], half_m: [0.5 * size_m[0], 0.5 * size_m[1]], z_m }
+        // On a banked road vehicles side by side are closer to each other as seen from above.
+        let half_width_m = 0.5 * size_m[1] * placement.roll_rad.cos();
+        Self { center_m: [x, y], axis: [cos, sin], half_m: [0.5 * size_m[0], half_width_m], z_m }
     }
 
     /// Grown by `margin_m` on every side.

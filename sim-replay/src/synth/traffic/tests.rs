@@ -2,7 +2,7 @@
 
 use super::*;
 use crate::synth::vehicle::Vehicle;
-use crate::town::{Lane, LaneGraph, LaneId, TownSource, build};
+use crate::town::{Lane, LaneGraph, LaneId, TownSource, build, lane_builder, opendrive};
 
 fn options(vehicles_per_km: f64) -> TrafficOptions {
     TrafficOptions { vehicles_per_km, radius_m: 210.0, focus_explores: false }
@@ -183,4 +183,88 @@ fn knots_come_undone() {
         }
         assert!(longest_s < 90.0, "seed {seed}: the focus stands for {longest_s} s");
     }
+}
+
+/// Lanes of an OpenDRIVE map of one road.
+fn one_road(attributes: &str, geometry: &str, lateral: &str, lanes: &str) -> LaneGraph {
+    let text = format!(
+        r#"<OpenDRIVE><road id="1" junction="-1" {attributes}><planView>{geometry}</planView>{lateral}
+        <lanes><laneSection s="0">{lanes}</laneSection></lanes></road></OpenDRIVE>"#
+    );
+    let network = opendrive::read(&text).unwrap();
+    assert_eq!(network.findings, []);
+    lane_builder::lane_graph(&network).0
+}
+
+#[test]
+fn vehicles_drive_on_the_side_that_the_map_gives() {
+    let lane =
+        |id: i32| format!(r#"<lane id="{id}" type="driving"><width sOffset="0" a="3.5" b="0" c="0" d="0"/></lane>"#);
+    let lanes = format!("<left>{}</left><right>{}</right>", lane(1), lane(-1));
+    let line = r#"<geometry s="0" x="0" y="0" hdg="0" length="400"><line/></geometry>"#;
+    for (rule, eastwards_y_m) in [("LHT", 1.75), ("RHT", -1.75)] {
+        let graph = one_road(&format!(r#"length="400" rule="{rule}""#), line, "", &lanes);
+        let roads = Roads::new(&graph);
+        let mut traffic = Traffic::new(&roads, &[], options(30.0), roads.spawns[3], 5);
+        let (mut east, mut west) = (0, 0);
+        for _ in 0..200 {
+            traffic.step();
+            assert_eq!(overlaps(&traffic), []);
+            for car in traffic.cars.iter().filter(|car| car.is_present) {
+                let (place, along) = (car.motion.end.position_m, car.motion.end.yaw_rad.cos());
+                // Half a metre of the own lane's middle, with the driver's habit.
+                assert!((place.y - along.signum() * eastwards_y_m).abs() < 0.5, "{rule}: {place} {along}");
+                let moved = place.x - car.motion.start.position_m.x;
+                assert!(along.abs() > 0.99 && moved * along >= 0.0, "{rule}: {moved} {along}");
+                *(if along > 0.0 { &mut east } else { &mut west }) += 1;
+            }
+        }
+        assert!(east > 100 && west > 100, "{rule}: {east} {west}");
+    }
+}
+
+#[test]
+fn vehicles_lean_with_a_banked_road_and_pass_side_by_side() {
+    let (radius_m, bank_rad): (f64, f64) = (80.0, 0.7);
+    let length_m = std::f64::consts::TAU * radius_m;
+    // A circle to the left, its right side high; both ends meet.
+    let link = r#"<link><predecessor elementType="road" elementId="1" contactPoint="end"/>
+        <successor elementType="road" elementId="1" contactPoint="start"/></link>"#;
+    let geometry = format!(
+        r#"<geometry s="0" x="0" y="0" hdg="0" length="{length_m}"><arc curvature="{}"/></geometry>"#,
+        1.0 / radius_m
+    );
+    let lateral = format!(
+        r#"{link}<lateralProfile><superelevation s="0" a="{}" b="0" c="0" d="0"/></lateralProfile>"#,
+        -bank_rad
+    );
+    let lane = |id: i32| {
+        format!(
+            r#"<lane id="{id}" type="driving"><link><predecessor id="{id}"/><successor id="{id}"/></link>
+            <width sOffset="0" a="3.4" b="0" c="0" d="0"/></lane>"#
+        )
+    };
+    let lanes = format!("<right>{}{}</right>", lane(-1), lane(-2));
+    let graph = one_road(&format!(r#"length="{length_m}""#), &geometry, &lateral, &lanes);
+    assert!(graph.lanes.iter().all(|lane| lane.successors == [lane.id]));
+    let roads = Roads::new(&graph);
+    let mut traffic = Traffic::new(&roads, &[], options(20.0), roads.spawns[0], 9);
+    let (mut moving, mut all) = (0, 0);
+    for step in 0..1200 {
+        traffic.step();
+        assert_eq!(overlaps(&traffic), []);
+        for car in traffic.cars.iter().filter(|car| car.is_present) {
+            let placement = car.motion.end;
+            let place = placement.position_m;
+            let beside_m = (place.x.powi(2) + (place.y - radius_m).powi(2)).sqrt() - radius_m;
+            // On the plane of the bank, and leaning as it does.
+            assert!((place.z - beside_m * bank_rad.tan()).abs() < 0.1, "{place} {beside_m}");
+            assert!((placement.roll_rad + bank_rad).abs() < 1e-6, "{}", placement.roll_rad);
+            if step > 400 {
+                all += 1;
+                moving += usize::from(car.speed_mps > 3.0);
+            }
+        }
+    }
+    assert!(moving * 10 > all * 9, "{moving} of {all}");
 }

@@ -52,7 +52,7 @@ fn along_side(site: &mut Site, side: &Side, share: f64, barrier: Barrier, rng: &
         if rng.random_bool(share) {
             let line = |s: f64| {
                 let pose = side.beyond_kerb(site.surface, site.network, s, 0.45);
-                [pose.x, pose.y, side.road_m(site.network, s)]
+                [pose.x, pose.y, side.road_m(site.surface, site.network, s)]
             };
             let pieces = pieces(s, end, |s| site.network.roads[side.road].pose_at(s).heading_rad);
             let parts: Vec<Vec<Solid>> =
@@ -80,8 +80,9 @@ fn between_directions(site: &mut Site, road: usize) {
         let low = network.roads[road].lane_span_m(cut.section, right, s)[1];
         let high = network.roads[road].lane_span_m(cut.section, left, s)[0];
         (high - low > 1.0).then(|| {
-            let [x, y] = cut.at((low + high) / 2.0);
-            [x, y, cut.z_m]
+            let middle_m = (low + high) / 2.0;
+            let [x, y] = cut.at(middle_m);
+            [x, y, cut.height_m(middle_m)]
         })
     };
     let cuts = &site.surface.roads[road];
@@ -102,10 +103,7 @@ fn between_directions(site: &mut Site, road: usize) {
         let outline = super::site::outline(part);
         network.roads[road].junction.is_none()
             && !site.surface.any(&outline, |patch| {
-                patch.road as usize != road
-                    && patch.carriageway
-                    && a < patch.z_m[0].max(patch.z_m[1]) + 4.5
-                    && b > patch.z_m[0] - 0.05
+                patch.road as usize != road && patch.carriageway && a < patch.high_m() + 4.5 && b > patch.low_m() - 0.05
             })
     };
     let parts: Vec<Solid> = parts.into_iter().filter(clear).collect();

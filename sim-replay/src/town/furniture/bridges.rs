@@ -40,7 +40,7 @@ pub(super) fn place(site: &mut Site) {
 fn drop_m(site: &Site, cut: &CrossSection) -> f64 {
     let [low, high] = cut.paved_m;
     let probes = [low, low + 0.25 * (high - low), (low + high) / 2.0, high - 0.25 * (high - low), high];
-    probes.iter().map(|&t| cut.z_m - site.ground_m(cut.at(t))).fold(0.0, f64::max)
+    probes.iter().map(|&t| cut.height_m(t) - site.ground_m(cut.at(t))).fold(0.0, f64::max)
 }
 
 fn bridge(site: &mut Site, road: usize) {
@@ -71,7 +71,7 @@ fn slab(from: &CrossSection, to: &CrossSection, thickness_m: f64) -> Solid {
     let middle = |cut: &CrossSection| cut.at((cut.paved_m[0] + cut.paved_m[1]) / 2.0);
     let (a, b) = (middle(from), middle(to));
     let width = (from.paved_m[1] - from.paved_m[0]).max(to.paved_m[1] - to.paved_m[0]);
-    let top = from.z_m.min(to.z_m) - 0.06;
+    let top = from.range_m()[0].min(to.range_m()[0]) - 0.06;
     wall(SolidKind::BridgeDeck, a, b, [top - thickness_m, top], width + 0.3, 0.35)
 }
 
@@ -80,12 +80,13 @@ fn parapet(site: &mut Site, road: usize, from: &CrossSection, to: &CrossSection)
     for side in [0, 1] {
         let out = if side == 0 { -0.2 } else { 0.2 };
         let [a, b] = [from, to].map(|cut| cut.at(cut.paved_m[side] + out));
-        let z = [from.z_m.min(to.z_m) - 0.3, from.z_m.max(to.z_m) + 1.0];
+        let edges = [from, to].map(|cut| cut.height_m(cut.paved_m[side]));
+        let z = [edges[0].min(edges[1]) - 0.3, edges[0].max(edges[1]) + 1.0];
         let part = wall(SolidKind::Barrier, a, b, z, 0.25, 0.45);
         let outline = super::site::outline(&part);
         let joined = site.surface.any(&outline, |patch| {
             let own = patch.road as usize == road && !patch.carriageway;
-            !own && z[0] < patch.z_m[0].max(patch.z_m[1]) + HEADROOM_M && z[1] > patch.z_m[0].min(patch.z_m[1]) - 0.05
+            !own && z[0] < patch.high_m() + HEADROOM_M && z[1] > patch.low_m() - 0.05
         });
         if !joined {
             site.place(&[part]);
@@ -100,7 +101,7 @@ fn pillars(site: &mut Site, cut: &CrossSection, thickness_m: f64) {
         let t = low + (high - low) * (f64::from(place) + 0.5) / f64::from(count);
         let at = cut.at(t);
         let ground = site.ground_m(at);
-        let height = cut.z_m - thickness_m - 0.1 - ground;
+        let height = cut.range_m()[0] - thickness_m - 0.1 - ground;
         if height < 2.0 {
             continue;
         }
@@ -126,7 +127,7 @@ fn retaining_walls(site: &mut Site, road: usize) {
             let sign = if side == 0 { -1.0 } else { 1.0 };
             let beside = [from, to].map(|cut| site.ground_m(cut.at(cut.paved_m[side] + sign * BESIDE_M)));
             let high = beside[0].max(beside[1]);
-            let road_z = from.z_m.min(to.z_m);
+            let road_z = from.height_m(from.paved_m[side]).min(to.height_m(to.paved_m[side]));
             if beside[0].min(beside[1]) - road_z < RETAINED_M {
                 continue;
             }
@@ -135,7 +136,7 @@ fn retaining_walls(site: &mut Site, road: usize) {
             let around = Rectangle { center_m: middle, half_m: [1.0, 1.0], yaw_rad: from.pose.heading_rad };
             let mut above = f64::INFINITY;
             site.surface.any(&around, |patch| {
-                let z = patch.z_m[0].min(patch.z_m[1]);
+                let z = patch.low_m();
                 if z > road_z + 3.0 {
                     above = above.min(z);
                 }
@@ -157,7 +158,7 @@ fn tunnel(site: &mut Site, road: usize, from_m: f64, to_m: f64) {
     while s + 1.0 < end {
         let next = (s + PIECE_M).min(end);
         let (a, b) = (*cut_at(site.surface, road, s), *cut_at(site.surface, road, next));
-        let z = [a.z_m.min(b.z_m), a.z_m.max(b.z_m)];
+        let z = [a.range_m()[0].min(b.range_m()[0]), a.range_m()[1].max(b.range_m()[1])];
         for side in [0, 1] {
             let out = if side == 0 { -0.45 } else { 0.45 };
             let [p, q] = [a, b].map(|cut| cut.at(cut.paved_m[side] + out));

@@ -41,7 +41,7 @@ pub(super) fn sides(network: &RoadNetwork) -> Vec<Side> {
         let [left, right] = [drives(road, true), drives(road, false)];
         for sign in [-1.0, 1.0] {
             let zone = zone(road);
-            let along = if sign < 0.0 { right } else { !left };
+            let along = if sign < 0.0 { right != road.left_hand } else { left == road.left_hand };
             let one_way_left = (sign > 0.0 && !left) || (sign < 0.0 && !right);
             let median = one_way_left && zone == Zone::Motorway;
             sides.push(Side { road: index, sign, zone, length_m: road.length_m, along, median });
@@ -62,9 +62,21 @@ impl Side {
         self.beyond(surface, network, s_m, out_m, |cut| cut.carriageway_m)
     }
 
-    /// Height of the road, metres.
-    pub(super) fn road_m(&self, network: &RoadNetwork, s_m: f64) -> f64 {
-        network.roads[self.road].elevation.at(s_m.clamp(0.0, self.length_m))
+    /// Height of the road at the edge of its carriageway, metres.
+    pub(super) fn road_m(&self, surface: &Surface, network: &RoadNetwork, s_m: f64) -> f64 {
+        let s_m = s_m.clamp(0.0, self.length_m);
+        let z_m = network.roads[self.road].elevation.at(s_m);
+        if network.roads[self.road].lateral.is_level() {
+            return z_m;
+        }
+        let cut = cut_at(surface, self.road, s_m);
+        z_m + cut.height_m(cut.carriageway_m[usize::from(self.sign > 0.0)]) - cut.z_m
+    }
+
+    /// Whether traffic passes close by this side, rather than oncoming traffic between: the right side where traffic
+    /// keeps right.
+    pub(super) fn is_near(&self, network: &RoadNetwork) -> bool {
+        ((self.sign < 0.0) == self.along) != network.roads[self.road].left_hand
     }
 
     /// Width of pavement and verge on this side, metres.
@@ -87,7 +99,8 @@ impl Side {
         range: impl Fn(&super::super::surface::CrossSection) -> [f64; 2],
     ) -> Pose2 {
         let inside = s_m.clamp(0.0, self.length_m);
-        let [low, high] = range(cut_at(surface, self.road, inside));
+        let cut = cut_at(surface, self.road, inside);
+        let [low, high] = range(cut).map(|t_m| cut.aside_m(t_m));
         let t = if self.sign > 0.0 { high + out_m } else { low - out_m };
         network.roads[self.road].pose_at(inside).moved(s_m - inside, t, 0.0)
     }

@@ -39,7 +39,7 @@ pub(super) fn fill(site: &mut Site, lot: &Lot, rng: &mut ChaCha8Rng) {
             let center_m = site.on_ground(pose);
             // Some drivers park backwards.
             let yaw_rad = if rng.random_bool(0.3) { pose.reversed().heading_rad } else { pose.heading_rad };
-            site.parking.push(ParkingSpot { center_m, yaw_rad, length_m: BAY_M[0], width_m: BAY_M[1] });
+            site.parking.push(ParkingSpot { center_m, yaw_rad, roll_rad: 0.0, length_m: BAY_M[0], width_m: BAY_M[1] });
         }
     }
     let back = Foot::new(lot.foot.pose.moved(0.0, lot.depth_m / 2.0 - 0.2, 0.0), lot.foot.z_m);

@@ -42,7 +42,7 @@ fn gantry(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) {
     let cut = *cut_at(site.surface, side.road, s);
     let [low, high] = [cut.carriageway_m[0] - 0.9, cut.carriageway_m[1] + 0.9];
     let clear = rng.random_range(5.4..6.4);
-    let z = cut.z_m;
+    let [_, z] = cut.range_m();
     let mut parts = Vec::new();
     for t in [low, high] {
         let pose = cut.pose.moved(0.0, t, 0.0);
@@ -69,7 +69,7 @@ fn gantry(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) {
 fn footbridge(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) {
     let cut = *cut_at(site.surface, side.road, s);
     let [low, high] = [cut.carriageway_m[0] - 1.6, cut.carriageway_m[1] + 1.6];
-    let (z, width) = (cut.z_m + rng.random_range(5.3..6.2), rng.random_range(2.4..4.5));
+    let (z, width) = (cut.range_m()[1] + rng.random_range(5.3..6.2), rng.random_range(2.4..4.5));
     let (a, b) = (cut.at(low), cut.at(high));
     let mut parts = vec![wall(SolidKind::BridgeDeck, a, b, [z, z + 0.5], width, 0.4)];
     for edge in [-0.5, 0.5] {
@@ -103,7 +103,7 @@ fn noise_walls(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
             let (low, high) = (ground[0].min(ground[1]), ground[0].max(ground[1]));
             // Panels of slightly different height between posts; some are missing or glazed (lower).
             let own = height * if rng.random_bool(0.08) { 0.45 } else { rng.random_range(0.94..1.06) };
-            let near_road = (low - side.road_m(site.network, s)).abs() < 3.0;
+            let near_road = (low - side.road_m(site.surface, site.network, s)).abs() < 3.0;
             if near_road {
                 let panel = wall(SolidKind::NoiseWall, [a.x, a.y], [b.x, b.y], [low - 0.3, high + own], 0.2, 0.35);
                 let post =

@@ -6,7 +6,7 @@ use rand_chacha::ChaCha8Rng;
 use super::super::ParkingSpot;
 use super::super::convex::Rectangle;
 use super::super::road::LaneKind;
-use super::frontage::{Side, Zone, sides};
+use super::frontage::{Side, Zone, cut_at, sides};
 use super::site::Site;
 
 /// Length and width of a spot, metres.
@@ -60,7 +60,7 @@ fn in_bays(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
             let pose = side.beyond_kerb(site.surface, site.network, middle, pavement + SPOT_M[1] / 2.0 + 0.2);
             let half_m = [SPOT_M[0] / 2.0, SPOT_M[1] / 2.0 + 0.1];
             let rectangle = Rectangle { center_m: [pose.x, pose.y], half_m, yaw_rad: pose.heading_rad };
-            let road = side.road_m(site.network, middle);
+            let road = side.road_m(site.surface, site.network, middle);
             let [low, high] = site.ground_range_m(&rectangle);
             let z_m = [road - 0.5, road + 3.5];
             if high - low < 0.5 && (low - road).abs() < 0.6 && site.is_free(&rectangle, z_m, true) {
@@ -78,8 +78,9 @@ fn push_spot(site: &mut Site, side: &Side, s_m: f64, out_m: f64) {
     let pose = side.beyond_kerb(site.surface, site.network, s_m, out_m);
     let ground = site.ground_m([pose.x, pose.y]);
     // In a parking lane the spot lies on the road, which may be a deck.
-    let z = if out_m < 0.0 { side.road_m(site.network, s_m) } else { ground };
-    let pose = if side.along { pose } else { pose.reversed() };
-    let yaw_rad = pose.heading_rad;
-    site.parking.push(ParkingSpot { center_m: [pose.x, pose.y, z], yaw_rad, length_m: SPOT_M[0], width_m: SPOT_M[1] });
+    let z = if out_m < 0.0 { side.road_m(site.surface, site.network, s_m) } else { ground };
+    let bank_rad = if out_m < 0.0 { cut_at(site.surface, side.road, s_m).bank_rad() } else { 0.0 };
+    let (pose, roll_rad) = if side.along { (pose, bank_rad) } else { (pose.reversed(), -bank_rad) };
+    let (center_m, yaw_rad) = ([pose.x, pose.y, z], pose.heading_rad);
+    site.parking.push(ParkingSpot { center_m, yaw_rad, roll_rad, length_m: SPOT_M[0], width_m: SPOT_M[1] });
 }

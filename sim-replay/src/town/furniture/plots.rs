@@ -104,7 +104,7 @@ fn free_lot(site: &Site, side: &Side, s: f64, [width, depth]: [f64; 2], set_back
     let half_m = [width / 2.0, depth / 2.0];
     let rectangle = Rectangle { center_m: [pose.x, pose.y], half_m, yaw_rad: pose.heading_rad };
     let [low, high] = site.ground_range_m(&rectangle);
-    let road = side.road_m(site.network, middle);
+    let road = side.road_m(site.surface, site.network, middle);
     let fits = high - low < MAX_SLOPE_M && (low - road).abs() < 4.0;
     let free = fits && site.is_free(&rectangle.grown(0.4), [low - 1.5, low + LOT_HEIGHT_M], true);
     free.then(|| Lot { foot: Foot::new(pose, low), width_m: width, depth_m: depth })

@@ -4,7 +4,7 @@ use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
 use super::super::curve::Pose2;
-use super::super::road::RoadLink;
+use super::super::road::{Road, RoadLink};
 use super::super::{Solid, SolidKind};
 use super::frontage::{Side, Zone, cut_at, sides};
 use super::parts::Foot;
@@ -41,19 +41,25 @@ fn place_recorded(site: &mut Site, rng: &mut ChaCha8Rng) -> bool {
         let road = &site.network.roads[index];
         for signal in &road.signals {
             lights |= signal.dynamic;
-            let pose = road.pose_at(signal.s_m).moved(0.0, signal.t_m, signal.heading_rad);
+            let pose = beside_line(road, signal.s_m, signal.t_m, signal.heading_rad);
             let foot = Foot::new(pose, site.ground_m([pose.x, pose.y]));
             let parts = if signal.dynamic { light(foot) } else { sign(foot, rng) };
             beside_carriageway(site, &parts, signal.t_m);
         }
         for object in road.objects.iter().filter(|object| is_sign(&object.label)) {
-            let pose = road.pose_at(object.s_m).moved(0.0, object.t_m, object.heading_rad);
+            let pose = beside_line(road, object.s_m, object.t_m, object.heading_rad);
             let foot = Foot::new(pose, site.ground_m([pose.x, pose.y]));
             let parts = sign(foot, rng);
             beside_carriageway(site, &parts, object.t_m);
         }
     }
     lights
+}
+
+/// A place that a map gives by `s` and `t`, turned by `heading_rad`.
+fn beside_line(road: &Road, s_m: f64, t_m: f64, heading_rad: f64) -> Pose2 {
+    let [aside_m, _] = road.aside_m(road.section_at(s_m), s_m, t_m);
+    road.pose_at(s_m).moved(0.0, aside_m, heading_rad)
 }
 
 /// Places parts, or the same a little farther out where the map has them on the carriageway.
@@ -141,8 +147,7 @@ fn traffic_light(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
     let Some(RoadLink::Junction(junction)) = link else { return };
     // The same answer for every road of the junction.
     let lit = !(junction * 7 + site.network.junctions[junction].connections.len()).is_multiple_of(3);
-    let right_of_traffic = (side.sign < 0.0) == side.along;
-    if !lit || !right_of_traffic {
+    if !lit || !side.is_near(site.network) {
         return;
     }
     let pose = side.beyond_kerb(site.surface, site.network, s, 0.4);
@@ -152,8 +157,9 @@ fn traffic_light(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
     // Some carry a second head over the lane.
     if rng.random_bool(0.3) {
         parts[0] = foot.cylinder(SolidKind::Pole, [0.0, 0.0, -0.2], [0.12, 6.6], 0.5);
-        parts.push(foot.cuboid(SolidKind::Pole, [0.0, 1.7, 6.0], [0.12, 3.2, 0.12], 0.5));
-        parts.push(foot.cuboid(SolidKind::Sign, [-0.2, 3.0, 5.2], [0.25, 0.45, 1.2], 0.6));
+        let over = if road.left_hand { -1.0 } else { 1.0 };
+        parts.push(foot.cuboid(SolidKind::Pole, [0.0, over * 1.7, 6.0], [0.12, 3.2, 0.12], 0.5));
+        parts.push(foot.cuboid(SolidKind::Sign, [-0.2, over * 3.0, 5.2], [0.25, 0.45, 1.2], 0.6));
     }
     site.try_place(&parts, 0.02, false);
 }

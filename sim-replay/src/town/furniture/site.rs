@@ -104,7 +104,7 @@ impl<'a> Site<'a> {
         let (mut points, mut z_m) = (Vec::new(), [f64::INFINITY, f64::NEG_INFINITY]);
         for patch in patches {
             points.extend(patch.quad);
-            z_m = [z_m[0].min(patch.z_m[0]), z_m[1].max(patch.z_m[1])];
+            z_m = [z_m[0].min(patch.z_m[0]).min(patch.z_m[3]), z_m[1].max(patch.z_m[1]).max(patch.z_m[2])];
         }
         let [low, high] = bounds(&points);
         if points.len() > 2 && (high[0] - low[0]).max(high[1] - low[1]) < MAX_JUNCTION_M {

@@ -2,9 +2,9 @@
 
 use super::super::clothoid;
 use super::super::curve::{Curve, CurveShape, Pose2};
-use super::super::road::{
-    Connection, Contact, Junction, LaneKind, LaneSection, Profile, Road, RoadLane, RoadLink, RoadNetwork,
-};
+use super::super::lateral::LateralProfile;
+use super::super::profile::Profile;
+use super::super::road::{Connection, Contact, Junction, LaneKind, LaneSection, Road, RoadLane, RoadLink, RoadNetwork};
 
 /// Lanes across a road, each outwards from the reference line: kind and width in metres.
 #[derive(Debug, Clone, Default)]
@@ -78,8 +78,9 @@ impl Builder {
         profile: &CrossProfile,
         limit_mps: f64,
     ) -> usize {
-        let lanes =
-            |side: &[(LaneKind, f64)]| side.iter().map(|&(kind, width)| lane(kind, Profile::constant(width))).collect();
+        let lanes = |side: &[(LaneKind, f64)]| {
+            side.iter().map(|&(kind, width)| RoadLane::new(kind, Profile::constant(width))).collect()
+        };
         let section = LaneSection { s_m: 0.0, left: lanes(&profile.left), right: lanes(&profile.right) };
         self.push(plan_view, elevation, section, limit_mps)
     }
@@ -87,7 +88,7 @@ impl Builder {
     /// Adds a junction without connections.
     pub(super) fn junction(&mut self) -> usize {
         let id = self.network.junctions.len();
-        self.network.junctions.push(Junction { id: format!("j{id}"), connections: Vec::new() });
+        self.network.junctions.push(Junction { id: format!("j{id}"), ..Junction::default() });
         id
     }
 
@@ -113,7 +114,7 @@ impl Builder {
         let cubic = |from, to| Profile { records: vec![Profile::hermite(0.0, length_m, from, to)] };
         let elevation = cubic([exit.height_m, exit.slope], [entry.height_m, entry.slope]);
         let width = cubic([exit.width_m, 0.0], [entry.width_m, 0.0]);
-        let mut only = lane(LaneKind::Driving, width);
+        let mut only = RoadLane::new(LaneKind::Driving, width);
         (only.predecessor, only.successor) = (Some(from.lane), Some(to.lane));
         let section = LaneSection { s_m: 0.0, left: Vec::new(), right: vec![only] };
         let connecting = self.push(vec![curve], elevation, section, limit_mps);
@@ -179,11 +180,13 @@ impl Builder {
         self.network.roads.push(Road {
             id: format!("r{place}"),
             length_m: path_length_m(&plan_view),
+            left_hand: false,
             junction: None,
             predecessor: None,
             successor: None,
             plan_view,
             elevation,
+            lateral: LateralProfile::default(),
             lane_offset: Profile::default(),
             sections: vec![section],
             speed_limits: vec![(0.0, limit_mps)],
@@ -198,8 +201,4 @@ impl Builder {
 /// An arc of a circle as a road's whole reference line.
 pub(super) fn arc(start: Pose2, curvature: f64, length_m: f64) -> Vec<Curve> {
     vec![Curve { s_m: 0.0, start, length_m, shape: CurveShape::Arc { curvature } }]
-}
-
-fn lane(kind: LaneKind, width: Profile) -> RoadLane {
-    RoadLane { kind, width, predecessor: None, successor: None, speed_limit_mps: None }
 }

@@ -3,7 +3,8 @@
 use std::f64::consts::PI;
 
 use super::super::curve::Pose2;
-use super::super::road::{Contact, LaneKind, Profile, RoadStructure};
+use super::super::profile::Profile;
+use super::super::road::{Contact, LaneKind, RoadStructure};
 use super::builder::{Builder, CrossProfile, LaneEnd, RoadEnd, path};
 use super::ring::Ring;
 

@@ -3,7 +3,8 @@
 use std::f64::consts::{FRAC_PI_2, PI};
 
 use super::super::curve::Pose2;
-use super::super::road::{Contact, LaneKind, Profile};
+use super::super::profile::Profile;
+use super::super::road::{Contact, LaneKind};
 use super::builder::{Builder, CrossProfile, LaneEnd, RoadEnd, arc};
 
 /// Width of the ring's lane, metres.

@@ -5,7 +5,8 @@ use rand_chacha::ChaCha8Rng;
 
 use super::super::curve::Pose2;
 use super::super::lane::wrap_angle;
-use super::super::road::{Contact, LaneKind, Profile};
+use super::super::profile::Profile;
+use super::super::road::{Contact, LaneKind};
 use super::builder::{Builder, CrossProfile, RoadEnd, path};
 
 /// Half of the largest angle by which a street leaves its edge's direction, radians.

@@ -6,7 +6,8 @@ use std::f64::consts::{FRAC_PI_2, PI};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 
-use super::super::road::{Contact, LaneKind, Profile};
+use super::super::profile::Profile;
+use super::super::road::{Contact, LaneKind};
 use super::Layout;
 use super::builder::{Builder, CrossProfile, RoadEnd, path};
 use super::grid::{GridPlan, grid, spread};

@@ -1,6 +1,8 @@
-//! Typed access to XML elements, with errors that say where.
+//! Typed access to XML elements, with errors that name the place, and findings where a value is treated as absent.
 
 use roxmltree::Node;
+
+use super::super::finding::FindingLog;
 
 /// Why a map cannot be used.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]
@@ -52,21 +54,90 @@ pub enum OpenDriveError {
     },
 }
 
+impl OpenDriveError {
+    /// Writes the error down as a finding: what it is about was handled by `action`.
+    pub(super) fn note(&self, log: &mut FindingLog, action: &str) {
+        match self {
+            Self::TooLarge { .. } | Self::Xml(_) => log.add(1, "OpenDRIVE", &self.to_string(), action),
+            Self::Element { line, element, problem } => log.add(*line, element, problem, action),
+            Self::Missing { line, element, attribute } => {
+                log.add(*line, element, &format!("has no attribute {attribute}"), action);
+            }
+            Self::Value { line, element, attribute, value, expected } => {
+                log.add(*line, element, &format!("{attribute}=\"{value}\", expected {expected}"), action);
+            }
+        }
+    }
+}
+
+/// Line numbers of places in a text, with one count for each block: the document itself would count from its beginning
+/// for each place, and a list of all lines could be larger than the text.
+pub(super) struct LineIndex<'input> {
+    text: &'input [u8],
+    /// Line breaks before each block.
+    breaks: Vec<u32>,
+}
+
+/// Length of the blocks, bytes.
+const BLOCK: usize = 4096;
+
+impl<'input> LineIndex<'input> {
+    pub(super) fn new(text: &'input str) -> Self {
+        let text = text.as_bytes();
+        let mut breaks = vec![0];
+        for block in text.chunks(BLOCK) {
+            breaks.push(breaks[breaks.len() - 1] + line_breaks(block));
+        }
+        Self { text, breaks }
+    }
+
+    fn line(&self, place: usize) -> u32 {
+        let place = place.min(self.text.len());
+        let block = place / BLOCK;
+        self.breaks[block] + line_breaks(&self.text[block * BLOCK..place]) + 1
+    }
+}
+
+fn line_breaks(bytes: &[u8]) -> u32 {
+    bytes.iter().map(|&byte| u32::from(byte == b'\n')).sum()
+}
+
 /// An XML element.
 #[derive(Clone, Copy)]
-pub(super) struct Element<'a, 'input>(pub(super) Node<'a, 'input>);
+pub(super) struct Element<'a, 'input> {
+    node: Node<'a, 'input>,
+    lines: &'a LineIndex<'input>,
+}
 
 /// Children of `parent` with a name.
 pub(super) fn children<'a, 'input>(
     parent: Element<'a, 'input>,
     name: &'static str,
 ) -> impl Iterator<Item = Element<'a, 'input>> {
-    parent.0.children().filter(move |node| node.has_tag_name(name)).map(Element)
+    parent.elements().filter(move |element| element.node.has_tag_name(name))
 }
 
 impl<'a, 'input> Element<'a, 'input> {
+    /// The root of a document with the lines of its text.
+    pub(super) fn root(node: Node<'a, 'input>, lines: &'a LineIndex<'input>) -> Self {
+        Self { node, lines }
+    }
+
     pub(super) fn name(&self) -> &'a str {
-        self.0.tag_name().name()
+        self.node.tag_name().name()
+    }
+
+    /// All child elements.
+    pub(super) fn elements(self) -> impl Iterator<Item = Self> {
+        let lines = self.lines;
+        self.node.children().filter(Node::is_element).map(move |node| Self { node, lines })
+    }
+
+    /// The largest size of a number among the descendants with a name; 0 where there is none.
+    pub(super) fn largest(&self, name: &'static str, attribute: &'static str) -> f64 {
+        let nodes = self.node.descendants().filter(|node| node.has_tag_name(name));
+        let values = nodes.filter_map(|node| node.attribute(attribute)?.trim().parse::<f64>().ok());
+        values.map(f64::abs).filter(|value| value.is_finite()).fold(0.0, f64::max)
     }
 
     /// The first child with a name.
@@ -80,7 +151,7 @@ impl<'a, 'input> Element<'a, 'input> {
     }
 
     pub(super) fn optional_text(&self, attribute: &'static str) -> Option<&'a str> {
-        self.0.attribute(attribute)
+        self.node.attribute(attribute)
     }
 
     pub(super) fn text(&self, attribute: &'static str) -> Result<&'a str, OpenDriveError> {
@@ -106,7 +177,7 @@ impl<'a, 'input> Element<'a, 'input> {
         low: f64,
         high: f64,
     ) -> Result<f64, OpenDriveError> {
-        if self.0.has_attribute(attribute) { self.number(attribute, low, high) } else { Ok(default) }
+        if self.node.has_attribute(attribute) { self.number(attribute, low, high) } else { Ok(default) }
     }
 
     /// A lane id.
@@ -130,8 +201,19 @@ impl<'a, 'input> Element<'a, 'input> {
         Ok(coefficients)
     }
 
+    /// Writes a finding about this element down.
+    pub(super) fn note(&self, log: &mut FindingLog, found: &str, action: &str) {
+        log.add(self.line(), self.name(), found, action);
+    }
+
+    /// Writes the value of an attribute down as a finding.
+    pub(super) fn note_value(&self, log: &mut FindingLog, attribute: &'static str, action: &str) {
+        let value = self.optional_text(attribute).unwrap_or_default();
+        self.note(log, &format!("{attribute}=\"{value}\""), action);
+    }
+
     pub(super) fn line(&self) -> u32 {
-        self.0.document().text_pos_at(self.0.range().start).row
+        self.lines.line(self.node.range().start)
     }
 
     pub(super) fn error_element(&self, problem: &str) -> OpenDriveError {
@@ -161,5 +243,23 @@ impl<'a, 'input> Element<'a, 'input> {
 
 /// Lanes on one side of a road, at most.
 pub(super) const MAX_LANES: i32 = 64;
+/// Longest road and longest element of a reference line, metres.
+pub(super) const MAX_LENGTH_M: f64 = 100_000.0;
 /// Places farther from the origin than this are refused, metres.
 pub(super) const MAX_COORDINATE_M: f64 = 1e7;
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn lines_are_counted_over_all_blocks() {
+        let text: String = (0..1500).map(|line| "x".repeat(line % 17) + "\n").collect();
+        assert!(text.len() > 3 * BLOCK);
+        let lines = LineIndex::new(&text);
+        for place in (0..=text.len()).step_by(7).chain([BLOCK, BLOCK - 1, text.len(), text.len() + 9]) {
+            let counted = text.bytes().take(place).filter(|&byte| byte == b'\n').count() as u32 + 1;
+            assert_eq!(lines.line(place), counted, "{place}");
+        }
+    }
+}

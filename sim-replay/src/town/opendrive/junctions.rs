@@ -1,32 +1,60 @@
 //! `<junction>`: the ways through it.
 
+use super::super::finding::FindingLog;
 use super::super::road::{Connection, Junction};
 use super::element::{Element, children};
-use super::roads::read_contact;
+use super::links::read_contact;
 use super::{Ids, OpenDriveError};
 
-pub(super) fn read(element: Element, ids: &Ids) -> Result<Junction, OpenDriveError> {
+/// Reads a junction; connections that cannot be read are left out.
+pub(super) fn read(element: Element, ids: &Ids, log: &mut FindingLog) -> Junction {
+    let kind = element.optional_text("type").unwrap_or("default");
+    let direct = kind == "direct";
+    match kind {
+        "default" | "direct" | "" => {}
+        "virtual" => element.note_value(log, "type", "built only where its roads begin or end at other roads' ends"),
+        "crossing" => element.note_value(log, "type", "left out: nobody crosses the road there"),
+        _ => element.note_value(log, "type", "treated as a common junction"),
+    }
     let mut connections = Vec::new();
     for connection in children(element, "connection") {
-        let road = |attribute| {
-            let id = connection.text(attribute)?;
-            let found = ids.roads.get(id).copied();
-            found.ok_or_else(|| connection.error_value(attribute, id, "the id of a <road>"))
-        };
-        // Connections of virtual junctions name no connecting road.
-        if connection.optional_text("connectingRoad").is_none() {
-            continue;
+        match read_connection(connection, ids, direct, log) {
+            Ok(Some(found)) => connections.push(found),
+            Ok(None) => connection.note(log, "names no road that it leads to", "connection left out"),
+            Err(error) => error.note(log, "connection left out"),
         }
-        let mut lane_links = Vec::new();
-        for link in children(connection, "laneLink") {
-            lane_links.push((link.lane_id("from")?, link.lane_id("to")?));
-        }
-        connections.push(Connection {
-            incoming: road("incomingRoad")?,
-            connecting: road("connectingRoad")?,
-            contact: read_contact(connection)?,
-            lane_links,
-        });
     }
-    Ok(Junction { id: element.text("id")?.to_owned(), connections })
+    Junction { id: element.optional_text("id").unwrap_or_default().to_owned(), direct, connections }
+}
+
+fn read_connection(
+    element: Element,
+    ids: &Ids,
+    direct: bool,
+    log: &mut FindingLog,
+) -> Result<Option<Connection>, OpenDriveError> {
+    let road = |attribute| {
+        let id = element.text(attribute)?;
+        let found = ids.roads.get(id).copied();
+        found.ok_or_else(|| element.error_value(attribute, id, "the id of a road of this map"))
+    };
+    let onto = if direct { "linkedRoad" } else { "connectingRoad" };
+    if element.optional_text(onto).is_none() {
+        return Ok(None);
+    }
+    let mut lane_links = Vec::new();
+    let mut is_empty = true;
+    for link in children(element, "laneLink") {
+        is_empty = false;
+        match (link.lane_id("from"), link.lane_id("to")) {
+            (Ok(from), Ok(to)) => lane_links.push((from, to)),
+            (Err(error), _) | (_, Err(error)) => error.note(log, "lane link left out"),
+        }
+    }
+    // Without any link, lanes of one id are linked; links that are all unreadable link nothing.
+    if lane_links.is_empty() && !is_empty {
+        return Err(element.error_element("has no lane link that can be read"));
+    }
+    let (incoming, connecting) = (road("incomingRoad")?, road(onto)?);
+    Ok(Some(Connection { incoming, connecting, contact: read_contact(element)?, lane_links }))
 }

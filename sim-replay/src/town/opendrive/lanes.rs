@@ -1,34 +1,56 @@
 //! `<lanes>`: sections and their lanes.
 
-use super::super::road::{Ignored, LaneKind, LaneSection, MAX_WIDTH_M, Profile, RoadLane};
+use super::super::finding::FindingLog;
+use super::super::profile::Profile;
+use super::super::road::{LaneKind, LaneSection, MAX_WIDTH_M, RoadLane};
 use super::OpenDriveError;
+use super::border::widths_from_borders;
 use super::element::{Element, MAX_LANES, children};
-use super::roads::{read_profile, read_speed};
+use super::profile::read_profile;
+use super::speed::read_speed;
 
 pub(super) fn read_sections(
     lanes: Element,
+    lane_offset: &Profile,
     road_length_m: f64,
-    ignored: &mut Ignored,
+    log: &mut FindingLog,
 ) -> Result<Vec<LaneSection>, OpenDriveError> {
-    let mut sections: Vec<LaneSection> = Vec::new();
+    let mut starts: Vec<(f64, Element)> = Vec::new();
     for element in children(lanes, "laneSection") {
         // Writers round: a section may begin a little behind the road's end.
         let s_m = element.number("s", 0.0, road_length_m + 1.0)?.min(road_length_m);
-        if let Some(before) = sections.last().filter(|before| s_m < before.s_m) {
-            let expected = format!("at least the section before, {}", before.s_m);
+        if let Some((before, _)) = starts.last().filter(|(before, _)| s_m < *before) {
+            let expected = format!("at least the section before, {before}");
             return Err(element.error_value("s", &s_m.to_string(), &expected));
         }
-        if let Some(before) = sections.last() {
-            check_widths(element, before, s_m - before.s_m)?;
-        }
-        let left = read_side(element, "left", 1, ignored)?;
-        sections.push(LaneSection { s_m, left, right: read_side(element, "right", -1, ignored)? });
+        starts.push((s_m, element));
     }
-    match sections.last() {
-        Some(last) => check_widths(lanes, last, road_length_m - last.s_m)?,
-        None => return Err(lanes.error_element("has no <laneSection>")),
+    if starts.is_empty() {
+        return Err(lanes.error_element("has no <laneSection>"));
+    }
+    let mut sections = Vec::with_capacity(starts.len());
+    for (place, &(s_m, element)) in starts.iter().enumerate() {
+        let end_m = starts.get(place + 1).map_or(road_length_m, |(next, _)| *next);
+        if matches!(element.optional_text("singleSide"), Some("true" | "1")) {
+            element.note_value(log, "singleSide", "the other side has no lanes here");
+        }
+        let mut side = |name, sign| {
+            let stretch = Stretch { s_m, length_m: end_m - s_m, lane_offset };
+            read_side(element, name, sign, &stretch, log)
+        };
+        let section = LaneSection { s_m, left: side("left", 1)?, right: side("right", -1)? };
+        check_widths(element, &section, end_m - s_m)?;
+        sections.push(section);
     }
     Ok(sections)
+}
+
+/// Where a section lies.
+pub(super) struct Stretch<'a> {
+    pub(super) s_m: f64,
+    pub(super) length_m: f64,
+    /// Of the whole road, over `s` of the road.
+    pub(super) lane_offset: &'a Profile,
 }
 
 /// Refuses sections whose width polynomials leave what a road can be.
@@ -43,47 +65,104 @@ fn check_widths(element: Element, section: &LaneSection, length_m: f64) -> Resul
     }
 }
 
-/// Lanes of one side, from the reference line outwards.
+/// Lanes of one side, from the reference line outwards. Where one cannot be told from its id, it is left out with all
+/// lanes outside it, whose place depends on it.
 fn read_side(
     section: Element,
     name: &'static str,
     sign: i32,
-    ignored: &mut Ignored,
+    stretch: &Stretch,
+    log: &mut FindingLog,
 ) -> Result<Vec<RoadLane>, OpenDriveError> {
     let Some(side) = section.child(name) else { return Ok(Vec::new()) };
-    let mut lanes: Vec<(i32, RoadLane, Element)> = Vec::new();
+    let mut elements: Vec<(i32, Element)> = Vec::new();
     for element in children(side, "lane") {
-        let id = element.lane_id("id")?;
-        if id.signum() != sign {
-            return Err(element.error_range("id", id, sign, sign * MAX_LANES));
-        }
-        ignored.level_lanes += usize::from(matches!(element.optional_text("level"), Some("true" | "1")));
-        lanes.push((id.abs(), read_lane(element)?, element));
-    }
-    lanes.sort_by_key(|&(id, ..)| id);
-    for (place, (id, _, element)) in lanes.iter().enumerate() {
-        if *id as usize != place + 1 {
-            let expected = format!("{}, without gaps or doubles", sign * (place as i32 + 1));
-            return Err(element.error_value("id", &(id * sign).to_string(), &expected));
+        match element.lane_id("id") {
+            Ok(id) if id.signum() == sign => elements.push((id.abs(), element)),
+            Ok(id) => element.error_range("id", id, sign, sign * MAX_LANES).note(log, "lane left out"),
+            Err(error) => error.note(log, "lane left out"),
         }
     }
-    Ok(lanes.into_iter().map(|(_, lane, _)| lane).collect())
+    elements.sort_by_key(|&(id, _)| id);
+    let count = elements.iter().zip(1..).take_while(|((id, _), place)| id == place).count();
+    for &(_, element) in &elements[count..] {
+        let expected = format!("{}, without gaps or doubles", sign * (count as i32 + 1));
+        let id = element.optional_text("id").unwrap_or_default();
+        element.error_value("id", id, &expected).note(log, "lane left out");
+    }
+    elements.truncate(count);
+    let mut lanes = Vec::with_capacity(count);
+    for &(_, element) in &elements {
+        lanes.push(read_lane(element, log)?);
+    }
+    let elements: Vec<Element> = elements.into_iter().map(|(_, element)| element).collect();
+    widths_from_borders(&elements, &mut lanes, sign, stretch, log)?;
+    Ok(lanes)
 }
 
-fn read_lane(element: Element) -> Result<RoadLane, OpenDriveError> {
-    let kind = match element.optional_text("type").unwrap_or_default() {
-        "driving" | "entry" | "exit" | "onRamp" | "offRamp" | "connectingRamp" | "mwyEntry" | "mwyExit"
-        | "bidirectional" => LaneKind::Driving,
+fn read_lane(element: Element, log: &mut FindingLog) -> Result<RoadLane, OpenDriveError> {
+    let width = read_profile(element, "width", "sOffset", MAX_WIDTH_M)?;
+    let link = element.child("link");
+    let mut linked = |name| {
+        let end = link.and_then(|link| link.child(name))?;
+        end.lane_id("id").map_err(|error| error.note(log, "lane link treated as absent")).ok()
+    };
+    let (predecessor, successor) = (linked("predecessor"), linked("successor"));
+    let mut speeds = children(element, "speed");
+    let speed_limit_mps = speeds.next().and_then(|speed| read_speed(speed, log));
+    for further in speeds {
+        further.note_value(log, "sOffset", "left out: the first limit holds for the whole lane");
+    }
+    let reversed = match element.optional_text("direction") {
+        Some("reversed") => true,
+        Some("both") => {
+            element.note_value(log, "direction", "driven in the direction of its side only");
+            false
+        }
+        _ => false,
+    };
+    note_heights(element, log);
+    Ok(RoadLane {
+        predecessor,
+        successor,
+        speed_limit_mps,
+        level: matches!(element.optional_text("level"), Some("true" | "1")),
+        reversed,
+        ..RoadLane::new(read_kind(element, log), width)
+    })
+}
+
+fn read_kind(element: Element, log: &mut FindingLog) -> LaneKind {
+    match element.optional_text("type").unwrap_or_default() {
+        "bidirectional" => {
+            element.note_value(log, "type", "driven in the direction of its side only");
+            LaneKind::Driving
+        }
+        "driving" | "entry" | "exit" | "onRamp" | "offRamp" | "connectingRamp" | "slipLane" | "mwyEntry"
+        | "mwyExit" => LaneKind::Driving,
         "parking" => LaneKind::Parking,
         "shoulder" | "stop" => LaneKind::Shoulder,
         "sidewalk" | "walking" => LaneKind::Sidewalk,
         "median" => LaneKind::Median,
-        _ => LaneKind::Other,
-    };
-    let link = element.child("link");
-    let linked = |name| link.and_then(|link| link.child(name)).map(|end| end.lane_id("id")).transpose();
-    // Several speed records may follow each other along a lane; the first is taken for all of it.
-    let speed_limit_mps = element.child("speed").map(read_speed).transpose()?.flatten();
-    let width = read_profile(element, "width", "sOffset", MAX_WIDTH_M)?;
-    Ok(RoadLane { kind, width, predecessor: linked("predecessor")?, successor: linked("successor")?, speed_limit_mps })
+        "none" | "border" | "curb" | "restricted" | "biking" | "rail" | "tram" => LaneKind::Other,
+        _ => {
+            element.note_value(log, "type", "not driven on");
+            LaneKind::Other
+        }
+    }
+}
+
+/// Names the heights of lanes over the road (kerbs), which are not built.
+fn note_heights(element: Element, log: &mut FindingLog) {
+    let height = |element: &Element, name| element.number_or(name, 0.0, -1e3, 1e3).unwrap_or(0.0).abs();
+    let heights = children(element, "height").map(|record| height(&record, "inner").max(height(&record, "outer")));
+    let highest_m = heights.fold(0.0, f64::max);
+    if highest_m > 0.0 {
+        let kind = element.optional_text("type").unwrap_or_default();
+        element.note(
+            log,
+            &format!("type=\"{kind}\" has <height> up to {highest_m} m"),
+            "height over the road left out",
+        );
+    }
 }

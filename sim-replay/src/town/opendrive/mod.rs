@@ -1,23 +1,32 @@
-//! Maps in OpenDRIVE format, version 1.4 (what RoadRunner writes for CARLA) and its close relatives.
+//! Maps in OpenDRIVE format, versions 1.4 to 1.8.
 //!
-//! Read are reference lines (line, arc, spiral, poly3, paramPoly3), elevation, lane offset, lane sections with widths,
-//! kinds, links and speeds, junction connections, objects, signals, bridges and tunnels. Superelevation is left out
-//! and counted. Everything from the file is bounded before it is used, so that no file can make the program
-//! panic, hang or take memory without limit.
+//! Read are reference lines (line, arc, spiral, poly3, paramPoly3), elevation, superelevation, crossfall and shape, lane
+//! offset, lane sections with widths or borders, kinds, links and speeds, traffic on either side, the connections of
+//! common and direct junctions, objects, signals, bridges and tunnels. What cannot be read or built is left out in the
+//! smallest part that can be, and named in [`RoadNetwork::findings`]. Everything from the file is bounded before it is
+//! used, so that no file can make the program panic, hang or take memory without limit.
 
+mod beside;
+mod border;
 mod element;
+mod encoding;
 mod junctions;
 mod lanes;
+mod links;
+mod plan_view;
+mod profile;
 mod roads;
+mod speed;
 
 use std::collections::BTreeMap;
 
 use roxmltree::{Document, ParsingOptions};
 
 pub use element::OpenDriveError;
-use element::{Element, children};
+use element::{Element, LineIndex, children};
 
-use super::road::{Ignored, Road, RoadNetwork};
+use super::finding::FindingLog;
+use super::road::{Road, RoadNetwork};
 
 /// Larger files are refused, bytes.
 pub(super) const MAX_BYTES: usize = 64 << 20;
@@ -39,43 +48,92 @@ struct Ids {
 /// Reads a map from the text of its file.
 ///
 /// # Errors
-/// [`OpenDriveError`] with line, element, attribute and value of the first thing that cannot be used.
+/// [`OpenDriveError`] where the text is no OpenDRIVE map, is larger than maps are, or holds no road that can be read;
+/// the latter with line, element, attribute and value of the first road's fault.
 pub fn read(text: &str) -> Result<RoadNetwork, OpenDriveError> {
-    if text.len() > MAX_BYTES {
-        return Err(OpenDriveError::TooLarge { bytes: text.len(), limit: MAX_BYTES });
-    }
+    check_size(text.len())?;
+    read_text(text, FindingLog::default())
+}
+
+/// Reads a map from the bytes of its file: UTF-8, UTF-16, or the encoding that it declares.
+///
+/// # Errors
+/// As [`read`].
+pub fn read_bytes(bytes: &[u8]) -> Result<RoadNetwork, OpenDriveError> {
+    check_size(bytes.len())?;
+    let mut log = FindingLog::default();
+    let text = encoding::decode(bytes, &mut log);
+    read_text(&text, log)
+}
+
+fn check_size(bytes: usize) -> Result<(), OpenDriveError> {
+    if bytes > MAX_BYTES { Err(OpenDriveError::TooLarge { bytes, limit: MAX_BYTES }) } else { Ok(()) }
+}
+
+fn read_text(text: &str, mut log: FindingLog) -> Result<RoadNetwork, OpenDriveError> {
     let options = ParsingOptions { nodes_limit: MAX_NODES, ..ParsingOptions::default() };
     let document =
         Document::parse_with_options(text, options).map_err(|error| OpenDriveError::Xml(error.to_string()))?;
-    let root = Element(document.root_element());
+    let lines = LineIndex::new(text);
+    let root = Element::root(document.root_element(), &lines);
     if root.name() != "OpenDRIVE" {
         return Err(root.error_element("is the root; expected <OpenDRIVE>"));
     }
-    let ids = Ids { roads: collect_ids(root, "road")?, junctions: collect_ids(root, "junction")? };
-    if ids.roads.is_empty() {
-        return Err(root.error_element("has no <road>"));
-    }
-    let mut ignored = Ignored::default();
-    let mut roads = Vec::new();
-    let (mut total_m, mut lanes_m, mut junctions_m) = (0.0, 0.0, vec![0.0; ids.junctions.len()]);
-    for element in children(root, "road") {
-        let road = roads::read(element, &ids, &mut ignored)?;
-        let own_lanes_m = lanes_length_m(&road);
-        total_m += road.length_m;
-        lanes_m += own_lanes_m;
-        check_total(element, "all roads so far", total_m, MAX_TOTAL_M)?;
-        check_total(element, "all lanes so far", lanes_m, MAX_LANES_M)?;
+    children(root, "include").for_each(|element| element.note_value(&mut log, "file", "left out"));
+    let (mut roads, elements) = read_roads(root, &mut log)?;
+    let (junctions, junction_elements) = collect_ids(root, "junction", &mut log);
+    let places = roads.iter().enumerate().map(|(place, road)| (road.id.clone(), place));
+    let ids = Ids { roads: places.collect(), junctions };
+    let mut junctions_m = vec![0.0; ids.junctions.len()];
+    for (road, element) in roads.iter_mut().zip(elements) {
+        log.enter("road", &road.id);
+        links::read(element, road, &ids, &mut log);
         if let Some(junction) = road.junction {
-            junctions_m[junction] += own_lanes_m;
+            junctions_m[junction] += lanes_length_m(road);
             check_total(element, "the lanes of its junction", junctions_m[junction], MAX_JUNCTION_M)?;
         }
-        roads.push(road);
     }
     let mut junctions = Vec::new();
-    for element in children(root, "junction") {
-        junctions.push(junctions::read(element, &ids)?);
+    for element in junction_elements {
+        log.enter("junction", element.optional_text("id").unwrap_or_default());
+        junctions.push(junctions::read(element, &ids, &mut log));
     }
-    Ok(RoadNetwork { roads, junctions, ignored })
+    Ok(RoadNetwork { roads, junctions, findings: log.into_list() })
+}
+
+/// All roads that can be read, each with its element; the others are left out.
+fn read_roads<'a, 'input>(
+    root: Element<'a, 'input>,
+    log: &mut FindingLog,
+) -> Result<(Vec<Road>, Vec<Element<'a, 'input>>), OpenDriveError> {
+    let (_, elements) = collect_ids(root, "road", log);
+    if elements.is_empty() {
+        return Err(root.error_element("has no <road>"));
+    }
+    let (mut roads, mut kept, mut first_error) = (Vec::new(), Vec::new(), None);
+    let (mut total_m, mut lanes_m) = (0.0, 0.0);
+    for element in elements {
+        log.enter("road", element.optional_text("id").unwrap_or_default());
+        match roads::read(element, log) {
+            Ok(road) => {
+                total_m += road.length_m;
+                lanes_m += lanes_length_m(&road);
+                check_total(element, "all roads so far", total_m, MAX_TOTAL_M)?;
+                check_total(element, "all lanes so far", lanes_m, MAX_LANES_M)?;
+                roads.push(road);
+                kept.push(element);
+            }
+            Err(error) => {
+                error.note(log, "road left out");
+                first_error.get_or_insert(error);
+            }
+        }
+    }
+    log.leave();
+    match first_error {
+        Some(error) if roads.is_empty() => Err(error),
+        _ => Ok((roads, kept)),
+    }
 }
 
 fn lanes_length_m(road: &Road) -> f64 {
@@ -93,15 +151,26 @@ fn check_total(element: Element, what: &str, total_m: f64, limit_m: f64) -> Resu
     Err(element.error_element(&format!("brings {what} to {total_m:.0} m, more than the limit of {limit_m} m")))
 }
 
-fn collect_ids(root: Element, name: &'static str) -> Result<BTreeMap<String, usize>, OpenDriveError> {
-    let mut ids = BTreeMap::new();
-    for (place, element) in children(root, name).enumerate() {
-        let id = element.text("id")?;
-        if ids.insert(id.to_owned(), place).is_some() {
-            return Err(element.error_value("id", id, "used by one element only"));
+/// Elements with an id of their own, and their places by id; others are left out.
+fn collect_ids<'a, 'input>(
+    root: Element<'a, 'input>,
+    name: &'static str,
+    log: &mut FindingLog,
+) -> (BTreeMap<String, usize>, Vec<Element<'a, 'input>>) {
+    let (mut ids, mut elements) = (BTreeMap::new(), Vec::new());
+    for element in children(root, name) {
+        match element.text("id") {
+            Ok(id) if ids.contains_key(id) => {
+                element.error_value("id", id, "used by one element only").note(log, "left out");
+            }
+            Ok(id) => {
+                ids.insert(id.to_owned(), elements.len());
+                elements.push(element);
+            }
+            Err(error) => error.note(log, "left out"),
         }
     }
-    Ok(ids)
+    (ids, elements)
 }
 
 #[cfg(test)]

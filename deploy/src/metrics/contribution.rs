@@ -1,0 +1,98 @@
+//! What neighbours contributed to the frames of a run.
+
+use protocol::{Account, CavId, Ledger, Role, Stream, Topic};
+use serde::{Deserialize, Serialize};
+
+/// How much of what neighbours shared came to use.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub struct Contribution {
+    /// Neighbours whose data are in the result, mean over the frames.
+    pub fused_per_frame: Option<f64>,
+    /// Maps, boxes or clouds that neighbours have sent; 0 where messages cross no air.
+    pub sent: u64,
+    /// Those of them that arrived in time and were used.
+    pub used: u64,
+    /// Mean bytes of everything a neighbour sent for a frame, headers and pose message included, used or not.
+    pub sent_bytes_mean: Option<f64>,
+}
+
+impl Contribution {
+    /// Sums up the books of a run of `ego`: in `frames` frames `fused` neighbours were fused. `sent_bytes` is the size of all
+    /// that was sent, where it is known.
+    pub(crate) fn of(frames: usize, fused: usize, ego: &CavId, books: &Ledger, sent_bytes: Option<u64>) -> Self {
+        let of_neighbours = || books.iter().filter(|(account, _)| shares(&account.topic, ego));
+        let is_sent = |account: &Account| matches!(account.topic, Topic::Stream { .. });
+        let sent = of_neighbours().filter(|(account, _)| is_sent(account)).map(|(_, counts)| counts.sent).sum();
+        let ego_process = format!("{}-", Role::Ego);
+        let is_used = |account: &Account| account.to.as_ref().is_some_and(|to| to.as_str().starts_with(&ego_process));
+        let used = of_neighbours().filter(|(account, _)| is_used(account)).map(|(_, counts)| counts.received).sum();
+        Self {
+            fused_per_frame: (frames > 0).then(|| fused as f64 / frames as f64),
+            sent,
+            used,
+            sent_bytes_mean: sent_bytes.filter(|_| sent > 0).map(|bytes| bytes as f64 / sent as f64),
+        }
+    }
+}
+
+/// Whether a topic carries what another vehicle than `ego` sees.
+fn shares(topic: &Topic, ego: &CavId) -> bool {
+    match topic {
+        Topic::Stream { cav, stream } | Topic::Received { cav, stream, .. } => {
+            cav != ego && matches!(stream, Stream::Bev | Stream::Boxes | Stream::Points)
+        }
+        _ => false,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use protocol::{DropReason, ProcessId};
+
+    use super::*;
+
+    fn books() -> (Ledger, CavId) {
+        let (ego, to) = (CavId::new("1").unwrap(), ProcessId::new("ego-1").unwrap());
+        let topic = |name: &str, stream| Topic::Stream { cav: CavId::new(name).unwrap(), stream };
+        let mut books = Ledger::default();
+        for name in ["1", "2", "3"] {
+            for stream in [Stream::Pose, Stream::Bev] {
+                let towards = Account::towards(topic(name, stream), &to);
+                for tick in 0..4 {
+                    books.sent(&Account::published(topic(name, stream)));
+                    match (tick, stream) {
+                        (0, _) | (_, Stream::Pose) => books.received(&towards),
+                        _ => books.dropped(&towards, DropReason::Stale),
+                    }
+                }
+            }
+        }
+        (books, ego)
+    }
+
+    #[test]
+    fn maps_of_neighbours_are_counted_and_neither_poses_nor_the_egos_own() {
+        let (books, ego) = books();
+        let contribution = Contribution::of(4, 2, &ego, &books, Some(800));
+        assert_eq!((contribution.sent, contribution.used), (8, 2));
+        assert_eq!((contribution.fused_per_frame, contribution.sent_bytes_mean), (Some(0.5), Some(100.0)));
+    }
+
+    #[test]
+    fn what_a_live_link_passes_on_is_sent_once() {
+        let (mut books, ego) = books();
+        let cav = CavId::new("2").unwrap();
+        let passed = Topic::Received { ego: ego.clone(), cav: cav.clone(), stream: Stream::Bev };
+        books.received(&Account::towards(Topic::Stream { cav, stream: Stream::Bev }, &ProcessId::new("link").unwrap()));
+        books.sent(&Account::published(passed.clone()));
+        books.received(&Account::towards(passed, &ProcessId::new("ego-1").unwrap()));
+        let contribution = Contribution::of(4, 2, &ego, &books, None);
+        assert_eq!((contribution.sent, contribution.used), (8, 3));
+    }
+
+    #[test]
+    fn without_frames_and_air_nothing_is_known() {
+        let nothing = Contribution::of(0, 0, &CavId::new("1").unwrap(), &Ledger::default(), Some(0));
+        assert_eq!(nothing, Contribution::default());
+    }
+}

@@ -1,0 +1,116 @@
+//! Sets of object classes: which annotated objects a detector is expected to find.
+
+use std::fmt;
+use std::str::FromStr;
+
+use serde::{Deserialize, Serialize};
+
+use crate::frame::{ObjectClass, UnknownClass};
+
+/// Name of the four classes of motor vehicles together.
+const VEHICLE: &str = "vehicle";
+
+/// A set of object classes. As text: names with commas between, `vehicle` for car, van, truck and bus.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(try_from = "Vec<String>", into = "Vec<String>")]
+pub struct ClassSet(u8);
+
+impl ClassSet {
+    /// Cars, vans, trucks and buses.
+    pub const VEHICLES: Self = Self(0b000_1111);
+    /// Everything but pedestrians, as V2V4Real counts.
+    pub const ALL_BUT_PEDESTRIANS: Self = Self(0b101_1111);
+
+    /// Whether a class is among them.
+    #[must_use]
+    pub fn contains(self, class: ObjectClass) -> bool {
+        self.0 & bit(class) != 0
+    }
+
+    /// Their names; `vehicle` where all four kinds of vehicles are among them.
+    #[must_use]
+    pub fn names(self) -> Vec<String> {
+        let has_vehicles = self.0 & Self::VEHICLES.0 == Self::VEHICLES.0;
+        let single =
+            |class: &&ObjectClass| self.contains(**class) && !(has_vehicles && Self::VEHICLES.contains(**class));
+        has_vehicles
+            .then(|| VEHICLE.to_owned())
+            .into_iter()
+            .chain(ObjectClass::ALL.iter().filter(single).map(|class| class.name().to_owned()))
+            .collect()
+    }
+
+    fn of<'a>(names: impl IntoIterator<Item = &'a str>) -> Result<Self, String> {
+        let mut set = Self(0);
+        for asked in names.into_iter().map(str::trim) {
+            set.0 |= if asked == VEHICLE {
+                Self::VEHICLES.0
+            } else {
+                bit(asked.parse().map_err(|error: UnknownClass| error.to_string())?)
+            };
+        }
+        if set.0 == 0 { Err("no class is named".into()) } else { Ok(set) }
+    }
+}
+
+fn bit(class: ObjectClass) -> u8 {
+    ObjectClass::ALL.iter().position(|known| *known == class).map_or(0, |index| 1 << index)
+}
+
+impl FromStr for ClassSet {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        Self::of(text.split(','))
+    }
+}
+
+impl TryFrom<Vec<String>> for ClassSet {
+    type Error = String;
+
+    fn try_from(names: Vec<String>) -> Result<Self, String> {
+        Self::of(names.iter().map(String::as_str))
+    }
+}
+
+impl From<ClassSet> for Vec<String> {
+    fn from(set: ClassSet) -> Self {
+        set.names()
+    }
+}
+
+impl fmt::Display for ClassSet {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str(&self.names().join(","))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn vehicles_are_four_classes() {
+        let vehicles: ClassSet = "vehicle".parse().unwrap();
+        assert_eq!(vehicles, ClassSet::VEHICLES);
+        assert_eq!(vehicles, "car,van,truck,bus".parse().unwrap());
+        assert!(vehicles.contains(ObjectClass::Truck) && !vehicles.contains(ObjectClass::TwoWheeler));
+        assert_eq!(ClassSet::ALL_BUT_PEDESTRIANS.to_string(), "vehicle,two_wheeler,other");
+    }
+
+    #[test]
+    fn text_and_files_agree() {
+        let set: ClassSet = "pedestrian, car".parse().unwrap();
+        assert_eq!(set.to_string(), "car,pedestrian");
+        let json = serde_json::to_string(&set).unwrap();
+        assert_eq!(json, r#"["car","pedestrian"]"#);
+        assert_eq!(serde_json::from_str::<ClassSet>(&json).unwrap(), set);
+    }
+
+    #[test]
+    fn an_unknown_class_is_named_with_those_that_are_known() {
+        let error = "vehicles".parse::<ClassSet>().unwrap_err();
+        assert!(error.starts_with("\"vehicles\" is no class: expected vehicle, car,"), "{error}");
+        assert!("".parse::<ClassSet>().is_err());
+    }
+}

@@ -1,0 +1,120 @@
+//! `sim-replay convert`: write a data set in another layout.
+
+use std::io::IsTerminal;
+use std::path::{Path, PathBuf};
+
+use indicatif::ProgressBar;
+use sim_replay::dataset::{self, IntensityScale, OpenOptions};
+use sim_replay::output;
+use sim_replay::synth::{ConvertOptions, Converted, SceneLayout, SynthError, convert};
+
+use crate::cli::Outcome;
+
+/// Problems that are printed; all are counted, and stand in the JSON summary.
+const SHOWN_PROBLEMS: usize = 10;
+
+/// Write a data set in another layout: sweeps, poses and boxes stay what they are, as far as the layout holds them.
+///
+/// The layout of the input is found out, as by `inspect`.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// The data set, split, scenario or sequence, or a recording.
+    from: PathBuf,
+    /// Folder for the scenarios; made if missing.
+    #[arg(long)]
+    out: PathBuf,
+    /// Layout of the files.
+    #[arg(long, value_enum)]
+    layout: SceneLayout,
+    /// Number that stored intensities are divided by [default: by the type and the range of the numbers, as inspect shows].
+    #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
+    intensity_scale: IntensityScale,
+    /// Write into a folder that is not empty; what the layout writes there is replaced.
+    #[arg(long)]
+    force: bool,
+    /// Print a JSON summary.
+    #[arg(long)]
+    json: bool,
+}
+
+/// Converts and prints a summary to standard output.
+pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
+    let open = OpenOptions { intensity_scale: args.intensity_scale, ..OpenOptions::default() };
+    let input = match dataset::open_with(&args.from, &open) {
+        Ok(input) => input,
+        Err(error) => {
+            output::note(format_args!("error: {error}"));
+            return Ok(Outcome::BadInput);
+        }
+    };
+    if overlap(&args.from, &args.out) {
+        output::note(format_args!(
+            "error: {}: the input lies there; take another folder for --out",
+            args.out.display()
+        ));
+        return Ok(Outcome::BadInput);
+    }
+    let bar = if std::io::stderr().is_terminal() { ProgressBar::new(0) } else { ProgressBar::hidden() };
+    let options = ConvertOptions { out: args.out.clone(), layout: args.layout, force: args.force };
+    let result = convert(&input, &options, &|done, total| {
+        bar.set_length(total as u64);
+        bar.set_position(done as u64);
+    });
+    bar.finish_and_clear();
+    match result {
+        Ok(converted) => {
+            print(&converted, args)?;
+            Ok(if converted.left_out.is_nothing() { Outcome::Done } else { Outcome::DataLost })
+        }
+        Err(error @ SynthError::Write { .. }) => Err(error.into()),
+        Err(error) => {
+            output::note(format_args!("error: {error}"));
+            Ok(Outcome::BadInput)
+        }
+    }
+}
+
+/// Whether one of the two lies in the other: what is read would be replaced.
+fn overlap(from: &Path, out: &Path) -> bool {
+    let real = |path: &Path| path.canonicalize().ok();
+    real(from).zip(real(out)).is_some_and(|(from, out)| from.starts_with(&out) || out.starts_with(&from))
+}
+
+fn print(converted: &Converted, args: &Args) -> std::io::Result<()> {
+    let Converted { scenarios, agent_frames, omitted, left_out } = converted;
+    for problem in left_out.problems().take(SHOWN_PROBLEMS) {
+        output::note(format_args!("left out: {}", problem.message));
+    }
+    if args.json {
+        let report = serde_json::json!({
+            "out": args.out, "layout": args.layout.name(), "scenarios": scenarios, "agent_frames": agent_frames,
+            "omitted": omitted, "left_out": left_out,
+        });
+        return output::line(report);
+    }
+    output::line(format_args!(
+        "{}: {scenarios} scenarios, {agent_frames} agent-frames, layout {}",
+        args.out.display(),
+        args.layout.name()
+    ))?;
+    super::synth::print_omitted(omitted)?;
+    let summary = left_out.to_string();
+    if summary.is_empty() { Ok(()) } else { output::line(summary) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_input_is_not_written_over() {
+        let folder = tempfile::tempdir().unwrap();
+        let [from, out, inside] = ["a", "b", "a/c"].map(|name| folder.path().join(name));
+        std::fs::create_dir_all(&inside).unwrap();
+        assert!(!overlap(&from, &out), "a folder that is not there yet");
+        std::fs::create_dir(&out).unwrap();
+        assert!(!overlap(&from, &out));
+        assert!(overlap(&from, &from) && overlap(&from, &inside) && overlap(&inside, &from));
+        assert!(overlap(&from, &inside.join("..")));
+    }
+}

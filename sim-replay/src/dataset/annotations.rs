@@ -1,0 +1,183 @@
+//! Objects and optional fields in the YAML of the OPV2V family. A part that cannot be right is left out and named; the rest
+//! of the frame stays.
+
+use std::collections::HashMap;
+use std::path::Path;
+
+use protocol::{Pose, PoseError};
+
+use super::yaml::{Field, Value};
+use super::{Problem, ReadError, classes};
+use crate::carla_pose::CarlaPose;
+use crate::frame::{Object, ObjectClass};
+
+/// Kilometres per hour in a metre per second.
+const KMH_PER_MPS: f64 = 3.6;
+/// Largest half size of an object, metres. Simulators have written bicycles of 500 m.
+const MAX_HALF_SIZE_M: f64 = 50.0;
+/// Largest angle, degrees: sums of turns are written, garbage is not.
+const MAX_ANGLE_DEG: f64 = 1e5;
+/// Largest speed, metres per second.
+const MAX_SPEED_MPS: f64 = 1000.0;
+/// Keys of an object's type in the relatives of the format, the first one that is there counts.
+const CLASS_KEYS: [&str; 4] = ["obj_type", "object_type", "class", "type"];
+
+/// A frame's annotations, and what was left out of them.
+#[derive(Debug)]
+pub(super) struct Annotations<'a> {
+    root: Field<'a>,
+    problems: Vec<Problem>,
+}
+
+impl<'a> Annotations<'a> {
+    pub(super) fn new(root: Field<'a>) -> Self {
+        Self { root, problems: Vec::new() }
+    }
+
+    /// What was left out.
+    pub(super) fn into_problems(self) -> Vec<Problem> {
+        self.problems
+    }
+
+    /// The field of the first of `keys` that is there; one that cannot be read is left out.
+    pub(super) fn optional<T>(
+        &mut self,
+        keys: &[&str],
+        read: impl Fn(&Field<'a>) -> Result<T, ReadError>,
+    ) -> Option<T> {
+        let root = self.root.clone();
+        self.optional_of(&root, keys, read)
+    }
+
+    fn optional_of<T>(
+        &mut self,
+        parent: &Field<'a>,
+        keys: &[&str],
+        read: impl Fn(&Field<'a>) -> Result<T, ReadError>,
+    ) -> Option<T> {
+        let field = keys.iter().find_map(|key| parent.optional(key).ok().flatten())?;
+        let value = read(&field).map_err(|error| self.left_out("field", error));
+        value.ok()
+    }
+
+    /// All objects that can be right. `id` gives the id of an object of the listed number, `pose` takes its place in the
+    /// file's numbers to the world.
+    pub(super) fn objects(
+        &mut self,
+        id: impl Fn(i64, &Field<'a>) -> Result<i64, ReadError>,
+        pose: impl Fn(&CarlaPose) -> Result<Pose, PoseError>,
+    ) -> Vec<Object> {
+        let entries = self.object_entries().unwrap_or_else(|error| {
+            self.left_out("list of objects", error);
+            Vec::new()
+        });
+        let last: HashMap<&str, usize> = entries.iter().enumerate().map(|(index, (key, _))| (*key, index)).collect();
+        let mut objects = Vec::with_capacity(entries.len());
+        for (index, (key, field)) in entries.iter().enumerate() {
+            let object = if last.get(key) == Some(&index) {
+                self.object(key, field, &id, &pose)
+            } else {
+                Err(field.error("listed again below"))
+            };
+            match object {
+                Ok(object) => objects.push(object),
+                Err(error) => self.left_out("object", error),
+            }
+        }
+        objects
+    }
+
+    fn object(
+        &mut self,
+        key: &str,
+        field: &Field<'a>,
+        id: &impl Fn(i64, &Field<'a>) -> Result<i64, ReadError>,
+        pose: &impl Fn(&CarlaPose) -> Result<Pose, PoseError>,
+    ) -> Result<Object, ReadError> {
+        let listed_id = listed_id(key, field)?;
+        Ok(Object {
+            id: id(listed_id, field)?,
+            world_from_object: pose(&place(field)?).map_err(|error| field.error(error.to_string()))?,
+            size_m: size_m(field)?,
+            class: self.class(field),
+            speed_mps: self.optional_of(field, &["speed"], speed_mps),
+        })
+    }
+
+    /// The map of annotated objects: `vehicles`, or `objects` in relatives of the format.
+    fn object_entries(&self) -> Result<Vec<(&'a str, Field<'a>)>, ReadError> {
+        let root = &self.root;
+        let key = if !root.has("vehicles") && root.has("objects") { "objects" } else { "vehicles" };
+        match root.optional(key)? {
+            Some(field) if matches!(&field.node().value, Value::List(items) if items.is_empty()) => Ok(Vec::new()),
+            Some(field) => field.entries().map_err(|_| field.expected("a map of objects by id")),
+            // An empty map may be written as nothing; a key that is not there is a fault.
+            None if root.has(key) => Ok(Vec::new()),
+            None => root.required(key).map(|_| Vec::new()),
+        }
+    }
+
+    /// A car where no type is given. An unknown type is no vehicle, and is named once per scenario.
+    fn class(&mut self, field: &Field<'a>) -> ObjectClass {
+        let kind = CLASS_KEYS.iter().find_map(|key| Some((*key, field.optional(key).ok().flatten()?)));
+        let Some((key, kind)) = kind else { return ObjectClass::Car };
+        kind.text().ok().and_then(classes::of_name).unwrap_or_else(|| {
+            self.unknown_class(key, &kind.found());
+            ObjectClass::Other
+        })
+    }
+
+    fn unknown_class(&mut self, key: &str, found: &str) {
+        let scenario = self.root.path().parent().and_then(Path::parent).unwrap_or(Path::new(""));
+        let problem = classes::unknown(scenario, key, found);
+        if !self.problems.contains(&problem) {
+            self.problems.push(problem);
+        }
+    }
+
+    fn left_out(&mut self, what: &str, error: ReadError) {
+        self.problems.push(Problem::from(&error.with_consequence(&format!("the {what} is left out"))));
+    }
+}
+
+/// Ids are integers; those that went through an array of floats have a point.
+fn listed_id(key: &str, field: &Field<'_>) -> Result<i64, ReadError> {
+    let whole = || key.parse().ok().filter(|number: &f64| number.fract() == 0.0 && number.abs() < 1e15);
+    let id = key.parse().ok().or_else(|| whole().map(|number| number as i64));
+    id.ok_or_else(|| field.error(format!("{key:?} is no object id, expected an integer")))
+}
+
+/// The box's centre and how it is turned, in the numbers of the file.
+fn place(field: &Field<'_>) -> Result<CarlaPose, ReadError> {
+    let center = field.optional("center")?.map_or(Ok([0.0; 3]), |center| center.numbers::<3>())?;
+    let (location, angle) = (field.required("location")?.numbers()?, field.required("angle")?);
+    let angle_deg = angle.numbers::<3>()?;
+    if angle_deg.iter().any(|angle| angle.abs() > MAX_ANGLE_DEG) {
+        return Err(angle.error(format!("{angle_deg:?}, expected angles in degrees")));
+    }
+    Ok(CarlaPose::of_box(location, angle_deg, center))
+}
+
+/// `extent` holds half sizes.
+fn size_m(field: &Field<'_>) -> Result<[f64; 3], ReadError> {
+    let extent = field.required("extent")?;
+    let half = extent.numbers::<3>()?;
+    if half.iter().any(|&half| half <= 0.0 || half > MAX_HALF_SIZE_M) {
+        return Err(extent.error(format!("{half:?} m, expected half sizes above 0 and up to {MAX_HALF_SIZE_M} m")));
+    }
+    Ok(half.map(|half| 2.0 * half))
+}
+
+/// km/h to m/s. Relatives of the format write a vector; its length is the speed.
+pub(super) fn speed_mps(field: &Field<'_>) -> Result<f64, ReadError> {
+    let kmh = match field.number() {
+        Ok(kmh) => kmh,
+        Err(error) => {
+            let vector = field.array().map_err(|_| error)?.values;
+            vector.iter().map(|component| component * component).sum::<f64>().sqrt()
+        }
+    };
+    let mps = kmh / KMH_PER_MPS;
+    // Not a number is not smaller either.
+    if mps.abs() <= MAX_SPEED_MPS { Ok(mps) } else { Err(field.error(format!("{kmh} km/h is no speed"))) }
+}

@@ -1,0 +1,153 @@
+//! Names of object classes in the annotations of all layouts.
+//!
+//! Letters count, not their case, and neither do blanks, `_` and `-`. Names are those of V2V4Real, V2X-Real and V2XPnP
+//! (their misspellings included), V2X-Radar, RCooper, DAIR-V2X, KITTI, nuScenes, and CARLA's blueprints.
+
+use std::path::Path;
+
+use super::{Problem, ReadError};
+use crate::frame::ObjectClass;
+
+/// CARLA's blueprints of the library `vehicle.*` that are no cars, by their last word.
+const BLUEPRINTS: [(ObjectClass, &[&str]); 4] = [
+    (ObjectClass::TwoWheeler, &["crossbike", "century", "omafiets", "lowrider", "ninja", "yzf", "zx125"]),
+    (ObjectClass::Truck, &["carlacola", "firetruck", "europeanhgv"]),
+    (ObjectClass::Van, &["ambulance", "sprinter", "t2", "t22021"]),
+    (ObjectClass::Bus, &["fusorosa"]),
+];
+
+/// The class of a name; `None` where the name is not known.
+pub(super) fn of_name(name: &str) -> Option<ObjectClass> {
+    if let Some(class) = of_library(&name.to_ascii_lowercase()) {
+        return Some(class);
+    }
+    Some(match plain(name).as_str() {
+        "car" | "suv" | "sedan" | "vehicle" | "motorvehicle" | "passengercar" | "policecar" | "tourcar" | "taxi" => {
+            ObjectClass::Car
+        }
+        // V2X-Real counts it among cars.
+        "longvehicle" => ObjectClass::Car,
+        "van" | "minibus" | "ambulance" => ObjectClass::Van,
+        // V2X-Real counts `TrashCan` among trucks.
+        "truck"
+        | "concretetruck"
+        | "firetruck"
+        | "boxtruck"
+        | "pickuptruck"
+        | "trailer"
+        | "hugevehicle"
+        | "largevehicle"
+        | "construction"
+        | "constructionvehicle"
+        | "engineeringvehicle"
+        | "crane"
+        | "forklift"
+        | "bulldozer"
+        | "excavator"
+        | "trashcan" => ObjectClass::Truck,
+        "bus" | "tram" | "coach" => ObjectClass::Bus,
+        "cyclist" | "bicycle" | "bike" | "bicyclerider" | "bicyclegroup" | "densebicycle" | "biker" | "rider"
+        | "motorcycle" | "motorcyclist" | "motorcyclerider" | "motorcylerider" | "motorbike" | "motorrider"
+        | "nonmotorrider" | "scooter" | "scooterrider" | "tricycle" | "tricyclist" | "tricyclerider"
+        | "trimotorcycle" | "threewheeler" | "twowheeler" | "barrow" | "barrowlist" => ObjectClass::TwoWheeler,
+        "pedestrian" | "person" | "personsitting" | "humansitting" | "child" | "roadworker" | "walker" | "adult" => {
+            ObjectClass::Pedestrian
+        }
+        "other" | "misc" | "dontcare" | "cone" | "trafficcone" | "trafficsign" | "trafficsigns" | "barrier"
+        | "trafficbarrier" | "roadbarrel" | "babycart" | "firehydrant" | "saftytriangle" | "safetytriangle"
+        | "animal" | "dog" | "unknown" | "unknownmovable" | "unknownunmovable" | "unknownsmovable"
+        | "unknownsunmovable" | "pedestrianignore" | "carignore" | "otherignore" => ObjectClass::Other,
+        _ => return None,
+    })
+}
+
+/// The finding about a type that is not known, the same for all its objects below `dir`.
+pub(super) fn unknown(dir: &Path, field: &str, found: &str) -> Problem {
+    Problem::from(&ReadError::Malformed {
+        path: dir.to_owned(),
+        line: None,
+        field: Some(field.to_owned()),
+        reason: format!("{found} is no known type of object: it counts as other, not as a vehicle"),
+    })
+}
+
+/// Names with dots: nuScenes' categories and CARLA's blueprints.
+fn of_library(name: &str) -> Option<ObjectClass> {
+    let (library, rest) = name.split_once('.')?;
+    match library {
+        "human" | "walker" => Some(ObjectClass::Pedestrian),
+        "movable_object" | "static_object" | "static" | "traffic" | "animal" => Some(ObjectClass::Other),
+        "vehicle" => {
+            let kind = rest.split('.').next().unwrap_or(rest);
+            let model = plain(rest.rsplit('.').next().unwrap_or(rest));
+            let blueprint = BLUEPRINTS.iter().find(|(_, models)| models.contains(&model.as_str()));
+            // `vehicle.bus.rigid` and `vehicle.emergency.police` of nuScenes, or make and model.
+            let category = if kind == "emergency" { of_name(&model) } else { of_name(kind) };
+            Some(blueprint.map(|(class, _)| *class).or(category).unwrap_or(ObjectClass::Car))
+        }
+        _ => None,
+    }
+}
+
+fn plain(name: &str) -> String {
+    name.chars().filter(char::is_ascii_alphanumeric).map(|letter| letter.to_ascii_lowercase()).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn names_of_all_layouts_are_known() {
+        let cases: [(ObjectClass, &[&str]); 7] = [
+            (ObjectClass::Car, &["Car", "car", "PoliceCar", "LongVehicle", "vehicle.car", "vehicle.audi.tt"]),
+            (ObjectClass::Van, &["Van", "vehicle.emergency.ambulance", "vehicle.volkswagen.t2_2021"]),
+            (
+                ObjectClass::Truck,
+                &["Truck", "ConcreteTruck", "huge_vehicle", "vehicle.truck", "vehicle.carlamotors.european_hgv"],
+            ),
+            (ObjectClass::Bus, &["Bus", "Tram", "vehicle.bus.rigid", "vehicle.mitsubishi.fusorosa"]),
+            (
+                ObjectClass::TwoWheeler,
+                &[
+                    "Cyclist",
+                    "BicycleRider",
+                    "MotorcyleRider",
+                    "ScooterRider",
+                    "Tricyclist",
+                    "Barrowlist",
+                    "vehicle.bicycle",
+                    "vehicle.bh.crossbike",
+                    "vehicle.harley-davidson.low_rider",
+                ],
+            ),
+            (
+                ObjectClass::Pedestrian,
+                &[
+                    "Pedestrian",
+                    "Person_sitting",
+                    "Child",
+                    "RoadWorker",
+                    "human.pedestrian.adult",
+                    "walker.pedestrian.0001",
+                ],
+            ),
+            (ObjectClass::Other, &["Misc", "TrafficCone", "Traffic cone", "movable_object.barrier"]),
+        ];
+        for (class, names) in cases {
+            for name in names {
+                assert_eq!(of_name(name), Some(class), "{name}");
+            }
+        }
+        assert_eq!(of_name("vehicle.emergency.police"), Some(ObjectClass::Car));
+        assert_eq!(of_name("Spaceship"), None);
+        assert_eq!(of_name(""), None);
+    }
+
+    #[test]
+    fn our_own_names_are_read_as_they_are() {
+        for class in ObjectClass::ALL {
+            assert_eq!(of_name(class.name()), Some(class));
+        }
+    }
+}

@@ -1,0 +1,156 @@
+//! Account of what a reading pass left out: counts by kind, and the findings behind them.
+
+use std::collections::BTreeSet;
+use std::fmt;
+
+use serde::{Deserialize, Serialize};
+
+use super::{LoadedTick, Problem};
+use crate::frame::Frame;
+
+/// Findings that are kept; further ones are only counted.
+const KEPT: usize = 1000;
+
+/// What was left out of a data set while its frames were used.
+#[derive(Debug, Clone, Default, PartialEq, Eq, Serialize, Deserialize)]
+pub struct LeftOut {
+    /// Ticks of the ego without a result, because its own frame cannot be read.
+    pub ticks: u64,
+    /// Frames of other agents that cannot be read: the agent counts as absent there.
+    pub frames: u64,
+    /// Objects and other parts of frames that cannot be right.
+    pub parts: u64,
+    /// Frames of other agents that do not exist at the ego's ticks: they came later or have left. No fault.
+    pub absent_frames: u64,
+    /// Files and folders of the data set that are not used, found when it was opened.
+    pub files: u64,
+    problems: BTreeSet<Problem>,
+}
+
+impl LeftOut {
+    /// Adds what was found when the data set was opened.
+    pub fn add_files<'a>(&mut self, problems: impl IntoIterator<Item = &'a super::ReadError>) {
+        for problem in problems {
+            self.files += 1;
+            self.keep(Problem::from(problem));
+        }
+    }
+
+    /// Adds what a tick lacks.
+    pub fn add_tick(&mut self, loaded: &LoadedTick) {
+        self.absent_frames += loaded.absent as u64;
+        loaded.frames.iter().for_each(|(_, frame)| self.add_parts(frame));
+        loaded.unreadable.iter().for_each(|(agent, problem)| self.add_unreadable(*agent, problem.clone()));
+    }
+
+    /// Adds a frame that cannot be read; the ego is agent 0.
+    pub fn add_unreadable(&mut self, agent: usize, problem: Problem) {
+        if agent == 0 {
+            self.ticks += 1;
+        } else {
+            self.frames += 1;
+        }
+        self.keep(problem);
+    }
+
+    /// Adds the parts that a frame was read without.
+    pub fn add_parts(&mut self, frame: &Frame) {
+        self.parts += frame.problems.len() as u64;
+        frame.problems.iter().for_each(|problem| self.keep(problem.clone()));
+    }
+
+    /// Adds another account.
+    pub fn merge(&mut self, other: &Self) {
+        self.ticks += other.ticks;
+        self.frames += other.frames;
+        self.parts += other.parts;
+        self.absent_frames += other.absent_frames;
+        self.files += other.files;
+        other.problems.iter().for_each(|problem| self.keep(problem.clone()));
+    }
+
+    /// Whether nothing was lost. Absent agents are no loss.
+    #[must_use]
+    pub fn is_nothing(&self) -> bool {
+        self.ticks + self.frames + self.parts + self.files == 0
+    }
+
+    /// The findings, each once, at most 1,000.
+    pub fn problems(&self) -> impl Iterator<Item = &Problem> {
+        self.problems.iter()
+    }
+
+    fn keep(&mut self, problem: Problem) {
+        if self.problems.len() < KEPT {
+            self.problems.insert(problem);
+        }
+    }
+}
+
+impl fmt::Display for LeftOut {
+    /// One line, empty where nothing is missing.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let counts = [
+            (self.ticks, "ticks (the ego's frame cannot be read)"),
+            (self.frames, "frames of other agents that cannot be read"),
+            (self.parts, "objects or other parts of frames"),
+            (self.files, "files or folders"),
+        ];
+        let left_out: Vec<String> =
+            counts.iter().filter(|(count, _)| *count > 0).map(|(count, kind)| format!("{count} {kind}")).collect();
+        if !left_out.is_empty() {
+            write!(f, "left out: {}", left_out.join(", "))?;
+        }
+        if self.absent_frames > 0 {
+            let separator = if left_out.is_empty() { "" } else { "; " };
+            write!(f, "{separator}absent agents: {} frames", self.absent_frames)?;
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use protocol::{CavId, Handedness};
+
+    use super::*;
+
+    fn problem(name: &str) -> Problem {
+        Problem { path: name.into(), line: None, field: None, message: format!("{name}: cut off") }
+    }
+
+    fn frame(problems: &[&str]) -> Frame {
+        let problems = problems.iter().map(|name| problem(name)).collect();
+        Frame { problems, ..Frame::empty(CavId::new("1").unwrap(), 0, Handedness::Right) }
+    }
+
+    #[test]
+    fn losses_and_absences_are_told_apart() {
+        let mut left_out = LeftOut::default();
+        let loaded = LoadedTick { frames: vec![(0, frame(&[]))], unreadable: vec![], absent: 2 };
+        left_out.add_tick(&loaded);
+        assert!(left_out.is_nothing());
+        assert_eq!(left_out.to_string(), "absent agents: 2 frames");
+        let loaded = LoadedTick {
+            frames: vec![(1, frame(&["a.yaml", "b.yaml"]))],
+            unreadable: vec![(0, problem("0.pcd")), (2, problem("2.pcd"))],
+            absent: 0,
+        };
+        left_out.add_tick(&loaded);
+        assert!(!left_out.is_nothing());
+        assert_eq!((left_out.ticks, left_out.frames, left_out.parts, left_out.problems().count()), (1, 1, 2, 4));
+        let expected = "left out: 1 ticks (the ego's frame cannot be read), 1 frames of other agents that cannot be read, \
+                        2 objects or other parts of frames; absent agents: 2 frames";
+        assert_eq!(left_out.to_string(), expected);
+    }
+
+    #[test]
+    fn the_same_finding_is_kept_once_and_counted_each_time() {
+        let mut left_out = LeftOut::default();
+        (0..3).for_each(|_| left_out.add_parts(&frame(&["a.yaml"])));
+        assert_eq!((left_out.parts, left_out.problems().count()), (3, 1));
+        let mut both = left_out.clone();
+        both.merge(&left_out);
+        assert_eq!((both.parts, both.problems().count()), (6, 1));
+    }
+}

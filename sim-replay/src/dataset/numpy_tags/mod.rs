@@ -1,0 +1,210 @@
+//! NumPy's arrays and scalars as PyYAML pickles them into text: the few node shapes that data sets contain.
+//!
+//! V2V4Real writes its pose matrices as `!!python/object/apply:numpy.core.multiarray._reconstruct` with a dtype and
+//! base64 data, converters of other data sets do so wherever numbers stand. A Python loader would call what the tag names.
+//! Here the tag is compared with the few that are known, every part of the node is checked, and anything else is an error:
+//! nothing is ever looked up or called by name.
+
+mod data;
+
+use std::path::Path;
+
+use super::ReadError;
+use super::yaml::{Field, Node, Value};
+use data::{binary, numbers, read_dtype};
+
+/// What calls of Python begin with.
+const APPLY: &str = "python/object/apply:";
+/// The modules of NumPy before and since 2.0.
+const PACKAGES: [&str; 2] = ["numpy.core", "numpy._core"];
+/// Most numbers in an array; a pose has 16.
+const MAX_NUMBERS: usize = 4096;
+
+/// An array of numbers, row-major.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct NumpyArray {
+    pub(super) shape: Vec<usize>,
+    pub(super) values: Vec<f64>,
+}
+
+/// True where the node carries a tag of Python's.
+pub(super) fn is_python(node: &Node) -> bool {
+    node.tag.as_deref().is_some_and(|tag| tag.starts_with("python/"))
+}
+
+/// True where the node is a pickled call, and not a tuple or list of Python's.
+pub(super) fn is_call(node: &Node) -> bool {
+    node.tag.as_deref().is_some_and(|tag| tag.starts_with(APPLY))
+}
+
+/// The text of a key that NumPy's scalar was used for; `None` where it is none.
+pub(super) fn key_text(node: &Node) -> Option<String> {
+    scalar(&Field::root(Path::new(""), node)).ok().map(|number| number.to_string())
+}
+
+/// Reads `_reconstruct` and `_frombuffer`; a scalar is an array without dimensions.
+pub(super) fn array(field: &Field<'_>) -> Result<NumpyArray, ReadError> {
+    match function(field)? {
+        Function::Reconstruct => reconstruct(field),
+        Function::FromBuffer => from_buffer(field),
+        Function::Scalar => Ok(NumpyArray { shape: vec![], values: vec![scalar_value(field)?] }),
+    }
+}
+
+/// Reads `scalar(dtype, data)` or an array with one number; it must be finite.
+pub(super) fn scalar(field: &Field<'_>) -> Result<f64, ReadError> {
+    let NumpyArray { shape, values } = array(field)?;
+    match values[..] {
+        [value] if value.is_finite() => Ok(value),
+        [value] => Err(field.error(format!("{value}, expected a finite number"))),
+        _ => Err(field.error(format!("an array of shape {shape:?}, expected a number"))),
+    }
+}
+
+/// The functions of NumPy that pickled numbers name.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Function {
+    Reconstruct,
+    FromBuffer,
+    Scalar,
+}
+
+fn function(field: &Field<'_>) -> Result<Function, ReadError> {
+    const KNOWN: [(&str, Function); 3] = [
+        ("multiarray._reconstruct", Function::Reconstruct),
+        ("numeric._frombuffer", Function::FromBuffer),
+        ("multiarray.scalar", Function::Scalar),
+    ];
+    let call = field.node().tag.as_deref().and_then(|tag| tag.strip_prefix(APPLY));
+    let in_package = |call: &str| {
+        PACKAGES.iter().find_map(|package| call.strip_prefix(package)?.strip_prefix('.').map(str::to_owned))
+    };
+    let name = call.and_then(in_package);
+    let known = name.and_then(|name| KNOWN.iter().find(|(known, _)| *known == name));
+    known.map(|(_, function)| *function).ok_or_else(|| {
+        let tag = shown(field.node().tag.as_deref());
+        field.error(format!("tag {tag} is none of those that are known, expected numbers or NumPy's arrays of them"))
+    })
+}
+
+/// `_reconstruct(ndarray, (0,), b'b')` with its state `(1, shape, dtype, is_fortran, data)`.
+fn reconstruct(field: &Field<'_>) -> Result<NumpyArray, ReadError> {
+    let parts = field.entries()?;
+    if parts.len() != 2 {
+        return Err(field.error(format!("{} parts, expected args and state", parts.len())));
+    }
+    check_args(&field.required("args")?)?;
+    let state_field = field.required("state")?;
+    let [version, shape, dtype, is_fortran, data] = tuple::<5>(&state_field)?;
+    if version.integer()? != 1 {
+        return Err(version.error(format!("pickle version {}, expected 1", version.integer()?)));
+    }
+    let shape = read_shape(&shape)?;
+    let values = numbers(&data, read_dtype(&dtype)?, shape.iter().product())?;
+    let is_fortran = match is_fortran.node().value {
+        Value::Bool(flag) => flag,
+        Value::Integer(0) => false,
+        Value::Integer(1) => true,
+        _ => return Err(is_fortran.error("expected true or false: is the array in Fortran order?")),
+    };
+    Ok(ordered(shape, values, is_fortran))
+}
+
+/// `_frombuffer(data, dtype, shape, order)`.
+fn from_buffer(field: &Field<'_>) -> Result<NumpyArray, ReadError> {
+    let [data, dtype, shape, order] = items::<4>(&args(field)?)?;
+    let shape = read_shape(&shape)?;
+    let values = numbers(&data, read_dtype(&dtype)?, shape.iter().product())?;
+    match order.text()? {
+        "C" => Ok(ordered(shape, values, false)),
+        "F" => Ok(ordered(shape, values, true)),
+        other => Err(order.error(format!("order {other:?}, expected C or F"))),
+    }
+}
+
+/// `scalar(dtype, data)`.
+fn scalar_value(field: &Field<'_>) -> Result<f64, ReadError> {
+    let [dtype, data] = items::<2>(&args(field)?)?;
+    let values = numbers(&data, read_dtype(&dtype)?, 1)?;
+    values.first().copied().ok_or_else(|| data.error("no number"))
+}
+
+/// Arguments of a call without state are its items, or stand under `args`.
+fn args<'a>(field: &Field<'a>) -> Result<Field<'a>, ReadError> {
+    if matches!(field.node().value, Value::Map(_)) { field.required("args") } else { Ok(field.clone()) }
+}
+
+fn expect_tag(field: &Field<'_>, expected: &str) -> Result<(), ReadError> {
+    match field.node().tag.as_deref() {
+        Some(tag) if tag == expected => Ok(()),
+        tag => Err(field.error(format!("tag {}, expected !!{expected}", shown(tag)))),
+    }
+}
+
+fn shown(tag: Option<&str>) -> String {
+    tag.map_or("is missing".into(), |tag| format!("{:?}", tag.chars().take(80).collect::<String>()))
+}
+
+fn items<'a, const N: usize>(field: &Field<'a>) -> Result<[Field<'a>; N], ReadError> {
+    let items = field.items()?;
+    let found = items.len();
+    items.try_into().map_err(|_| field.error(format!("{found} items, expected {N}")))
+}
+
+fn tuple<'a, const N: usize>(field: &Field<'a>) -> Result<[Field<'a>; N], ReadError> {
+    expect_tag(field, "python/tuple")?;
+    items(field)
+}
+
+/// `args` of `_reconstruct` are always the same: an empty array to be filled by the state.
+fn check_args(args: &Field<'_>) -> Result<(), ReadError> {
+    let [class, shape, code] = items::<3>(args)?;
+    expect_tag(&class, "python/name:numpy.ndarray")?;
+    let [zero] = tuple::<1>(&shape)?;
+    if zero.integer()? != 0 {
+        return Err(zero.error("expected 0: the shape comes with the state"));
+    }
+    match binary(&code)?.as_slice() {
+        b"b" => Ok(()),
+        _ => Err(code.error("expected the code b")),
+    }
+}
+
+fn read_shape(field: &Field<'_>) -> Result<Vec<usize>, ReadError> {
+    expect_tag(field, "python/tuple")?;
+    let shape: Vec<usize> = field
+        .items()?
+        .iter()
+        .map(|item| usize::try_from(item.integer()?).map_err(|_| item.error("a shape is not negative")))
+        .collect::<Result<_, _>>()?;
+    let count = shape.iter().try_fold(1usize, |count, &size| count.checked_mul(size));
+    match count.filter(|&count| count <= MAX_NUMBERS && shape.len() <= 4) {
+        Some(_) => Ok(shape),
+        None => Err(field.error(format!("shape {shape:?} is larger than {MAX_NUMBERS} numbers"))),
+    }
+}
+
+fn ordered(shape: Vec<usize>, values: Vec<f64>, is_fortran: bool) -> NumpyArray {
+    let values = if is_fortran { row_major(&shape, &values) } else { values };
+    NumpyArray { shape, values }
+}
+
+/// Turns the order in which the first index runs fastest into the usual one.
+fn row_major(shape: &[usize], values: &[f64]) -> Vec<f64> {
+    let place = |index: usize| {
+        let (mut rest, mut place, mut stride) = (index, 0, values.len());
+        // Digits of the row-major index, weighed as Fortran weighs them.
+        let mut weight = 1;
+        for &size in shape {
+            stride /= size.max(1);
+            place += (rest / stride.max(1)) * weight;
+            rest %= stride.max(1);
+            weight *= size;
+        }
+        place
+    };
+    (0..values.len()).map(|index| values[place(index)]).collect()
+}
+
+#[cfg(test)]
+pub(super) mod tests;

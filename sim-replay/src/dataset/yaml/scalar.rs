@@ -1,0 +1,70 @@
+//! Resolution of scalars: which text is a number, a truth value or nothing, by YAML 1.2's core schema.
+
+use super::Value;
+
+/// The value of a plain (unquoted) scalar.
+pub(super) fn plain(text: &str) -> Value {
+    let known = match text.as_bytes().first() {
+        None => Some(Value::Null),
+        Some(b'0'..=b'9' | b'+' | b'-' | b'.') => number(text),
+        Some(b'~' | b'n' | b'N') => matches!(text, "~" | "null" | "Null" | "NULL").then_some(Value::Null),
+        Some(b't' | b'T') => matches!(text, "true" | "True" | "TRUE").then_some(Value::Bool(true)),
+        Some(b'f' | b'F') => matches!(text, "false" | "False" | "FALSE").then_some(Value::Bool(false)),
+        Some(_) => None,
+    };
+    known.unwrap_or_else(|| Value::Text(text.to_owned()))
+}
+
+/// An integer or float; exponents need no point, as in `1e-06`.
+fn number(text: &str) -> Option<Value> {
+    let unsigned = text.strip_prefix(['+', '-']).unwrap_or(text);
+    if !unsigned.is_empty() && unsigned.bytes().all(|byte| byte.is_ascii_digit()) {
+        // Beyond 64 bits it is still a number.
+        return text.parse().map(Value::Integer).or_else(|_| text.parse().map(Value::Float)).ok();
+    }
+    match unsigned {
+        ".inf" | ".Inf" | ".INF" => {
+            let sign = if text.starts_with('-') { -1.0 } else { 1.0 };
+            return Some(Value::Float(sign * f64::INFINITY));
+        }
+        ".nan" | ".NaN" | ".NAN" => return Some(Value::Float(f64::NAN)),
+        _ => {}
+    }
+    if let Some(digits) = text.strip_prefix("0x") {
+        return i64::from_str_radix(digits, 16).map(Value::Integer).ok();
+    }
+    if let Some(digits) = text.strip_prefix("0o") {
+        return i64::from_str_radix(digits, 8).map(Value::Integer).ok();
+    }
+    // Rust would take `1_0` for none and `infinity` for a number: letters other than the exponent's are no number's.
+    let is_decimal = |byte: u8| byte.is_ascii_digit() || matches!(byte, b'+' | b'-' | b'.' | b'e' | b'E');
+    text.bytes().all(is_decimal).then(|| text.parse().map(Value::Float).ok()).flatten()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn scalars_are_what_the_core_schema_makes_of_them() {
+        for (text, expected) in [
+            ("", Value::Null),
+            ("~", Value::Null),
+            ("Null", Value::Null),
+            ("true", Value::Bool(true)),
+            ("False", Value::Bool(false)),
+            ("-7", Value::Integer(-7)),
+            ("000069", Value::Integer(69)),
+            ("18446744073709551616", Value::Float(18_446_744_073_709_551_616.0)),
+            ("1e-06", Value::Float(1e-6)),
+            ("-.inf", Value::Float(f64::NEG_INFINITY)),
+            ("0x1F", Value::Integer(31)),
+        ] {
+            assert_eq!(plain(text), expected, "{text}");
+        }
+        for text in ["-", ".", "1-2", "2024-01-01", "inf", "nan", "1, 2, 3", "no", "none", "-e", "12abc", "0x", "+"] {
+            assert_eq!(plain(text), Value::Text(text.into()));
+        }
+        assert!(matches!(plain(".nan"), Value::Float(value) if value.is_nan()));
+    }
+}

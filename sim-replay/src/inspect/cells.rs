@@ -1,0 +1,88 @@
+//! Points of a sweep by square cells, so that a box looks at those near it alone.
+
+use nalgebra::{Isometry3, Point3};
+use protocol::PointCloud;
+
+/// Width of a cell, metres: about that of a car.
+const CELL_M: f32 = 4.0;
+/// Cells on each side of the sensor; what lies beyond is in the outermost.
+const CELLS: usize = 40;
+const ACROSS: usize = 2 * CELLS;
+
+/// The points of a sweep, sorted by cell.
+pub(super) struct Cells {
+    points: Vec<[f32; 3]>,
+    /// Where the points of each cell begin, and the end of the last.
+    begins: Vec<usize>,
+}
+
+impl Cells {
+    pub(super) fn new(cloud: &PointCloud) -> Self {
+        let mut begins = vec![0; ACROSS * ACROSS + 1];
+        for point in &cloud.xyzi {
+            begins[cell_of(point) + 1] += 1;
+        }
+        for cell in 1..begins.len() {
+            begins[cell] += begins[cell - 1];
+        }
+        let mut ends = begins.clone();
+        let mut points = vec![[0.0; 3]; cloud.len()];
+        for point in &cloud.xyzi {
+            let end = &mut ends[cell_of(point)];
+            points[*end] = [point[0], point[1], point[2]];
+            *end += 1;
+        }
+        Self { points, begins }
+    }
+
+    /// Whether a box holds a point: half its sizes, and how the frame of the points lies in its own.
+    pub(super) fn holds_point(&self, box_from_lidar: &Isometry3<f32>, half: [f32; 3]) -> bool {
+        // A little more than the box, for what rounding does.
+        let radius = 1.0 + half.iter().map(|half| half * half).sum::<f32>().sqrt();
+        let center = box_from_lidar.inverse().translation.vector;
+        let columns = index(center.x - radius)..=index(center.x + radius);
+        let mut rows = index(center.y - radius)..=index(center.y + radius);
+        rows.any(|row| {
+            let (first, last) = (row * ACROSS + columns.start(), row * ACROSS + columns.end());
+            self.points[self.begins[first]..self.begins[last + 1]].iter().any(|&[x, y, z]| {
+                let local = box_from_lidar * Point3::new(x, y, z);
+                (0..3).all(|axis| local[axis].abs() <= half[axis])
+            })
+        })
+    }
+}
+
+fn cell_of(&[x, y, ..]: &[f32; 4]) -> usize {
+    index(y) * ACROSS + index(x)
+}
+
+/// The column or row of a coordinate. Not a number is 0.
+fn index(metres: f32) -> usize {
+    let cell = (metres / CELL_M + CELLS as f32).clamp(0.0, (ACROSS - 1) as f32);
+    cell as usize
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    proptest! {
+        #[test]
+        fn cells_find_what_a_look_at_all_points_finds(
+            points in prop::collection::vec(prop::array::uniform4(-200.0..200.0f32), 0..60),
+            center in prop::array::uniform3(-200.0..200.0f32),
+            yaw in -3.2..3.2f32,
+            half in prop::array::uniform3(0.1..60.0f32),
+        ) {
+            let box_from_lidar = Isometry3::new(center.into(), nalgebra::Vector3::new(0.0, 0.0, yaw)).inverse();
+            let holds = |point: &[f32; 4]| {
+                let local = box_from_lidar * Point3::new(point[0], point[1], point[2]);
+                (0..3).all(|axis| local[axis].abs() <= half[axis])
+            };
+            let cells = Cells::new(&PointCloud { xyzi: points.clone() });
+            prop_assert_eq!(cells.holds_point(&box_from_lidar, half), points.iter().any(holds));
+        }
+    }
+}

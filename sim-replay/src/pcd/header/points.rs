@@ -1,0 +1,51 @@
+//! How many points a header promises.
+
+use super::super::PcdError;
+use super::Entries;
+
+/// More points than any sweep has; a header that promises more is wrong.
+const MAX_POINTS: u64 = 50_000_000;
+
+impl Entries<'_> {
+    /// `POINTS`, or `WIDTH` times `HEIGHT`: whatever is there must fit, and one of `POINTS` and `WIDTH` must be.
+    pub(super) fn points(&self) -> Result<usize, PcdError> {
+        let (width, height, points) = (self.count("WIDTH")?, self.count("HEIGHT")?, self.count("POINTS")?);
+        let (key, line, count) = match (width, points) {
+            (Some((_, width)), Some((line, points))) => {
+                check_product(width, height.map(|(_, height)| height), line, points)?;
+                ("POINTS", line, points)
+            }
+            (None, Some((line, points))) => ("POINTS", line, points),
+            (Some((line, width)), None) => {
+                ("WIDTH", line, width.saturating_mul(height.map_or(1, |(_, height)| height)))
+            }
+            (None, None) => return Err(PcdError::of("POINTS", "missing in the header, and WIDTH too")),
+        };
+        if count > MAX_POINTS {
+            return Err(PcdError::at(line, key, format!("{count} points, at most {MAX_POINTS} are read")));
+        }
+        usize::try_from(count).map_err(|_| PcdError::at(line, key, format!("{count} do not fit this machine")))
+    }
+
+    fn count(&self, key: &str) -> Result<Option<(u64, u64)>, PcdError> {
+        if !self.has(key) {
+            return Ok(None);
+        }
+        let (line, value) = self.single(key)?;
+        let number = value.parse().map_err(|_| PcdError::at(line, key, format!("{value:?} is no count")))?;
+        Ok(Some((line, number)))
+    }
+}
+
+fn check_product(width: u64, height: Option<u64>, line: u64, points: u64) -> Result<(), PcdError> {
+    let fits = match height {
+        Some(height) => width.checked_mul(height) == Some(points),
+        // As many rows as it takes.
+        None => points.checked_rem(width).unwrap_or(points) == 0,
+    };
+    if fits {
+        return Ok(());
+    }
+    let height = height.map_or_else(|| "of no HEIGHT".into(), |height| format!("x HEIGHT {height}"));
+    Err(PcdError::at(line, "POINTS", format!("{points}, but WIDTH {width} {height} says otherwise")))
+}

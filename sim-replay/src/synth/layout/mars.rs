@@ -1,0 +1,39 @@
+//! Open MARS, multiagent subset, in the tables of nuScenes: the names of vehicles end the names of channels.
+
+use serde_json::{Map, Value, json};
+
+use super::SceneHeader;
+use super::boxes::of_255;
+use super::nuscenes::Style;
+
+/// The style.
+#[derive(Debug)]
+pub(super) struct Mars;
+
+impl Style for Mars {
+    fn version(&self) -> &'static str {
+        "v1.0"
+    }
+
+    fn channels(&self, scene: &SceneHeader) -> Vec<String> {
+        scene.agents.iter().map(|agent| format!("LIDAR_FRONT_CENTER_{}", agent.id)).collect()
+    }
+
+    fn file_name(&self, _: usize, _: usize, micros: u64) -> String {
+        format!("{micros}.pcd.bin")
+    }
+
+    /// A sensor's bytes, as floats.
+    fn intensity(&self, intensity: f32) -> f32 {
+        of_255(intensity)
+    }
+
+    fn scene_fields(&self, scene: &SceneHeader) -> Map<String, Value> {
+        let vehicles: Vec<&str> = scene.agents.iter().map(|agent| agent.id.as_str()).collect();
+        Map::from_iter([
+            ("vehicle_list".to_owned(), json!(vehicles)),
+            ("intersection".to_owned(), json!(0)),
+            ("err_max".to_owned(), json!(0.0)),
+        ])
+    }
+}

@@ -1,0 +1,84 @@
+//! V2X-Real and V2XPnP: the folders of OPV2V with `.bin` sweeps, right-handed; objects in the world, with their type.
+
+use std::fmt::Write as _;
+use std::path::{Path, PathBuf};
+
+use protocol::Pose;
+
+use super::boxes::{float_bytes, real_type};
+use super::disk::write_file;
+use super::opv2v::AgentFolders;
+use super::yaml_text::{KMH_PER_MPS, ObjectEntry, anchors, write_list};
+use super::{AgentFrame, Moment, Omissions, SceneHeader, SceneWriter};
+use crate::carla_pose::CarlaPose;
+use crate::synth::error::SynthError;
+
+/// The writer.
+#[derive(Debug)]
+pub(super) struct V2xreal {
+    root: PathBuf,
+    folders: Option<AgentFolders>,
+}
+
+impl V2xreal {
+    pub(super) fn new(root: &Path) -> Self {
+        Self { root: root.to_owned(), folders: None }
+    }
+}
+
+impl SceneWriter for V2xreal {
+    fn begin(&mut self, scene: &SceneHeader) -> Result<(), SynthError> {
+        self.folders = Some(AgentFolders::make(&self.root, scene)?);
+        Ok(())
+    }
+
+    fn write(&self, moment: &Moment, _: &Omissions) -> Result<(), SynthError> {
+        let Some(folders) = &self.folders else { return Ok(()) };
+        for frame in &moment.frames {
+            let points = float_bytes(frame.frame.points.xyzi.iter().copied());
+            write_file(&folders.file(moment, frame, ".bin"), points)?;
+            let mut yaml = String::with_capacity(512 + 400 * frame.frame.objects.len());
+            write_frame(&mut yaml, frame).expect("a String takes all that is written to it");
+            write_file(&folders.file(moment, frame, ".yaml"), yaml)?;
+        }
+        Ok(())
+    }
+
+    fn end(&mut self) -> Result<(), SynthError> {
+        self.folders.take().map_or(Ok(()), AgentFolders::close)
+    }
+}
+
+fn write_frame(yaml: &mut String, agent: &AgentFrame) -> std::fmt::Result {
+    let frame = &agent.frame;
+    if let Some(speed_mps) = frame.speed_mps {
+        writeln!(yaml, "ego_speed: {}", KMH_PER_MPS * speed_mps)?;
+    }
+    for (key, pose) in [("lidar_pose", frame.world_from_lidar), ("true_ego_pos", frame.world_from_vehicle)] {
+        if let Some(pose) = pose {
+            write_list(yaml, "", key, &six(&pose))?;
+        }
+    }
+    if frame.objects.is_empty() {
+        return writeln!(yaml, "vehicles: {{}}");
+    }
+    writeln!(yaml, "vehicles:")?;
+    frame.objects.iter().zip(anchors(agent)).try_for_each(|(object, anchor)| {
+        let more = [("obj_type", real_type(object.class).to_owned())];
+        let [.., roll, yaw, pitch] = six(&object.world_from_object);
+        let entry = ObjectEntry {
+            id: object.id,
+            angle_deg: [roll, yaw, pitch],
+            location_m: anchor.location_m,
+            center_m: anchor.center_offset_m,
+            size_m: object.size_m,
+            speed_mps: object.speed_mps,
+            more: &more,
+        };
+        entry.write(yaml)
+    })
+}
+
+fn six(pose: &Pose) -> [f64; 6] {
+    CarlaPose::from_right_handed(pose).into()
+}

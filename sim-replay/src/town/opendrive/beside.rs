@@ -1,0 +1,81 @@
+//! `<objects>` and `<signals>`: what stands beside a road, and its bridges and tunnels.
+
+use super::super::finding::FindingLog;
+use super::super::road::{RoadObject, RoadSignal, RoadStructure};
+use super::OpenDriveError;
+use super::element::{Element, MAX_LENGTH_M, children};
+
+/// Everything named `name` in the list `list` of a road; what cannot be read is left out.
+fn read_all<T>(
+    road: Element,
+    list: &'static str,
+    name: &'static str,
+    read: impl Fn(Element) -> Result<T, OpenDriveError>,
+    log: &mut FindingLog,
+) -> Vec<T> {
+    let Some(list) = road.child(list) else { return Vec::new() };
+    let read =
+        children(list, name).filter_map(|element| read(element).map_err(|error| error.note(log, "left out")).ok());
+    read.collect()
+}
+
+pub(super) fn read_objects(road: Element, log: &mut FindingLog) -> Vec<RoadObject> {
+    let read_object = |element: Element| {
+        let label =
+            [element.optional_text("type"), element.optional_text("name")].map(Option::unwrap_or_default).join(" ");
+        let size = |name| element.number_or(name, 0.0, 0.0, 1e4);
+        Ok(RoadObject {
+            label,
+            s_m: element.number("s", 0.0, MAX_LENGTH_M)?,
+            t_m: element.number("t", -1e4, 1e4)?,
+            z_offset_m: element.number_or("zOffset", 0.0, -1e4, 1e4)?,
+            heading_rad: element.number_or("hdg", 0.0, -1e4, 1e4)?,
+            size_m: [size("length")?, size("width")?, size("height")?],
+        })
+    };
+    read_all(road, "objects", "object", read_object, log)
+}
+
+pub(super) fn read_signals(road: Element, log: &mut FindingLog) -> Vec<RoadSignal> {
+    let read_signal = |element: Element| {
+        // The signal faces against the direction it is for; `+` is for traffic along the road.
+        let flip = if element.optional_text("orientation") == Some("-") { std::f64::consts::PI } else { 0.0 };
+        Ok(RoadSignal {
+            name: element.optional_text("name").unwrap_or_default().to_owned(),
+            dynamic: element.optional_text("dynamic") == Some("yes"),
+            s_m: element.number("s", 0.0, MAX_LENGTH_M)?,
+            t_m: element.number("t", -1e4, 1e4)?,
+            z_offset_m: element.number_or("zOffset", 0.0, -1e4, 1e4)?,
+            heading_rad: flip + element.number_or("hOffset", 0.0, -1e4, 1e4)?,
+            height_m: element.number_or("height", 0.0, 0.0, 100.0)?,
+        })
+    };
+    read_all(road, "signals", "signal", read_signal, log)
+}
+
+pub(super) fn read_structures(road: Element, road_length_m: f64, log: &mut FindingLog) -> Vec<RoadStructure> {
+    let mut structures = Vec::new();
+    for (name, tunnel) in [("bridge", false), ("tunnel", true)] {
+        let read = |element: Element| {
+            let s_m = element.number("s", 0.0, MAX_LENGTH_M)?;
+            Ok(RoadStructure { tunnel, s_m, length_m: element.number("length", 0.0, MAX_LENGTH_M)? })
+        };
+        structures.extend(read_all(road, "objects", name, read, log));
+    }
+    part_tunnels(&mut structures, road_length_m);
+    structures
+}
+
+/// Cuts tunnels so that none reaches into the next or beyond its road, and leaves out those of which nothing is left:
+/// together they are at most as long as the road, however many a map has for its lanes.
+fn part_tunnels(structures: &mut Vec<RoadStructure>, road_length_m: f64) {
+    structures.sort_by(|a, b| a.tunnel.cmp(&b.tunnel).then(a.s_m.total_cmp(&b.s_m)));
+    let mut covered_m = 0.0;
+    for tunnel in structures.iter_mut().filter(|structure| structure.tunnel) {
+        let end_m = (tunnel.s_m + tunnel.length_m).min(road_length_m);
+        tunnel.s_m = tunnel.s_m.max(covered_m);
+        tunnel.length_m = (end_m - tunnel.s_m).max(0.0);
+        covered_m = covered_m.max(end_m);
+    }
+    structures.retain(|structure| !structure.tunnel || structure.length_m > 0.0);
+}

@@ -1,0 +1,136 @@
+//! `<border>`: lanes given by where they end instead of how wide they are.
+//!
+//! A border is a `t` coordinate, whatever lies inside it: a lane's width is the distance between its border and the
+//! inner border, which is the border or the width of the lane inside it, or the lane offset. Differences of cubics
+//! are cubics, so nothing is lost.
+
+use super::super::curve::{cubic, cubic_slope};
+use super::super::finding::FindingLog;
+use super::super::profile::Profile;
+use super::super::road::{MAX_OFFSET_M, RoadLane};
+use super::OpenDriveError;
+use super::element::Element;
+use super::lanes::Stretch;
+use super::profile::read_profile;
+
+/// Looks along a section for widths below zero.
+const LOOKS: u32 = 20;
+/// A border this far inside the inner border is rounding, metres.
+const ROUNDING_M: f64 = 0.01;
+
+/// Fills the widths of the lanes of one side, inner lanes first, that have a border and no width.
+pub(super) fn widths_from_borders(
+    elements: &[Element],
+    lanes: &mut [RoadLane],
+    sign: i32,
+    stretch: &Stretch,
+    log: &mut FindingLog,
+) -> Result<(), OpenDriveError> {
+    if elements.iter().all(|element| element.child("border").is_none()) {
+        return Ok(());
+    }
+    let side = f64::from(sign);
+    // Outwards from the reference line, as `t` of the left side.
+    let mut inner = times(&shifted(stretch.lane_offset, stretch.s_m), side);
+    for (element, lane) in elements.iter().zip(lanes) {
+        if lane.width.records.is_empty() {
+            let border = read_border(*element, side, stretch, log)?;
+            if !border.records.is_empty() {
+                lane.width = sum(&border, &times(&inner, -1.0));
+                note_overlaps(*element, &lane.width, stretch.length_m, log);
+                inner = border;
+            }
+            continue;
+        }
+        if element.child("border").is_some() {
+            element.note(log, "has both <width> and <border>", "the width is used");
+        }
+        inner = sum(&inner, &lane.width);
+    }
+    Ok(())
+}
+
+/// A lane's border as a distance outwards from the reference line. Some writers give the borders of right lanes without
+/// their sign.
+fn read_border(
+    element: Element,
+    side: f64,
+    stretch: &Stretch,
+    log: &mut FindingLog,
+) -> Result<Profile, OpenDriveError> {
+    let border = read_profile(element, "border", "sOffset", MAX_OFFSET_M)?;
+    let looks = (0..=LOOKS).map(|look| border.at(stretch.length_m * f64::from(look) / f64::from(LOOKS)));
+    let farthest = looks.fold(0.0, |far: f64, t| if t.abs() > far.abs() { t } else { far });
+    if farthest * side < 0.0 {
+        let found = format!("has <border> at t={farthest:.3} on its other side");
+        element.note(log, &found, "its sign is turned");
+        return Ok(times(&border, -side));
+    }
+    Ok(times(&border, side))
+}
+
+fn note_overlaps(element: Element, width: &Profile, length_m: f64, log: &mut FindingLog) {
+    let narrowest = (0..=LOOKS).map(|look| width.at(length_m * f64::from(look) / f64::from(LOOKS)));
+    let narrowest = narrowest.fold(f64::INFINITY, f64::min);
+    if narrowest < -ROUNDING_M {
+        let found = format!("has <border> {:.3} m inside the inner border", -narrowest);
+        element.note(log, &found, "width 0 there");
+    }
+}
+
+/// A profile over places counted from `start_m` on.
+fn shifted(profile: &Profile, start_m: f64) -> Profile {
+    let last_before = profile.records.partition_point(|&(start, _)| start <= start_m).saturating_sub(1);
+    let records = profile.records[last_before.min(profile.records.len())..].iter();
+    let records = records.map(|&(start, coefficients)| {
+        if start < start_m { (0.0, moved(coefficients, start_m - start)) } else { (start - start_m, coefficients) }
+    });
+    Profile { records: records.collect() }
+}
+
+fn times(profile: &Profile, factor: f64) -> Profile {
+    let records = profile.records.iter().map(|&(start, coefficients)| (start, coefficients.map(|c| factor * c)));
+    Profile { records: records.collect() }
+}
+
+/// Sum of two profiles: a record wherever either has one.
+fn sum(a: &Profile, b: &Profile) -> Profile {
+    let mut starts: Vec<f64> = a.records.iter().chain(&b.records).map(|&(start, _)| start).collect();
+    starts.sort_unstable_by(f64::total_cmp);
+    starts.dedup();
+    let at = |profile: &Profile, place: f64| {
+        let after = profile.records.partition_point(|&(start, _)| start <= place);
+        let record = profile.records.get(after.saturating_sub(1));
+        record.map_or([0.0; 4], |&(start, coefficients)| moved(coefficients, place - start))
+    };
+    let records = starts.into_iter().map(|place| {
+        let (a, b) = (at(a, place), at(b, place));
+        (place, std::array::from_fn(|power| a[power] + b[power]))
+    });
+    Profile { records: records.collect() }
+}
+
+/// The same cubic of a variable that begins `by` later.
+fn moved(coefficients: [f64; 4], by: f64) -> [f64; 4] {
+    let [_, _, c, d] = coefficients;
+    [cubic(coefficients, by), cubic_slope(coefficients, by), c + 3.0 * d * by, d]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sums_of_cubics_are_exact_wherever_either_changes() {
+        let a = Profile { records: vec![(0.0, [3.0, 0.1, -0.01, 0.001]), (12.0, [2.0, 0.0, 0.02, 0.0])] };
+        let b = Profile { records: vec![(0.0, [1.0, 0.0, 0.0, 0.0]), (7.5, [0.5, -0.2, 0.0, 0.003])] };
+        let found = sum(&a, &b);
+        assert_eq!(found.records.iter().map(|record| record.0).collect::<Vec<_>>(), [0.0, 7.5, 12.0]);
+        for place in 0..200 {
+            let place = f64::from(place) / 10.0;
+            assert!((found.at(place) - a.at(place) - b.at(place)).abs() < 1e-9, "{place}");
+            assert!((shifted(&a, 5.0).at(place) - a.at(place + 5.0)).abs() < 1e-9, "{place}");
+        }
+        assert_eq!(shifted(&Profile::default(), 5.0), Profile::default());
+    }
+}

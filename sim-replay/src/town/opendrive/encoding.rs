@@ -1,0 +1,95 @@
+//! From the bytes of a map to its text: byte order marks, declared encodings, and bytes that are neither.
+
+use std::borrow::Cow;
+
+use encoding_rs::{Encoding, UTF_8, UTF_16BE, UTF_16LE, WINDOWS_1252};
+
+use super::super::finding::FindingLog;
+
+/// The declaration stands within this many bytes.
+const DECLARATION_BYTES: usize = 200;
+
+/// The text of a file, without byte order mark. A mark wins over the declaration; where bytes do not fit the encoding,
+/// the text is read as Western European (windows-1252), in which any byte means something.
+pub(super) fn decode<'a>(bytes: &'a [u8], log: &mut FindingLog) -> Cow<'a, str> {
+    let (encoding, mark) = match Encoding::for_bom(bytes) {
+        Some(found) => found,
+        None => (unmarked(bytes, log), 0),
+    };
+    let bytes = &bytes[mark..];
+    if let Some(text) = encoding.decode_without_bom_handling_and_without_replacement(bytes) {
+        return text;
+    }
+    let found = format!("holds bytes that are not {}", encoding.name());
+    if encoding == UTF_16LE || encoding == UTF_16BE {
+        log.add(1, "OpenDRIVE", &found, "replaced by U+FFFD");
+        return encoding.decode_without_bom_handling(bytes).0;
+    }
+    log.add(1, "OpenDRIVE", &found, "read as windows-1252");
+    WINDOWS_1252.decode_without_bom_handling(bytes).0
+}
+
+/// The encoding of a file without byte order mark.
+fn unmarked(bytes: &[u8], log: &mut FindingLog) -> &'static Encoding {
+    match bytes {
+        [b'<', 0, ..] => return UTF_16LE,
+        [0, b'<', ..] => return UTF_16BE,
+        _ => {}
+    }
+    let Some(label) = declared(&bytes[..bytes.len().min(DECLARATION_BYTES)]) else { return UTF_8 };
+    match Encoding::for_label(label.as_bytes()) {
+        // A declaration that can be read byte by byte is no UTF-16, whatever it declares.
+        Some(encoding) if encoding == UTF_16LE || encoding == UTF_16BE => UTF_8,
+        Some(encoding) => encoding,
+        None => {
+            log.add(1, "OpenDRIVE", &format!("encoding=\"{label}\""), "unknown; read as UTF-8");
+            UTF_8
+        }
+    }
+}
+
+/// The label in `<?xml ... encoding="label"?>`.
+fn declared(head: &[u8]) -> Option<String> {
+    let head = String::from_utf8_lossy(head);
+    let declaration = head.trim_start().strip_prefix("<?xml")?.split("?>").next()?;
+    let value = declaration.split_once("encoding")?.1.trim_start().strip_prefix('=')?.trim_start();
+    let quote = value.chars().next().filter(|&quote| quote == '"' || quote == '\'')?;
+    value[1..].split_once(quote).map(|(label, _)| label.trim().to_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn decoded(bytes: &[u8]) -> (String, Vec<String>) {
+        let mut log = FindingLog::default();
+        let text = decode(bytes, &mut log).into_owned();
+        (text, log.into_list().iter().map(ToString::to_string).collect())
+    }
+
+    #[test]
+    fn marks_and_declarations_give_the_encoding() {
+        let latin = b"<?xml version=\"1.0\" encoding='ISO-8859-1'?><a b=\"Stra\xdfe\"/>";
+        assert_eq!(decoded(latin).0, "<?xml version=\"1.0\" encoding='ISO-8859-1'?><a b=\"Straße\"/>");
+        assert_eq!(decoded(b"\xef\xbb\xbf<a/>"), ("<a/>".into(), vec![]));
+        let wide = |text: &str, bytes: fn(u16) -> [u8; 2]| text.encode_utf16().flat_map(bytes).collect::<Vec<_>>();
+        for text in ["\u{feff}<a b=\"ß\"/>", "<a b=\"ß\"/>"] {
+            let plain = text.trim_start_matches('\u{feff}');
+            assert_eq!(decoded(&wide(text, u16::to_le_bytes)), (plain.into(), vec![]));
+            assert_eq!(decoded(&wide(text, u16::to_be_bytes)), (plain.into(), vec![]));
+        }
+    }
+
+    #[test]
+    fn what_does_not_fit_is_read_all_the_same_and_named() {
+        let (text, found) = decoded(b"<?xml version=\"1.0\" encoding=\"UTF-8\"?><a b=\"Stra\xdfe\"/>");
+        assert!(text.contains("Straße"), "{text}");
+        assert_eq!(found, ["line 1: <OpenDRIVE> holds bytes that are not UTF-8; read as windows-1252"]);
+        let (_, found) = decoded(b"<?xml version=\"1.0\" encoding=\"klingon\"?><a/>");
+        assert_eq!(found, ["line 1: <OpenDRIVE> encoding=\"klingon\"; unknown; read as UTF-8"]);
+        let (_, found) = decoded(b"\xff\xfe<\0\0\xd8");
+        assert_eq!(found.len(), 1);
+        assert_eq!(decoded(b"<?xml version=\"1.0\" encoding=\"UTF-16\"?><a/>").1, Vec::<String>::new());
+        assert_eq!(decoded(b""), (String::new(), vec![]));
+    }
+}

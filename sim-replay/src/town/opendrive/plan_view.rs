@@ -1,0 +1,157 @@
+//! `<planView>`: the elements of a road's reference line.
+
+use super::super::curve::{Curve, CurveShape, Pose2};
+use super::super::finding::FindingLog;
+use super::OpenDriveError;
+use super::element::{Element, MAX_COORDINATE_M, MAX_LENGTH_M, children};
+
+/// Tightest bend: a radius of 0.1 m.
+const MAX_CURVATURE: f64 = 10.0;
+/// Most that one element may turn, radians; bounds the cost of evaluating it.
+const MAX_TURN_RAD: f64 = 20.0;
+/// Curvatures beyond this are no numbers of a road, not even of an odd one.
+const ANY_CURVATURE: f64 = 1e9;
+/// The elements' lengths may miss the road's length by this much, metres; rounding in the wild stays far below.
+const LENGTH_TOLERANCE_M: f64 = 1.0;
+/// Elements may miss each other by this much, metres.
+const JOINT_TOLERANCE_M: f64 = 2.0;
+/// An element up to this length whose shape is absurd is as good as a straight line, metres.
+const SHORT_M: f64 = 1.0;
+
+/// Reads a reference line; also returns the length of its road: that of the elements where the road's own differs.
+pub(super) fn read(road: Element, log: &mut FindingLog) -> Result<(Vec<Curve>, f64), OpenDriveError> {
+    let plan_view = road.required("planView")?;
+    let mut curves: Vec<Curve> = Vec::new();
+    for element in children(plan_view, "geometry") {
+        let curve = read_curve(element, log)?;
+        if curves.last().is_some_and(|before| curve.s_m < before.s_m) {
+            return Err(element.error_value("s", &curve.s_m.to_string(), "the elements in rising order"));
+        }
+        if let Some(gap_m) = curves.last().map(|before| before.end().distance_m(&curve.start)).filter(too_far) {
+            let problem =
+                format!("starts {gap_m:.2} m from the end of the one before; expected at most {JOINT_TOLERANCE_M}");
+            return Err(element.error_element(&problem));
+        }
+        // An element of no length has no direction of its own and adds nothing.
+        if curve.length_m > 0.0 || curves.is_empty() {
+            curves.push(curve);
+        }
+    }
+    if curves.is_empty() {
+        return Err(plan_view.error_element("has no <geometry>"));
+    }
+    let total_m: f64 = curves.iter().map(|curve| curve.length_m).sum();
+    Ok((curves, road_length_m(road, total_m, log)))
+}
+
+fn road_length_m(road: Element, total_m: f64, log: &mut FindingLog) -> f64 {
+    let error = match road.number("length", 0.0, MAX_LENGTH_M) {
+        Ok(length_m) if (total_m - length_m).abs() <= LENGTH_TOLERANCE_M => return length_m,
+        Ok(length_m) => road.error_value("length", &length_m.to_string(), &format!("{total_m}, as its <planView>")),
+        Err(error) => error,
+    };
+    error.note(log, "the length of its reference line is used");
+    total_m
+}
+
+fn too_far(gap_m: &f64) -> bool {
+    *gap_m > JOINT_TOLERANCE_M
+}
+
+fn read_curve(element: Element, log: &mut FindingLog) -> Result<Curve, OpenDriveError> {
+    let coordinate = |name| element.number(name, -MAX_COORDINATE_M, MAX_COORDINATE_M);
+    let start = Pose2::new(coordinate("x")?, coordinate("y")?, element.number("hdg", -1e4, 1e4)?);
+    let length_m = element.number("length", 0.0, MAX_LENGTH_M)?;
+    let s_m = element.number("s", 0.0, MAX_LENGTH_M)?;
+    let Some(kind) = element.elements().find(|child| child.name() != "userData") else {
+        return Err(element.error_element("has no shape"));
+    };
+    let curve = |shape| Curve { s_m, start, length_m, shape };
+    let shape = match kind.name() {
+        "line" => return Ok(curve(CurveShape::Line)),
+        "arc" => {
+            let [curvature] = curvatures(kind, ["curvature"], length_m, log)?;
+            if curvature.is_nan() { CurveShape::Line } else { CurveShape::Arc { curvature } }
+        }
+        "spiral" if length_m == 0.0 => CurveShape::Line,
+        "spiral" => {
+            let [start, end] = curvatures(kind, ["curvStart", "curvEnd"], length_m, log)?;
+            if start.is_nan() { CurveShape::Line } else { CurveShape::Spiral { start, end } }
+        }
+        "poly3" => CurveShape::Poly3(kind.cubic(["a", "b", "c", "d"])?),
+        "paramPoly3" => return read_param_poly3(element, kind, &curve, log),
+        other => {
+            return Err(
+                element.error_element(&format!("holds <{other}>; expected line, arc, spiral, poly3 or paramPoly3"))
+            );
+        }
+    };
+    checked(element, curve(shape), log)
+}
+
+/// Curvatures of an element; where one is tighter than any road bends, all are NaN: the element becomes a straight line.
+fn curvatures<const N: usize>(
+    element: Element,
+    names: [&'static str; N],
+    length_m: f64,
+    log: &mut FindingLog,
+) -> Result<[f64; N], OpenDriveError> {
+    let bound = MAX_CURVATURE.min(MAX_TURN_RAD / length_m.max(1e-9));
+    let mut values = [0.0; N];
+    for (value, name) in values.iter_mut().zip(names) {
+        *value = element.number(name, -ANY_CURVATURE, ANY_CURVATURE)?;
+    }
+    let odd = values.iter().zip(names).find(|(value, _)| value.abs() > bound);
+    let Some((value, name)) = odd else { return Ok(values) };
+    element.error_range(name, value, -bound, bound).note(log, &format!("built as a straight line of {length_m} m"));
+    Ok([f64::NAN; N])
+}
+
+/// The parameter runs from 0 to 1 unless the element has it run over the length.
+fn read_param_poly3(
+    element: Element,
+    kind: Element,
+    curve: &dyn Fn(CurveShape) -> Curve,
+    log: &mut FindingLog,
+) -> Result<Curve, OpenDriveError> {
+    let (u, v) = (kind.cubic(["aU", "bU", "cU", "dU"])?, kind.cubic(["aV", "bV", "cV", "dV"])?);
+    let with = |normalized| curve(CurveShape::ParamPoly3 { u, v, normalized });
+    let has_length = with(true).length_m > 0.0;
+    match kind.optional_text("pRange").map(str::trim) {
+        Some("arcLength") => return checked(element, with(false), log),
+        Some("normalized") => return checked(element, with(has_length), log),
+        Some(_) => kind.note_value(log, "pRange", "treated as absent: normalized"),
+        None => {}
+    }
+    if has_length && !fits(&with(true)) && fits(&with(false)) {
+        kind.note(log, "has no pRange and fits its length only by arcLength", "arcLength is used");
+        return Ok(with(false));
+    }
+    checked(element, with(has_length), log)
+}
+
+/// The curve, if it is about as long as its element; a short one that is not becomes a straight line.
+fn checked(element: Element, curve: Curve, log: &mut FindingLog) -> Result<Curve, OpenDriveError> {
+    if keeps_its_length(&curve) {
+        return Ok(curve);
+    }
+    let error = element.error_value("length", &curve.length_m.to_string(), "about the length of its curve");
+    if curve.length_m > SHORT_M {
+        return Err(error);
+    }
+    error.note(log, "built as a straight line");
+    Ok(Curve { shape: CurveShape::Line, ..curve })
+}
+
+/// Whether a curve is as long as its element up to a factor of two.
+fn fits(curve: &Curve) -> bool {
+    let at = |tenth: u32| curve.at(curve.length_m * f64::from(tenth) / 10.0);
+    let measured_m: f64 = (0..10).map(|tenth| at(tenth).distance_m(&at(tenth + 1))).sum();
+    measured_m > 0.5 * curve.length_m && measured_m < 2.0 * curve.length_m
+}
+
+/// Whether no tenth of a curve is longer than twice what its length says: polynomials can claim anything.
+fn keeps_its_length(curve: &Curve) -> bool {
+    let at = |tenth: u32| curve.at(curve.length_m * f64::from(tenth) / 10.0);
+    (0..10).all(|tenth| at(tenth).distance_m(&at(tenth + 1)) <= 0.2 * curve.length_m + 0.1)
+}

@@ -1,0 +1,124 @@
+//! Values along a road as cubics, and how a road lies across: `<lateralProfile>`.
+
+use super::super::finding::FindingLog;
+use super::super::lateral::{CrossShape, LateralProfile, MAX_SHAPE_M, MAX_SLOPE_RAD};
+use super::super::profile::Profile;
+use super::super::road::MAX_OFFSET_M;
+use super::OpenDriveError;
+use super::element::{Element, MAX_LENGTH_M, children};
+
+/// Looks along a road for slopes that no road has.
+const LOOKS: u32 = 50;
+
+/// Cubics a, b, c, d from the elements `name` of `parent`, by rising `start`.
+pub(super) fn read_profile(
+    parent: Element,
+    name: &'static str,
+    start: &'static str,
+    bound: f64,
+) -> Result<Profile, OpenDriveError> {
+    let mut records: Vec<(f64, [f64; 4])> = Vec::new();
+    for element in children(parent, name) {
+        let s = element.number(start, 0.0, MAX_LENGTH_M)?;
+        element.number("a", -bound, bound)?;
+        if records.last().is_some_and(|&(before, _)| s < before) {
+            return Err(element.error_value(start, &s.to_string(), "the elements in rising order"));
+        }
+        records.push((s, element.cubic(["a", "b", "c", "d"])?));
+    }
+    Ok(Profile { records })
+}
+
+/// Reads how a road lies across. A part that cannot be read, or is steeper than any road, is left out.
+pub(super) fn read_lateral(road: Element, length_m: f64, log: &mut FindingLog) -> LateralProfile {
+    let mut lateral = LateralProfile::default();
+    let Some(element) = road.child("lateralProfile") else { return lateral };
+    lateral.superelevation_rad = slope(element, "superelevation", |_| true, length_m, log);
+    lateral.crossfall_rad = ["left", "right"].map(|side| {
+        let is_of_side = |record: &Element| {
+            matches!(record.optional_text("side"), None | Some("both")) || record.optional_text("side") == Some(side)
+        };
+        slope(element, "crossfall", is_of_side, length_m, log)
+    });
+    match read_shapes(element) {
+        Ok(shapes) if shapes.iter().any(|shape| !is_zero(&shape.height_m)) => lateral.shapes = shapes,
+        Ok(_) => {}
+        Err(error) => error.note(log, "shape of the road left out"),
+    }
+    for other in element.elements() {
+        if !matches!(other.name(), "superelevation" | "crossfall" | "shape" | "userData") {
+            let found = format!("up to {:.2} m high", highest_constant_m(other));
+            other.note(log, &found, "left out: the road lies as without it");
+        }
+    }
+    lateral
+}
+
+fn slope(
+    parent: Element,
+    name: &'static str,
+    is_wanted: impl Fn(&Element) -> bool,
+    length_m: f64,
+    log: &mut FindingLog,
+) -> Profile {
+    let profile = match read_wanted(parent, name, is_wanted) {
+        Ok(profile) if is_zero(&profile) => return Profile::default(),
+        Ok(profile) => profile,
+        Err(error) => {
+            error.note(log, "left out: the road lies as without it");
+            return Profile::default();
+        }
+    };
+    let steepest = (0..=LOOKS).map(|look| profile.at(length_m * f64::from(look) / f64::from(LOOKS)));
+    let steepest = steepest.map(f64::abs).fold(0.0, f64::max);
+    if steepest > MAX_SLOPE_RAD {
+        let found = format!("holds <{name}> up to {steepest:.2} rad, expected at most {MAX_SLOPE_RAD}");
+        parent.note(log, &found, "left out: the road lies as without it");
+        return Profile::default();
+    }
+    profile
+}
+
+fn read_wanted(
+    parent: Element,
+    name: &'static str,
+    is_wanted: impl Fn(&Element) -> bool,
+) -> Result<Profile, OpenDriveError> {
+    let mut profile = read_profile(parent, name, "s", MAX_OFFSET_M)?;
+    let mut wanted = children(parent, name).map(|record| is_wanted(&record));
+    profile.records.retain(|_| wanted.next().unwrap_or(false));
+    Ok(profile)
+}
+
+/// The records of one place along the road, by rising `t`, are one cross-section.
+fn read_shapes(parent: Element) -> Result<Vec<CrossShape>, OpenDriveError> {
+    let mut shapes: Vec<CrossShape> = Vec::new();
+    for element in children(parent, "shape") {
+        let s_m = element.number("s", 0.0, MAX_LENGTH_M)?;
+        let t_m = element.number("t", -MAX_OFFSET_M, MAX_OFFSET_M)?;
+        element.number("a", -MAX_SHAPE_M, MAX_SHAPE_M)?;
+        let record = (t_m, element.cubic(["a", "b", "c", "d"])?);
+        match shapes.last_mut() {
+            Some(last) if last.s_m == s_m => {
+                if last.height_m.records.last().is_some_and(|&(before, _)| t_m < before) {
+                    return Err(element.error_value("t", &t_m.to_string(), "the elements in rising order"));
+                }
+                last.height_m.records.push(record);
+            }
+            Some(last) if last.s_m > s_m => {
+                return Err(element.error_value("s", &s_m.to_string(), "the elements in rising order"));
+            }
+            _ => shapes.push(CrossShape { s_m, height_m: Profile { records: vec![record] } }),
+        }
+    }
+    Ok(shapes)
+}
+
+fn is_zero(profile: &Profile) -> bool {
+    profile.records.iter().all(|(_, coefficients)| coefficients.iter().all(|&coefficient| coefficient == 0.0))
+}
+
+/// The largest constant of an element's descendants, metres: how high a surface is that is not built.
+fn highest_constant_m(element: Element) -> f64 {
+    element.largest("constant", "a")
+}

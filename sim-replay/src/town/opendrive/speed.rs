@@ -1,0 +1,38 @@
+//! `<speed>`: limits of roads and lanes.
+
+use super::super::finding::FindingLog;
+use super::element::Element;
+
+/// Driven where the map has no limit: 130 km/h, metres per second.
+const UNLIMITED_MPS: f64 = 130.0 / 3.6;
+/// Higher limits are no limits, in any unit.
+const MAX_LIMIT: f64 = 1000.0;
+
+/// A speed limit in metres per second; `None` where it is undefined, or odd and treated so.
+pub(super) fn read_speed(element: Element, log: &mut FindingLog) -> Option<f64> {
+    match element.optional_text("max").map(str::trim) {
+        Some("undefined") => return None,
+        Some("no limit") => return Some(UNLIMITED_MPS),
+        _ => {}
+    }
+    let metres = match element.optional_text("unit").map(str::trim) {
+        None | Some("m/s" | "") => 1.0,
+        Some("km/h") => 1.0 / 3.6,
+        Some("mph") => 0.447_04,
+        Some(_) => {
+            element.note_value(log, "unit", "speed limit treated as absent");
+            return None;
+        }
+    };
+    match element.number("max", 0.0, MAX_LIMIT) {
+        Ok(limit) if limit > 0.0 => Some(limit * metres),
+        Ok(_) => {
+            element.note_value(log, "max", "speed limit treated as absent");
+            None
+        }
+        Err(error) => {
+            error.note(log, "speed limit treated as absent");
+            None
+        }
+    }
+}

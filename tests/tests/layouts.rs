@@ -1,0 +1,58 @@
+//! One generated scene in every layout: the same ground truth, and the same AP to the digit.
+
+use std::path::Path;
+
+use deploy::evaluation::{EvaluationOptions, evaluate};
+use ego_fuser::Method;
+use serde_json::{Value, json};
+use sim_replay::dataset::{self, Layout};
+use sim_replay::evaluation_protocol::ProtocolConfig;
+use sim_replay::synth::{SceneLayout, Subset, SynthOptions, generate};
+
+/// Layouts that hold both agents and their boxes, and as what they are read. A line for each.
+const LAYOUTS: [(SceneLayout, Layout); 3] = [
+    (SceneLayout::Opv2v, Layout::Opv2v),
+    (SceneLayout::V2v4real, Layout::V2v4Real),
+    (SceneLayout::V2xreal, Layout::V2xReal),
+];
+/// Methods without and with messages.
+const METHODS: [Method; 2] = [Method::None, Method::Max];
+/// Released weights, trained with other scenes.
+const WEIGHTS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../deploy/weights");
+
+/// Average precision of a method, by threshold and order.
+fn average_precision(scene: &Path, method: Method) -> Value {
+    let options = EvaluationOptions {
+        dataset: scene.to_owned(),
+        weights: WEIGHTS.into(),
+        // One protocol for all: each layout has its own otherwise.
+        protocol: ProtocolConfig { preset: Some("opv2v".into()), ..ProtocolConfig::default() },
+        ..EvaluationOptions::default()
+    };
+    let metrics = evaluate(&options, method, &mut || {}).unwrap();
+    assert_eq!(metrics.frames, 4);
+    json!([metrics.ap_global, metrics.ap_frame_order])
+}
+
+#[test]
+fn every_layout_gives_the_same_average_precision() {
+    tch::set_num_threads(1);
+    let mut expected = Vec::new();
+    for (layout, found) in LAYOUTS {
+        let folder = tempfile::tempdir().unwrap();
+        let options = SynthOptions::new(Subset::V2vdet, 1007, folder.path().to_owned());
+        generate(&SynthOptions { layout, frames: 4, agents: 2..=2, ..options }, &|_| {}).unwrap();
+        let dataset = dataset::open(folder.path()).unwrap();
+        assert!(dataset.layout == found && dataset.problems.is_empty(), "{layout:?}: {:?}", dataset.problems);
+        let found: Vec<Value> = METHODS.map(|method| average_precision(folder.path(), method)).to_vec();
+        if expected.is_empty() {
+            // Nothing would be shown by numbers that are zero anyway.
+            let at_30 = |precision: &Value| precision[0]["0.3"].as_f64().unwrap_or_else(|| panic!("{precision}"));
+            assert!(found.iter().all(|precision| at_30(precision) > 0.3), "{found:?}");
+            assert_ne!(found[0], found[1]);
+            expected = found;
+        } else {
+            assert_eq!(found, expected, "{layout:?}");
+        }
+    }
+}
