@@ -134,8 +134,8 @@ impl TrainingOptions {
     /// longer then.
     fn precision_on(&self, device: Device, has_bfloat16: bool) -> ComputePrecision {
         if self.precision == ComputePrecision::Bf16 && device == Device::Cpu && !has_bfloat16 {
-            eprintln!(
-                "--precision bf16: this processor has no bfloat16 of its own, so f32 is used, which is faster here"
+            output::note(
+                "--precision bf16: this processor has no bfloat16 of its own, so f32 is used, which is faster here",
             );
             return ComputePrecision::F32;
         }

@@ -1,9 +1,10 @@
 //! `sim-replay inspect`: what is in a dataset, and what is wrong with it.
 
-use std::io::Write;
+use std::fmt::Display;
 use std::path::{Path, PathBuf};
 
 use indicatif::{ProgressBar, ProgressStyle};
+use serde::Serialize;
 use sim_replay::dataset::{IntensityScale, OpenOptions, layouts_text};
 use sim_replay::evaluation_protocol::ProtocolConfig;
 use sim_replay::inspect::{Report, inspect, inspect_map};
@@ -34,13 +35,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
         return run_map(&args.dir, args.json);
     }
     let report = with_progress(args);
-    let mut out = std::io::stdout().lock();
-    if args.json {
-        serde_json::to_writer_pretty(&mut out, &report)?;
-        writeln!(out)?;
-    } else {
-        writeln!(out, "{report}")?;
-    }
+    print(&report, args.json)?;
     Ok(if report.problems.is_empty() { Outcome::Done } else { Outcome::BadInput })
 }
 
@@ -53,14 +48,18 @@ fn run_map(path: &Path, json: bool) -> anyhow::Result<Outcome> {
             return Ok(Outcome::BadInput);
         }
     };
-    let mut out = std::io::stdout().lock();
-    if json {
-        serde_json::to_writer_pretty(&mut out, &report)?;
-        writeln!(out)?;
-    } else {
-        writeln!(out, "{report}")?;
-    }
+    print(&report, json)?;
     Ok(Outcome::Done)
+}
+
+/// As JSON, or as the table that it is displayed as.
+fn print(report: &(impl Serialize + Display), json: bool) -> anyhow::Result<()> {
+    if json {
+        output::line(serde_json::to_string_pretty(report)?)?;
+    } else {
+        output::line(report)?;
+    }
+    Ok(())
 }
 
 /// Reads everything; a bar on a terminal says how far.

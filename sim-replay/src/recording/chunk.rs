@@ -130,6 +130,14 @@ pub(super) fn unpack(body: &[u8], channels: &mut Channels) -> McapResult<(Vec<Me
     Ok((messages, orphans))
 }
 
+/// What is wrong, as whoever unpacks says it.
+pub(super) fn in_words(error: McapError) -> String {
+    match error {
+        McapError::Io(source) => source.to_string(),
+        other => other.to_string(),
+    }
+}
+
 /// Gives the records of `source` to `visit`, one after the other, until it has had enough or there are no more.
 fn for_each_record(
     mut source: impl Read,

@@ -11,7 +11,7 @@ use mcap::Message;
 use mcap::records::op;
 use protocol::{Header, Key, wire};
 
-use super::chunk::{Channels, unpack};
+use super::chunk::{Channels, in_words, unpack};
 use super::damage::Damage;
 use super::lengths::{self, RECORD_HEAD};
 use super::records::{RawRecord, Records};
@@ -143,7 +143,7 @@ impl Recording {
             true => unpack(&body, &mut unpacked.channels).map(|(messages, _)| messages),
             false => unpacked.channels.message(&body).map(|message| message.into_iter().collect()),
         };
-        let messages = Arc::new(messages.map_err(|error| self.changed(holder, error.to_string()))?);
+        let messages = Arc::new(messages.map_err(|error| self.changed(holder, in_words(error)))?);
         unpacked.kept.truncate(KEPT_CHUNKS - 1);
         unpacked.kept.push_front((holder, Arc::clone(&messages)));
         Ok(messages)
@@ -180,7 +180,10 @@ impl Contents {
             let taken = match records.next()? {
                 Ok(Some(record)) => self.take(&record),
                 Ok(None) if self.lost.last().is_some_and(|lost| lost.end == size) => return Ok(()),
-                Ok(None) => return Ok(self.lose((begin, begin), "the file ends without an index".into())),
+                Ok(None) => {
+                    self.lose((begin, begin), "the file ends without an index".into());
+                    return Ok(());
+                }
                 Err(reason) => Err(reason),
             };
             match taken {
@@ -190,7 +193,8 @@ impl Contents {
                     return Ok(());
                 }
                 Err(reason) if self.lost.len() >= MAX_DAMAGED => {
-                    return Ok(self.lose((begin, size), format!("too many damaged parts; {reason}")));
+                    self.lose((begin, size), format!("too many damaged parts; {reason}"));
+                    return Ok(());
                 }
                 Err(reason) => {
                     let has_chunks = self.has_chunks();
@@ -217,7 +221,7 @@ impl Contents {
                 return Ok(ControlFlow::Break(crc));
             }
             op::CHUNK => {
-                let (messages, orphans) = unpack(body, &mut self.channels).map_err(|error| error.to_string())?;
+                let (messages, orphans) = unpack(body, &mut self.channels).map_err(in_words)?;
                 self.add(Holder { begin, len: body.len(), is_chunk: true }, &messages);
                 if orphans > 0 {
                     let what = format!("{orphans} messages of channels that are described nowhere");
@@ -228,12 +232,12 @@ impl Contents {
             op::MESSAGE => self.take_message(begin, body)?,
             _ => self.channels.add(opcode, body),
         };
-        added.map(|()| ControlFlow::Continue(())).map_err(|error| error.to_string())
+        added.map(|()| ControlFlow::Continue(())).map_err(in_words)
     }
 
     /// A message that stands in no chunk has no checksum but its own.
     fn take_message(&mut self, begin: u64, body: &[u8]) -> Result<mcap::McapResult<()>, String> {
-        let message = self.channels.message(body).map_err(|error| error.to_string())?;
+        let message = self.channels.message(body).map_err(in_words)?;
         let message = message.ok_or("a message of a channel that is described nowhere")?;
         if is_own(&message.channel.message_encoding)
             && lengths::own_message(&message.data) != Some(message.data.len() as u64)
