@@ -87,8 +87,8 @@ pub fn table(all: &[Metrics]) -> String {
 }
 
 /// AP by the overlap that it is at.
-const BY_IOU: [(&str, fn(&ByIou) -> Option<f64>); 3] =
-    [("0.3", |ap| ap.at_30), ("0.5", |ap| ap.at_50), ("0.7", |ap| ap.at_70)];
+type AtOverlap = (&'static str, fn(&ByIou) -> Option<f64>);
+const BY_IOU: [AtOverlap; 3] = [("0.3", |ap| ap.at_30), ("0.5", |ap| ap.at_50), ("0.7", |ap| ap.at_70)];
 
 /// What keeps lines of a table from being compared, and what the air has kept from an ego.
 fn comparison(all: &[Metrics]) -> String {
