@@ -184,6 +184,8 @@ mod tests {
     use std::collections::BTreeMap;
 
     use super::*;
+    use sim_replay::dataset::LeftOut;
+
     use crate::metrics::{Communication, Latencies, Messages, PoseErrors};
 
     fn metrics(method: &str, at_50: Option<f64>) -> Metrics {
@@ -203,6 +205,8 @@ mod tests {
             comm: Communication::default(),
             contribution: Contribution::default(),
             messages: Messages::default(),
+            protocol: None,
+            left_out: LeftOut::default(),
         }
     }
 

@@ -10,10 +10,14 @@ use sim_replay::evaluation_protocol::ProtocolConfig;
 use sim_replay::synth::{SceneLayout, Subset, SynthOptions, generate};
 
 /// Layouts that hold both agents and their boxes, and as what they are read. A line for each.
-const LAYOUTS: [(SceneLayout, Layout); 3] = [
+const LAYOUTS: [(SceneLayout, Layout); 7] = [
     (SceneLayout::Opv2v, Layout::Opv2v),
     (SceneLayout::V2v4real, Layout::V2v4Real),
     (SceneLayout::V2xreal, Layout::V2xReal),
+    (SceneLayout::Dair, Layout::Dair),
+    (SceneLayout::V2xseq, Layout::V2xSeq),
+    (SceneLayout::V2xsim, Layout::V2xSim),
+    (SceneLayout::Mars, Layout::Mars),
 ];
 /// Methods without and with messages.
 const METHODS: [Method; 2] = [Method::None, Method::Max];

@@ -148,6 +148,9 @@ mod tests {
     use agent::pose_source::PoseSourceConfig;
     use ego_fuser::Method;
 
+    use sim_replay::dataset::LeftOut;
+    use sim_replay::evaluation_protocol::ProtocolConfig;
+
     use super::super::CellKey;
     use super::*;
     use crate::metrics::{Communication, Contribution, Latencies, Messages, Metrics, Percentiles, PoseErrors};
@@ -174,6 +177,8 @@ mod tests {
                 ..Communication::default()
             },
             messages: Messages::default(),
+            protocol: None,
+            left_out: LeftOut::default(),
         };
         let key = CellKey {
             method,
@@ -187,6 +192,7 @@ mod tests {
             scenarios: None,
             attack: None,
             trust: None,
+            protocol: ProtocolConfig::default(),
             score_threshold: 0.1,
             version: "1".into(),
         };

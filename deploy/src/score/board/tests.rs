@@ -1,4 +1,5 @@
 use protocol::{AgentTruth, Detection, Doubt, FusedNeighbour, HeardNeighbour, SkippedNeighbour, TrueObject};
+use sim_replay::class_set::ClassSet;
 
 use super::super::open_ticks::MOST_OPEN;
 use super::*;
