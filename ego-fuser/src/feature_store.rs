@@ -19,7 +19,7 @@ use protocol::{
     BevFeatures, CavId, CodecConfig, Dtype, Header, Limits, NoPoseReason, PoseEstimate, Stamp, WIRE_VERSION, WireError,
     wire,
 };
-use sim_replay::dataset::{self, LoadOptions, ReadError, Scenario};
+use sim_replay::dataset::{self, IntensityScale, LoadOptions, ReadError, Scenario};
 use tch::{TchError, Tensor};
 
 /// Digits of each hash in the name of a file.
@@ -69,6 +69,8 @@ pub struct KeptMaps {
     pub dtype: Dtype,
     /// Size of a file at most, bytes; sweeps beyond are encoded whenever they are needed.
     pub limit_bytes: u64,
+    /// Scale of the intensities that were encoded: maps of another scale are other maps.
+    pub intensity_scale: IntensityScale,
 }
 
 /// Whether a parameter is one of the encoder.
@@ -108,7 +110,12 @@ impl FeatureStore {
     ) -> Result<Self, FeatureStoreError> {
         let [encoder, data] = [weights.sha256_of(is_encoder), dataset::content_sha256(scenarios)];
         let dtype = format!("{:?}", kept.dtype).to_lowercase();
-        let name = format!("{}-{}-{dtype}-wire{WIRE_VERSION}.maps", &encoder[..HASH_DIGITS], &data[..HASH_DIGITS]);
+        let scale = match kept.intensity_scale {
+            IntensityScale::AUTO => String::new(),
+            scale => format!("-intensity{scale}"),
+        };
+        let [encoder, data] = [&encoder[..HASH_DIGITS], &data[..HASH_DIGITS]];
+        let name = format!("{encoder}-{data}-{dtype}{scale}-wire{WIRE_VERSION}.maps");
         let path = kept.folder.join(name);
         let io = |source| FeatureStoreError::Io { path: path.clone(), source };
         fs::create_dir_all(&kept.folder).map_err(io)?;

@@ -17,7 +17,7 @@ use ego_fuser::fusion::pastat::Part;
 use ego_fuser::samples::{Moments, SamplePoses};
 use ego_fuser::train::{self, TrainConfig};
 use protocol::{CodecConfig, Dtype, NoPoseReason, PoseEstimate};
-use sim_replay::dataset::{self, LoadOptions, Scenario};
+use sim_replay::dataset::{self, IntensityScale, LoadOptions, Scenario};
 use tests::scene;
 use tests::training::{Ear, alone, config, small};
 
@@ -42,7 +42,12 @@ fn pastat(folder: &Path, data: &Path, init: &Path, name: &str) -> TrainConfig {
     };
     let mut config = config(data, &folder.join(name), Method::Pastat, 10);
     config.init = Some(init.to_owned());
-    config.frozen_encoder = Some(KeptMaps { folder: folder.join("maps"), dtype: Dtype::I8, limit_bytes: 1 << 30 });
+    config.frozen_encoder = Some(KeptMaps {
+        folder: folder.join("maps"),
+        dtype: Dtype::I8,
+        limit_bytes: 1 << 30,
+        intensity_scale: IntensityScale::AUTO,
+    });
     config.samples.moments = Moments { frames: 1, gap: 2, max_delay_nanos: 300_000_000 };
     config.samples.poses = SamplePoses { noise: Some(noise), noise_share: 0.5, ..SamplePoses::default() };
     config
@@ -66,7 +71,7 @@ fn evaluate(weights: &Path, data: &Path, poses: PoseSourceConfig, delay_nanos: u
     if maps {
         let weights = Weights::load(weights).unwrap();
         let folder = data.join("../evaluation-maps");
-        let kept = KeptMaps { folder, dtype: Dtype::F16, limit_bytes: u64::MAX };
+        let kept = KeptMaps { folder, dtype: Dtype::F16, limit_bytes: u64::MAX, intensity_scale: IntensityScale::AUTO };
         let store = FeatureStore::open(&kept, &weights, &scenarios, &mut |_, _| {}).unwrap();
         evaluator = evaluator.with_maps(MapSource::new(store.into(), weights.into()));
     }
@@ -136,7 +141,12 @@ fn kept_maps_are_bounded_and_survive_a_cut() {
     let weights = Weights::load(&init).unwrap();
     let scenarios = dataset::open(&data).unwrap().scenarios;
     let open = |limit_bytes: u64| {
-        let kept = KeptMaps { folder: folder.path().join("maps"), dtype: Dtype::F16, limit_bytes };
+        let kept = KeptMaps {
+            folder: folder.path().join("maps"),
+            dtype: Dtype::F16,
+            limit_bytes,
+            intensity_scale: IntensityScale::AUTO,
+        };
         let mut encoded = 0;
         let store = FeatureStore::open(&kept, &weights, &scenarios, &mut |_, _| encoded += 1).unwrap();
         (store, encoded)

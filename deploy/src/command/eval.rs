@@ -11,7 +11,6 @@ use agent::pose_source::{
 use agent::rate::RateConfig;
 use clap::ValueEnum;
 use deploy::evaluation::{EvaluationOptions, Part, evaluate, frame_count};
-use deploy::metrics::Metrics;
 use deploy::report;
 use deploy::table::{self, TableObserver, TableSpec};
 use ego_fuser::Method;
@@ -22,12 +21,11 @@ use ego_fuser::trust::TrustConfig;
 use indicatif::{ProgressBar, ProgressStyle};
 use protocol::{CodecConfig, ConfidenceGate, Dtype};
 use sim_replay::dataset::IntensityScale;
-use sim_replay::dataset::LeftOut;
 use sim_replay::evaluation_protocol::ProtocolConfig;
 use sim_replay::link::LinkConfig;
 use sim_replay::output;
 
-use super::{BadInput, Outcome};
+use super::{BadInput, Outcome, left_out};
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct Arguments {
@@ -220,7 +218,7 @@ impl Arguments {
                 }
             }
         }
-        Ok(left_out(&all))
+        Ok(left_out(all.iter().map(|metrics| &metrics.left_out)))
     }
 
     fn options(&self) -> Result<EvaluationOptions, BadInput> {
@@ -261,6 +259,7 @@ impl Arguments {
                 folder: folder.clone(),
                 dtype: codec.dtype,
                 limit_bytes: u64::MAX,
+                intensity_scale: self.intensity_scale,
             }),
             frames: self.frames.map(at_most),
             stepped: self.link.as_deref().map(|link| self.stepped(link)).transpose()?,
@@ -329,26 +328,14 @@ impl Arguments {
     }
 }
 
-/// Prints what the evaluations left out, each finding once.
-fn left_out(all: &[Metrics]) -> Outcome {
-    let mut sum = LeftOut::default();
-    all.iter().for_each(|metrics| sum.merge(&metrics.left_out));
-    for problem in sum.problems() {
-        output::note(format_args!("left out: {}", problem.message));
-    }
-    if let Some(one) = all.iter().map(|metrics| &metrics.left_out).find(|one| **one != LeftOut::default()) {
-        output::note(one);
-    }
-    Outcome::of(!sum.is_nothing())
-}
-
 /// Fills tables and prints them.
 fn tables(spec: &Path, out: &Path) -> anyhow::Result<Outcome> {
     let mut progress = TableProgress(ProgressBar::new_spinner());
     let filled = table::run(&TableSpec::read(spec)?, out, &mut progress)?;
     progress.0.finish_and_clear();
     filled.iter().try_for_each(|table| output::line(table::markdown(table)))?;
-    Ok(Outcome::Done)
+    let cells = filled.iter().flat_map(|table| &table.rows).flat_map(|row| row.cells.iter().flatten());
+    Ok(left_out(cells.map(|cell| &cell.metrics.left_out)))
 }
 
 /// Shows on standard error which cell is computed.

@@ -21,6 +21,8 @@ use deploy::sweep::SweepError;
 use deploy::table::TableError;
 use deploy::up::UpError;
 use sim_replay::bus::BusError;
+use sim_replay::dataset::LeftOut;
+use sim_replay::output;
 
 /// What `v2vloc` can be asked to do.
 #[derive(Debug, clap::Subcommand)]
@@ -73,6 +75,19 @@ impl Outcome {
     pub(crate) fn of(lost_data: bool) -> Self {
         if lost_data { Self::DataLost } else { Self::Done }
     }
+}
+
+/// Prints what evaluations left out, each finding once, and the counts of the first that lacks anything.
+fn left_out<'a>(all: impl Iterator<Item = &'a LeftOut>) -> Outcome {
+    let mut sum = LeftOut::default();
+    let mut first = None;
+    for one in all.filter(|one| **one != LeftOut::default()) {
+        sum.merge(one);
+        first.get_or_insert(one);
+    }
+    sum.problems().for_each(|problem| output::note(format_args!("left out: {}", problem.message)));
+    first.into_iter().for_each(output::note);
+    Outcome::of(!sum.is_nothing())
 }
 
 impl From<Outcome> for ExitCode {

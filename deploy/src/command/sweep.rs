@@ -5,7 +5,7 @@ use std::path::PathBuf;
 use deploy::sweep::{Experiment, Sweep, SweepOptions};
 use sim_replay::output;
 
-use super::Outcome;
+use super::{Outcome, left_out};
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct Arguments {
@@ -39,11 +39,11 @@ impl Arguments {
             return Ok(Outcome::Done);
         }
         let options = SweepOptions { out: out.clone(), jobs: usize::from(self.jobs), dry_run: self.dry_run };
-        let table = sweep.run(&options)?;
-        output::text(&table)?;
+        let swept = sweep.run(&options)?;
+        output::text(&swept.table)?;
         if !self.dry_run {
             output::note(format_args!("report {}", out.join("report.html").display()));
         }
-        Ok(Outcome::Done)
+        Ok(left_out(swept.left_out.iter()))
     }
 }

@@ -15,6 +15,7 @@ use ego_fuser::feature_store::KeptMaps;
 use protocol::{Counts, DropReason, Dtype, Stream, Topic};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
+use sim_replay::dataset::IntensityScale;
 use sim_replay::evaluation_protocol::ProtocolConfig;
 use sim_replay::link::LinkConfig;
 use sim_replay::whole_file;
@@ -193,7 +194,7 @@ pub(super) fn options(experiment: &Experiment, point: &Point, maps: &Path) -> Re
 /// Maps are kept exactly, so that they change no result.
 pub(super) fn kept_maps(experiment: &Experiment, folder: &Path) -> KeptMaps {
     let limit_bytes = (experiment.maps_limit_gb * 1e9) as u64;
-    KeptMaps { folder: folder.to_owned(), dtype: Dtype::F32, limit_bytes }
+    KeptMaps { folder: folder.to_owned(), dtype: Dtype::F32, limit_bytes, intensity_scale: IntensityScale::AUTO }
 }
 
 /// Computes the run of a point; `on_frame` is told of every frame.

@@ -21,7 +21,7 @@ use ego_fuser::Exchange;
 use ego_fuser::evaluate::EvaluateError;
 use ego_fuser::feature_store::FeatureStore;
 use indicatif::{ProgressBar, ProgressStyle};
-use sim_replay::dataset::{self, ReadError, Scenario};
+use sim_replay::dataset::{self, LeftOut, ReadError, Scenario};
 use sim_replay::link::LinkError;
 use sim_replay::output;
 use sim_replay::synth::{self, Subset, SynthError, SynthOptions};
@@ -36,6 +36,15 @@ use crate::weights_choice::{WeightsChoiceError, weights_of};
 
 /// Ticks that are timed before a sweep begins, for its estimate.
 const PROBED_TICKS: usize = 4;
+
+/// What came of a sweep.
+#[derive(Debug, Default)]
+pub struct Swept {
+    /// The table, as CSV.
+    pub table: String,
+    /// What each run left out of the data set.
+    pub left_out: Vec<LeftOut>,
+}
 
 /// Why a sweep came to nothing.
 #[derive(Debug, thiserror::Error)]
@@ -152,23 +161,26 @@ impl Sweep {
         self.scenarios.iter().map(|scenario| scenario.ticks.len()).sum()
     }
 
-    /// Runs what is missing and writes table, charts and report. Returns the table.
+    /// Runs what is missing and writes table, charts and report.
     ///
     /// # Errors
     /// [`SweepError`] at the first run that cannot be computed; those before it are kept.
-    pub fn run(&self, options: &SweepOptions) -> Result<String, SweepError> {
+    pub fn run(&self, options: &SweepOptions) -> Result<Swept, SweepError> {
         fs::create_dir_all(self.cells()).map_err(|source| SweepError::Io { path: self.cells(), source })?;
         let known = self.known()?;
         let missing: Vec<usize> = (0..known.len()).filter(|&index| known[index].is_none()).collect();
         self.announce(&known, &missing, options)?;
         if options.dry_run {
-            return Ok(String::new());
+            return Ok(Swept::default());
         }
         self.encode(&missing)?;
         self.compute(&missing, options.jobs)?;
         let cells: Option<Vec<Cell>> = self.known()?.into_iter().collect();
         let cells = cells.ok_or_else(|| SweepError::Worker("a run that was done is not there".into()))?;
-        self.write(&cells)
+        Ok(Swept {
+            table: self.write(&cells)?,
+            left_out: cells.into_iter().map(|cell| cell.metrics.left_out).collect(),
+        })
     }
 
     /// Says how many runs there are and how long they will take.

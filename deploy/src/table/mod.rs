@@ -14,7 +14,7 @@ use std::process::Command;
 
 use agent::postprocess::SCORE_THRESHOLD;
 use agent::rate::RateConfig;
-use sim_replay::dataset::{self, ReadError};
+use sim_replay::dataset::{self, IntensityScale, ReadError};
 
 pub use cell::{Cell, CellKey};
 pub use spec::{Column, Row, Table, TableSpec};
@@ -175,6 +175,7 @@ impl Run<'_> {
                 folder: folder.clone(),
                 dtype: self.spec.dtype,
                 limit_bytes: (self.spec.maps_limit_gb.max(0.0) * 1e9) as u64,
+                intensity_scale: IntensityScale::AUTO,
             }),
             frames: self.spec.frames,
             part: Part { scenarios: table.scenarios, ..Part::default() },

@@ -13,12 +13,19 @@ use ego_fuser::evaluate::{EvaluateConfig, EvaluatedFrame, Evaluator};
 use ego_fuser::multi_scale::{MULTI_SCALE_KIND, OfflineDetector};
 use protocol::CodecConfig;
 use serde_json::json;
-use sim_replay::dataset::{IntensityScale, LoadOptions, Scenario};
+use sim_replay::dataset::{self, Dataset, IntensityScale, LeftOut, LoadOptions, OpenOptions, Scenario};
+use sim_replay::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
 use sim_replay::frame::Frame;
 use sim_replay::ground_truth;
 use sim_replay::output;
 
-use super::{BadInput, progress, scenarios};
+use super::{BadInput, check_left_out, progress};
+
+/// A data set with the protocol that it is judged by.
+struct Data {
+    protocol: EvaluationProtocol,
+    scenarios: Vec<Scenario>,
+}
 
 /// Measures AP on datasets, with true poses, nothing late and nothing lost.
 #[derive(Debug, clap::Args)]
@@ -38,6 +45,8 @@ pub(crate) struct Arguments {
     /// At most so many frames of every scenario.
     #[arg(long)]
     frames: Option<usize>,
+    #[command(flatten)]
+    protocol: ProtocolConfig,
     /// Torch threads.
     #[arg(long, default_value_t = 1)]
     threads: u16,
@@ -50,37 +59,55 @@ impl Arguments {
     /// Evaluates and prints a line per method.
     pub(crate) fn run(self) -> Result<()> {
         tch::set_num_threads(i32::from(self.threads.max(1)));
-        let scenarios = scenarios(&self.data, self.intensity_scale)?;
+        let mut left_out = LeftOut::default();
+        let data = self.open(&mut left_out)?;
         if kind_of(&self.weights)?.as_deref() == Some(MULTI_SCALE_KIND) {
-            return self.run_multi_scale(&scenarios);
+            self.run_multi_scale(&data, &mut left_out)?;
+            return Ok(check_left_out(&left_out)?);
         }
         let methods =
             if self.method.is_empty() { vec![None] } else { self.method.iter().map(|method| Some(*method)).collect() };
         let mut rows = Vec::new();
         for method in methods {
-            let config = EvaluateConfig {
+            let config = |data: &Data| EvaluateConfig {
+                protocol: Some(data.protocol.clone()),
                 weights: self.weights.clone(),
                 method,
                 pose_source: PoseSourceConfig::Recorded,
                 codec: CodecConfig::default(),
                 rate: RateConfig::default(),
-                protocol: None,
                 delay_nanos: 0,
                 attack: None,
                 trust: None,
             };
-            rows.push(evaluate(config, &scenarios, self.frames.unwrap_or(usize::MAX), self.json)?);
+            let (row, lost) = evaluate(&config, &data, self.frames.unwrap_or(usize::MAX), self.json)?;
+            left_out.merge(&lost);
+            rows.push(row);
         }
         if self.json {
             output::line(serde_json::to_string_pretty(&rows)?)?;
         }
-        Ok(())
+        Ok(check_left_out(&left_out)?)
     }
 }
 
 impl Arguments {
+    /// The data sets, each with the agents of its protocol.
+    fn open(&self, left_out: &mut LeftOut) -> Result<Vec<Data>> {
+        let options = OpenOptions { intensity_scale: self.intensity_scale, ..OpenOptions::default() };
+        let open = |folder: &PathBuf| {
+            let Dataset { layout, scenarios, problems } =
+                dataset::open_with(folder, &options).map_err(|error| BadInput(error.to_string()))?;
+            left_out.add_files(&problems);
+            let protocol = self.protocol.resolve(layout).map_err(BadInput)?;
+            let scenarios = scenarios.iter().filter_map(|scenario| protocol.arrange(scenario)).collect();
+            Ok(Data { protocol, scenarios })
+        };
+        self.data.iter().map(open).collect()
+    }
+
     /// A network that fuses at every level is one method of its own.
-    fn run_multi_scale(&self, scenarios: &[Scenario]) -> Result<()> {
+    fn run_multi_scale(&self, data: &[Data], left_out: &mut LeftOut) -> Result<()> {
         if !self.method.is_empty() {
             return Err(BadInput("a multi-scale network has one method: leave --method out".to_owned()).into());
         }
@@ -88,11 +115,14 @@ impl Arguments {
         let rule = detector.rule();
         let frames = self.frames.unwrap_or(usize::MAX);
         let mut tally = Tally::default();
-        for scenario in scenarios {
+        for scenario in data.iter().flat_map(|data| &data.scenarios) {
             for tick in 0..scenario.ticks.len().min(frames) {
-                let frames: Vec<Frame> = (scenario.present_agents(tick))
-                    .map(|agent| scenario.load(agent, tick, &LoadOptions::default()))
-                    .collect::<Result<_, _>>()?;
+                let loaded = scenario.load_tick(tick, 0..scenario.agents.len(), &LoadOptions::default());
+                left_out.add_tick(&loaded);
+                if loaded.frames.first().is_none_or(|(agent, _)| *agent != 0) {
+                    continue;
+                }
+                let frames: Vec<Frame> = loaded.frames.into_iter().map(|(_, frame)| frame).collect();
                 let objects = ground_truth::merge(&frames.iter().collect::<Vec<_>>(), 0, &rule);
                 let objects: Vec<_> = objects.into_iter().map(|(_, object)| object).collect();
                 tally.frames += 1;
@@ -117,27 +147,35 @@ fn kind_of(weights: &Path) -> Result<Option<String>, BadInput> {
     Ok(weights.metadata(KIND_KEY).map(ToOwned::to_owned))
 }
 
-fn evaluate(config: EvaluateConfig, scenarios: &[Scenario], frames: usize, json: bool) -> Result<serde_json::Value> {
-    let mut evaluator = Evaluator::new(config).map_err(|error| BadInput(error.to_string()))?;
-    let ticks: usize = scenarios.iter().map(|scenario| scenario.ticks.len().min(frames)).sum();
-    let method = evaluator.ego().method();
-    let bar = progress(method.name(), ticks);
-    let mut tally = Tally::default();
-    for scenario in scenarios {
-        let mut done = 0;
-        let _ = evaluator.run(scenario, &mut |frame| {
-            tally.add(&frame);
-            bar.inc(1);
-            done += 1;
-            if done < frames { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
-        })?;
+/// The numbers of one method over all data, and what was left out.
+fn evaluate(
+    config: &dyn Fn(&Data) -> EvaluateConfig,
+    data: &[Data],
+    frames: usize,
+    json: bool,
+) -> Result<(serde_json::Value, LeftOut)> {
+    let (mut tally, mut left_out, mut name) = (Tally::default(), LeftOut::default(), "");
+    for data in data {
+        let mut evaluator = Evaluator::new(config(data)).map_err(|error| BadInput(error.to_string()))?;
+        name = evaluator.ego().method().name();
+        let bar = progress(name, data.scenarios.iter().map(|scenario| scenario.ticks.len().min(frames)).sum());
+        for scenario in &data.scenarios {
+            let mut done = 0;
+            let _ = evaluator.run(scenario, &mut |frame| {
+                tally.add(&frame);
+                bar.inc(1);
+                done += 1;
+                if done < frames { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
+            })?;
+        }
+        bar.finish_and_clear();
+        left_out.merge(evaluator.left_out());
     }
-    bar.finish_and_clear();
-    let row = tally.row(method.name());
+    let row = tally.row(name);
     if !json {
         print_row(&row)?;
     }
-    Ok(row)
+    Ok((row, left_out))
 }
 
 fn print_row(row: &serde_json::Value) -> std::io::Result<()> {

@@ -15,7 +15,8 @@ use agent::process;
 use anyhow::Context;
 use indicatif::{ProgressBar, ProgressStyle};
 use sim_replay::bus::BusError;
-use sim_replay::dataset::{self, IntensityScale, OpenOptions, Scenario};
+use sim_replay::dataset::{self, IntensityScale, LeftOut, OpenOptions, Scenario};
+use sim_replay::output;
 
 /// What `ego-fuser` can be asked to do.
 #[derive(Debug, clap::Subcommand)]
@@ -54,8 +55,22 @@ impl Command {
 #[error("{0}")]
 pub(crate) struct BadInput(pub(crate) String);
 
-/// Exit code of a failed command: 2 for bad usage or input, 1 otherwise.
+/// The numbers are printed, but data were left out: exit code 3.
+#[derive(Debug, thiserror::Error)]
+#[error("{0}")]
+pub(crate) struct DataLost(LeftOut);
+
+/// Names what was left out; an error where data were lost.
+fn check_left_out(left_out: &LeftOut) -> Result<(), DataLost> {
+    left_out.problems().for_each(|problem| output::note(format_args!("left out: {}", problem.message)));
+    if left_out.is_nothing() { Ok(()) } else { Err(DataLost(left_out.clone())) }
+}
+
+/// Exit code of a command that did not end well: 2 for bad usage or input, 3 where data were left out, 1 otherwise.
 pub(crate) fn exit_code(error: &anyhow::Error) -> ExitCode {
+    if error.is::<DataLost>() {
+        return ExitCode::from(3);
+    }
     let is_bad_input = error.chain().any(|cause| cause.is::<BadInput>()) || BusError::is_behind(error.as_ref());
     if is_bad_input { ExitCode::from(2) } else { ExitCode::FAILURE }
 }

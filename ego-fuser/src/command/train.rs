@@ -190,6 +190,7 @@ impl Arguments {
                     Exactness::I8 => Dtype::I8,
                 },
                 limit_bytes: (self.maps_limit.max(0.0) * 1e9) as u64,
+                intensity_scale: self.intensity_scale,
             }),
             run: RunConfig { optimizer: AdamWConfig { weight_decay: self.weight_decay, ..run.optimizer }, ..run },
             validate_every: self.validate_every,
