@@ -103,22 +103,21 @@ fn comparison(all: &[Metrics]) -> String {
         let _ = writeln!(text, "\nwarning: lines are judged over different frames: {compare}");
     }
     for Metrics { method, contribution: Contribution { sent, used, sent_bytes_mean, .. }, .. } in all {
-        if used < sent {
+        if let Some(what) = shared(method).filter(|_| used < sent) {
             let size = sent_bytes_mean.map_or(String::new(), |mean| format!(" of {} each", bytes(mean)));
-            let what = shared(method);
             let _ = writeln!(text, "{method}: of {sent} {what}{size} {used} arrived in time");
         }
     }
     text
 }
 
-/// What neighbours share by a method.
-fn shared(method: &str) -> &'static str {
+/// What an ego fuses of its neighbours by a method; none where it fuses nothing.
+fn shared(method: &str) -> Option<&'static str> {
     match method.parse().map(Method::exchange) {
-        Ok(Exchange::Features) => "maps",
-        Ok(Exchange::Boxes) => "lists of boxes",
-        Ok(Exchange::Points) => "clouds",
-        Ok(Exchange::Nothing) | Err(_) => "messages",
+        Ok(Exchange::Features) => Some("maps"),
+        Ok(Exchange::Boxes) => Some("lists of boxes"),
+        Ok(Exchange::Points) => Some("clouds"),
+        Ok(Exchange::Nothing) | Err(_) => None,
     }
 }
 
@@ -240,6 +239,8 @@ mod tests {
         let contribution =
             Contribution { fused_per_frame: Some(0.05), sent: 38, used: 2, sent_bytes_mean: Some(3_150_000.0) };
         let latency_ms = Latencies::default();
+        let alone = Metrics { contribution, ..metrics("none", Some(0.7)) };
+        assert!(!table(&[alone]).contains("arrived in time"), "it fuses nothing in any case");
         let text = table(&[Metrics { contribution, latency_ms, ..metrics("max", Some(0.8)) }]);
         assert!(text.contains("neighbours fused per frame") && text.contains("0.05"), "{text}");
         assert!(text.contains("max: of 38 maps of 3.1 MB each 2 arrived in time"), "{text}");
