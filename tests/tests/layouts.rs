@@ -1,12 +1,16 @@
 //! One generated scene in every layout: the same ground truth, and the same AP to the digit.
 
+use std::fs;
 use std::path::Path;
 
 use deploy::evaluation::{EvaluationOptions, evaluate};
 use ego_fuser::Method;
+use protocol::PointCloud;
 use serde_json::{Value, json};
-use sim_replay::dataset::{self, Layout};
+use sim_replay::dataset::{self, Layout, OpenOptions};
 use sim_replay::evaluation_protocol::ProtocolConfig;
+use sim_replay::inspect::inspect;
+use sim_replay::pcd::{self, Encoding, IntensityField};
 use sim_replay::synth::{SceneLayout, Subset, SynthOptions, generate};
 
 /// Layouts that hold both agents and their boxes, and as what they are read. A line for each.
@@ -59,4 +63,46 @@ fn every_layout_gives_the_same_average_precision() {
             assert_eq!(found, expected, "{layout:?}");
         }
     }
+}
+
+/// Rewrites every sweep below `folder`: intensities as bytes, stored by `write`.
+fn rewrite_sweeps(folder: &Path, write: &dyn Fn(PointCloud) -> Vec<u8>) {
+    for entry in fs::read_dir(folder).unwrap() {
+        let path = entry.unwrap().path();
+        if path.is_dir() {
+            rewrite_sweeps(&path, write);
+        } else if path.extension().is_some_and(|kind| kind == "pcd") {
+            let mut cloud = pcd::decode(&fs::read(&path).unwrap()).unwrap().points;
+            cloud.xyzi.iter_mut().for_each(|point| point[3] = (point[3] * 255.0).round());
+            fs::write(path, write(cloud)).unwrap();
+        }
+    }
+}
+
+#[test]
+fn intensity_in_three_spellings_gives_the_same_average_precision() {
+    tch::set_num_threads(1);
+    let unit = |mut cloud: PointCloud| {
+        cloud.xyzi.iter_mut().for_each(|point| point[3] /= 255.0);
+        pcd::encode(&cloud, Encoding::Binary, IntensityField::Intensity)
+    };
+    let byte = |cloud: PointCloud| pcd::encode(&cloud, Encoding::Binary, IntensityField::Intensity);
+    let other_name = |cloud: PointCloud| {
+        let file = byte(cloud);
+        let at = file.windows(9).position(|window| window == b"intensity").unwrap();
+        [&file[..at], b"Intensity", &file[at + 9..]].concat()
+    };
+    let spellings: [&dyn Fn(PointCloud) -> Vec<u8>; 3] = [&unit, &byte, &other_name];
+    let found = spellings.map(|write| {
+        let folder = tempfile::tempdir().unwrap();
+        let options = SynthOptions::new(Subset::V2vdet, 1007, folder.path().to_owned());
+        generate(&SynthOptions { frames: 4, agents: 2..=2, ..options }, &|_| {}).unwrap();
+        rewrite_sweeps(folder.path(), write);
+        let report = inspect(folder.path(), &OpenOptions::default(), &ProtocolConfig::default(), &|_, _| {});
+        assert!(report.problems.is_empty(), "{:?}", report.problems);
+        METHODS.map(|method| average_precision(folder.path(), method))
+    });
+    assert!(found[0][1][0]["0.3"].as_f64().unwrap() > 0.3, "{found:?}");
+    assert_eq!(found[1], found[0], "0 to 255");
+    assert_eq!(found[2], found[0], "0 to 255 in a field Intensity");
 }

@@ -22,7 +22,9 @@ impl fmt::Display for Report {
             count(self.scenarios.len(), "scenario"),
             count(frames, "frame")
         )?;
-        if let Some(protocol) = &self.protocol {
+        let agents = self.scenarios.iter().flat_map(|scenario| &scenario.agents);
+        let has_boxes = agents.filter_map(|agent| agent.boxes).any(|boxes| boxes.max > 0);
+        if let Some(protocol) = self.protocol.as_ref().filter(|_| has_boxes) {
             writeln!(f, "{protocol}")?;
         }
         for scenario in &self.scenarios {

@@ -4,6 +4,7 @@
 //! the readers produce. Axes, units and file formats of a layout stand in its writer alone. A new layout is one file
 //! beside this one, a line in [`SceneLayout`] and a line in [`SceneLayout::writer`].
 
+mod agent_folders;
 mod boxes;
 mod dair;
 mod dair_json;
@@ -102,11 +103,11 @@ impl SceneLayout {
     /// A writer of data sets below `root`, which exists.
     pub(crate) fn writer(self, root: &Path) -> Box<dyn SceneWriter> {
         match self {
-            Self::Opv2v => Box::new(opv2v::Opv2v::new(root)),
-            Self::V2v4real => Box::new(v2v4real::V2v4real::new(root)),
+            Self::Opv2v => Box::new(opv2v::writer(root)),
+            Self::V2v4real => Box::new(v2v4real::writer(root)),
             Self::Dair => Box::new(dair::Dair::new(root, dair::Edition::Dair)),
             Self::V2xseq => Box::new(dair::Dair::new(root, dair::Edition::V2xSeq)),
-            Self::V2xreal => Box::new(v2xreal::V2xreal::new(root)),
+            Self::V2xreal => Box::new(v2xreal::writer(root)),
             Self::V2xsim => Box::new(nuscenes::NuScenes::new(root, &v2xsim::V2xSim)),
             Self::Mars => Box::new(nuscenes::NuScenes::new(root, &mars::Mars)),
             Self::Nclt => Box::new(sequences::Sequences::new(root, &nclt::Nclt)),

@@ -3,99 +3,36 @@
 //! The world of the files is CARLA's: left-handed, degrees, half extents. This is the only writer that mirrors.
 
 use std::fmt::Write as _;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use protocol::{PointCloud, Pose};
 
-use super::disk::{Unfinished, make_folder, make_fresh_folder, scene_path, write_file};
-use super::yaml_text::{KMH_PER_MPS, ObjectEntry, agent_folders, anchors, write_list};
-use super::{AgentFrame, Moment, Omissions, SceneHeader, SceneWriter, SweepVariant};
+use super::agent_folders::{AgentFolderWriter, AgentFolders};
+use super::disk::write_file;
+use super::yaml_text::{KMH_PER_MPS, ObjectEntry, anchors, write_list};
+use super::{AgentFrame, Moment, SweepVariant};
 use crate::carla_pose::{CarlaPose, mirrored_point};
 use crate::frame::ObjectClass;
 use crate::pcd::{self, Encoding, IntensityField};
 use crate::synth::error::SynthError;
 use crate::synth::positioning::Fix;
-use crate::synth::protocol_file::FILE_NAME;
-
-/// The folders of a scene in the layouts of the OPV2V family.
-#[derive(Debug)]
-pub(super) struct AgentFolders {
-    agents: Vec<PathBuf>,
-    is_roadside: Vec<bool>,
-    /// Number of the moment's tick, by index.
-    ticks: Vec<u64>,
-    mark: Unfinished,
-}
-
-impl AgentFolders {
-    /// Makes the folders anew.
-    pub(super) fn make(root: &Path, scene: &SceneHeader) -> Result<Self, SynthError> {
-        let folder = scene_path(root, &scene.name);
-        make_fresh_folder(&folder)?;
-        let mark = Unfinished::mark(&folder)?;
-        write_file(&folder.join(FILE_NAME), &scene.origin)?;
-        let agents: Vec<PathBuf> = agent_folders(scene).iter().map(|name| folder.join(name)).collect();
-        agents.iter().try_for_each(|folder| make_folder(folder))?;
-        let ticks = scene.capture_nanos.iter().map(|nanos| nanos / scene.tick_nanos).collect();
-        let is_roadside = scene.agents.iter().map(|agent| agent.is_roadside).collect();
-        Ok(Self { agents, is_roadside, ticks, mark })
-    }
-
-    /// Whether an agent is a unit at the roadside.
-    pub(super) fn is_roadside(&self, frame: &AgentFrame) -> bool {
-        self.is_roadside[frame.agent]
-    }
-
-    /// A file of an agent's frame: `suffix` follows the number of the tick.
-    pub(super) fn file(&self, moment: &Moment, frame: &AgentFrame, suffix: &str) -> PathBuf {
-        self.agents[frame.agent].join(format!("{:06}{suffix}", self.ticks[moment.index]))
-    }
-
-    /// All is written.
-    pub(super) fn close(self) -> Result<(), SynthError> {
-        self.mark.clear()
-    }
-}
 
 /// The writer.
-#[derive(Debug)]
-pub(super) struct Opv2v {
-    root: PathBuf,
-    folders: Option<AgentFolders>,
+pub(super) fn writer(root: &Path) -> AgentFolderWriter {
+    AgentFolderWriter::new(root, write_files)
 }
 
-impl Opv2v {
-    pub(super) fn new(root: &Path) -> Self {
-        Self { root: root.to_owned(), folders: None }
+fn write_files(folders: &AgentFolders, moment: &Moment, frame: &AgentFrame) -> Result<(), SynthError> {
+    let points = pcd_of(&frame.frame.points.xyzi, IntensityField::Intensity);
+    write_file(&folders.file(moment, frame, ".pcd"), points)?;
+    for SweepVariant { name, points, labels } in &frame.variants {
+        let bytes = pcd_of(points, IntensityField::RedAndLabel(labels));
+        write_file(&folders.file(moment, frame, &format!("_{name}.pcd")), bytes)?;
     }
-}
-
-impl SceneWriter for Opv2v {
-    fn begin(&mut self, scene: &SceneHeader) -> Result<(), SynthError> {
-        self.folders = Some(AgentFolders::make(&self.root, scene)?);
-        Ok(())
+    if let Some(radar) = &frame.frame.radar {
+        write_file(&folders.file(moment, frame, "_radar.pcd"), pcd_of(&radar.xyzi, IntensityField::Red))?;
     }
-
-    fn write(&self, moment: &Moment, _: &Omissions) -> Result<(), SynthError> {
-        let Some(folders) = &self.folders else { return Ok(()) };
-        for frame in &moment.frames {
-            let points = pcd_of(&frame.frame.points.xyzi, IntensityField::Intensity);
-            write_file(&folders.file(moment, frame, ".pcd"), points)?;
-            for SweepVariant { name, points, labels } in &frame.variants {
-                let bytes = pcd_of(points, IntensityField::RedAndLabel(labels));
-                write_file(&folders.file(moment, frame, &format!("_{name}.pcd")), bytes)?;
-            }
-            if let Some(radar) = &frame.frame.radar {
-                write_file(&folders.file(moment, frame, "_radar.pcd"), pcd_of(&radar.xyzi, IntensityField::Red))?;
-            }
-            write_file(&folders.file(moment, frame, ".yaml"), frame_yaml(frame, folders.is_roadside(frame)))?;
-        }
-        Ok(())
-    }
-
-    fn end(&mut self) -> Result<(), SynthError> {
-        self.folders.take().map_or(Ok(()), AgentFolders::close)
-    }
+    write_file(&folders.file(moment, frame, ".yaml"), frame_yaml(frame, folders.is_roadside(frame)))
 }
 
 fn pcd_of(points: &[[f32; 4]], intensity: IntensityField<'_>) -> Vec<u8> {

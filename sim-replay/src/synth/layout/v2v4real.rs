@@ -2,17 +2,17 @@
 //! frame of the agent's own LiDAR, and `ass_id` is the id that agents share.
 
 use std::fmt::Write as _;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use base64::Engine;
 use base64::engine::general_purpose::STANDARD;
 use protocol::Pose;
 
+use super::agent_folders::{AgentFolderWriter, AgentFolders};
 use super::boxes::real_type;
 use super::disk::write_file;
-use super::opv2v::AgentFolders;
 use super::yaml_text::{KMH_PER_MPS, ObjectEntry};
-use super::{AgentFrame, Moment, Omissions, SceneHeader, SceneWriter};
+use super::{AgentFrame, Moment};
 use crate::carla_pose::CarlaPose;
 use crate::frame::Object;
 use crate::pcd::{self, Encoding, IntensityField};
@@ -52,39 +52,16 @@ const MATRIX_HEAD: &str = "!!python/object/apply:numpy.core.multiarray._reconstr
 const BASE64_LINE: usize = 76;
 
 /// The writer.
-#[derive(Debug)]
-pub(super) struct V2v4real {
-    root: PathBuf,
-    folders: Option<AgentFolders>,
+pub(super) fn writer(root: &Path) -> AgentFolderWriter {
+    AgentFolderWriter::new(root, write_files)
 }
 
-impl V2v4real {
-    pub(super) fn new(root: &Path) -> Self {
-        Self { root: root.to_owned(), folders: None }
-    }
-}
-
-impl SceneWriter for V2v4real {
-    fn begin(&mut self, scene: &SceneHeader) -> Result<(), SynthError> {
-        self.folders = Some(AgentFolders::make(&self.root, scene)?);
-        Ok(())
-    }
-
-    fn write(&self, moment: &Moment, _: &Omissions) -> Result<(), SynthError> {
-        let Some(folders) = &self.folders else { return Ok(()) };
-        for frame in &moment.frames {
-            let points = pcd::encode(&frame.frame.points, Encoding::Binary, IntensityField::Intensity);
-            write_file(&folders.file(moment, frame, ".pcd"), points)?;
-            let mut yaml = String::with_capacity(2048 + 400 * frame.frame.objects.len());
-            write_frame(&mut yaml, frame).expect("a String takes all that is written to it");
-            write_file(&folders.file(moment, frame, ".yaml"), yaml)?;
-        }
-        Ok(())
-    }
-
-    fn end(&mut self) -> Result<(), SynthError> {
-        self.folders.take().map_or(Ok(()), AgentFolders::close)
-    }
+fn write_files(folders: &AgentFolders, moment: &Moment, frame: &AgentFrame) -> Result<(), SynthError> {
+    let points = pcd::encode(&frame.frame.points, Encoding::Binary, IntensityField::Intensity);
+    write_file(&folders.file(moment, frame, ".pcd"), points)?;
+    let mut yaml = String::with_capacity(2048 + 400 * frame.frame.objects.len());
+    write_frame(&mut yaml, frame).expect("a String takes all that is written to it");
+    write_file(&folders.file(moment, frame, ".yaml"), yaml)
 }
 
 fn write_frame(yaml: &mut String, agent: &AgentFrame) -> std::fmt::Result {

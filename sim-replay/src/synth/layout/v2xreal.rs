@@ -1,52 +1,29 @@
 //! V2X-Real and V2XPnP: the folders of OPV2V with `.bin` sweeps, right-handed; objects in the world, with their type.
 
 use std::fmt::Write as _;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
 use protocol::Pose;
 
+use super::agent_folders::{AgentFolderWriter, AgentFolders};
 use super::boxes::{float_bytes, real_type};
 use super::disk::write_file;
-use super::opv2v::AgentFolders;
 use super::yaml_text::{KMH_PER_MPS, ObjectEntry, anchors, write_list};
-use super::{AgentFrame, Moment, Omissions, SceneHeader, SceneWriter};
+use super::{AgentFrame, Moment};
 use crate::carla_pose::CarlaPose;
 use crate::synth::error::SynthError;
 
 /// The writer.
-#[derive(Debug)]
-pub(super) struct V2xreal {
-    root: PathBuf,
-    folders: Option<AgentFolders>,
+pub(super) fn writer(root: &Path) -> AgentFolderWriter {
+    AgentFolderWriter::new(root, write_files)
 }
 
-impl V2xreal {
-    pub(super) fn new(root: &Path) -> Self {
-        Self { root: root.to_owned(), folders: None }
-    }
-}
-
-impl SceneWriter for V2xreal {
-    fn begin(&mut self, scene: &SceneHeader) -> Result<(), SynthError> {
-        self.folders = Some(AgentFolders::make(&self.root, scene)?);
-        Ok(())
-    }
-
-    fn write(&self, moment: &Moment, _: &Omissions) -> Result<(), SynthError> {
-        let Some(folders) = &self.folders else { return Ok(()) };
-        for frame in &moment.frames {
-            let points = float_bytes(frame.frame.points.xyzi.iter().copied());
-            write_file(&folders.file(moment, frame, ".bin"), points)?;
-            let mut yaml = String::with_capacity(512 + 400 * frame.frame.objects.len());
-            write_frame(&mut yaml, frame).expect("a String takes all that is written to it");
-            write_file(&folders.file(moment, frame, ".yaml"), yaml)?;
-        }
-        Ok(())
-    }
-
-    fn end(&mut self) -> Result<(), SynthError> {
-        self.folders.take().map_or(Ok(()), AgentFolders::close)
-    }
+fn write_files(folders: &AgentFolders, moment: &Moment, frame: &AgentFrame) -> Result<(), SynthError> {
+    let points = float_bytes(frame.frame.points.xyzi.iter().copied());
+    write_file(&folders.file(moment, frame, ".bin"), points)?;
+    let mut yaml = String::with_capacity(512 + 400 * frame.frame.objects.len());
+    write_frame(&mut yaml, frame).expect("a String takes all that is written to it");
+    write_file(&folders.file(moment, frame, ".yaml"), yaml)
 }
 
 fn write_frame(yaml: &mut String, agent: &AgentFrame) -> std::fmt::Result {
