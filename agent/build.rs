@@ -4,7 +4,10 @@
 use std::env;
 
 fn main() {
-    println!("cargo:rerun-if-changed=build.rs");
+    // This file, seen from whichever package names it: a path that is not there would mean a build each time.
+    if let Ok(package) = env::var("CARGO_MANIFEST_DIR") {
+        println!("cargo:rerun-if-changed={package}/../agent/build.rs");
+    }
     // Set by the build script of torch-sys, however it was told where libtorch is.
     let Ok(lib_dir) = env::var("DEP_TCH_LIBTORCH_LIB") else {
         return;

@@ -17,7 +17,7 @@ pub fn line(line: impl Display) -> io::Result<()> {
 /// Prints a text, which brings its own line ends, to standard output.
 ///
 /// # Errors
-/// As [`line`].
+/// As [`line()`].
 pub fn text(text: impl Display) -> io::Result<()> {
     print(io::stdout().lock(), text)
 }

@@ -49,6 +49,12 @@ fn eval(dataset: &Path, method: &str) -> (Option<i32>, Metrics, String) {
     (output.status.code(), metrics, said)
 }
 
+/// The file of the same tick with another ending.
+fn beside(sweep: &Path, ending: &str) -> PathBuf {
+    let stem = sweep.file_stem().unwrap().to_string_lossy();
+    sweep.with_file_name(format!("{stem}{ending}"))
+}
+
 fn truncate(file: &Path) {
     let bytes = fs::read(file).unwrap();
     fs::write(file, &bytes[..bytes.len() / 2]).unwrap();
@@ -96,8 +102,11 @@ fn a_tick_whose_ego_cannot_be_read_is_not_judged() {
 fn a_vehicle_that_leaves_is_no_fault() {
     let folder = tempfile::tempdir().unwrap();
     let agents = scene(folder.path());
-    for suffix in [".pcd", ".yaml"] {
-        files(&agents[1], suffix)[2..].iter().for_each(|file| fs::remove_file(file).unwrap());
+    for sweep in &files(&agents[1], ".pcd")[2..] {
+        // The radar's points too.
+        for file in [sweep.clone(), sweep.with_extension("yaml"), beside(sweep, "_radar.pcd")] {
+            fs::remove_file(file).unwrap();
+        }
     }
     let (code, metrics, said) = eval(folder.path(), "max");
     assert_eq!((code, metrics.frames, metrics.left_out.absent_frames), (Some(0), FRAMES as u64, 3), "{said}");

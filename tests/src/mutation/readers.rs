@@ -152,7 +152,7 @@ fn drives(root: &Path) -> Vec<Reader> {
         ),
         (root.join("object/training"), &object[..], &["kitti object points", "kitti object calib", "kitti labels"][..]),
         (root.join("raw/2012-01-22"), &nclt[..], &["nclt raw points", "nclt ground truth"][..]),
-        (root.join("nclt/2012-01-22"), &with_poses[6..], &["", "", "", "", "", "", "nclt poses hdf5"][..]),
+        (root.join("nclt/2012-01-22"), &with_poses[5..], &["", "", "", "", "", "", "", "nclt poses hdf5"][..]),
         (root.join("oxford").join(oxford), &with_poses[5..], &["oxford points", "", "", "", "", "", "", ""][..]),
     ]
     .into_iter()
