@@ -12,7 +12,7 @@ use agent::weights::Weights;
 use ego_fuser::Exchange;
 use protocol::{CavId, Party, Role, Stream};
 use sim_replay::dataset;
-use sim_replay::evaluation_protocol::EvaluationProtocol;
+use sim_replay::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
 use sim_replay::ground_truth::GroundTruthRule;
 use sim_replay::link::Air;
 use tch::Device;
@@ -51,6 +51,19 @@ pub struct Fleet {
     pub protocol: EvaluationProtocol,
 }
 
+/// Refuses options of a protocol that a live run has other fields for.
+fn chosen_elsewhere(protocol: &ProtocolConfig) -> Result<(), FleetError> {
+    let options = [
+        ("agents", protocol.agents.is_some()),
+        ("ego", protocol.ego.is_some()),
+        ("max_agents", protocol.max_agents.is_some()),
+    ];
+    match options.iter().find(|(_, is_given)| *is_given) {
+        Some((option, _)) => Err(FleetError::Protocol(format!("{option}: choose by scene.agents and ego.id instead"))),
+        None => Ok(()),
+    }
+}
+
 impl Fleet {
     /// Looks into scene and weights.
     ///
@@ -72,6 +85,7 @@ impl Fleet {
         }
         let scene = &mut scenario.scene;
         let dataset = dataset::open(&scene.dir)?;
+        chosen_elsewhere(&scenario.protocol)?;
         let protocol = scenario.protocol.resolve(dataset.layout).map_err(FleetError::Protocol)?;
         let recorded = match &scene.scenario {
             None => dataset.scenarios.first().ok_or_else(|| FleetError::Empty(scene.dir.clone()))?,
