@@ -29,7 +29,7 @@ pub struct AgentInput<'a> {
 /// What the detector makes of one sweep.
 #[derive(Debug, Clone, PartialEq)]
 pub struct Perception {
-    /// The map for intermediate fusion as it crosses the air: with a compressor, its code.
+    /// The map for intermediate fusion as it is transmitted: with a compressor, its code.
     pub features: BevFeatures,
     /// `[H, W]`, 0..1: where a vehicle is likely; which cells are worth sending.
     pub confidence: Vec<f32>,

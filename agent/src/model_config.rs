@@ -125,7 +125,7 @@ pub struct DetectorConfig {
     pub num_upsample_filters: Vec<i64>,
     /// Reduction of the concatenated map; absent: it crosses the air as it is.
     pub shrink: Option<ShrinkConfig>,
-    /// The learnt channel compressor keeps one channel in so many on the air; absent: none.
+    /// The learnt channel compressor transmits one channel in so many; absent: none.
     pub compress_ratio: Option<i64>,
     /// Anchors of the head.
     pub anchors: AnchorConfig,
@@ -219,7 +219,7 @@ impl DetectorConfig {
         }
     }
 
-    /// Channels of the map that crosses the air: of the code, where there is a compressor.
+    /// Channels of the map that is transmitted: of the code, where there is a compressor.
     #[must_use]
     pub fn sent_channels(&self) -> i64 {
         self.compress_ratio.map_or(self.feature_channels(), |ratio| (self.feature_channels() / ratio).max(1))

@@ -74,7 +74,7 @@ impl PointPillars {
         features.to_kind(Kind::Float)
     }
 
-    /// What the compressor leaves: `[B, C, H, W]` squeezed and widened again; unchanged without a compressor.
+    /// What the compressor leaves: `[B, C, H, W]` compressed and expanded again; unchanged without a compressor.
     pub fn through_compressor(&self, features: &Tensor, train: bool) -> Tensor {
         match &self.compressor {
             Some(compressor) => compressor.decode(&compressor.encode(features, train), train),

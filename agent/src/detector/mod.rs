@@ -125,7 +125,7 @@ impl Detector {
         [self.config.feature_channels(), i64::from(grid.height), i64::from(grid.width)]
     }
 
-    /// The same as they cross the air: with a compressor, of the code.
+    /// The same as they are transmitted: with a compressor, of the code.
     #[must_use]
     pub fn sent_shape(&self) -> [i64; 3] {
         let [_, height, width] = self.map_shape();
@@ -193,7 +193,7 @@ impl Detector {
         Ok(Encoded { features, points: self.cropped.len(), pillars: pillars.len(), times })
     }
 
-    /// What crosses the air of an encoded map `[1, C, H, W]`: the compressor's code `[1, C / ratio, H, W]`; the map itself where
+    /// The transmitted part of an encoded map `[1, C, H, W]`: the compressor's code `[1, C / ratio, H, W]`; the map itself where
     /// the configuration has none.
     ///
     /// # Errors
@@ -204,7 +204,7 @@ impl Detector {
         Ok(tch::no_grad(|| compressor.encode(&map, false).f_contiguous())?)
     }
 
-    /// What head and fusion have learnt to read, `[1, C, H, W]`, of what crossed the air.
+    /// What head and fusion have learnt to read, `[1, C, H, W]`, from what was transmitted.
     ///
     /// # Errors
     /// [`DetectorError::Shape`] when there is a compressor and it is no code of this detector's.
@@ -214,9 +214,9 @@ impl Detector {
         Ok(tch::no_grad(|| compressor.decode(&code, false).f_contiguous())?)
     }
 
-    /// What is left of an encoded map `[1, C, H, W]` behind the compressor: squeezed and widened again.
+    /// What is left of an encoded map `[1, C, H, W]` behind the compressor: compressed and expanded again.
     ///
-    /// Maps are encoded and kept without: whoever reads one that has not crossed the air calls this once.
+    /// Maps are encoded and kept without: whoever reads one that was not transmitted calls this once.
     ///
     /// # Errors
     /// As [`Self::squeezed`].
@@ -273,7 +273,7 @@ impl Detector {
         Ok(boxes)
     }
 
-    /// The message of what crosses the air, see [`Self::squeezed`].
+    /// The message of the transmitted map, see [`Self::squeezed`].
     ///
     /// # Errors
     /// [`DetectorError::Shape`] when the tensor is not one of this detector.

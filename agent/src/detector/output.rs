@@ -22,7 +22,7 @@ pub struct EncodeTimes {
 #[derive(Debug)]
 pub struct Encoded {
     /// `[1, C, H, W]` `f32`, contiguous, before the compressor where there is one:
-    /// [`Detector::squeezed`](super::Detector::squeezed) makes of it what crosses the air.
+    /// [`Detector::squeezed`](super::Detector::squeezed) makes of it the transmitted map.
     pub features: Tensor,
     /// Points inside the area.
     pub points: usize,
