@@ -4,10 +4,8 @@
 use std::env;
 
 fn main() {
-    // This file, seen from whichever package names it: a path that is not there would mean a build each time.
-    if let Ok(package) = env::var("CARGO_MANIFEST_DIR") {
-        println!("cargo:rerun-if-changed={package}/../agent/build.rs");
-    }
+    // No file but this one counts, and Cargo compiles and runs it again by itself where it has changed.
+    println!("cargo:rerun-if-env-changed=LIBTORCH");
     // Set by the build script of torch-sys, however it was told where libtorch is.
     let Ok(lib_dir) = env::var("DEP_TCH_LIBTORCH_LIB") else {
         return;

@@ -10,10 +10,10 @@ use protocol::{
 use tch::Tensor;
 
 use crate::attack::{Attack, Overheard};
-use crate::detector::{Detector, DetectorError, EncodeTimes};
-use crate::pose_source::{PoseInput, PoseSource};
-use crate::postprocess::{AgentBoxes, PostprocessConfig, postprocess};
 use crate::rate::{RateConfig, RateControl};
+use localization::pose_source::{PoseInput, PoseSource};
+use perception::boxes::postprocess::{AgentBoxes, PostprocessConfig, postprocess};
+use perception::detector::{Detector, DetectorError, EncodeTimes};
 
 /// Everything known about one sweep.
 #[derive(Debug, Clone, Copy)]
@@ -238,9 +238,9 @@ mod tests {
     use tch::nn::VarStore;
 
     use super::*;
-    use crate::model_config::DetectorConfig;
-    use crate::point_pillars::PointPillars;
-    use crate::pose_source::RecordedPose;
+    use localization::pose_source::RecordedPose;
+    use perception::model_config::DetectorConfig;
+    use perception::pillars::point_pillars::PointPillars;
 
     fn agent() -> Agent {
         agent_with(None)

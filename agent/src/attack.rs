@@ -5,7 +5,7 @@
 
 use protocol::{BevFeatures, BevGrid, Box3d, CavId, Detection, PointCloud, Pose, PoseEstimate};
 use serde::{Deserialize, Serialize};
-use sim_replay::random::SplitMix64;
+use support::random::SplitMix64;
 
 use crate::agent::Perception;
 

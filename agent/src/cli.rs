@@ -1,17 +1,21 @@
-//! The sub-commands and the exit codes they share.
+//! Command line of the vehicle's process, and its exit codes.
 
+use std::io;
 use std::process::ExitCode;
 
-use agent::process;
 use anyhow::Context;
+use bus::BusError;
+use bus::malloc_settings;
 use clap::{Parser, Subcommand};
-use sim_replay::bus::BusError;
-use sim_replay::dataset::LeftOut;
-use sim_replay::output;
+use support::output;
+use support::sibling_program::Forwarded;
 
 use crate::command;
 
-/// What one connected vehicle does with its sweeps: where am I, what do I see, what do I tell the others.
+/// Program of the offline subcommands.
+const OFFLINE: &str = "agent-offline";
+
+/// Agent of one connected vehicle: localizes each LiDAR sweep, computes its BEV features and publishes both.
 #[derive(Debug, Parser)]
 #[command(
     version,
@@ -24,10 +28,13 @@ pub(crate) struct Cli {
 
 #[derive(Debug, Subcommand)]
 enum Command {
-    Run(command::run::Args),
-    Eval(command::eval::Args),
-    Localize(command::localize::Args),
-    Train(command::train::Args),
+    Run(Box<command::run::Args>),
+    /// Localize recorded sweeps and compare with their true poses
+    Eval(Forwarded),
+    /// Localize recorded sweeps and keep their poses in a table
+    Localize(Forwarded),
+    /// Train the networks of the localization
+    Train(Forwarded),
 }
 
 /// Usage or input at fault, and not the program: exit code 2.
@@ -35,41 +42,25 @@ enum Command {
 #[error(transparent)]
 pub(crate) struct BadInput(pub(crate) anyhow::Error);
 
-/// The end of a command that did not fail.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Outcome {
-    /// All data were used.
-    Done,
-    /// Data were left out: exit code 3.
-    DataLost,
-}
-
-impl Outcome {
-    /// Prints what was left out, if anything was.
-    pub(crate) fn of(left_out: &LeftOut) -> Self {
-        for problem in left_out.problems() {
-            output::note(format_args!("left out: {}", problem.message));
+impl Command {
+    fn run(&self) -> anyhow::Result<()> {
+        let offline = |forwarded: &Forwarded, name| -> io::Result<()> { Err(forwarded.exec(OFFLINE, name)) };
+        match self {
+            Self::Run(args) => {
+                malloc_settings::ensure(&malloc_settings::KEPT_MEMORY).context("this program again")?;
+                command::run::run(args)
+            }
+            Self::Eval(forwarded) => Ok(offline(forwarded, "eval")?),
+            Self::Localize(forwarded) => Ok(offline(forwarded, "localize")?),
+            Self::Train(forwarded) => Ok(offline(forwarded, "train")?),
         }
-        if left_out.is_nothing() { Self::Done } else { Self::DataLost }
     }
 }
 
-/// Runs what was asked for and prints the chain of causes where it failed.
+/// Runs a subcommand and prints the chain of causes where it failed.
 pub(crate) fn run(cli: Cli) -> ExitCode {
-    let kept = process::ensure(&process::KEPT_MEMORY).context("this program again");
-    let outcome = kept.and_then(|()| match cli.command {
-        Command::Run(args) => command::run::run(&args).map(|()| Outcome::Done),
-        Command::Eval(args) => command::eval::run(&args),
-        Command::Localize(args) => command::localize::run(&args),
-        Command::Train(args) => command::train::run(&args).map(|()| Outcome::Done),
-    });
-    match outcome {
-        Ok(Outcome::Done) => ExitCode::SUCCESS,
-        Ok(Outcome::DataLost) => ExitCode::from(3),
-        Err(error) => {
-            output::note(format_args!("error: {error:#}"));
-            let is_bad_input = error.is::<BadInput>() || BusError::is_behind(error.as_ref());
-            if is_bad_input { ExitCode::from(2) } else { ExitCode::FAILURE }
-        }
-    }
+    let Err(error) = cli.command.run() else { return ExitCode::SUCCESS };
+    output::note(format_args!("error: {error:#}"));
+    let is_bad_input = error.is::<BadInput>() || BusError::is_behind(error.as_ref());
+    if is_bad_input { ExitCode::from(2) } else { ExitCode::FAILURE }
 }

@@ -7,14 +7,12 @@ use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
+use bus::bounded_queue::Taken;
+use bus::shutdown::Stop;
+use bus::{Arrival, Books, Bus, BusError, Event, Inbox, Publisher, PublisherOptions, Subscription, unix_nanos};
 use protocol::codec::CodecConfig;
 use protocol::message::{Bev, Boxes, Descriptor, Points};
 use protocol::{DropReason, Dtype, Gnss, Lidar, Limits, PointCloud, PoseEstimate, Role, Stream, Topic, wire};
-use sim_replay::bus::mailbox::Taken;
-use sim_replay::bus::shutdown::Stop;
-use sim_replay::bus::{
-    Arrival, Books, Bus, BusError, Event, Inbox, Publisher, PublisherOptions, Subscription, unix_nanos,
-};
 
 use crate::agent::{Agent, AgentInput, Perception};
 use crate::rate::{RateConfig, RateControl, Turn};

@@ -7,7 +7,7 @@ mod command;
 use std::process::ExitCode;
 
 use clap::Parser;
-use sim_replay::output;
+use support::output;
 
 /// Collaborative perception without GNSS as a distributed system: run it, judge it, look at it.
 #[derive(Debug, Parser)]
@@ -24,7 +24,7 @@ struct CommandLine {
 }
 
 fn main() -> ExitCode {
-    sim_replay::bus::log_to_stderr();
+    bus::log_to_stderr();
     match CommandLine::parse().command.run() {
         Ok(outcome) => outcome.into(),
         Err(error) => {

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Times OpenCOOD's own fusions at their published sizes, to stand beside `cargo bench -p ego-fuser --bench transformers`.
+"""Times OpenCOOD's own fusions at their published sizes, to stand beside `cargo bench -p fusion --bench transformers`.
 
     deploy/tools/time_opencood.py OPENCOOD [--threads 2] [--times 5] [v2xvit/5 cobevt/2 ...]
 

@@ -10,21 +10,21 @@ mod view;
 
 use std::path::Path;
 
-use agent::decode::Decoded;
-use agent::detector::Detector;
-use agent::postprocess::{AgentBoxes, PostprocessConfig, postprocess};
-use agent::weights::Weights;
 use nalgebra::Isometry3;
+use perception::boxes::decode::Decoded;
+use perception::boxes::postprocess::{AgentBoxes, PostprocessConfig, postprocess};
+use perception::detector::Detector;
+use perception::weights::Weights;
 use protocol::{DecodedFeatures, Detection, DropReason, Pose, StageTiming};
 use tch::{Kind, TchError, Tensor, no_grad};
 
-use crate::fusion::{AlignedMaps, EarlierMaps, FusionStage, SentMaps, StageError, ViewFacts};
-use crate::history::{History, KeptMap};
-use crate::method::{Exchange, Method};
-use crate::model::METHOD_KEY;
-use crate::numbers;
-use crate::samples::merge_points;
-use crate::trust::{Belief, Trust, TrustConfig};
+use crate::misbehaviour::{Belief, Trust, TrustConfig};
+use fusion::f64_tensor;
+use fusion::history::{History, KeptMap};
+use fusion::method::{Exchange, Method};
+use fusion::model::METHOD_KEY;
+use fusion::points::merge_points;
+use fusion::{AlignedMaps, EarlierMaps, FusionStage, SentMaps, StageError, ViewFacts};
 
 pub use error::EgoError;
 use stages::Stages;
@@ -247,7 +247,7 @@ impl Ego {
         let earlier = (!earlier.is_empty()).then(|| EarlierMaps::together(&earlier)).transpose()?;
         let moved = self.fusion.align_kept(&newest, earlier, &facts)?;
         stages.lap("align");
-        let fused = numbers::as_batch(&self.fusion.fuse(&moved, &facts, false)?)?;
+        let fused = f64_tensor::as_batch(&self.fusion.fuse(&moved, &facts, false)?)?;
         stages.lap("fuse");
         let detections = self.boxes_of(&fused, stages)?;
         self.keep(aligned, maps.into_iter().zip(sent), &moved)?;

@@ -7,7 +7,7 @@ mod command;
 use std::process::ExitCode;
 
 use clap::Parser;
-use sim_replay::output;
+use support::output;
 
 /// Fuses the views of connected vehicles into boxes around the ego.
 #[derive(Debug, Parser)]

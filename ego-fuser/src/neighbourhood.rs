@@ -3,8 +3,8 @@
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
 
+use bus::{Bus, BusError, Inbox, RollCall, Subscription};
 use protocol::{CavId, Role, Stream, Topic};
-use sim_replay::bus::{Bus, BusError, Inbox, RollCall, Subscription};
 
 /// Neighbours that an ego listens to at most: a flood of tokens must not become a flood of subscriptions.
 const MAX_NEIGHBOURS: usize = 64;

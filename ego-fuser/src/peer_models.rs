@@ -5,7 +5,7 @@
 
 use std::collections::BTreeMap;
 
-use agent::detector::Detector;
+use perception::detector::Detector;
 use protocol::message::{Descriptor, ModelHash};
 use protocol::{BevGrid, CavId, EncodedFeatures, WireError};
 

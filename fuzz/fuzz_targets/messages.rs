@@ -2,7 +2,7 @@
 #![no_main]
 
 use libfuzzer_sys::{fuzz_mutator, fuzz_target, fuzzer_mutate};
-use sim_replay::random::SplitMix64;
+use support::random::SplitMix64;
 use tests::mutation::wire_target::{damage_message, read, reseal};
 
 fuzz_target!(|bytes: &[u8]| {

@@ -17,8 +17,17 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
-use crate::names::written_as_text;
-use crate::{CavId, IdError, Limits, ProcessId, Role, RunId, Selector, Stream, Topic, Verb};
+use crate::CavId;
+use crate::IdError;
+use crate::Limits;
+use crate::ProcessId;
+use crate::Role;
+use crate::RunId;
+use crate::Selector;
+use crate::Stream;
+use crate::Topic;
+use crate::Verb;
+use crate::string_enum::written_as_text;
 
 /// A process as its certificate names it: `agent-4279`, `replay`.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]

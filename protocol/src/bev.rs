@@ -4,7 +4,8 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use crate::{Limits, WireError};
+use crate::Limits;
+use crate::WireError;
 
 /// Bounds of a lattice's edges, metres: far beyond any sensor.
 const MAX_EDGE_M: f64 = 1e4;

@@ -1,6 +1,6 @@
 //! Why messages are lost.
 
-use crate::names::named;
+use crate::string_enum::named;
 
 named! {
     /// Why a message was not used.

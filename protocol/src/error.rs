@@ -1,7 +1,10 @@
 //! What can be wrong with a message, and under which reason its loss is counted.
 
+use crate::CavId;
+use crate::DropReason;
+use crate::IdError;
+use crate::PoseError;
 use crate::header::{HEADER_LEN, Kind, MAGIC, WIRE_VERSION};
-use crate::{CavId, DropReason, IdError, PoseError};
 
 /// Why bytes are not a message, or values cannot become one.
 #[derive(Debug, Clone, PartialEq, thiserror::Error)]

@@ -24,7 +24,9 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use crate::{CavId, IdError, WireError};
+use crate::CavId;
+use crate::IdError;
+use crate::WireError;
 
 /// First four bytes of every message.
 pub const MAGIC: [u8; 4] = *b"V2VL";

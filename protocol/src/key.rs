@@ -18,7 +18,15 @@
 use std::fmt;
 use std::str::FromStr;
 
-use crate::{CavId, IdError, ProcessId, Role, RunId, Runs, Stream, Topic, Verb};
+use crate::CavId;
+use crate::IdError;
+use crate::ProcessId;
+use crate::Role;
+use crate::RunId;
+use crate::Runs;
+use crate::Stream;
+use crate::Topic;
+use crate::Verb;
 
 /// First chunk of every key.
 pub const KEY_ROOT: &str = "v2v";

@@ -20,8 +20,12 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use crate::balance::Difference;
-use crate::{Balance, DropReason, ProcessId, RateReason, Topic};
+use crate::Balance;
+use crate::DropReason;
+use crate::ProcessId;
+use crate::RateReason;
+use crate::Topic;
+use crate::reconciliation::Difference;
 
 /// What is counted separately: a topic, and who receives it (`None`: whoever does).
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]

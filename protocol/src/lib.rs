@@ -77,12 +77,10 @@
 //! - Times are nanoseconds: capture times on the clock of the scene, everything else on the Unix clock.
 
 pub mod access;
-mod balance;
 mod bev;
 mod body;
 mod box3d;
 pub mod codec;
-mod doubt;
 mod drop_reason;
 mod error;
 pub mod header;
@@ -92,15 +90,17 @@ mod ledger;
 mod limits;
 pub mod message;
 mod metadata;
-mod names;
+mod misbehaviour_reason;
 mod point_cloud;
 mod pose;
+mod reconciliation;
+pub mod rotated_iou;
 mod stream;
+mod string_enum;
 mod topic;
 pub mod wire;
 
 pub use access::{Act, Party, PartyError, Right, Runs};
-pub use balance::{Balance, Difference, Unheard};
 pub use bev::{BevFeatures, BevGrid};
 pub use body::{Body, BodyShape};
 pub use box3d::{Box3d, Detection};
@@ -108,7 +108,6 @@ pub use codec::{
     ByteLimit, Codec, CodecConfig, ConfidenceGate, DecodedFeatures, Dtype, EncodedFeatures, LimitedBy, Packing,
     RateChoice, RateReason, Selection, Smoothing, encode_features, encode_within,
 };
-pub use doubt::Doubt;
 pub use drop_reason::DropReason;
 pub use error::WireError;
 pub use header::{HEADER_LEN, Header, Kind, Stamp, WIRE_VERSION};
@@ -121,8 +120,10 @@ pub use message::{
     HeardNeighbour, Lidar, Message, ModelHash, NoPoseReason, Payload, Points, PoseEstimate, Radar, SkippedNeighbour,
     StageSummary, StageTiming, Stats, TopicCount, TrueObject, Truth,
 };
+pub use misbehaviour_reason::Doubt;
 pub use point_cloud::{Handedness, PointCloud};
 pub use pose::{Pose, PoseError};
+pub use reconciliation::{Balance, Difference, Unheard};
 pub use stream::Stream;
 pub use topic::{Role, Topic, Verb};
 pub use wire::Encoded;

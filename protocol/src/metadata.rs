@@ -7,7 +7,9 @@ use bincode::config::{Configuration, Limit, LittleEndian, Varint};
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
-use crate::{Kind, Limits, WireError};
+use crate::Kind;
+use crate::Limits;
+use crate::WireError;
 
 const HARD_LIMIT: usize = Limits::HARD_METADATA_BYTES as usize;
 

@@ -5,8 +5,9 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
-use crate::names::written_as_text;
-use crate::{KeyError, Kind};
+use crate::KeyError;
+use crate::Kind;
+use crate::string_enum::written_as_text;
 
 /// A stream of one vehicle.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]

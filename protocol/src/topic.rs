@@ -5,9 +5,15 @@ use std::str::FromStr;
 
 use serde::{Deserialize, Serialize};
 
+use crate::CavId;
+use crate::IdError;
+use crate::Key;
+use crate::KeyError;
+use crate::ProcessId;
+use crate::RunId;
+use crate::Stream;
 use crate::key::{MAX_KEY_BYTES, beginning};
-use crate::names::{named, written_as_text};
-use crate::{CavId, IdError, Key, KeyError, ProcessId, RunId, Stream};
+use crate::string_enum::{named, written_as_text};
 
 named! {
     /// What a process does in a run: the part of a liveliness token that says whom one can expect what from.

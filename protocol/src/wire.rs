@@ -6,13 +6,16 @@
 
 use crc32fast::Hasher;
 
+use crate::Body;
+use crate::Limits;
+use crate::WireError;
 use crate::body::{PayloadReader, check_body};
 use crate::header::{HEADER_LEN, Header, Kind, Stamp};
 use crate::message::{
     Bev, Boxes, Control, Descriptor, Detections, Gnss, Lidar, Message, Payload, Points, PoseEstimate, Radar, Stats,
     Truth, for_message,
 };
-use crate::{Body, Limits, WireError, metadata};
+use crate::metadata;
 
 /// A message as it goes on the wire: `head`, then `body`, nothing between or after.
 #[derive(Debug, Clone, PartialEq)]

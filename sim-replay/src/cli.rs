@@ -4,8 +4,8 @@ use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 
-use sim_replay::bus::BusError;
-use sim_replay::output;
+use bus::BusError;
+use support::output;
 
 use crate::command;
 

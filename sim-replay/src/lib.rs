@@ -1,28 +1,13 @@
-//! Scenes as live traffic: reading recorded scenes, generating new ones, streaming both, and the emulated air between
-//! vehicles.
+//! Scenes as live traffic: replay, inspection and recording, and the link process between agents and ego.
 //!
-//! Recorded datasets differ in axes, units, pose formats and file layouts. All of that ends at this crate's readers:
-//! behind [`dataset::open`] there is one [`frame::Frame`], in the conventions of [`protocol`].
+//! - [`stream`]: publishes the sensor data of a scene at the pace of its capture times, or in lockstep.
+//! - [`link_node`]: link emulation between the agents and an ego of a live run.
+//! - [`inspect`]: contents and problems of a data set.
+//! - [`recorder`]: every message of a run in one MCAP file.
 
 #![warn(clippy::print_stdout, clippy::print_stderr)]
 
-pub mod bounded;
-pub mod bus;
-pub mod carla_pose;
-pub mod class_set;
-pub mod dataset;
-pub mod evaluation_protocol;
-pub mod frame;
-pub mod ground_truth;
 pub mod inspect;
-pub mod link;
-pub mod output;
-pub mod pcd;
-pub mod random;
-pub mod recording;
-pub mod rotated_iou;
+pub mod link_node;
+pub mod recorder;
 pub mod stream;
-pub mod synth;
-pub mod town;
-pub mod web;
-pub mod whole_file;

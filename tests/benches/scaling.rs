@@ -21,21 +21,21 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use agent::agent::{Agent, AgentInput};
-use agent::detector::Detector;
-use agent::model_config::DetectorConfig;
-use agent::pose_source::RecordedPose;
-use agent::weights::{self, Weights};
 use anyhow::{Context, Result, bail};
-use ego_fuser::Method;
-use ego_fuser::model::CooperativeModel;
+use bus::bounded_queue::Taken;
+use bus::{Barrier, Bus, BusOptions, Event, Identity, PublisherOptions, Route, open, unix_nanos};
+use dataset::{self, LoadOptions};
+use fusion::Method;
+use fusion::model::CooperativeModel;
+use localization::pose_source::RecordedPose;
+use perception::detector::Detector;
+use perception::model_config::DetectorConfig;
+use perception::weights::{self, Weights};
 use protocol::message::Bev;
 use protocol::{
     CavId, CodecConfig, Detections, Dtype, EncodedFeatures, Limits, Pose, PoseEstimate, ProcessId, Role, RunId, Stream,
     Topic, encode_features, wire,
 };
-use sim_replay::bus::mailbox::Taken;
-use sim_replay::bus::{Barrier, Bus, BusOptions, Event, Identity, PublisherOptions, Route, open, unix_nanos};
-use sim_replay::dataset::{self, LoadOptions};
 use tests::bus::{PATIENCE, TestRouter};
 use tests::machine;
 
@@ -198,8 +198,8 @@ fn measure(file: &Path, map: &EncodedFeatures, count: usize, seconds: u32) -> Re
     }
     thread::sleep(PERIOD * 3);
     let cpu_ms = machine::cpu_ms(ego.id())? - cpu_ms;
-    publishers.into_iter().for_each(sim_replay::bus::Publisher::finish);
-    presences.into_iter().try_for_each(sim_replay::bus::Presence::withdraw)?;
+    publishers.into_iter().for_each(bus::Publisher::finish);
+    presences.into_iter().try_for_each(bus::Presence::withdraw)?;
     if !ego.wait()?.success() {
         bail!("the ego failed: see above");
     }

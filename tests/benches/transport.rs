@@ -15,9 +15,9 @@ use std::sync::Arc;
 use std::sync::mpsc::{Receiver, channel};
 use std::time::{Duration, Instant};
 
+use bus::{Barrier, Bus, Event, Inbox, Publisher, PublisherOptions, Route, Subscription};
 use protocol::message::Bev;
 use protocol::{BevFeatures, BevGrid, Body, CodecConfig, Limits, Pose, PoseEstimate, Topic, encode_features};
-use sim_replay::bus::{Barrier, Bus, Event, Inbox, Publisher, PublisherOptions, Route, Subscription};
 use tests::bus::{PATIENCE, TestRouter, free_port, next_event, wait_for};
 use zenoh::bytes::ZBytes;
 use zenoh::qos::CongestionControl;

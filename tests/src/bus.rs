@@ -3,8 +3,8 @@
 use std::net::TcpListener;
 use std::time::{Duration, Instant};
 
+use bus::{self, Bus, BusOptions, Endpoint, Event, Identity, Inbox, bounded_queue::Taken};
 use protocol::{CavId, ProcessId, RunId, Topic};
-use sim_replay::bus::{self, Bus, BusOptions, Endpoint, Event, Identity, Inbox, mailbox::Taken};
 use zenoh::Session;
 
 /// Longer than anything here takes, on a machine however busy.

@@ -9,10 +9,10 @@ use std::sync::mpsc::{Receiver, channel};
 use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
 use std::time::{Duration, Instant};
 
-use agent::model_config::{DetectorConfig, ShrinkConfig};
-use agent::weights;
-use ego_fuser::Method;
-use ego_fuser::model::CooperativeModel;
+use fusion::Method;
+use fusion::model::CooperativeModel;
+use perception::model_config::{DetectorConfig, ShrinkConfig};
+use perception::weights;
 use serde_json::Value;
 
 /// Longer than anything takes here, under whatever load.

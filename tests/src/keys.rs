@@ -3,9 +3,9 @@
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use deploy::keys::{KeyPlan, make};
+use bus::{self, Bus, BusError, BusOptions, Credentials, Endpoint, Guard, Identity, Refusal, Refusals};
+use deploy::operate::keys::{KeyPlan, make};
 use protocol::{CavId, Party, RunId, Runs};
-use sim_replay::bus::{self, Bus, BusError, BusOptions, Credentials, Endpoint, Guard, Identity, Refusal, Refusals};
 use zenoh::{Config, Session, Wait};
 
 use crate::bus::free_port;

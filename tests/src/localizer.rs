@@ -3,11 +3,9 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use agent::localizer::{
-    EndToEnd, EndToEndConfig, EndToEndKind, EndToEndLocalizer, SceneEncoder, SceneEncoderConfig, SceneHead,
-    SceneHeadConfig,
-};
-use agent::weights::{CONFIG_KEY, KIND_KEY, Precision, save};
+use localization::competitors::{EndToEnd, EndToEndConfig, EndToEndKind, EndToEndLocalizer};
+use localization::pgc::{SceneEncoder, SceneEncoderConfig, SceneHead, SceneHeadConfig};
+use perception::weights::{CONFIG_KEY, KIND_KEY, Precision, save};
 use serde::Serialize;
 use tch::Device;
 use tch::nn::VarStore;

@@ -3,8 +3,8 @@
 use std::fs;
 use std::path::Path;
 
+use dataset::pcd::{Encoding, IntensityField, encode};
 use protocol::PointCloud;
-use sim_replay::pcd::{Encoding, IntensityField, encode};
 
 /// Between two ticks in the counter of file names, which counts at 20 Hz: scenes run at 10 Hz.
 const STEM_STEP: usize = 2;

@@ -5,8 +5,8 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
+use dataset::{LoadOptions, Scenario};
 use nalgebra::{Isometry3, UnitQuaternion, Vector3};
-use sim_replay::dataset::{LoadOptions, Scenario};
 
 /// Sweeps at either end of a drive that LightLoc, and so the reader, leaves out.
 pub const LEFT_OUT: usize = 5;

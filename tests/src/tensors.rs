@@ -2,8 +2,8 @@
 
 use std::collections::BTreeMap;
 
-use agent::model_config::DetectorConfig;
-use agent::pillars::Pillars;
+use perception::model_config::DetectorConfig;
+use perception::pillars::voxels::Pillars;
 use serde_json::Value;
 use tch::nn::VarStore;
 use tch::{Kind, Tensor};

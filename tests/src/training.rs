@@ -3,14 +3,14 @@
 use std::path::Path;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 
-use agent::model_config::DetectorConfig;
-use agent::training::{Length, RunConfig};
-use ego_fuser::Method;
-use ego_fuser::loss::LossConfig;
-use ego_fuser::samples::{SampleConfig, SampleKind};
-use ego_fuser::train::{Accuracy, Observer, StepReport, TrainConfig};
-use sim_replay::dataset::OpenOptions;
-use sim_replay::evaluation_protocol::ProtocolConfig;
+use ::training::loss::LossConfig;
+use ::training::samples::{SampleConfig, SampleKind};
+use ::training::train::{Accuracy, Observer, StepReport, TrainConfig};
+use dataset::OpenOptions;
+use dataset::evaluation_protocol::ProtocolConfig;
+use fusion::Method;
+use perception::model_config::DetectorConfig;
+use perception::train::{Length, RunConfig};
 
 /// libtorch has one generator of random numbers per process: who begins a training has it alone.
 pub fn alone() -> MutexGuard<'static, ()> {

@@ -4,16 +4,17 @@ use std::collections::HashSet;
 use std::process::Command;
 use std::sync::Arc;
 
-use agent::pose_source::{IcpMapPose, PoseSource, RecordedPose, read_map};
-use agent::registration::icp::{self, IcpConfig, IcpSource, IcpTarget};
-use ego_fuser::alignment::compare::{self, BoxSource, PairOutcome};
-use ego_fuser::alignment::table::Tally;
-use ego_fuser::alignment::{Approach, BoxIcp, CloudIcp, FreeAlign, Measured, Poses};
+use agent_offline::icp_map::{IcpMapPose, read_map};
+use dataset::pcd;
+use dataset::{self, LoadOptions};
+use ego_fuser_offline::alignment::compare::{self, BoxSource, PairOutcome};
+use ego_fuser_offline::alignment::table::Tally;
+use ego_fuser_offline::alignment::{Approach, BoxIcp, CloudIcp, FreeAlign, Measured, Poses};
+use localization::pose_source::{PoseSource, RecordedPose};
+use localization::registration::icp::{self, IcpConfig, IcpSource, IcpTarget};
 use nalgebra::{Isometry3, Matrix4, Point3};
 use protocol::{PointCloud, Pose};
-use sim_replay::dataset::{self, LoadOptions};
-use sim_replay::pcd;
-use sim_replay::synth::{Subset, SynthOptions, generate};
+use simulator::generate::{Subset, SynthOptions, generate};
 use tests::fixtures::data;
 use tests::fleet::programs;
 

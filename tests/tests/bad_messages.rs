@@ -5,22 +5,22 @@ use std::collections::BTreeMap;
 use std::sync::{Mutex, PoisonError};
 
 use agent::agent::{Agent, AgentInput};
-use agent::detector::Detector;
-use agent::model_config::DetectorConfig;
-use agent::point_pillars::PointPillars;
-use agent::pose_source::RecordedPose;
-use ego_fuser::Method;
+use bus::shutdown::Stop;
+use bus::{Barrier, Bus, Event, Presence, PublisherOptions, Route, process_id, unix_nanos};
+use dataset::{self, LoadOptions, Scenario};
 use ego_fuser::ego::Ego;
 use ego_fuser::node::{self, NodeOptions};
+use fusion::Method;
+use localization::pose_source::RecordedPose;
+use perception::detector::Detector;
+use perception::model_config::DetectorConfig;
+use perception::pillars::point_pillars::PointPillars;
 use protocol::message::Bev;
 use protocol::{
     Account, BevFeatures, BevGrid, Body, CavId, Codec, CodecConfig, Counts, Detection, Detections, DropReason, Dtype,
     EncodedFeatures, HEADER_LEN, Ledger, Limits, Packing, PoseEstimate, Role, Selection, Stamp, Stream, Topic,
     encode_features, wire,
 };
-use sim_replay::bus::shutdown::Stop;
-use sim_replay::bus::{Barrier, Bus, Event, Presence, PublisherOptions, Route, process_id, unix_nanos};
-use sim_replay::dataset::{self, LoadOptions, Scenario};
 use tch::Device;
 use tch::nn::VarStore;
 use tests::bus::{PATIENCE, TestRouter, next_event, wait_for};

@@ -3,13 +3,13 @@
 use std::sync::mpsc;
 use std::time::{Duration, Instant};
 
+use bus::{
+    self, Barrier, Bus, BusError, BusOptions, Endpoint, Event, Overflow, Publisher, PublisherOptions, Route, Sighting,
+    bounded_queue::Taken,
+};
 use protocol::{
     Account, CavId, Control, DropReason, Gnss, GnssSource, Ledger, Lidar, Limits, PointCloud, Pose, Role, Stamp,
     Stream, Topic,
-};
-use sim_replay::bus::{
-    self, Barrier, Bus, BusError, BusOptions, Endpoint, Event, Overflow, Publisher, PublisherOptions, Route, Sighting,
-    mailbox::Taken,
 };
 use tests::bus::{PATIENCE, TestRouter, free_port, next_event, wait_for};
 use zenoh::Wait;
@@ -386,11 +386,8 @@ fn shared_memory_carries_the_same_messages() {
     let join = |process: &str, cav_id: &str| {
         let mut options = BusOptions::client(router.endpoint.clone());
         options.shared_memory_pool = Some(64 << 20);
-        let identity = sim_replay::bus::Identity {
-            run: "test".parse().unwrap(),
-            process: process.parse().unwrap(),
-            cav: cav(cav_id),
-        };
+        let identity =
+            bus::Identity { run: "test".parse().unwrap(), process: process.parse().unwrap(), cav: cav(cav_id) };
         Bus::join(&options, identity).unwrap()
     };
     let (replay, agent) = (join("replay", "replay"), join("agent-7", "7"));

@@ -7,25 +7,27 @@ use std::thread::{Scope, ScopedJoinHandle};
 use std::time::{Duration, Instant};
 
 use agent::agent::{Agent, AgentInput};
-use agent::detector::Detector;
-use agent::model_config::DetectorConfig;
 use agent::node as agent_node;
-use agent::point_pillars::PointPillars;
-use agent::pose_source::RecordedPose;
 use agent::rate::RateConfig;
-use ego_fuser::Method;
+use bus::bounded_queue::Taken;
+use bus::shutdown::Stop;
+use bus::{Bus, Event, Inbox, PublisherOptions, Route, Subscription, process_id};
+use dataset::{self, LoadOptions, Scenario};
 use ego_fuser::ego::{Content, Ego, View, own_content};
 use ego_fuser::node as ego_node;
-use ego_fuser::{Exchange, pairing::PairingConfig};
+use ego_fuser::pairing::PairingConfig;
+use fusion::Exchange;
+use fusion::Method;
+use localization::pose_source::RecordedPose;
+use perception::detector::Detector;
+use perception::model_config::DetectorConfig;
+use perception::pillars::point_pillars::PointPillars;
 use protocol::message::{Descriptor, ModelHash};
 use protocol::{
     Account, CavId, DecodedFeatures, Detection, Detections, DropReason, Ledger, Limits, RateReason, Stream, Topic,
 };
-use sim_replay::bus::mailbox::Taken;
-use sim_replay::bus::shutdown::Stop;
-use sim_replay::bus::{Bus, Event, Inbox, PublisherOptions, Route, Subscription, process_id};
-use sim_replay::dataset::{self, LoadOptions, Scenario};
-use sim_replay::recording::{self, RecordReport, RecorderOptions, Recording, RecordingOptions};
+use recording::{Recording, RecordingOptions};
+use sim_replay::recorder::{self, RecordReport, RecorderOptions};
 use sim_replay::stream::{Replay, StreamOptions};
 use tch::Device;
 use tch::nn::VarStore;
@@ -159,7 +161,7 @@ fn record<'scope>(
         let bus = router.join("recorder", "recorder");
         let recording = RecordingOptions::default();
         let options = RecorderOptions { out, recording, without: Vec::new(), keeps_running: true };
-        let report = recording::record(&bus, &options, &stop, &mut |_| {}).unwrap();
+        let report = recorder::record(&bus, &options, &stop, &mut |_| {}).unwrap();
         bus.leave(PATIENCE).unwrap();
         report
     })
@@ -335,10 +337,10 @@ fn maps_that_keep_within_a_limit_are_fused_and_booked_with_the_reason() {
 /// Sends a fleet's maps by hand, so that the test decides who is late, wrong or gone.
 struct Puppet {
     bus: Bus,
-    publisher: sim_replay::bus::Publisher,
+    publisher: bus::Publisher,
     agent: Agent,
     index: usize,
-    _presence: sim_replay::bus::Presence,
+    _presence: bus::Presence,
 }
 
 impl Puppet {
@@ -369,7 +371,7 @@ impl Puppet {
 
     fn wait_until_heard(&self, receiver: &str) {
         let route = Route { topic: self.publisher.topic().clone(), receiver: receiver.parse().unwrap() };
-        sim_replay::bus::Barrier::new([route]).attend(&self.bus).unwrap().wait(PATIENCE).unwrap();
+        bus::Barrier::new([route]).attend(&self.bus).unwrap().wait(PATIENCE).unwrap();
     }
 }
 
@@ -544,7 +546,7 @@ fn an_agent_hears_its_own_sensors_only_and_says_so_when_it_has_no_pose() {
             |cav_id| replay.publisher(topic(cav_id, Stream::Lidar), PublisherOptions::SENSOR.lossless(8)).unwrap();
         let (own, other) = (lidar("20"), lidar("10"));
         let route = Route { topic: topic("20", Stream::Lidar), receiver: "agent-20".parse().unwrap() };
-        sim_replay::bus::Barrier::new([route]).attend(&replay).unwrap().wait(PATIENCE).unwrap();
+        bus::Barrier::new([route]).attend(&replay).unwrap().wait(PATIENCE).unwrap();
         let frame = scenario.load(1, 0, &LoadOptions::default()).unwrap();
         // A sweep whose pose never comes.
         other.offer(1, protocol::Lidar { points: frame.points.clone() });

@@ -6,7 +6,7 @@ use std::net::TcpListener;
 use std::path::Path;
 use std::process::{Command, Output, Stdio};
 
-use sim_replay::recording::Recording;
+use recording::Recording;
 use tests::fleet::{Up, alone, programs, results, signal, write_scenario};
 
 /// Runs `program` to its end; exit code and what it says on both outputs.

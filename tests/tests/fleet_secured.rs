@@ -8,9 +8,9 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::Duration;
 
-use deploy::keys::{KeyPlan, make};
+use bus::{self, Bus, BusOptions, Credentials, Endpoint, Identity};
+use deploy::operate::keys::{KeyPlan, make};
 use serde_json::Value;
-use sim_replay::bus::{self, Bus, BusOptions, Credentials, Endpoint, Identity};
 use tests::bus::free_port;
 use tests::fleet::{Up, alone, programs, results, write_scenario, write_sighted_weights};
 use tests::keys::{TRIED_FOR, keys_for, stranger};

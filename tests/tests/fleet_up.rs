@@ -5,8 +5,8 @@ use std::time::{Duration, Instant};
 
 use deploy::scenario::Scenario;
 use protocol::{Stream, Topic};
+use recording::Recording;
 use serde_json::Value;
-use sim_replay::recording::Recording;
 use tests::fleet::{PATIENCE, Up, alone, fused, is_running, results, signal, write_scenario};
 
 fn json(path: &std::path::Path) -> Value {

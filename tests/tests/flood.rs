@@ -4,9 +4,9 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
+use bus::bounded_queue::Taken;
+use bus::{Barrier, Bus, Event, Inbox, InboxLimits, PublisherOptions, Route};
 use protocol::{Account, DropReason, Lidar, Limits, PointCloud, Topic};
-use sim_replay::bus::mailbox::Taken;
-use sim_replay::bus::{Barrier, Bus, Event, Inbox, InboxLimits, PublisherOptions, Route};
 use tests::bus::{PATIENCE, TestRouter, wait_for};
 
 const HONEST: u64 = 20;

@@ -1,14 +1,14 @@
 //! Anchors, decoding, overlap, suppression and clean-up against the reference implementation.
 
-use agent::anchors::Anchors;
-use agent::decode::{Decoded, decode, decode_box, sigmoid};
-use agent::model_config::AnchorConfig;
-use agent::nms::rotated_nms;
-use agent::postprocess::{self, AgentBoxes, Candidate, PostprocessConfig, corners_to_box, footprint};
 use nalgebra::{Isometry3, Matrix4};
+use perception::boxes::anchors::Anchors;
+use perception::boxes::decode::{Decoded, decode, decode_box, sigmoid};
+use perception::boxes::nms::rotated_nms;
+use perception::boxes::postprocess::{self, AgentBoxes, Candidate, PostprocessConfig, corners_to_box, footprint};
+use perception::model_config::AnchorConfig;
+use protocol::rotated_iou::Polygon;
 use protocol::{Box3d, Pose};
 use serde_json::Value;
-use sim_replay::rotated_iou::Polygon;
 use tests::fixtures::{Golden, assert_close, golden};
 
 #[test]

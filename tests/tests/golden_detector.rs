@@ -1,13 +1,13 @@
 //! The detector against the reference implementation: encoder and voxelisation.
 
-use agent::backbone::BevBackbone;
-use agent::head::DetectionHead;
-use agent::model_config::{DetectorConfig, ShrinkConfig};
-use agent::pillar_batch::{PillarBatch, PillarLattice};
-use agent::pillar_encoder::PillarEncoder;
-use agent::pillar_projection::PillarProjection;
-use agent::pillars::{Pillars, Voxeliser};
-use agent::shrink::{Compressor, Shrink};
+use perception::layers::backbone::BevBackbone;
+use perception::layers::head::DetectionHead;
+use perception::layers::shrink::{Compressor, Shrink};
+use perception::model_config::{DetectorConfig, ShrinkConfig};
+use perception::pillars::batch::{PillarBatch, PillarLattice};
+use perception::pillars::encoder::PillarEncoder;
+use perception::pillars::projection::PillarProjection;
+use perception::pillars::voxels::{Pillars, Voxeliser};
 use tch::nn::VarStore;
 use tch::{Device, Tensor};
 use tests::fixtures::{Golden, assert_close, golden};

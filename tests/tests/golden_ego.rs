@@ -1,13 +1,13 @@
 //! Training targets, loss, AP, warps and fusion against the reference implementations.
 
-use ego_fuser::average_precision::{Curve, Ordering, Scorer};
-use ego_fuser::fusion::{AlignedViews, AttentionFusion, Fusion, MaxFusion, ViewFacts, regroup};
-use ego_fuser::loss::{LabelTensors, LossConfig, Unassigned, detection_loss};
-use ego_fuser::targets::{BOX_CODE, Labels, Positive, TargetAssigner, TargetRule};
-use ego_fuser::warp::opencood::{self, Interpolation};
-use ego_fuser::warp::{coalign, warp_to_ego};
+use ::training::average_precision::{Curve, Ordering, Scorer};
+use ::training::loss::{LabelTensors, LossConfig, Unassigned, detection_loss};
+use fusion::targets::{BOX_CODE, Labels, Positive, TargetAssigner, TargetRule};
+use fusion::warp::opencood::{self, Interpolation};
+use fusion::warp::{coalign, warp_to_ego};
+use fusion::{AlignedViews, AttentionFusion, Fusion, MaxFusion, ViewFacts, regroup};
+use protocol::rotated_iou::Polygon;
 use protocol::{BevGrid, Box3d, Pose};
-use sim_replay::rotated_iou::Polygon;
 use tch::{Device, Kind, Tensor};
 use tests::fixtures::{Golden, assert_close, golden};
 

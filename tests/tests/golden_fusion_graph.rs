@@ -1,17 +1,15 @@
 //! V2VNet, DiscoNet, Where2comm and CoAlign against the reference implementations.
 
-use agent::backbone::BevBackbone;
-use agent::model_config::{BlockKind, DetectorConfig, ShrinkConfig};
-use agent::pillar_batch::PillarBatch;
-use agent::point_pillars::PointPillars;
-use ego_fuser::fusion::disconet::{DiscoNet, DiscoNetConfig};
-use ego_fuser::fusion::v2vnet::{self, Incoming, V2vNet, V2vNetConfig};
-use ego_fuser::fusion::where2comm::{
-    Aggregation, Communication, CommunicationConfig, Missing, Where2comm, Where2commConfig,
-};
-use ego_fuser::fusion::{AlignedViews, Fusion, ViewFacts};
-use ego_fuser::multi_scale::{Levels, MultiScaleConfig, MultiScaleNetwork, Placement, Senders, fuse_levels};
-use ego_fuser::warp::{coalign, opencood};
+use ego_fuser_offline::multi_scale::{Levels, MultiScaleConfig, MultiScaleNetwork, Placement, Senders, fuse_levels};
+use fusion::disconet::{DiscoNet, DiscoNetConfig};
+use fusion::v2vnet::{self, Incoming, V2vNet, V2vNetConfig};
+use fusion::warp::{coalign, opencood};
+use fusion::where2comm::{Aggregation, Communication, CommunicationConfig, Missing, Where2comm, Where2commConfig};
+use fusion::{AlignedViews, Fusion, ViewFacts};
+use perception::layers::backbone::BevBackbone;
+use perception::model_config::{BlockKind, DetectorConfig, ShrinkConfig};
+use perception::pillars::batch::PillarBatch;
+use perception::pillars::point_pillars::PointPillars;
 use protocol::{BevFeatures, BevGrid, CodecConfig, ConfidenceGate, Limits, Pose, Smoothing, encode_features};
 use serde_json::Value;
 use tch::nn::VarStore;

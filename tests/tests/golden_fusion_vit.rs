@@ -1,10 +1,10 @@
 //! V2X-ViT and CoBEVT against the reference implementations.
 
-use ego_fuser::fusion::cobevt::CobevtConfig;
-use ego_fuser::fusion::swap_fusion::{Slots, SwapFusion};
-use ego_fuser::fusion::v2xvit::{AgentAttention, Encoder, Merge, V2xVitConfig, WindowAttention, WindowConfig};
-use ego_fuser::fusion::{BlockOrder, layers::unseen};
-use ego_fuser::warp::{coalign, opencood};
+use fusion::cobevt::CobevtConfig;
+use fusion::swap_fusion::{Slots, SwapFusion};
+use fusion::v2xvit::{AgentAttention, Encoder, Merge, V2xVitConfig, WindowAttention, WindowConfig};
+use fusion::warp::{coalign, opencood};
+use fusion::{BlockOrder, layers::unseen};
 use serde_json::Value;
 use tch::nn::VarStore;
 use tch::{Device, Kind, Tensor, no_grad};

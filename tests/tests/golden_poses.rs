@@ -2,14 +2,14 @@
 //!
 //! The archives are left-handed. Inputs go through the readers' conversion, results are mirrored back.
 
-use agent::crop::Crop;
-use agent::model_config::DetectorConfig;
+use dataset::carla_pose::{CarlaPose, mirrored_point};
+use dataset::frame::{Frame, Object, ObjectClass};
+use dataset::ground_truth::{self, GroundTruthRule};
 use nalgebra::{Matrix4, Point3};
+use perception::crop::Crop;
+use perception::model_config::DetectorConfig;
 use protocol::{CavId, Handedness, Pose};
 use serde_json::Value;
-use sim_replay::carla_pose::{CarlaPose, mirrored_point};
-use sim_replay::frame::{Frame, Object, ObjectClass};
-use sim_replay::ground_truth::{self, GroundTruthRule};
 use tests::fixtures::{Golden, assert_close, golden};
 
 /// Tolerance of matrices that the reference computed in doubles.

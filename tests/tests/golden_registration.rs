@@ -1,9 +1,9 @@
 //! Rigid fits and SC2-PCR against the reference implementation.
 
-use agent::registration::Correspondence;
-use agent::registration::kabsch::PairMoments;
-use agent::registration::ransac::{self, RansacConfig};
-use agent::registration::sc2pcr::{self, Refinement, Sc2PcrConfig};
+use localization::registration::Correspondence;
+use localization::registration::kabsch::PairMoments;
+use localization::registration::ransac::{self, RansacConfig};
+use localization::registration::sc2pcr::{self, Refinement, Sc2PcrConfig};
 use nalgebra::{Isometry3, Matrix4, Point3, Vector3};
 use protocol::Pose;
 use serde_json::Value;

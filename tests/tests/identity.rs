@@ -4,12 +4,10 @@ use std::collections::BTreeSet;
 use std::sync::{Arc, Mutex};
 use std::time::{Duration, Instant};
 
-use deploy::keys::{KeyPlan, make};
+use bus::{self, Barrier, Bus, BusError, BusOptions, Credentials, Event, Inbox, PublisherOptions, Route, unix_nanos};
+use deploy::operate::keys::{KeyPlan, make};
 use protocol::message::Points;
 use protocol::{Gnss, GnssSource, Lidar, Limits, PointCloud, Pose, PoseEstimate, Stamp, Stream, Topic, wire};
-use sim_replay::bus::{
-    self, Barrier, Bus, BusError, BusOptions, Credentials, Event, Inbox, PublisherOptions, Route, unix_nanos,
-};
 use tests::bus::{PATIENCE, next_event, wait_for};
 use tests::keys::{GuardedRouter, TRIED_FOR, keys_for, stranger};
 use zenoh::qos::CongestionControl;
@@ -48,7 +46,7 @@ fn reaches(sender: &Bus, topic_text: &str, receiver: &Arc<Inbox>) {
     loop {
         assert!(Instant::now() < deadline, "nothing comes on {topic_text}");
         publisher.offer(7, estimate());
-        if let bus::mailbox::Taken::Item(came, Event::Message(arrival)) =
+        if let bus::bounded_queue::Taken::Item(came, Event::Message(arrival)) =
             receiver.take(Some(Instant::now() + Duration::from_millis(100)))
             && came == topic(topic_text)
         {
@@ -93,7 +91,7 @@ fn a_fleet_with_keys_says_what_it_has_to() {
     publisher.offer(3, measured);
     let (_, Event::Message(_)) = next_event(&inbox) else { panic!("an end before the message") };
     // The barrier knows nothing of those who only listen: their route may come up later.
-    let is_gnss = |taken| matches!(taken, bus::mailbox::Taken::Item(heard, _) if heard == topic("1/gnss"));
+    let is_gnss = |taken| matches!(taken, bus::bounded_queue::Taken::Item(heard, _) if heard == topic("1/gnss"));
     wait_for("the recorder", || {
         publisher.offer(3, measured);
         is_gnss(tap.take(Some(Instant::now())))
@@ -106,7 +104,7 @@ fn a_fleet_with_keys_says_what_it_has_to() {
     wait_for("an onlooker", || preview.is_wanted());
     wait_for("a preview", || {
         preview.offer(3, Lidar::default());
-        matches!(looking.take(Some(Instant::now())), bus::mailbox::Taken::Item(..))
+        matches!(looking.take(Some(Instant::now())), bus::bounded_queue::Taken::Item(..))
     });
     preview.finish();
     drop(looking);

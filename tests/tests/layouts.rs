@@ -3,15 +3,15 @@
 use std::fs;
 use std::path::Path;
 
-use deploy::evaluation::{EvaluationOptions, evaluate};
-use ego_fuser::Method;
+use dataset::evaluation_protocol::ProtocolConfig;
+use dataset::pcd::{self, Encoding, IntensityField};
+use dataset::{self, Layout, OpenOptions};
+use deploy::experiment::evaluation::{EvaluationOptions, evaluate};
+use fusion::Method;
 use protocol::PointCloud;
 use serde_json::{Value, json};
-use sim_replay::dataset::{self, Layout, OpenOptions};
-use sim_replay::evaluation_protocol::ProtocolConfig;
 use sim_replay::inspect::inspect;
-use sim_replay::pcd::{self, Encoding, IntensityField};
-use sim_replay::synth::{SceneLayout, Subset, SynthOptions, generate};
+use simulator::generate::{SceneLayout, Subset, SynthOptions, generate};
 
 /// Layouts that hold both agents and their boxes, and as what they are read. A line for each.
 const LAYOUTS: [(SceneLayout, Layout); 7] = [

@@ -4,8 +4,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use deploy::metrics::Metrics;
-use sim_replay::synth::{Subset, SynthOptions, generate};
+use deploy::experiment::metrics::Metrics;
+use simulator::generate::{Subset, SynthOptions, generate};
 use tests::fleet::programs;
 
 const FRAMES: usize = 5;

@@ -3,12 +3,12 @@
 use std::path::Path;
 use std::time::Duration;
 
+use bus::shutdown::Stop;
+use bus::{Barrier, Bus, Event, InboxLimits, PublisherOptions, Route};
+use link::{Air, CapacityConfig, DelayLaw, DeviceClock, LinkConfig, LossLaw, TraceConfig};
 use protocol::message::Points;
 use protocol::{CavId, DropReason, Ledger, Limits, PointCloud, Pose, PoseEstimate, Role, Stream, Topic};
-use sim_replay::bus::shutdown::Stop;
-use sim_replay::bus::{Barrier, Bus, Event, InboxLimits, PublisherOptions, Route};
-use sim_replay::link::node::{self, LinkReport, NodeOptions};
-use sim_replay::link::{Air, CapacityConfig, DelayLaw, DeviceClock, LinkConfig, LossLaw, TraceConfig};
+use sim_replay::link_node::{self, LinkReport, NodeOptions};
 use tests::bus::{PATIENCE, TestRouter, next_event, wait_for};
 
 /// Sweeps that are sent, and their points: 16 kB each.
@@ -56,7 +56,7 @@ fn cross(config: LinkConfig, options: &NodeOptions) -> Crossing {
     let _subscription = ego.subscribe(received.clone(), &inbox).unwrap();
     let stop = Stop::new();
     let (arrivals, report) = std::thread::scope(|scope| {
-        let carrying = scope.spawn(|| node::run(&link, air, options, &stop).unwrap());
+        let carrying = scope.spawn(|| link_node::run(&link, air, options, &stop).unwrap());
         let presence = agent.announce(Role::Agent).unwrap();
         let publisher = agent.publisher(sent.clone(), PublisherOptions::FEATURES.lossless(16)).unwrap();
         wait_for_route(&agent, &sent, "link-9");
@@ -140,7 +140,7 @@ fn a_link_that_carries_nothing_says_so() {
     let air = Air::new(config, folder.path(), 1).unwrap();
     let (sent, stop, options) = (Topic::Stream { cav: cav("7"), stream: Stream::Points }, Stop::new(), options());
     let report = std::thread::scope(|scope| {
-        let carrying = scope.spawn(|| node::run(&link, air, &options, &stop).unwrap());
+        let carrying = scope.spawn(|| link_node::run(&link, air, &options, &stop).unwrap());
         let _presence = agent.announce(Role::Agent).unwrap();
         let publisher = agent.publisher(sent.clone(), PublisherOptions::FEATURES.lossless(16)).unwrap();
         wait_for_route(&agent, &sent, "link-9");
@@ -164,7 +164,7 @@ fn a_flood_ends_in_front_of_the_air() {
     // Little more than the one that shows the route.
     let narrow = NodeOptions { inbox: InboxLimits { messages_per_s: 0.6, ..InboxLimits::PEERS }, ..options() };
     let report = std::thread::scope(|scope| {
-        let carrying = scope.spawn(|| node::run(&link, air, &narrow, &stop).unwrap());
+        let carrying = scope.spawn(|| link_node::run(&link, air, &narrow, &stop).unwrap());
         let _presence = agent.announce(Role::Agent).unwrap();
         let publisher = agent.publisher(sent.clone(), PublisherOptions::FEATURES.lossless(16)).unwrap();
         wait_for_route(&agent, &sent, "link-9");
@@ -194,7 +194,7 @@ fn an_agent_that_comes_back_is_carried_again() {
         // While another agent is there the link does not end.
         let presence = other.announce(Role::Agent).unwrap();
         let air = Air::new(LinkConfig::default(), Path::new("."), 1).unwrap();
-        let carrying = scope.spawn(|| node::run(&link, air, &options, &stop).unwrap());
+        let carrying = scope.spawn(|| link_node::run(&link, air, &options, &stop).unwrap());
         for ticks in [0..3, 3..6] {
             let agent = router.join("agent-7", "7");
             let presence = agent.announce(Role::Agent).unwrap();

@@ -4,16 +4,17 @@ use std::path::{Path, PathBuf};
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::Duration;
 
-use agent::localizer::training::{
+use agent_offline::training::{
     EncoderReport, EncoderStart, EncoderTrainConfig, EndToEndReport, EndToEndTrainConfig, LocalizerTrainError,
     RedundancyConfig, SceneReport, SceneTrainConfig, SweepAugmentation, train_encoder, train_end_to_end, train_scene,
 };
-use agent::localizer::{EndToEndKind, EndToEndLocalizer, Localizer, LocalizerError, SceneEncoder};
-use agent::training::{Length, RunConfig, TrainingError};
-use agent::weights::Weights;
+use dataset::{self, LoadOptions};
+use localization::competitors::{EndToEndKind, EndToEndLocalizer};
+use localization::pgc::{Localizer, LocalizerError, SceneEncoder};
+use perception::train::{Length, RunConfig, TrainingError};
+use perception::weights::Weights;
 use protocol::{NoPoseReason, PointCloud, PoseEstimate};
-use sim_replay::dataset::{self, LoadOptions};
-use sim_replay::synth::{Subset, SynthOptions, generate};
+use simulator::generate::{Subset, SynthOptions, generate};
 use tch::Device;
 use tch::nn::VarStore;
 use tests::localizer::small_encoder;

@@ -5,12 +5,12 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 use std::time::Duration;
 
-use agent::localizer::Localizer;
-use agent::localizer::training::{EncoderTrainConfig, SceneTrainConfig, SweepAugmentation, train_encoder, train_scene};
-use agent::training::{Length, RunConfig};
+use agent_offline::training::{EncoderTrainConfig, SceneTrainConfig, SweepAugmentation, train_encoder, train_scene};
+use dataset::{self, Layout, LoadOptions, Scenario};
+use localization::pgc::Localizer;
+use perception::train::{Length, RunConfig};
 use serde_json::Value;
-use sim_replay::dataset::{self, Layout, LoadOptions, Scenario};
-use sim_replay::synth::{Subset, SynthOptions, generate};
+use simulator::generate::{Subset, SynthOptions, generate};
 use tch::Device;
 use tests::fleet::programs;
 use tests::localizer::small_encoder;

@@ -3,8 +3,8 @@
 
 use std::sync::{Mutex, PoisonError};
 
+use dataset::pcd;
 use peak_alloc::PeakAlloc;
-use sim_replay::pcd;
 use tests::mutation::readers::all as all_readers;
 use tests::mutation::run::{Report, files, formats, messages};
 use tests::mutation::scratch;

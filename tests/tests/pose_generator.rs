@@ -5,8 +5,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::process::Command;
 
-use agent::localizer::EndToEndKind;
 use deploy::scenario::Scenario;
+use localization::competitors::EndToEndKind;
 use serde_json::Value;
 use tests::fleet::{Up, alone, programs, results, write_scenario};
 use tests::{localizer, scene};

@@ -2,12 +2,12 @@
 
 use std::collections::HashSet;
 
-use sim_replay::dataset::{self, Dataset, Layout, LoadOptions, OpenOptions};
-use sim_replay::evaluation_protocol::ProtocolConfig;
-use sim_replay::frame::{Frame, Object, ObjectClass};
-use sim_replay::ground_truth::{self, GroundTruthRule};
+use dataset::evaluation_protocol::ProtocolConfig;
+use dataset::frame::{Frame, Object, ObjectClass};
+use dataset::ground_truth::{self, GroundTruthRule};
+use dataset::pcd;
+use dataset::{self, Dataset, Layout, LoadOptions, OpenOptions};
 use sim_replay::inspect::{TickReport, inspect};
-use sim_replay::pcd;
 use tests::fixtures::data;
 
 fn open(name: &str) -> Option<Dataset> {

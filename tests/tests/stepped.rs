@@ -5,18 +5,17 @@ use std::ops::ControlFlow;
 use std::path::Path;
 use std::process::{Command, Output};
 
-use agent::pose_source::PoseSourceConfig;
 use agent::rate::RateConfig;
+use deploy::operate::run_fleet::{RunResult, UpOptions, up};
 use deploy::scenario::Scenario;
-use deploy::up::{RunResult, UpOptions, up};
-use ego_fuser::Method;
-use ego_fuser::evaluate::stepped::{ComputeTimes, Crew, SteppedConfig};
-use ego_fuser::evaluate::{EvaluateConfig, EvaluatedFrame, Evaluator};
 use ego_fuser::pairing::PairingConfig;
+use ego_fuser_offline::evaluation::stepped::{ComputeTimes, Crew, SteppedConfig};
+use ego_fuser_offline::evaluation::{EvaluateConfig, EvaluatedFrame, Evaluator};
+use fusion::Method;
+use link::{ClockStep, DelayLaw, DeviceClock, LinkConfig, LossLaw};
+use localization::pose_source::PoseSourceConfig;
 use protocol::{CodecConfig, DropReason, Dtype};
 use serde_json::Value;
-use sim_replay::dataset;
-use sim_replay::link::{ClockStep, DelayLaw, DeviceClock, LinkConfig, LossLaw};
 use tests::fleet::{alone, programs, results, write_scenario, write_sighted_weights};
 
 const TICKS: usize = 8;

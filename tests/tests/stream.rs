@@ -5,10 +5,10 @@ use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use bus::shutdown::Stop;
+use bus::{Bus, Event, Inbox, PublisherOptions, Subscription, bounded_queue::Taken};
+use dataset::{self, Scenario};
 use protocol::{CavId, Control, Gnss, Lidar, Limits, Selector, Stream, Topic, Truth, wire};
-use sim_replay::bus::shutdown::Stop;
-use sim_replay::bus::{Bus, Event, Inbox, PublisherOptions, Subscription, mailbox::Taken};
-use sim_replay::dataset::{self, Scenario};
 use sim_replay::stream::{Replay, StreamError, StreamOptions, StreamReport};
 use tests::bus::{PATIENCE, TestRouter, next_event, wait_for};
 use tests::scene;

@@ -5,14 +5,14 @@ use std::fs;
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 
+use dataset::frame::{Frame, Object};
+use dataset::pcd;
+use dataset::{self, LoadOptions};
 use nalgebra::Point3;
-use sim_replay::dataset::{self, LoadOptions};
-use sim_replay::frame::{Frame, Object};
-use sim_replay::pcd;
-use sim_replay::synth::lidar::LIDAR_MOUNT_M;
-use sim_replay::synth::radar::red_to_velocity;
-use sim_replay::synth::{Subset, Summary, SynthError, SynthOptions, Weather, generate};
-use sim_replay::town::TownSource;
+use simulator::generate::lidar::LIDAR_MOUNT_M;
+use simulator::generate::radar::red_to_velocity;
+use simulator::generate::{Subset, Summary, SynthError, SynthOptions, Weather, generate};
+use simulator::map::TownSource;
 
 fn v2vdet(seed: u64, out: &Path) -> SynthOptions {
     SynthOptions { frames: 3, agents: 2..=3, ..SynthOptions::new(Subset::V2vdet, seed, out.to_owned()) }

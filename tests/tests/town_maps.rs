@@ -1,8 +1,8 @@
 //! CARLA's own maps as towns: counts as in their README, connected lanes, free lanes.
 
-use sim_replay::town::lane_builder::lane_graph;
-use sim_replay::town::road::RoadNetwork;
-use sim_replay::town::{LaneGraph, TownSource, build, opendrive};
+use simulator::map::lane_builder::lane_graph;
+use simulator::map::road::RoadNetwork;
+use simulator::map::{LaneGraph, TownSource, build, opendrive};
 use tests::fixtures;
 
 /// How far one should be able to drive from a lane, metres.

@@ -3,14 +3,13 @@
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 
-use agent::pose_source::PoseSourceConfig;
+use ::training::train::{self, Accuracy, Observer, StepReport, Summary, TrainConfig, TrainError};
 use agent::rate::RateConfig;
-use agent::training::{Length, RunConfig};
-use ego_fuser::Method;
-use ego_fuser::evaluate::{EvaluateConfig, EvaluatedFrame, Evaluator};
-use ego_fuser::train::{self, Accuracy, Observer, StepReport, Summary, TrainConfig, TrainError};
+use ego_fuser_offline::evaluation::{EvaluateConfig, EvaluatedFrame, Evaluator};
+use fusion::Method;
+use localization::pose_source::PoseSourceConfig;
+use perception::train::{Length, RunConfig};
 use protocol::{CodecConfig, Dtype};
-use sim_replay::dataset;
 use tests::fixtures::data;
 use tests::training::{self, Ear, alone};
 

@@ -5,11 +5,10 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
 
-use deploy::metrics::Metrics;
-use deploy::status::RunStatus;
+use deploy::experiment::metrics::Metrics;
+use deploy::operate::status::RunStatus;
 use protocol::{DetectionsReport, DropReason};
-use sim_replay::dataset;
-use sim_replay::synth::{Subset, SynthOptions, generate};
+use simulator::generate::{Subset, SynthOptions, generate};
 use tests::fleet::{Up, alone};
 
 const FRAMES: usize = 6;

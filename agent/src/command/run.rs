@@ -5,16 +5,18 @@ use std::str::FromStr;
 
 use agent::agent::Agent;
 use agent::attack::{Attack, Lie};
-use agent::detector::Detector;
 use agent::node::{self, NodeOptions};
-use agent::pose_source::sanity::SanityConfig;
-use agent::pose_source::{EndToEndPoseConfig, NoiseMode, NoisyPoseConfig, PgcConfig, PoseSource, PoseSourceConfig};
 use agent::rate::RateConfig;
 use anyhow::Context;
+use bus::{BusArgs, STOP_LIMIT, log_to_stderr};
 use clap::ValueEnum;
+use localization::pose_source::motion_gate::SanityConfig;
+use localization::pose_source::{
+    EndToEndPoseConfig, NoiseMode, NoisyPoseConfig, PgcConfig, PoseSource, PoseSourceConfig,
+};
+use perception::detector::Detector;
 use protocol::{CavId, CodecConfig, ConfidenceGate, Dtype, Role, Smoothing, Stream};
-use sim_replay::bus::{BusArgs, STOP_LIMIT, log_to_stderr};
-use sim_replay::output;
+use support::output;
 
 use crate::cli::BadInput;
 

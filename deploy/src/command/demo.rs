@@ -4,14 +4,14 @@ use std::path::PathBuf;
 use std::time::Instant;
 
 use anyhow::Context;
-use deploy::report;
-use deploy::run_folder::name_of_now;
+use deploy::experiment::report;
+use deploy::operate::run_fleet::{RunResult, UpOptions, up};
+use deploy::operate::run_folder::name_of_now;
 use deploy::scenario::Scenario;
-use deploy::up::{RunResult, UpOptions, up};
-use ego_fuser::Method;
+use fusion::Method;
 use protocol::RunId;
-use sim_replay::output;
-use sim_replay::synth::{self, Subset, SynthError, SynthOptions};
+use simulator::generate::{self, Subset, SynthError, SynthOptions};
+use support::output;
 
 use super::{BadInput, Outcome, programs};
 
@@ -80,7 +80,7 @@ impl Arguments {
         let name = format!("v2vdet-{}-{}x{}", self.seed, self.agents, self.frames);
         let folder = scenes.join(&name);
         let options = self.options(folder.clone());
-        if synth::are_kept(&options).map_err(|error| BadInput(error.to_string()))? {
+        if generate::are_kept(&options).map_err(|error| BadInput(error.to_string()))? {
             return Ok(folder);
         }
         output::note(format_args!(
@@ -122,7 +122,7 @@ impl Arguments {
 /// Generates a scene with a progress bar.
 fn generate(options: &SynthOptions) -> anyhow::Result<()> {
     let bar = indicatif::ProgressBar::new(1000 * options.scenarios() as u64);
-    let generated = synth::generate_whole(options, &|thousandths| bar.set_position(thousandths));
+    let generated = generate::generate_whole(options, &|thousandths| bar.set_position(thousandths));
     bar.finish_and_clear();
     match generated {
         Ok(_) => Ok(()),

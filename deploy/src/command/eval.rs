@@ -4,26 +4,26 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use agent::attack::{AttackConfig, Lie};
-use agent::pose_source::sanity::SanityConfig;
-use agent::pose_source::{
-    CachedPoseConfig, EndToEndPoseConfig, NoiseMode, NoisyPoseConfig, PgcConfig, PoseSourceConfig,
-};
 use agent::rate::RateConfig;
 use clap::ValueEnum;
-use deploy::evaluation::{EvaluationOptions, Part, evaluate, frame_count};
-use deploy::report;
-use deploy::table::{self, TableObserver, TableSpec};
-use ego_fuser::Method;
-use ego_fuser::evaluate::stepped::{ComputeTimes, Crew, SteppedConfig};
-use ego_fuser::feature_store::KeptMaps;
+use dataset::IntensityScale;
+use dataset::evaluation_protocol::ProtocolConfig;
+use deploy::experiment::evaluation::{EvaluationOptions, Part, evaluate, frame_count};
+use deploy::experiment::report;
+use deploy::experiment::table::{self, TableObserver, TableSpec};
+use ego_fuser::misbehaviour::TrustConfig;
 use ego_fuser::pairing::PairingConfig;
-use ego_fuser::trust::TrustConfig;
+use ego_fuser_offline::evaluation::stepped::{ComputeTimes, Crew, SteppedConfig};
+use fusion::Method;
 use indicatif::{ProgressBar, ProgressStyle};
+use link::LinkConfig;
+use localization::pose_source::motion_gate::SanityConfig;
+use localization::pose_source::{
+    CachedPoseConfig, EndToEndPoseConfig, NoiseMode, NoisyPoseConfig, PgcConfig, PoseSourceConfig,
+};
 use protocol::{CodecConfig, ConfidenceGate, Dtype};
-use sim_replay::dataset::IntensityScale;
-use sim_replay::evaluation_protocol::ProtocolConfig;
-use sim_replay::link::LinkConfig;
-use sim_replay::output;
+use support::output;
+use training::feature_store::KeptMaps;
 
 use super::{BadInput, Outcome, left_out};
 

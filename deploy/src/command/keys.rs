@@ -3,9 +3,9 @@
 use std::path::PathBuf;
 use std::time::Duration;
 
-use deploy::keys::{KeyError, KeyPlan, make};
+use deploy::operate::keys::{KeyError, KeyPlan, make};
 use protocol::{CavId, Party, Role};
-use sim_replay::output;
+use support::output;
 
 use super::{BadInput, Outcome};
 

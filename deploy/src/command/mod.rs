@@ -12,17 +12,17 @@ mod view;
 use std::path::PathBuf;
 use std::process::ExitCode;
 
-use agent::process;
 use anyhow::Context;
-use deploy::evaluation::EvaluationError;
-use deploy::fleet::FleetError;
+use bus::BusError;
+use bus::malloc_settings;
+use dataset::LeftOut;
+use deploy::experiment::evaluation::EvaluationError;
+use deploy::experiment::sweep::SweepError;
+use deploy::experiment::table::TableError;
+use deploy::operate::fleet::FleetError;
+use deploy::operate::run_fleet::UpError;
 use deploy::scenario::ScenarioError;
-use deploy::sweep::SweepError;
-use deploy::table::TableError;
-use deploy::up::UpError;
-use sim_replay::bus::BusError;
-use sim_replay::dataset::LeftOut;
-use sim_replay::output;
+use support::output;
 
 /// What `v2vloc` can be asked to do.
 #[derive(Debug, clap::Subcommand)]
@@ -48,7 +48,7 @@ pub(crate) enum Command {
 impl Command {
     /// Does what was asked.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
-        process::ensure(&process::KEPT_MEMORY).context("this program again")?;
+        malloc_settings::ensure(&malloc_settings::KEPT_MEMORY).context("this program again")?;
         match self {
             Self::Demo(arguments) => arguments.run(),
             Self::Eval(arguments) => arguments.run(),

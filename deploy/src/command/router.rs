@@ -5,10 +5,10 @@ use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 use anyhow::Context;
+use bus::shutdown::Stop;
+use bus::{BusOptions, Credentials, Endpoint, Guard, ROUTER, Refusals, STOP_LIMIT, open};
 use protocol::{RunId, Runs};
-use sim_replay::bus::shutdown::Stop;
-use sim_replay::bus::{BusOptions, Credentials, Endpoint, Guard, ROUTER, Refusals, STOP_LIMIT, open};
-use sim_replay::output;
+use support::output;
 use zenoh::Wait;
 
 use super::Outcome;

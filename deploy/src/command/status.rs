@@ -2,8 +2,8 @@
 
 use std::path::PathBuf;
 
-use deploy::status::RunStatus;
-use sim_replay::output;
+use deploy::operate::status::RunStatus;
+use support::output;
 
 use super::{BadInput, Outcome};
 
@@ -22,7 +22,7 @@ pub(crate) struct Arguments {
 impl Arguments {
     /// Prints how the run goes.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
-        let bad_input = |error: deploy::status::StatusError| BadInput(error.to_string());
+        let bad_input = |error: deploy::operate::status::StatusError| BadInput(error.to_string());
         let folder = match self.run {
             Some(run) if run.is_dir() => run,
             Some(name) => self.runs.join(name),

@@ -2,8 +2,8 @@
 
 use std::path::PathBuf;
 
-use deploy::sweep::{Experiment, Sweep, SweepOptions};
-use sim_replay::output;
+use deploy::experiment::sweep::{Experiment, Sweep, SweepOptions};
+use support::output;
 
 use super::{Outcome, left_out};
 

@@ -2,12 +2,12 @@
 
 use std::path::PathBuf;
 
-use deploy::report;
+use deploy::experiment::report;
+use deploy::operate::run_fleet::{UpOptions, up};
 use deploy::scenario::Scenario;
-use deploy::up::{UpOptions, up};
-use ego_fuser::Method;
+use fusion::Method;
 use protocol::RunId;
-use sim_replay::output;
+use support::output;
 
 use super::{Outcome, programs};
 

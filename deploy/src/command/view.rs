@@ -5,12 +5,12 @@ use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use bus::shutdown::Stop;
+use bus::web::WebServer;
+use bus::{Bus, BusOptions, Credentials, Endpoint, Identity, process_id};
 use deploy::view::{LiveRun, Onlooker, RecordedRun, ViewError, serve_live, serve_recorded};
 use protocol::{CavId, Role, RunId};
-use sim_replay::bus::shutdown::Stop;
-use sim_replay::bus::{Bus, BusOptions, Credentials, Endpoint, Identity, process_id};
-use sim_replay::output;
-use sim_replay::web::WebServer;
+use support::output;
 
 use super::{BadInput, Outcome};
 

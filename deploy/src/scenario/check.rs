@@ -2,7 +2,7 @@
 
 use std::path::Path;
 
-use sim_replay::bus::Endpoint;
+use bus::Endpoint;
 
 use super::{Clock, Launch, Scenario, ScenarioError};
 

@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use sim_replay::link::PRESETS;
+use link::PRESETS;
 
 use super::{Scenario, ScenarioError};
 
@@ -86,7 +86,7 @@ fn first_line(text: &str) -> String {
 
 #[cfg(test)]
 mod tests {
-    use ego_fuser::Method;
+    use fusion::Method;
     use protocol::{CavId, Dtype};
 
     use super::super::{NoiseMode, PoseSource};

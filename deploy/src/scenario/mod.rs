@@ -12,18 +12,18 @@ use std::collections::BTreeMap;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 
-use ego_fuser::Method;
-use ego_fuser::evaluate::stepped::ComputeTimes;
+use bus::InboxLimits;
+use ego_fuser_offline::evaluation::stepped::ComputeTimes;
+use fusion::Method;
 use protocol::{CavId, RunId, Stream};
 use serde::{Deserialize, Serialize};
-use sim_replay::bus::InboxLimits;
 
 pub use error::ScenarioError;
 pub use vehicle::{AgentOverrides, AgentSettings, Launch, NoiseMode, PoseNoise, PoseSource, Publish};
 
-use sim_replay::evaluation_protocol::ProtocolConfig;
+use dataset::evaluation_protocol::ProtocolConfig;
 
-use crate::fingerprint::Provenance;
+use crate::experiment::fingerprint::Provenance;
 
 /// A deployment: which scene, which vehicles, which method, which network.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

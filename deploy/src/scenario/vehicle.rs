@@ -2,7 +2,8 @@
 
 use agent::attack::Lie;
 use agent::rate::RateConfig;
-use ego_fuser::{Exchange, Method};
+use fusion::Exchange;
+use fusion::Method;
 use protocol::{CodecConfig, Stream};
 use serde::{Deserialize, Serialize};
 

@@ -5,16 +5,16 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
+use bus::bounded_queue::Taken;
+use bus::{Bus, BusError, Overheard, Tap};
 use bytes::Bytes;
 use futures_util::{Stream as Pieces, stream};
 use protocol::{Kind, RunId, Selector, Stream, wire};
-use sim_replay::bus::mailbox::Taken;
-use sim_replay::bus::{Bus, BusError, Overheard, Tap};
 use tokio::sync::watch;
 use tokio::time::{sleep, timeout};
 
 use super::SceneFrame;
-use super::assembly::{Assembly, Seen};
+use super::frame_assembler::{Assembly, Seen};
 
 /// Messages of one key that may wait to be looked at.
 const PLACES: usize = 4;

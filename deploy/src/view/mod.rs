@@ -4,8 +4,10 @@
 //! ([`LiveRun`]), over a tap that nobody's books know of, or from a recorded one ([`RecordedRun`]); both put their messages
 //! through the same [`Assembly`], and a [`SceneFrame`] is what comes out. With the feature `rerun` moments are written for Rerun, too.
 
-mod assembly;
+pub mod demo;
+mod frame_assembler;
 mod live;
+pub mod picture;
 mod recorded;
 #[cfg(feature = "rerun")]
 mod rerun;
@@ -14,7 +16,7 @@ mod server;
 #[cfg(test)]
 mod tests;
 
-pub use assembly::{Assembly, Seen};
+pub use frame_assembler::{Assembly, Seen};
 pub use live::{LiveRun, Onlooker};
 pub use recorded::{RecordedRun, ViewError};
 #[cfg(feature = "rerun")]

@@ -5,12 +5,12 @@ use std::path::{Path, PathBuf};
 use std::sync::{Mutex, PoisonError};
 
 use protocol::{Detections, Limits, PoseEstimate, Stream, Topic, Truth, wire};
+use recording::{Entry, Recording, RecordingError};
 use serde::Serialize;
-use sim_replay::recording::{Entry, Recording, RecordingError};
 
-use super::assembly::{Assembly, Seen};
+use super::frame_assembler::{Assembly, Seen};
 use super::scene_frame::SceneFrame;
-use crate::run_folder::{RECORDING, SWEEP_LOG};
+use crate::operate::run_folder::{RECORDING, SWEEP_LOG};
 
 /// Why a run cannot be shown.
 #[derive(Debug, thiserror::Error)]
@@ -201,7 +201,7 @@ impl RecordedRun {
 
 fn ego_error_m(pose: &PoseEstimate, truth: &Truth, result: &Detections) -> Option<f64> {
     let agent = truth.agents.iter().find(|agent| agent.cav == result.ego)?;
-    Some(agent::pose_error::PoseError::between(pose.world_from_cav()?, &agent.world_from_lidar).distance_m)
+    Some(localization::pose_error::PoseError::between(pose.world_from_cav()?, &agent.world_from_lidar).distance_m)
 }
 
 fn is_result(topic: &Topic) -> bool {

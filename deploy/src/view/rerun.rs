@@ -27,7 +27,7 @@ pub enum RerunError {
     Log(#[from] RecordingStreamError),
     /// The recording has changed.
     #[error(transparent)]
-    Recording(#[from] sim_replay::recording::RecordingError),
+    Recording(#[from] recording::RecordingError),
     /// What was written has not arrived.
     #[error("not all that Rerun was told has arrived: {0}")]
     Flush(#[from] re_sdk::sink::SinkFlushError),

@@ -5,10 +5,10 @@ use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
 
+use bus::web::{Answer, Request, WebServer};
 use bytes::Bytes;
 use futures_util::{StreamExt, stream};
 use serde_json::json;
-use sim_replay::web::{Answer, Request, WebServer};
 
 use super::{LiveRun, RecordedRun};
 

@@ -8,15 +8,15 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
+use bus::web::fetch;
+use bus::{Bus, BusOptions, Endpoint, Identity, PublisherOptions};
 use protocol::message::{AgentTruth, FusedNeighbour, HeardNeighbour, StageTiming};
 use protocol::{
     Box3d, CavId, Detection, Detections, Key, Lidar, PointCloud, Pose, PoseEstimate, RunId, Stamp, Stream, Topic,
     TrueObject, Truth, wire,
 };
+use recording::{RecordingOptions, RecordingWriter};
 use serde_json::Value;
-use sim_replay::bus::{Bus, BusOptions, Endpoint, Identity, PublisherOptions};
-use sim_replay::recording::{RecordingOptions, RecordingWriter};
-use sim_replay::web::fetch;
 
 use super::*;
 
@@ -104,7 +104,7 @@ fn messages(tick: u64, now: u64, sweeps: Stream) -> Vec<(Topic, Vec<u8>)> {
 }
 
 fn record(folder: &Path) -> RecordedRun {
-    let file = folder.join(crate::run_folder::RECORDING);
+    let file = folder.join(crate::operate::run_folder::RECORDING);
     let mut writer = RecordingWriter::create(&file, RecordingOptions::default()).unwrap();
     let run = RunId::new("test").unwrap();
     for tick in 0..TICKS {
@@ -114,7 +114,7 @@ fn record(folder: &Path) -> RecordedRun {
         }
     }
     writer.finish().unwrap();
-    let mut sweeps = agent::sweep_log::SweepLog::open(&folder.join(crate::run_folder::SWEEP_LOG)).unwrap();
+    let mut sweeps = agent::sweep_log::SweepLog::open(&folder.join(crate::operate::run_folder::SWEEP_LOG)).unwrap();
     (0..TICKS).for_each(|tick| sweeps.note(100_000_000 * (tick + 1), 1_000_000_000 * tick + 3_000_000).unwrap());
     RecordedRun::open(folder).unwrap()
 }
@@ -275,7 +275,7 @@ fn join(options: &BusOptions, name: &str) -> Bus {
 fn publish(bus: Bus, ending: &AtomicBool) {
     let mut publishers = std::collections::BTreeMap::new();
     for tick in 0.. {
-        for (topic, payload) in messages(tick, sim_replay::bus::unix_nanos(), Stream::Preview) {
+        for (topic, payload) in messages(tick, bus::unix_nanos(), Stream::Preview) {
             if matches!(topic, Topic::Stream { stream: Stream::Detections, .. }) {
                 // As long as perception takes: sweeps are far ahead of what comes of them.
                 std::thread::sleep(Duration::from_millis(50));

@@ -1,8 +1,8 @@
 //! `ego-fuser methods`: the registry as a table or JSON.
 
 use anyhow::Result;
-use ego_fuser::Method;
-use sim_replay::output;
+use fusion::Method;
+use support::output;
 
 /// Lists the collaboration methods.
 #[derive(Debug, clap::Args)]

@@ -5,14 +5,14 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use anyhow::Context;
-use ego_fuser::Method;
+use bus::{BusArgs, PeerArgs, STOP_LIMIT, log_to_stderr};
 use ego_fuser::ego::Ego;
+use ego_fuser::misbehaviour::TrustConfig;
 use ego_fuser::node::{self, NodeOptions};
 use ego_fuser::pairing::PairingConfig;
-use ego_fuser::trust::TrustConfig;
+use fusion::Method;
 use protocol::{CavId, Role};
-use sim_replay::bus::{BusArgs, PeerArgs, STOP_LIMIT, log_to_stderr};
-use sim_replay::output;
+use support::output;
 
 use super::BadInput;
 

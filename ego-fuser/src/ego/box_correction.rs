@@ -3,14 +3,14 @@
 //! What a vehicle detects alone is its map under the head, and the ego has both: it finds in a neighbour's map what the
 //! neighbour itself would have sent as boxes, without another message to wait for.
 
-use agent::detector::{Detector, DetectorError};
-use agent::postprocess::{AgentBoxes, PostprocessConfig, postprocess};
 use nalgebra::Isometry3;
+use perception::boxes::postprocess::{AgentBoxes, PostprocessConfig, postprocess};
+use perception::detector::{Detector, DetectorError};
 use protocol::Detection;
 use tch::Tensor;
 
-use crate::alignment::pose_graph::{Observer, PoseGraphConfig, correct};
-use crate::fusion::ViewFacts;
+use fusion::ViewFacts;
+use fusion::pose_graph::{Observer, PoseGraphConfig, correct};
 
 /// Boxes at or below this score are no landmarks: the reference's threshold for boxes that poses are corrected by. It has
 /// nothing to do with which boxes are judged.

@@ -1,13 +1,13 @@
 //! Why the ego has no result.
 
-use agent::detector::DetectorError;
-use agent::weights::WeightsError;
+use perception::detector::DetectorError;
+use perception::weights::WeightsError;
 use protocol::BevGrid;
 use tch::TchError;
 
-use crate::fusion::StageError;
-use crate::method::{Exchange, Method, UnknownMethod};
-use crate::warp::WarpError;
+use fusion::StageError;
+use fusion::method::{Exchange, Method, UnknownMethod};
+use fusion::warp::WarpError;
 
 /// Why the ego has no result at all. What is wrong with a neighbour never leads here.
 #[derive(Debug, thiserror::Error)]

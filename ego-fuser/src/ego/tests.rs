@@ -1,13 +1,13 @@
 use agent::agent::{Agent, AgentInput};
-use agent::model_config::DetectorConfig;
-use agent::point_pillars::PointPillars;
-use agent::pose_source::RecordedPose;
+use localization::pose_source::RecordedPose;
+use perception::model_config::DetectorConfig;
+use perception::pillars::point_pillars::PointPillars;
 use protocol::{CavId, CodecConfig, ConfidenceGate, Limits, NoPoseReason, PointCloud, PoseEstimate, encode_features};
 use tch::Device;
 use tch::nn::VarStore;
 
 use super::*;
-use crate::average_precision::{Ordering, Scorer};
+use training::average_precision::{Ordering, Scorer};
 
 /// Capture time of all sweeps but those that say otherwise.
 const NOW: u64 = 5_000_000_000;

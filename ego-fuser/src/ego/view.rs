@@ -2,7 +2,7 @@
 
 use protocol::{CavId, DecodedFeatures, Detection, PointCloud, PoseEstimate};
 
-use crate::method::Exchange;
+use fusion::method::Exchange;
 
 /// What one vehicle sees, as it arrived.
 #[derive(Debug, Clone, PartialEq)]

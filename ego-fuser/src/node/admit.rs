@@ -2,9 +2,9 @@
 
 use std::time::{Duration, Instant};
 
+use bus::{Arrival, unix_nanos};
 use protocol::message::{Bev, Boxes, Descriptor, Points};
 use protocol::{CavId, DropReason, HEADER_LEN, PoseEstimate, Stamp, Stream, wire};
-use sim_replay::bus::{Arrival, unix_nanos};
 
 use super::{Node, OwnFrame, Received};
 use crate::ego::{Content, View};

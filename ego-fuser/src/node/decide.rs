@@ -2,15 +2,15 @@
 
 use std::time::Duration;
 
+use bus::unix_nanos;
 use protocol::message::{DetectionsReport, FusedNeighbour, HeardNeighbour, SkippedNeighbour, StageTiming};
 use protocol::{Body, CavId, Detections, DropReason, Encoded, wire};
-use sim_replay::bus::unix_nanos;
 
 use super::{Node, OwnFrame};
 use crate::ego::{EgoOutput, Skipped, View};
+use crate::misbehaviour::{Belief, heard};
 use crate::neighbourhood::Neighbourhood;
 use crate::pairing::Paired;
-use crate::trust::{Belief, heard};
 
 /// The neighbours' messages for a frame, and who has none.
 #[derive(Default)]

@@ -11,16 +11,16 @@ use std::collections::{BTreeSet, VecDeque};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
+use bus::bounded_queue::Taken;
+use bus::shutdown::Stop;
+use bus::{Bus, BusError, Event, Inbox, InboxLimits, Publisher, PublisherOptions, Subscription};
 use protocol::{CavId, DropReason, Limits, Role, Stream, Topic};
-use sim_replay::bus::mailbox::Taken;
-use sim_replay::bus::shutdown::Stop;
-use sim_replay::bus::{Bus, BusError, Event, Inbox, InboxLimits, Publisher, PublisherOptions, Subscription};
 
 use crate::ego::{Ego, View, own_content};
-use crate::method::{Exchange, Method};
 use crate::neighbourhood::{Neighbourhood, heard_on, sender_of};
 use crate::pairing::{Pairing, PairingConfig};
 use crate::peer_models::PeerModels;
+use fusion::method::{Exchange, Method};
 
 /// Messages of one sender that may wait while a frame is fused. An ego that needs longer than its frames' period answers
 /// frames that have waited this long, so no more than what a short pause costs.

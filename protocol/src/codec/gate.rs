@@ -2,7 +2,8 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::{BevGrid, WireError};
+use crate::BevGrid;
+use crate::WireError;
 
 /// Widest kernel of the smoothing, cells.
 const MAX_KERNEL: u32 = 63;

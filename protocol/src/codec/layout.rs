@@ -3,7 +3,9 @@
 use std::ops::Range;
 
 use super::{Codec, Dtype, Selection};
-use crate::{BevGrid, Limits, WireError};
+use crate::BevGrid;
+use crate::Limits;
+use crate::WireError;
 
 /// Where the parts of an unpacked body lie, and how many cells it has.
 pub(super) struct Layout {

@@ -6,8 +6,10 @@
 use serde::{Deserialize, Serialize};
 
 use super::{Codec, CodecConfig, Dtype, EncodedFeatures, Layout, Packing, Selection, encode_features, selection};
-use crate::names::named;
-use crate::{BevFeatures, Limits, WireError};
+use crate::BevFeatures;
+use crate::Limits;
+use crate::WireError;
+use crate::string_enum::named;
 
 /// Bytes of a message with a map that are kept free for header and metadata.
 pub const HEAD_BYTES: u64 = 256;
@@ -167,8 +169,13 @@ mod tests {
     use proptest::prelude::*;
 
     use super::*;
+    use crate::BevGrid;
+    use crate::CavId;
+    use crate::ConfidenceGate;
+    use crate::PoseEstimate;
+    use crate::Stamp;
     use crate::message::Bev;
-    use crate::{BevGrid, CavId, ConfidenceGate, PoseEstimate, Stamp, wire};
+    use crate::wire;
 
     const GRID: BevGrid = BevGrid { x_min_m: -8.0, y_min_m: -6.0, cell_m: 1.0, width: 16, height: 12 };
 

@@ -3,7 +3,15 @@
 use serde::{Deserialize, Serialize};
 
 use super::{Payload, PoseEstimate, private};
-use crate::{BevGrid, Body, BodyShape, Codec, EncodedFeatures, Kind, Limits, RateChoice, WireError};
+use crate::BevGrid;
+use crate::Body;
+use crate::BodyShape;
+use crate::Codec;
+use crate::EncodedFeatures;
+use crate::Kind;
+use crate::Limits;
+use crate::RateChoice;
+use crate::WireError;
 
 /// A BEV feature map: agent to ego, for intermediate fusion.
 ///

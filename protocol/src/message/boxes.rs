@@ -3,7 +3,9 @@
 use serde::{Deserialize, Serialize};
 
 use super::{PoseEstimate, check_detections, metadata_only};
-use crate::{Detection, Limits, WireError};
+use crate::Detection;
+use crate::Limits;
+use crate::WireError;
 
 /// Detections of one agent: agent to ego, for late fusion.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

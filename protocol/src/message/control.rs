@@ -3,7 +3,11 @@
 use serde::{Deserialize, Serialize};
 
 use super::{check_count, check_within, metadata_only};
-use crate::{Limits, ProcessId, Topic, Verb, WireError};
+use crate::Limits;
+use crate::ProcessId;
+use crate::Topic;
+use crate::Verb;
+use crate::WireError;
 
 /// One request or notice; [`Control::verb`] names the key it goes to.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -6,8 +6,12 @@ use std::str::FromStr;
 use serde::{Deserialize, Serialize};
 
 use super::{check_count, metadata_only};
-use crate::names::written_as_text;
-use crate::{BevGrid, Dtype, Limits, Stream, WireError};
+use crate::BevGrid;
+use crate::Dtype;
+use crate::Limits;
+use crate::Stream;
+use crate::WireError;
+use crate::string_enum::written_as_text;
 
 /// What an agent is and sends: agent to ego, once it is ready and to every late joiner.
 ///

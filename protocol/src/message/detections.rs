@@ -5,7 +5,13 @@ use serde::{Deserialize, Serialize};
 use super::{
     PoseEstimate, StageTiming, check_count, check_detections, check_name, check_nanos, check_within, metadata_only,
 };
-use crate::{CavId, Detection, Doubt, DropReason, Limits, Stamp, WireError};
+use crate::CavId;
+use crate::Detection;
+use crate::Doubt;
+use crate::DropReason;
+use crate::Limits;
+use crate::Stamp;
+use crate::WireError;
 
 /// The result of one ego frame: ego-fuser to anyone, also as JSON.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

@@ -3,7 +3,9 @@
 use serde::{Deserialize, Serialize};
 
 use super::{check_pose, check_within, metadata_only};
-use crate::{Limits, Pose, WireError};
+use crate::Limits;
+use crate::Pose;
+use crate::WireError;
 
 /// A pose that came with the recording: replay to that vehicle's agent.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]

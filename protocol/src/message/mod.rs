@@ -18,7 +18,12 @@ mod truth;
 use serde::Serialize;
 use serde::de::DeserializeOwned;
 
-use crate::{Body, BodyShape, Kind, Limits, Pose, WireError};
+use crate::Body;
+use crate::BodyShape;
+use crate::Kind;
+use crate::Limits;
+use crate::Pose;
+use crate::WireError;
 
 pub use bev::{Bev, BevMetadata};
 pub use boxes::Boxes;

@@ -3,7 +3,9 @@
 use serde::{Deserialize, Serialize};
 
 use super::{check_pose, check_within, metadata_only};
-use crate::{Limits, Pose, WireError};
+use crate::Limits;
+use crate::Pose;
+use crate::WireError;
 
 /// An agent's own pose, or why it has none: agent to ego, alone as soon as it is known and again inside everything
 /// that needs it.

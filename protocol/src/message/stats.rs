@@ -3,7 +3,10 @@
 use serde::{Deserialize, Serialize};
 
 use super::{check_count, check_name, check_nanos, check_within, metadata_only};
-use crate::{Ledger, Limits, ProcessId, WireError};
+use crate::Ledger;
+use crate::Limits;
+use crate::ProcessId;
+use crate::WireError;
 
 /// A process's books: any process to the operator, regularly and at the end.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]

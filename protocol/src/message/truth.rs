@@ -3,7 +3,11 @@
 use serde::{Deserialize, Serialize};
 
 use super::{check_box_from, check_count, check_name, check_pose, check_within, metadata_only};
-use crate::{Box3d, CavId, Limits, Pose, WireError};
+use crate::Box3d;
+use crate::CavId;
+use crate::Limits;
+use crate::Pose;
+use crate::WireError;
 
 /// The truth of one tick: replay to scorer, on a key of its own, so that no pipeline can lean on it by accident.
 ///
@@ -75,7 +79,8 @@ metadata_only!(Truth, Truth);
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::{Stamp, wire};
+    use crate::Stamp;
+    use crate::wire;
 
     fn encoded(size_m: [f64; 3]) -> Result<Vec<u8>, WireError> {
         let cav = CavId::new("4279").unwrap();

@@ -3,10 +3,10 @@
 use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 
+use dataset::{self, IntensityScale, OpenOptions};
 use indicatif::ProgressBar;
-use sim_replay::dataset::{self, IntensityScale, OpenOptions};
-use sim_replay::output;
-use sim_replay::synth::{ConvertOptions, Converted, SceneLayout, SynthError, convert};
+use simulator::generate::{ConvertOptions, Converted, SceneLayout, SynthError, convert};
+use support::output;
 
 use crate::cli::Outcome;
 

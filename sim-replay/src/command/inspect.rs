@@ -3,12 +3,12 @@
 use std::fmt::Display;
 use std::path::{Path, PathBuf};
 
+use dataset::evaluation_protocol::ProtocolConfig;
+use dataset::{IntensityScale, OpenOptions, layouts_text};
 use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
-use sim_replay::dataset::{IntensityScale, OpenOptions, layouts_text};
-use sim_replay::evaluation_protocol::ProtocolConfig;
 use sim_replay::inspect::{Report, inspect, inspect_map};
-use sim_replay::output;
+use support::output;
 
 use crate::cli::Outcome;
 

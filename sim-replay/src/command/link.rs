@@ -1,11 +1,11 @@
 //! `sim-replay link`: the emulated air between the agents of a run and an ego.
 
 use anyhow::Context;
+use bus::{BusArgs, PeerArgs, STOP_LIMIT, log_to_stderr};
+use link::{Air, PRESETS};
 use protocol::{CavId, Role, Stream};
-use sim_replay::bus::{BusArgs, PeerArgs, STOP_LIMIT, log_to_stderr};
-use sim_replay::link::node::{self, LinkReport, NodeOptions};
-use sim_replay::link::{Air, PRESETS};
-use sim_replay::output;
+use sim_replay::link_node::{self, LinkReport, NodeOptions};
+use support::output;
 
 use crate::cli::Outcome;
 
@@ -58,7 +58,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
         inbox: args.peers.limits(),
         ..NodeOptions::new(args.ego.clone(), args.streams.clone())
     };
-    let report = node::run(&bus, air, &options, &stop)?;
+    let report = link_node::run(&bus, air, &options, &stop)?;
     print(&report, args.json)?;
     if let Err(overdue) = bus.leave(STOP_LIMIT) {
         tracing::warn!("{overdue}");

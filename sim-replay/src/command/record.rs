@@ -3,10 +3,11 @@
 use std::path::PathBuf;
 
 use anyhow::Context;
+use bus::{BusArgs, STOP_LIMIT, log_to_stderr};
 use protocol::{CavId, Role, Stream};
-use sim_replay::bus::{BusArgs, STOP_LIMIT, log_to_stderr};
-use sim_replay::output;
-use sim_replay::recording::{self, RecordReport, RecorderError, RecorderOptions, RecordingOptions};
+use recording::RecordingOptions;
+use sim_replay::recorder::{self, RecordReport, RecorderError, RecorderOptions};
+use support::output;
 
 use crate::cli::Outcome;
 
@@ -54,7 +55,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
             tracing::error!("the failure cannot be printed");
         }
     };
-    let report = match recording::record(&bus, &options, &stop, &mut on_failure) {
+    let report = match recorder::record(&bus, &options, &stop, &mut on_failure) {
         Ok(report) => report,
         Err(RecorderError::Recording(error)) => {
             output::note(format_args!("error: {error}"));

@@ -2,9 +2,9 @@
 
 use std::path::PathBuf;
 
-use sim_replay::bus::log_to_stderr;
-use sim_replay::output;
-use sim_replay::recording::{RecordingOptions, recover};
+use bus::log_to_stderr;
+use recording::{RecordingOptions, recover};
+use support::output;
 
 use crate::cli::Outcome;
 

@@ -5,12 +5,12 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use anyhow::Context;
+use bus::{BusArgs, Route, STOP_LIMIT, log_to_stderr};
+use dataset::{self, IntensityScale, LoadOptions, OpenOptions, Scenario};
+use link::{CapacityConfig, DelayLaw, LinkConfig, LossLaw};
 use protocol::{CavId, DropReason, Role};
-use sim_replay::bus::{BusArgs, Route, STOP_LIMIT, log_to_stderr};
-use sim_replay::dataset::{self, IntensityScale, LoadOptions, OpenOptions, Scenario};
-use sim_replay::link::{CapacityConfig, DelayLaw, LinkConfig, LossLaw};
-use sim_replay::output;
 use sim_replay::stream::{AirReport, Replay, StreamError, StreamOptions, StreamReport};
+use support::output;
 
 use crate::cli::Outcome;
 

@@ -7,9 +7,9 @@ use std::path::PathBuf;
 use std::time::Instant;
 
 use indicatif::{ProgressBar, ProgressStyle};
-use sim_replay::output;
-use sim_replay::synth::{self, SceneLayout, Subset, Summary, SynthError, SynthOptions, Weather};
-use sim_replay::town::TownSource;
+use simulator::generate::{self, SceneLayout, Subset, Summary, SynthError, SynthOptions, Weather};
+use simulator::map::TownSource;
+use support::output;
 
 use crate::cli::Outcome;
 
@@ -79,7 +79,7 @@ pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
     let options = options(args);
     let bar = progress_bar(options.scenarios());
     let start = Instant::now();
-    let result = synth::generate(&options, &|thousandths| bar.set_position(thousandths));
+    let result = generate::generate(&options, &|thousandths| bar.set_position(thousandths));
     bar.finish_and_clear();
     match result {
         Ok(summary) => {

@@ -5,7 +5,7 @@ use std::path::Path;
 
 use serde::Serialize;
 
-use crate::town::{Finding, Map, TownError, read_map};
+use simulator::map::{Finding, Map, TownError, read_map};
 
 /// What an OpenDRIVE map holds. Serializes to the JSON of `sim-replay inspect --json MAP.xodr`, prints as its table.
 #[derive(Debug, Clone, PartialEq, Serialize)]

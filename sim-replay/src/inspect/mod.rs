@@ -16,9 +16,9 @@ pub use map::{MapReport, inspect_map};
 pub use survey::inspect;
 pub use sweeps::SweepReport;
 
-pub use crate::dataset::Problem;
-use crate::dataset::{Layout, MissingFrame};
-use crate::evaluation_protocol::EvaluationProtocol;
+pub use dataset::Problem;
+use dataset::evaluation_protocol::EvaluationProtocol;
+use dataset::{Layout, MissingFrame};
 
 /// The findings. Serializes to the JSON of `sim-replay inspect --json`, prints as its table.
 #[derive(Debug, Clone, Serialize)]

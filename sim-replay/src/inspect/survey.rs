@@ -11,11 +11,11 @@ use super::boxes;
 use super::cells::Cells;
 use super::sweeps::{self, SweepFindings};
 use super::{AgentReport, Problem, Report, ScenarioReport, Summary, TickReport};
-use crate::dataset::{self, OpenOptions, ReadError, Scenario};
-use crate::evaluation_protocol::ProtocolConfig;
-use crate::frame::{Frame, Object};
-use crate::ground_truth::{self, GroundTruthRule};
-use crate::pcd::{PcdCloud, Place};
+use dataset::evaluation_protocol::ProtocolConfig;
+use dataset::frame::{Frame, Object};
+use dataset::ground_truth::{self, GroundTruthRule};
+use dataset::pcd::{PcdCloud, Place};
+use dataset::{self, OpenOptions, ReadError, Scenario};
 
 /// Largest share of points that are not finite: with more of them a sweep is lost, not full of gaps.
 const MOST_DROPPED: f64 = 0.9;
@@ -310,7 +310,7 @@ mod tests {
     use std::path::PathBuf;
 
     use super::*;
-    use crate::pcd::{Encoding, IntensityField, encode};
+    use dataset::pcd::{Encoding, IntensityField, encode};
 
     const YAML: &str = "lidar_pose: [0, 0, 2, 0, 0, 0]\nvehicles:\n  7: {location: [10, 0, 0], center: [0, 0, 0.7], \
                         angle: [0, 0, 0], extent: [2, 1, 0.7]}\n";

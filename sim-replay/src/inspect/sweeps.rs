@@ -6,8 +6,8 @@ use protocol::CavId;
 use serde::Serialize;
 
 use super::Problem;
-use crate::dataset::{IntensityScale, Plausibility};
-use crate::pcd::{IntensityKind, IntensityOrigin, PcdCloud};
+use dataset::pcd::{IntensityKind, IntensityOrigin, PcdCloud};
+use dataset::{IntensityScale, Plausibility};
 
 /// Points of a sweep that its median is taken of at most.
 const MEDIAN_OF: usize = 4096;

@@ -6,7 +6,7 @@ use std::fmt;
 use protocol::Handedness;
 
 use super::{AgentReport, Report, ScenarioReport, Summary, TickReport};
-use crate::dataset::Layout;
+use dataset::Layout;
 
 /// Problems that are printed before the rest is only counted.
 const MAX_PROBLEMS: usize = 50;

@@ -7,19 +7,19 @@
 //! - [`Place`]: how far it is, for one that falls and is started again.
 //! - [`Replay`]: the loop over them, steered over `control/*`.
 
-mod bookmark;
+mod checkpoint;
 mod clock;
-mod outlet;
 mod read_ahead;
 mod replay;
 mod report;
 mod schedule;
-mod sensor_air;
+mod sensor_link;
+mod sensor_publisher;
 
-pub use bookmark::{BookmarkError, Place};
+pub use checkpoint::{BookmarkError, Place};
 pub use clock::ReplayClock;
 pub use read_ahead::{ReadAhead, TickFrames};
 pub use replay::{Replay, StreamError, StreamOptions};
 pub use report::{Lateness, StreamReport, Unreadable};
 pub use schedule::{Planned, Position, Schedule};
-pub use sensor_air::AirReport;
+pub use sensor_link::AirReport;

@@ -5,8 +5,8 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::Duration;
 
-use crate::dataset::{LoadOptions, ReadError, Scenario};
-use crate::frame::Frame;
+use dataset::frame::Frame;
+use dataset::{LoadOptions, ReadError, Scenario};
 
 /// The frames of one tick, one for each agent that was asked for, in that order.
 pub type TickFrames = Vec<Result<Frame, ReadError>>;

@@ -8,17 +8,17 @@ use std::time::{Duration, Instant};
 use protocol::{CavId, Control, Limits, Role, Stream, Topic, Truth, Verb};
 
 use super::ReplayClock;
-use super::bookmark::{Bookmark, BookmarkError, Place};
-use super::outlet::{Outlet, truth_of};
+use super::checkpoint::{Bookmark, BookmarkError, Place};
 use super::read_ahead::{ReadAhead, TickFrames};
 use super::report::StreamReport;
 use super::schedule::{Planned, Schedule};
-use super::sensor_air::{Held, SensorAir};
-use crate::bus::mailbox::Taken;
-use crate::bus::shutdown::Stop;
-use crate::bus::{Barrier, Bus, BusError, Event, Inbox, NotReady, Presence, Route, Subscription, process_id};
-use crate::dataset::{LoadOptions, Scenario};
-use crate::link::{LinkConfig, LinkError};
+use super::sensor_link::{Held, SensorAir};
+use super::sensor_publisher::{Outlet, truth_of};
+use bus::bounded_queue::Taken;
+use bus::shutdown::Stop;
+use bus::{Barrier, Bus, BusError, Event, Inbox, NotReady, Presence, Route, Subscription, process_id};
+use dataset::{LoadOptions, Scenario};
+use link::{LinkConfig, LinkError};
 
 /// Ticks read ahead of the clock.
 const READ_AHEAD: usize = 4;

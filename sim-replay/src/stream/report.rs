@@ -6,9 +6,9 @@ use std::time::Duration;
 use protocol::{DropReason, Ledger, TopicCount};
 use serde::Serialize;
 
-use crate::frame::Frame;
+use dataset::frame::Frame;
 
-use super::sensor_air::AirReport;
+use super::sensor_link::AirReport;
 
 /// Publishing later than this counts as late.
 const LATE: Duration = Duration::from_millis(5);

@@ -4,7 +4,7 @@ use std::sync::Arc;
 
 use serde::{Deserialize, Serialize};
 
-use crate::dataset::Tick;
+use dataset::Tick;
 
 /// Between two ticks where a scene has only one, nanoseconds.
 const SINGLE_TICK_PERIOD: u64 = 100_000_000;

@@ -8,16 +8,16 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail};
+use bus::bounded_queue::Taken;
+use bus::{
+    Bus, BusOptions, Credentials, Endpoint, Event, Guard, Identity, InboxLimits, PublisherOptions, open, unix_nanos,
+};
 use protocol::message::Bev;
 use protocol::{
     Account, BevFeatures, BevGrid, CodecConfig, DropReason, Limits, Party, Pose, PoseEstimate, RunId, Runs, Stamp,
     Topic, encode_features, wire,
 };
 use serde::{Deserialize, Serialize};
-use sim_replay::bus::mailbox::Taken;
-use sim_replay::bus::{
-    Bus, BusOptions, Credentials, Endpoint, Event, Guard, Identity, InboxLimits, PublisherOptions, open, unix_nanos,
-};
 use tests::bus::free_port;
 use tests::machine;
 use zenoh::Wait;

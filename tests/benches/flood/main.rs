@@ -22,7 +22,7 @@ use std::process::ExitCode;
 use std::time::Duration;
 
 use anyhow::{Context, Result, bail};
-use deploy::keys::{KeyPlan, make};
+use deploy::operate::keys::{KeyPlan, make};
 use tests::machine;
 
 use fleet::{FLOODING, Measured, Setting};

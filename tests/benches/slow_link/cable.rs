@@ -10,7 +10,7 @@ use std::thread;
 use std::time::Duration;
 
 use anyhow::{Context, Result, bail};
-use sim_replay::bus::{BusOptions, Endpoint, open};
+use bus::{BusOptions, Endpoint, open};
 use zenoh::{Config, Session, Wait};
 
 use super::ends::{self, Seen};

@@ -7,16 +7,16 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use anyhow::Result;
+use bus::shutdown::Stop;
+use bus::{Barrier, Bus, BusOptions, Endpoint, Event, Identity, PublisherOptions, Route, open, unix_nanos};
+use link::{Air, CapacityConfig, LinkConfig, QueueConfig};
 use protocol::message::Bev;
 use protocol::{
     BevFeatures, BevGrid, CavId, CodecConfig, Ledger, Limits, Pose, PoseEstimate, ProcessId, Role, RunId, Stream,
     Topic, encode_features,
 };
 use serde::{Deserialize, Serialize};
-use sim_replay::bus::shutdown::Stop;
-use sim_replay::bus::{Barrier, Bus, BusOptions, Endpoint, Event, Identity, PublisherOptions, Route, open, unix_nanos};
-use sim_replay::link::node::{self, NodeOptions};
-use sim_replay::link::{Air, CapacityConfig, LinkConfig, QueueConfig};
+use sim_replay::link_node::{self, NodeOptions};
 use tests::bus::{PATIENCE, free_port};
 use zenoh::bytes::ZBytes;
 use zenoh::{Session, Wait};
@@ -86,7 +86,7 @@ fn between(cell: &Cell, router: &Endpoint) -> Result<Seen> {
     let received = Topic::Received { ego: cav("9"), cav: cav("7"), stream: Stream::Bev };
     let stop = Stop::new();
     let (offers, arrivals) = thread::scope(|scope| {
-        let carrying = scope.spawn(|| node::run(&link, air, &options, &stop));
+        let carrying = scope.spawn(|| link_node::run(&link, air, &options, &stop));
         let receiving = scope.spawn(|| receive(&ego, &received));
         let offers = send(&agent, cell, &[(sent_topic(), "link-9"), (received.clone(), "ego-9")]);
         // What is under way now is booked as such; nobody waits for it.
@@ -139,7 +139,7 @@ pub(crate) fn receive(ego: &Bus, topic: &Topic) -> Result<Vec<Arrived>> {
     let inbox = ego.inbox(64, 1);
     let _subscription = ego.subscribe(topic.clone(), &inbox)?;
     let mut arrivals = Vec::new();
-    while let sim_replay::bus::mailbox::Taken::Item(_, Event::Message(arrival)) = inbox.take(None) {
+    while let bus::bounded_queue::Taken::Item(_, Event::Message(arrival)) = inbox.take(None) {
         if inbox.decode::<Bev>(&arrival, &Limits::DEFAULT).is_some() {
             ego.books().received(topic);
             let capture_nanos = arrival.header.stamp.capture_nanos;

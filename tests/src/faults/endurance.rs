@@ -4,8 +4,8 @@ use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
-use deploy::health::{State, Usage};
-use deploy::status::RunStatus;
+use deploy::operate::health::{State, Usage};
+use deploy::operate::status::RunStatus;
 
 use super::{Results, VEHICLES, unix_ms};
 use crate::fleet::{Up, signal, write_weights};

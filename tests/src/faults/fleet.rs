@@ -7,9 +7,9 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use deploy::health::Usage;
+use bus::{BusError, BusOptions, Endpoint, open};
+use deploy::operate::health::Usage;
 use protocol::HEADER_LEN;
-use sim_replay::bus::{BusError, BusOptions, Endpoint, open};
 use zenoh::{Session, Wait};
 
 use super::{Fault, Findings, Kind, Proxy, Results, Target, VEHICLES, unix_ms, write_scenario};
@@ -228,7 +228,7 @@ impl FaultyFleet {
         assert!(matches!(status.code(), Some(0 | 3)), "{status}");
         let text = fs::read_to_string(self.up.folder.join("ledger.json")).expect("a ledger");
         let ledger: serde_json::Value = serde_json::from_str(&text).expect("JSON");
-        let status = deploy::status::RunStatus::read(&self.up.folder).expect("a status");
+        let status = deploy::operate::status::RunStatus::read(&self.up.folder).expect("a status");
         let growth_of = |field: fn(&Usage) -> Option<u64>| {
             let growth = |(name, _, usage): &(String, Instant, Option<[Usage; 2]>)| {
                 let [first, last] = (*usage)?;

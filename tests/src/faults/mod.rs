@@ -9,7 +9,7 @@ mod proxy;
 use std::fmt;
 use std::time::Duration;
 
-use sim_replay::random::derive_seed;
+use support::random::derive_seed;
 
 pub use check::{Findings, Result, Results};
 pub use endurance::{ColdStart, Soak, cold_start, soak, write_scenario};
@@ -20,7 +20,7 @@ pub use proxy::Proxy;
 pub const VEHICLES: [&str; 4] = ["10", "20", "30", "40"];
 
 fn unix_ms() -> u64 {
-    sim_replay::bus::unix_nanos() / 1_000_000
+    bus::unix_nanos() / 1_000_000
 }
 
 /// What is done.

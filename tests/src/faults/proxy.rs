@@ -9,7 +9,7 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread;
 use std::time::Duration;
 
-use sim_replay::bus::Endpoint;
+use bus::Endpoint;
 
 /// How often a silent cable looks whether it may speak again.
 const LOOK: Duration = Duration::from_millis(5);

@@ -6,7 +6,7 @@ pub mod run;
 pub mod seeds;
 pub mod wire_target;
 
-use sim_replay::random::SplitMix64;
+use support::random::SplitMix64;
 
 /// Longest input that damage makes, bytes: what takes much memory from so little does so on somebody's word alone.
 pub const MAX_BYTES: usize = 1 << 16;

@@ -3,18 +3,19 @@
 use std::fs;
 use std::path::{Path, PathBuf};
 
-use agent::pose_source::{ErrorTable, PoseTable};
-use agent::weights::Weights;
+use dataset::pcd;
+use dataset::{self, LoadOptions, Tick};
+use deploy::experiment::sweep::Experiment;
+use deploy::experiment::table::TableSpec;
 use deploy::scenario::Scenario;
-use deploy::sweep::Experiment;
-use deploy::table::TableSpec;
+use link::{LinkConfig, Trace};
+use localization::pose_source::{ErrorTable, PoseTable};
+use perception::weights::Weights;
 use protocol::{Limits, wire};
+use recording::Recording;
 use safetensors::tensor::{Dtype, TensorView, serialize};
-use sim_replay::dataset::{self, LoadOptions, Tick};
-use sim_replay::link::{LinkConfig, Trace};
-use sim_replay::recording::Recording;
 use sim_replay::stream::{Place, Schedule};
-use sim_replay::{pcd, town};
+use simulator::map;
 
 use super::seeds;
 use crate::sequences;
@@ -60,7 +61,7 @@ pub fn all(root: &Path) -> Vec<Reader> {
     fs::write(file("experiment", "links/newest-first.yaml"), seeds::LINK).expect("a writable folder");
     let mut all = vec![
         in_memory("pcd", seeds::clouds(), |_, bytes| pcd::decode(bytes).is_ok()),
-        in_memory("opendrive", text(seeds::OPENDRIVE), |_, bytes| town::opendrive::read_bytes(bytes).is_ok()),
+        in_memory("opendrive", text(seeds::OPENDRIVE), |_, bytes| map::opendrive::read_bytes(bytes).is_ok()),
         on_disk("mcap recording", vec![seeds::recording(root)], file("mcap", "a.mcap"), read_recording),
         on_disk("scenario", text(seeds::SCENARIO), file("scenario", "a.yaml"), |path, _| {
             // What it names is not there, which is no fault of the file.

@@ -5,7 +5,7 @@ use std::path::Path;
 use std::time::{Duration, Instant};
 
 use peak_alloc::PeakAlloc;
-use sim_replay::random::SplitMix64;
+use support::random::SplitMix64;
 
 use super::{damage, readers, seeds, wire_target};
 

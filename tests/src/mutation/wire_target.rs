@@ -1,7 +1,7 @@
 //! Messages under damage: whatever is accepted is sound.
 
 use protocol::{HEADER_LEN, Header, Limits, Message, WireError, wire};
-use sim_replay::random::SplitMix64;
+use support::random::SplitMix64;
 
 use super::damage;
 

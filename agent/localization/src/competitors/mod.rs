@@ -1,0 +1,7 @@
+//! Localizers that the paper compares PGC with: networks trained end to end.
+
+mod end_to_end;
+mod end_to_end_localizer;
+
+pub use end_to_end::{EndToEnd, EndToEndConfig, EndToEndKind};
+pub use end_to_end_localizer::EndToEndLocalizer;

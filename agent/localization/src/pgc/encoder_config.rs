@@ -1,0 +1,231 @@
+//! What a scene encoder is built from.
+
+use serde::{Deserialize, Serialize};
+
+use super::head_config::MAX_PARAMETERS;
+use perception::sparse::KERNEL_VOLUME;
+
+/// Residual groups, and windows around a cell, at most.
+const MAX_ENTRIES: usize = 16;
+/// Cells of the last level from the sensor to the edge: planes of features have four times its square.
+const MAX_PLANE_CELLS: f64 = 512.0;
+
+/// What a voxel is described by.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum VoxelInput {
+    /// Mean of its points in the sensor frame, in units of 10 m: LightLoc's input.
+    Coordinates,
+    /// Mean of its points relative to its middle in voxels, height above the sensor in units of 10 m, and 1: the same
+    /// wherever the sensor stands.
+    Offsets,
+}
+
+impl VoxelInput {
+    /// Channels of a voxel.
+    #[must_use]
+    pub fn channels(self) -> i64 {
+        match self {
+            Self::Coordinates => 3,
+            Self::Offsets => 5,
+        }
+    }
+}
+
+/// A scene encoder.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SceneEncoderConfig {
+    /// Name, for model cards and messages.
+    pub name: String,
+    /// Edge of a voxel, metres.
+    pub voxel_m: f64,
+    /// Points farther than this from the sensor in the plane are left out, metres.
+    pub range_m: f64,
+    /// Lowest and highest point, metres in the sensor frame.
+    pub height_m: [f64; 2],
+    /// What a voxel is described by.
+    pub input: VoxelInput,
+    /// Channels of the convolutions: the first at stride 1, every other at stride 2.
+    pub widths: Vec<i64>,
+    /// Channels of the residual groups on the last level.
+    pub residual_widths: Vec<i64>,
+    /// Whether the level before the last has a residual group of its own, and cells are its sites, described by both.
+    pub fine_cells: bool,
+    /// Edges of the square windows whose mean feature describes a cell's surroundings, metres.
+    pub context_m: Vec<f64>,
+}
+
+impl SceneEncoderConfig {
+    /// LightLoc's encoder, its channels times `width`: one cell per 8x8x8 voxels of 0.25 m.
+    #[must_use]
+    pub fn full(width: f64) -> Self {
+        let scaled = |channels: i64| ((channels as f64 * width).round() as i64).max(1);
+        Self {
+            name: "full".into(),
+            voxel_m: 0.25,
+            range_m: 100.0,
+            height_m: [-6.0, 40.0],
+            input: VoxelInput::Coordinates,
+            widths: [32, 64, 128, 256].map(scaled).into(),
+            residual_widths: [256, 512].map(scaled).into(),
+            fine_cells: false,
+            context_m: Vec::new(),
+        }
+    }
+
+    /// For one core, live: half the channels, voxels of 0.5 m, cells of 2 m beside those of 4 m, and in place of the
+    /// second group the mean over the surroundings.
+    #[must_use]
+    pub fn lean() -> Self {
+        Self {
+            name: "lean".into(),
+            voxel_m: 0.5,
+            range_m: 64.0,
+            height_m: [-6.0, 30.0],
+            input: VoxelInput::Offsets,
+            widths: vec![16, 32, 64, 128],
+            residual_widths: vec![128],
+            fine_cells: true,
+            context_m: vec![20.0, 60.0],
+        }
+    }
+
+    /// A configuration by its name: `lean` or `full`.
+    #[must_use]
+    pub fn preset(name: &str) -> Option<Self> {
+        match name {
+            "lean" => Some(Self::lean()),
+            "full" => Some(Self::full(1.0)),
+            _ => None,
+        }
+    }
+
+    /// Number of levels, the voxels' own included.
+    #[must_use]
+    pub fn levels(&self) -> usize {
+        self.widths.len()
+    }
+
+    /// Edge of the coarse cells of the last level, metres.
+    #[must_use]
+    pub fn coarse_cell_m(&self) -> f64 {
+        self.voxel_m * f64::from(1 << (self.levels() - 1))
+    }
+
+    /// Edge of the cells that scene coordinates are regressed for, metres.
+    #[must_use]
+    pub fn cell_m(&self) -> f64 {
+        if self.fine_cells { 0.5 * self.coarse_cell_m() } else { self.coarse_cell_m() }
+    }
+
+    /// Channels of the last level.
+    #[must_use]
+    pub fn coarse_channels(&self) -> i64 {
+        self.residual_widths.last().or(self.widths.last()).copied().unwrap_or(0)
+    }
+
+    /// Channels of a cell before its surroundings are added.
+    #[must_use]
+    pub fn local_channels(&self) -> i64 {
+        let fine = if self.fine_cells { self.widths[self.levels() - 2] } else { 0 };
+        fine + self.coarse_channels()
+    }
+
+    /// Channels of a cell.
+    #[must_use]
+    pub fn cell_channels(&self) -> i64 {
+        self.local_channels() + self.context_m.len() as i64 * self.coarse_channels()
+    }
+
+    /// Channels of a whole sweep: mean and maximum over its cells.
+    #[must_use]
+    pub fn sweep_channels(&self) -> i64 {
+        2 * self.coarse_channels()
+    }
+
+    /// Checks that a network can be built.
+    ///
+    /// # Errors
+    /// Says which field is wrong and what stood there.
+    pub fn validate(&self) -> Result<(), String> {
+        let positive = |name: &str, value: f64| {
+            (value.is_finite() && value > 0.0)
+                .then_some(())
+                .ok_or_else(|| format!("{name} is {value}, must be above 0"))
+        };
+        positive("voxel_m", self.voxel_m)?;
+        positive("range_m", self.range_m)?;
+        self.context_m.iter().try_for_each(|&edge| positive("context_m", edge))?;
+        if self.height_m.iter().any(|height| !height.is_finite()) || self.height_m[0] >= self.height_m[1] {
+            return Err(format!("height_m is {:?}, must rise", self.height_m));
+        }
+        if !(2..=6).contains(&self.levels()) {
+            return Err(format!("widths has {} entries, must have 2 to 6", self.levels()));
+        }
+        for (name, entries) in [("residual_widths", self.residual_widths.len()), ("context_m", self.context_m.len())] {
+            if entries > MAX_ENTRIES {
+                return Err(format!("{name} has {entries} entries, must have {MAX_ENTRIES} at most"));
+            }
+        }
+        let channels = self.widths.iter().chain(&self.residual_widths);
+        match channels.copied().find(|channels| !(1..=4096).contains(channels)) {
+            Some(channels) => Err(format!("a layer has {channels} channels, must have 1 to 4096")),
+            None if self.range_m / self.voxel_m > 10_000.0 || self.range_m / self.coarse_cell_m() > MAX_PLANE_CELLS => {
+                Err(format!("range_m is {} with voxel_m {}: too many voxels", self.range_m, self.voxel_m))
+            }
+            // Checked before anything of this size is allocated: the file that the numbers come from may be anybody's.
+            None if self.parameters() > MAX_PARAMETERS => Err(format!(
+                "widths are {:?} and residual_widths {:?}: {} parameters, must be {MAX_PARAMETERS} at most",
+                self.widths,
+                self.residual_widths,
+                self.parameters()
+            )),
+            None => Ok(()),
+        }
+    }
+
+    /// Parameters of the 3x3x3 convolutions, nearly all there are.
+    fn parameters(&self) -> i64 {
+        let group = |from: i64, to: i64| (from + to) * to;
+        let before_last = self.widths[self.levels() - 2];
+        let mut products = self.input.channels() * self.widths[0];
+        products += self.widths.windows(2).map(|pair| pair[0] * pair[1]).sum::<i64>();
+        products += if self.fine_cells { group(before_last, before_last) } else { 0 };
+        let mut channels = self.widths[self.levels() - 1];
+        for &width in &self.residual_widths {
+            products += group(channels, width);
+            channels = width;
+        }
+        products * KERNEL_VOLUME as i64
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn presets_are_what_their_names_say() {
+        let full = SceneEncoderConfig::full(1.0);
+        assert_eq!((full.cell_m(), full.cell_channels(), full.sweep_channels()), (2.0, 512, 1024));
+        let lean = SceneEncoderConfig::lean();
+        assert_eq!((lean.cell_m(), lean.coarse_cell_m()), (2.0, 4.0));
+        assert_eq!((lean.local_channels(), lean.cell_channels()), (192, 448));
+        assert!(full.validate().is_ok() && lean.validate().is_ok());
+        assert_eq!(SceneEncoderConfig::preset("huge"), None);
+    }
+
+    #[test]
+    fn absurd_configurations_are_refused_by_name() {
+        let refused = |config: SceneEncoderConfig, field: &str| config.validate().unwrap_err().contains(field);
+        assert!(refused(SceneEncoderConfig { voxel_m: 0.0, ..SceneEncoderConfig::lean() }, "voxel_m"));
+        assert!(refused(SceneEncoderConfig { voxel_m: 1e-6, ..SceneEncoderConfig::lean() }, "too many"));
+        assert!(refused(SceneEncoderConfig { widths: vec![4], ..SceneEncoderConfig::lean() }, "widths"));
+        assert!(refused(SceneEncoderConfig { height_m: [2.0, 1.0], ..SceneEncoderConfig::lean() }, "height_m"));
+        assert!(refused(SceneEncoderConfig { context_m: vec![9.0; 17], ..SceneEncoderConfig::lean() }, "context_m"));
+        for residual_widths in [vec![1; 17], vec![4096; 9]] {
+            assert!(refused(SceneEncoderConfig { residual_widths, ..SceneEncoderConfig::lean() }, "residual_widths"));
+        }
+    }
+}

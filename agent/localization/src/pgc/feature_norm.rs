@@ -1,0 +1,36 @@
+//! Features at mean 0 and deviation 1.
+
+use tch::nn;
+use tch::{Kind, TchError, Tensor, no_grad};
+
+/// What is constant counts as if it had this deviation.
+const LEAST_DEVIATION: f64 = 1e-4;
+
+/// Brings features to mean 0 and deviation 1, each channel for itself; what it knows is computed, not learnt.
+#[derive(Debug)]
+pub(crate) struct FeatureNorm {
+    mean: Tensor,
+    scale: Tensor,
+}
+
+impl FeatureNorm {
+    /// One that changes nothing yet.
+    pub(crate) fn new(path: &nn::Path<'_>, channels: i64) -> Self {
+        Self { mean: path.zeros_no_train("mean", &[channels]), scale: path.ones_no_train("scale", &[channels]) }
+    }
+
+    /// Takes mean and deviation of `[N, channels]`.
+    pub(crate) fn fit(&mut self, features: &Tensor) -> Result<(), TchError> {
+        let features = features.f_to_kind(Kind::Float)?;
+        let deviation = features.f_std_dim(0_i64, false, false)?;
+        no_grad(|| {
+            self.mean.f_copy_(&features.f_mean_dim(0_i64, false, Kind::Float)?)?;
+            self.scale.f_copy_(&deviation.f_clamp_min(LEAST_DEVIATION)?.f_reciprocal()?)
+        })
+    }
+
+    /// In single precision.
+    pub(crate) fn forward(&self, x: &Tensor) -> Result<Tensor, TchError> {
+        Ok((x.f_to_kind(Kind::Float)? - &self.mean) * &self.scale)
+    }
+}

@@ -1,0 +1,372 @@
+//! The live pipeline: a sweep in, a pose with its confidence out.
+
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use protocol::{PointCloud, PoseEstimate, StageTiming};
+use tch::nn::VarStore;
+use tch::{Device, Kind, TchError, Tensor, no_grad};
+
+use super::confidence::{CONFIDENCE_KEY, Confidence, ConfidenceModel};
+use super::error::LocalizerError;
+use super::head_config::SceneHeadConfig;
+use super::pose_evidence::PoseEvidence;
+use super::pose_refinement::SweepCells;
+use super::pose_search::{PoseSearch, SearchTimes};
+use super::pose_solver::{self, FoundPose, PoseSolver, Solved};
+use super::scene_encoder::{SceneEncoder, SceneFeatures};
+use super::scene_regression::SceneHead;
+use super::voxel_batch::VoxelBatch;
+use super::voxelise::{Cell, SweepVoxels};
+use crate::registration::Correspondence;
+use perception::weights::Weights;
+
+/// Cells that are regressed at most, where the head allows for more: poses hardly gain from more, and they take time.
+pub(crate) const CELLS: usize = 256;
+/// Cells of the second look at most: it costs little for each of them, and what they err by averages out.
+const SECOND_CELLS: usize = 768;
+/// Share of the regressed cells that may be flat ground, which looks the same everywhere.
+const FLAT_SHARE: f64 = 0.25;
+
+/// Where each cell of a sweep lies in the world, as far as the network knows.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct SceneCoordinates {
+    /// `[N]`: in the sensor frame, metres.
+    pub sensor_m: Vec<[f32; 3]>,
+    /// `[N]`: in the world relative to the head's origin, metres.
+    pub world_m: Vec<[f32; 3]>,
+    /// `[N]`: predicted L1 error, metres.
+    pub epsilon_m: Vec<f32>,
+    /// The head's origin in the world, metres.
+    pub origin_m: [f64; 3],
+}
+
+/// Scene coordinates, and the cells that the second look asks for: more of the same sweep.
+struct Regressed {
+    coordinates: SceneCoordinates,
+    again: SweepCells,
+}
+
+/// Time per stage.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub struct LocalizerTimes {
+    /// Points into voxels and rulebooks.
+    pub voxelise: Duration,
+    /// The encoder.
+    pub encode: Duration,
+    /// The head.
+    pub regress: Duration,
+    /// The pose solver.
+    pub solve: Duration,
+    /// The second look, its fits included.
+    pub refine: Duration,
+}
+
+/// What came of one sweep.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Localization {
+    /// `world_from_lidar` with its confidence, or why there is none.
+    pub estimate: PoseEstimate,
+    /// The pose with what speaks for it, also where `estimate` withholds it.
+    pub found: Option<FoundPose>,
+    /// Cells that agree on the pose.
+    pub inlier_count: u32,
+    /// Their share of all regressed cells.
+    pub inlier_ratio: f64,
+    /// Where the time went.
+    pub times: LocalizerTimes,
+}
+
+/// Says where a sweep was made.
+pub trait Localize: std::fmt::Debug + Send {
+    /// Localises one sweep.
+    ///
+    /// # Errors
+    /// [`LocalizerError::Tensor`] when the tensor library refuses. A sweep that cannot be localised is no error but an
+    /// answer: [`PoseEstimate::NoPose`].
+    fn localize(&mut self, cloud: &PointCloud) -> Result<Localization, LocalizerError>;
+}
+
+/// Encoder, head of a town and solver.
+#[derive(Debug)]
+pub struct Localizer {
+    encoder: SceneEncoder,
+    head: SceneHead,
+    solver: PoseSolver,
+    device: Device,
+    sha256: [String; 2],
+}
+
+impl Localizer {
+    /// Reads encoder and head.
+    ///
+    /// # Errors
+    /// [`LocalizerError`] when a file is missing, cut off, of something else, when its confidence is none, or when the head
+    /// was trained on the features of another encoder.
+    pub fn load(encoder: &Path, head: &Path, device: Device) -> Result<Self, LocalizerError> {
+        let (mut localizer, weights) = Self::open(encoder, head, device)?;
+        localizer.solver.confidence = stored_confidence(&weights)?;
+        Ok(localizer)
+    }
+
+    /// The same without the confidence in the head's file, to fit one anew: one of an earlier version has other features.
+    ///
+    /// # Errors
+    /// As [`Self::load`].
+    pub fn load_without_confidence(encoder: &Path, head: &Path, device: Device) -> Result<Self, LocalizerError> {
+        Ok(Self::open(encoder, head, device)?.0)
+    }
+
+    fn open(encoder: &Path, head: &Path, device: Device) -> Result<(Self, Weights), LocalizerError> {
+        let (network, encoder_sha256) = SceneEncoder::load(encoder, device)?;
+        let weights = Weights::load(head)?;
+        weights.check_kind(SceneHead::KIND)?;
+        let config: SceneHeadConfig = weights.config()?;
+        if config.encoder_sha256 != encoder_sha256 {
+            return Err(LocalizerError::OtherEncoder {
+                head: head.display().to_string(),
+                expected: config.encoder_sha256,
+                encoder: encoder.display().to_string(),
+                found: encoder_sha256,
+            });
+        }
+        let mut variables = VarStore::new(device);
+        let scene_head = SceneHead::new(&variables.root(), &config)?;
+        weights.copy_into(&variables)?;
+        variables.freeze();
+        let sha256 = [encoder_sha256, weights.sha256().to_owned()];
+        Ok((Self { encoder: network, head: scene_head, solver: PoseSolver::default(), device, sha256 }, weights))
+    }
+
+    /// Hashes of encoder and head.
+    #[must_use]
+    pub fn sha256(&self) -> &[String; 2] {
+        &self.sha256
+    }
+
+    /// The head's configuration: town, origin.
+    #[must_use]
+    pub fn head_config(&self) -> &SceneHeadConfig {
+        self.head.config()
+    }
+
+    /// First steps: voxels, features, scene coordinates.
+    ///
+    /// # Errors
+    /// [`LocalizerError::Tensor`] when the tensor library refuses.
+    pub fn scene_coordinates(&self, cloud: &PointCloud) -> Result<(SceneCoordinates, LocalizerTimes), LocalizerError> {
+        let mut times = LocalizerTimes::default();
+        let regressed = self.regress(cloud, &mut times)?;
+        Ok((regressed.map(|regressed| regressed.coordinates).unwrap_or_default(), times))
+    }
+
+    /// Nothing for a sweep without cells.
+    fn regress(&self, cloud: &PointCloud, times: &mut LocalizerTimes) -> Result<Option<Regressed>, LocalizerError> {
+        let start = Instant::now();
+        let points = cloud.xyzi.iter().map(|&[x, y, z, _]| [x, y, z]);
+        let sweep = SweepVoxels::new(points, self.encoder.config());
+        let chosen = choose_evenly(sweep.cells(), self.head.config().max_cells.min(CELLS));
+        times.voxelise = start.elapsed();
+        if chosen.is_empty() {
+            return Ok(None);
+        }
+        let start = Instant::now();
+        let batch = VoxelBatch::new(&[&sweep], self.encoder.config(), self.device)?;
+        let features = self.encoder.encode(&batch, Kind::Float)?;
+        times.encode = start.elapsed();
+
+        let start = Instant::now();
+        let SweepCells { features: cells, sensor_m } = self.pick(&sweep, &features, &chosen)?;
+        let again = self.pick(&sweep, &features, &choose_evenly(sweep.cells(), SECOND_CELLS))?;
+        let (world, epsilon_m) = no_grad(|| -> Result<(Vec<f32>, Vec<f32>), TchError> {
+            let logits = self.head.classify(&features.sweeps, false)?.f_expand([chosen.len() as i64, -1], false)?;
+            let regression = self.head.regress(&self.head.normalise(&cells)?, &logits, Kind::Float)?;
+            let world = Vec::try_from(&regression.coordinates_m.f_reshape([-1])?.f_to_device(Device::Cpu)?)?;
+            Ok((world, Vec::try_from(&regression.epsilon_m.f_to_device(Device::Cpu)?)?))
+        })?;
+        times.regress = start.elapsed();
+        let origin_m = self.head.config().origin_m;
+        let coordinates = SceneCoordinates { sensor_m, world_m: world.as_chunks().0.to_vec(), epsilon_m, origin_m };
+        Ok(Some(Regressed { coordinates, again }))
+    }
+
+    fn pick(&self, sweep: &SweepVoxels, features: &SceneFeatures, chosen: &[usize]) -> Result<SweepCells, TchError> {
+        let rows: Vec<i64> = chosen.iter().map(|&cell| cell as i64).collect();
+        let rows = Tensor::f_from_slice(&rows)?.f_to_device(self.device)?;
+        let features = no_grad(|| features.cells.f_index_select(0, &rows))?;
+        Ok(SweepCells { features, sensor_m: chosen.iter().map(|&cell| sweep.cells()[cell].centroid_m).collect() })
+    }
+
+    /// Search and confidence.
+    #[must_use]
+    pub fn solver(&self) -> &PoseSolver {
+        &self.solver
+    }
+
+    /// Uses another search or confidence.
+    pub fn set_solver(&mut self, solver: PoseSolver) {
+        self.solver = solver;
+    }
+
+    /// All steps.
+    ///
+    /// # Errors
+    /// [`LocalizerError::Tensor`] when the tensor library refuses. A sweep that cannot be localised is no error but an
+    /// answer: [`PoseEstimate::NoPose`].
+    pub fn localize(&self, cloud: &PointCloud) -> Result<Localization, LocalizerError> {
+        let mut times = LocalizerTimes::default();
+        let Regressed { coordinates, again } = match self.regress(cloud, &mut times)? {
+            Some(regressed) => regressed,
+            None => return Ok(Localization::new(&self.solver.solve(&SceneCoordinates::default()), times)),
+        };
+        let search = PoseSearch { head: &self.head, solver: &self.solver, kind: Kind::Float };
+        let mut spent = SearchTimes::default();
+        let solved = search.run(&coordinates, &again, &mut spent)?;
+        Ok(Localization::new(&solved, LocalizerTimes { solve: spent.solve, refine: spent.refine, ..times }))
+    }
+}
+
+impl Localize for Localizer {
+    fn localize(&mut self, cloud: &PointCloud) -> Result<Localization, LocalizerError> {
+        Self::localize(self, cloud)
+    }
+}
+
+impl Localization {
+    /// The answer that a solver found.
+    #[must_use]
+    pub fn new(solved: &Solved, times: LocalizerTimes) -> Self {
+        let found = solved.as_ref().ok().copied();
+        let inliers = match solved {
+            Ok(found) => found.evidence.inliers,
+            Err(none) => none.inlier_count(),
+        };
+        Self {
+            estimate: pose_solver::estimate(solved),
+            found,
+            inlier_count: u32::try_from(inliers).unwrap_or(u32::MAX),
+            inlier_ratio: found.map_or(0.0, |found| found.evidence.inlier_ratio),
+            times,
+        }
+    }
+}
+
+impl Localization {
+    /// The answer of something that does not look at cells one by one: nothing speaks for a pose but the answer itself.
+    #[must_use]
+    pub fn told(estimate: PoseEstimate, times: LocalizerTimes) -> Self {
+        let (found, inlier_count) = match estimate {
+            PoseEstimate::Pose { world_from_cav, confidence } => {
+                let (world_from_sensor, sigma) = (world_from_cav.isometry(), f64::from(confidence));
+                let evidence = PoseEvidence::none();
+                (Some(FoundPose { world_from_sensor, evidence, sigma, is_withheld: false }), 0)
+            }
+            PoseEstimate::NoPose { inlier_count, .. } => (None, inlier_count),
+        };
+        Self { estimate, found, inlier_count, inlier_ratio: 0.0, times }
+    }
+}
+
+impl LocalizerTimes {
+    /// The stages by name, in the order they run.
+    #[must_use]
+    pub fn stages(&self) -> Vec<StageTiming> {
+        let Self { voxelise, encode, regress, solve, refine } = *self;
+        [
+            ("pose voxelise", voxelise),
+            ("pose encode", encode),
+            ("pose regress", regress),
+            ("pose solve", solve),
+            ("pose refine", refine),
+        ]
+        .map(|(stage, time)| StageTiming::new(stage, time))
+        .into()
+    }
+
+    /// All stages together.
+    #[must_use]
+    pub fn total(&self) -> Duration {
+        self.voxelise + self.encode + self.regress + self.solve + self.refine
+    }
+}
+
+impl SceneCoordinates {
+    /// For the solver, weighted by Eq. 6.
+    #[must_use]
+    pub fn correspondences(&self) -> Vec<Correspondence> {
+        let places = self.sensor_m.iter().zip(&self.world_m).zip(&self.epsilon_m);
+        places
+            .map(|((&source_m, &target_m), &epsilon_m)| Correspondence { source_m, target_m, weight: sigma(epsilon_m) })
+            .collect()
+    }
+}
+
+/// The confidence in a head's file; the plain one where there is none.
+fn stored_confidence(weights: &Weights) -> Result<Confidence, LocalizerError> {
+    if weights.metadata(CONFIDENCE_KEY).is_none() {
+        return Ok(Confidence::Plain);
+    }
+    let model: ConfidenceModel = weights.metadata_json(CONFIDENCE_KEY)?;
+    let head = weights.path().display().to_string();
+    model.check().map_err(|reason| LocalizerError::Confidence { head, reason })?;
+    Ok(Confidence::Calibrated(model))
+}
+
+/// Confidence of a cell (Eq. 6): 0.5 at an expected error of 1 m.
+#[must_use]
+pub fn sigma(epsilon_m: f32) -> f32 {
+    1.0 / (1.0 + epsilon_m * epsilon_m)
+}
+
+/// Up to `count` cells, evenly over the sweep, flat ground no more than its share.
+pub(crate) fn choose_evenly(cells: &[Cell], count: usize) -> Vec<usize> {
+    let (flat, high): (Vec<usize>, Vec<usize>) = (0..cells.len()).partition(|&cell| cells[cell].is_flat());
+    let mut chosen = every_nth(&high, (count as f64 * (1.0 - FLAT_SHARE)) as usize);
+    // A share of what is chosen: a sweep with little but ground must not be placed by its ground.
+    let flat_count = chosen.len() as f64 * FLAT_SHARE / (1.0 - FLAT_SHARE);
+    chosen.extend(every_nth(&flat, flat_count as usize));
+    chosen
+}
+
+fn every_nth(rows: &[usize], count: usize) -> Vec<usize> {
+    let kept = count.min(rows.len());
+    (0..kept).map(|place| rows[place * rows.len() / kept]).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+
+    use super::*;
+    use perception::weights::{self, Precision};
+
+    #[test]
+    fn a_confidence_that_would_fail_on_a_sweep_is_refused_with_its_file() {
+        let folder = tempfile::tempdir().unwrap();
+        let stored = |model: &ConfidenceModel| {
+            let path = folder.path().join("head.safetensors");
+            let metadata: BTreeMap<_, _> = [(CONFIDENCE_KEY.to_owned(), serde_json::to_string(model).unwrap())].into();
+            weights::save(&path, &VarStore::new(Device::Cpu), &metadata, Precision::Single).unwrap();
+            stored_confidence(&Weights::load(&path).unwrap())
+        };
+        let model = ConfidenceModel::example();
+        assert_eq!(stored(&model).unwrap(), Confidence::Calibrated(model.clone()));
+        let message = stored(&ConfidenceModel { bias: -1e308, ..model }).unwrap_err().to_string();
+        assert!(message.contains("head.safetensors") && message.contains("bias"), "{message}");
+    }
+
+    #[test]
+    fn ground_is_never_more_than_its_share() {
+        let cells = |high: usize, flat: usize| -> Vec<Cell> {
+            let cell = |extent_m| Cell { extent_m, ..Cell::default() };
+            std::iter::repeat_n(cell(2.0), high).chain(std::iter::repeat_n(cell(0.1), flat)).collect()
+        };
+        for (high, flat, expected) in [(1000, 1000, 256), (60, 1000, 80), (1000, 10, 202), (0, 500, 0)] {
+            let cells = cells(high, flat);
+            let chosen = choose_evenly(&cells, 256);
+            let ground = chosen.iter().filter(|&&cell| cells[cell].is_flat()).count();
+            assert_eq!(chosen.len(), expected);
+            assert!(ground as f64 <= FLAT_SHARE * chosen.len() as f64, "{ground} of {expected}");
+        }
+    }
+}

@@ -1,0 +1,34 @@
+//! Where am I: scene-coordinate regression from one sweep (the paper's PGC, after LightLoc).
+//!
+//! A sparse encoder describes cells of the sweep; a head that belongs to one town says for each cell where in the world
+//! it lies and how far off that may be; a robust solver turns these correspondences into a pose.
+
+pub mod confidence;
+pub(crate) mod dense;
+pub(crate) mod encoder_config;
+pub(crate) mod error;
+pub(crate) mod feature_norm;
+pub(crate) mod head_config;
+pub(crate) mod localize;
+mod pose_evidence;
+pub mod pose_refinement;
+pub mod pose_search;
+pub mod pose_solver;
+mod pose_std;
+mod refinement_network;
+pub(crate) mod scene_encoder;
+pub(crate) mod scene_regression;
+pub mod synthetic;
+pub(crate) mod voxel_batch;
+pub(crate) mod voxelise;
+
+pub use encoder_config::{SceneEncoderConfig, VoxelInput};
+pub use error::LocalizerError;
+pub use head_config::{RefinerConfig, SceneHeadConfig};
+pub use localize::{Localization, Localize, Localizer, LocalizerTimes, SceneCoordinates, sigma};
+pub use pose_evidence::{PoseEvidence, SecondEvidence};
+pub use refinement_network::Refiner;
+pub use scene_encoder::{LocalFeatures, SceneEncoder, SceneFeatures};
+pub use scene_regression::{Regression, SceneHead};
+pub use voxel_batch::VoxelBatch;
+pub use voxelise::{Cell, SweepVoxels};

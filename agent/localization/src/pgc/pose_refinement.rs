@@ -1,0 +1,136 @@
+//! From a rough pose to a sharp one: the refiner's answers, fitted anew, twice.
+
+use nalgebra::{Isometry3, Point3, Vector3};
+use tch::{Device, Kind, TchError, Tensor, no_grad};
+
+use super::pose_std::PoseStd;
+use super::scene_regression::SceneHead;
+use crate::registration::refine::{forgiveness, reweighted};
+use crate::registration::{Correspondence, Registration};
+
+/// Scales of the fits of each round, metres: the first pose may be off by two metres, the second hardly is.
+const ROUNDS_M: [&[f64]; 2] = [&[2.0, 1.2, 0.8], &[0.6, 0.4, 0.3, 0.3]];
+/// Scales of a round that goes before them where the first pose may be off by more, metres.
+const WIDE_ROUND_M: &[f64] = &[4.0, 3.0, 2.0];
+/// A cell agrees with the sharp pose when its answer is this near, metres.
+const AGREES_M: f64 = 1.0;
+/// What even the best cell does not know, metres.
+const FLOOR_M: f32 = 0.1;
+
+/// Cells of one sweep that the refiner is asked for.
+#[derive(Debug)]
+pub struct SweepCells {
+    /// `[N, cell_channels]`.
+    pub features: Tensor,
+    /// `[N]`: in the sensor frame, metres.
+    pub sensor_m: Vec<[f32; 3]>,
+}
+
+/// A sharpened pose and the answers that it rests on.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct SecondLook {
+    /// `origin_from_sensor` and who agrees with it.
+    pub(super) registration: Registration,
+    /// `[N]`: predicted L1 error of each cell's last answer, metres.
+    pub(super) epsilon_m: Vec<f32>,
+    /// A quarter of the cells, all of them counted, answer nearer than this to where the pose puts them, metres.
+    pub(super) residual_quartile_m: f64,
+    /// How far it may be off.
+    pub(super) std: PoseStd,
+    /// Sum of the weights of the last fit, 1 / square metres: what the cells know of the place by their own account, as far
+    /// as the fit listened to them.
+    pub(super) information_per_m2: f64,
+}
+
+/// Asks the refiner where cells are that `start` puts somewhere; poses are relative to the head's origin.
+///
+/// `is_wide` says that `start` may be off by more than usual. Nothing comes back where the head has no refiner or its
+/// answers fix no pose.
+///
+/// # Errors
+/// The tensor library's.
+pub(super) fn look_again(
+    head: &SceneHead,
+    cells: &SweepCells,
+    start: &Isometry3<f64>,
+    is_wide: bool,
+    kind: Kind,
+) -> Result<Option<SecondLook>, TchError> {
+    let Some(refiner) = head.refiner() else { return Ok(None) };
+    let sensor_m = &cells.sensor_m;
+    let cells = head.normalise(&cells.features)?;
+    let device = cells.device();
+    let mut pose = *start;
+    let mut answer = None;
+    let wide_rounds = if is_wide { 2 } else { 0 };
+    for scales_m in std::iter::repeat_n(WIDE_ROUND_M, wide_rounds).chain(ROUNDS_M) {
+        let assumed: Vec<f32> = sensor_m
+            .iter()
+            .flat_map(|point| (pose * Point3::from(point.map(f64::from))).coords.map(|axis| axis as f32).data.0[0])
+            .collect();
+        let ahead = pose.rotation * Vector3::x();
+        let norm = ahead.xy().norm().max(1e-6);
+        let heading = Tensor::f_from_slice(&[(ahead.x / norm) as f32, (ahead.y / norm) as f32])?;
+        let heading = heading.f_to_device(device)?.f_view([1, 2])?.f_expand([sensor_m.len() as i64, -1], false)?;
+        let assumed = Tensor::f_from_slice(&assumed)?.f_view([-1, 3])?.f_to_device(device)?;
+        let seen = no_grad(|| refiner.look(&cells, &assumed, &heading, kind))?;
+        let world: Vec<f32> = Vec::try_from(&seen.coordinates_m.f_reshape([-1])?.f_to_device(Device::Cpu)?)?;
+        let epsilon_m: Vec<f32> = Vec::try_from(&seen.epsilon_m.f_to_device(Device::Cpu)?)?;
+        let pairs: Vec<Correspondence> = (sensor_m.iter().zip(world.as_chunks().0).zip(&epsilon_m))
+            .map(|((&source_m, &target_m), &epsilon_m)| Correspondence {
+                source_m,
+                target_m,
+                weight: precision(epsilon_m),
+            })
+            .collect();
+        let usable = pairs.iter().filter(|pair| pair.usable());
+        let fits = usable.map(|pair| {
+            let point = |point: [f32; 3]| Vector3::from(point.map(f64::from));
+            (point(pair.source_m), point(pair.target_m), f64::from(pair.weight))
+        });
+        match reweighted(&fits.collect::<Vec<_>>(), &pose, scales_m.iter().copied()) {
+            Ok(fitted) => pose = fitted,
+            Err(_) => return Ok(None),
+        }
+        let scale_m = scales_m.last().copied().unwrap_or(AGREES_M);
+        let weigh = |pair: &Correspondence| f64::from(pair.weight) * forgiveness(pair.residual_m(&pose), scale_m);
+        let weighted: Vec<_> = pairs.iter().filter(|pair| pair.usable()).map(|pair| (pair, weigh(pair))).collect();
+        let information_per_m2 = weighted.iter().map(|(_, weight)| weight).sum();
+        let std = PoseStd::of(&pose, weighted.into_iter());
+        let registration = Registration::judge(&pairs, pose, AGREES_M);
+        let residual_quartile_m = lower_quartile(pairs.iter().map(|pair| distance_m(pair, &pose)).collect());
+        answer = Some(SecondLook { registration, epsilon_m, residual_quartile_m, std, information_per_m2 });
+    }
+    Ok(answer)
+}
+
+/// How far an answer is from where a pose puts its cell, metres; infinite where it is no place.
+fn distance_m(pair: &Correspondence, pose: &Isometry3<f64>) -> f64 {
+    if pair.usable() { pair.residual_m(pose) } else { f64::INFINITY }
+}
+
+/// A quarter of the values is below it; infinite where there are none.
+fn lower_quartile(mut values: Vec<f64>) -> f64 {
+    let quarter = values.len() / 4;
+    if values.is_empty() { f64::INFINITY } else { *values.select_nth_unstable_by(quarter, f64::total_cmp).1 }
+}
+
+/// Weight of an answer: the inverse of its expected squared error.
+fn precision(epsilon_m: f32) -> f32 {
+    1.0 / (FLOOR_M * FLOOR_M + epsilon_m * epsilon_m)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_quarter_lies_below_the_lower_quartile() {
+        let values: Vec<f64> = (0..100).map(|k| f64::from((k * 37) % 100)).collect();
+        assert_eq!(lower_quartile(values), 25.0);
+        assert_eq!(lower_quartile(vec![3.0]), 3.0);
+        assert_eq!(lower_quartile(Vec::new()), f64::INFINITY);
+        let nowhere = Correspondence { source_m: [1.0; 3], target_m: [f32::NAN; 3], weight: 1.0 };
+        assert_eq!(distance_m(&nowhere, &Isometry3::identity()), f64::INFINITY);
+    }
+}

@@ -1,0 +1,203 @@
+//! From scene coordinates to a pose that knows how far to trust it, or to the reason why there is none.
+
+use nalgebra::{Isometry3, Vector3};
+use protocol::{NoPoseReason, PoseEstimate};
+
+use super::confidence::Confidence;
+use super::localize::SceneCoordinates;
+use super::pose_evidence::PoseEvidence;
+use super::pose_refinement::SecondLook;
+use crate::registration::ransac::{self, RansacConfig};
+use crate::registration::sc2pcr::{self, Sc2PcrConfig};
+use crate::registration::{NoRegistration, Registration};
+
+/// Sweeps with fewer cells are not localised.
+pub(crate) const MIN_CELLS: usize = 30;
+
+/// Which search finds the pose.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Solver {
+    /// Random samples with local optimisation.
+    Ransac(RansacConfig),
+    /// Second-order spatial compatibility.
+    Sc2Pcr(Sc2PcrConfig),
+}
+
+impl Default for Solver {
+    fn default() -> Self {
+        Self::Ransac(RansacConfig::default())
+    }
+}
+
+/// Solver and judge.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct PoseSolver {
+    /// Finds the pose.
+    pub solver: Solver,
+    /// Says how far to trust it.
+    pub confidence: Confidence,
+}
+
+/// A pose with what speaks for it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct FoundPose {
+    /// Where the LiDAR is.
+    pub world_from_sensor: Isometry3<f64>,
+    /// What speaks for it.
+    pub evidence: PoseEvidence,
+    /// How far to trust it, 0..=1.
+    pub sigma: f64,
+    /// Whether that is too little to tell anyone.
+    pub is_withheld: bool,
+}
+
+/// The pose of one sweep, withheld or not, or why there is none.
+pub type Solved = Result<FoundPose, NoRegistration>;
+
+impl PoseSolver {
+    /// Solves one sweep.
+    ///
+    /// # Errors
+    /// [`NoRegistration`] when there are too few cells, or too few of them agree.
+    pub fn solve(&self, coordinates: &SceneCoordinates) -> Solved {
+        self.search(coordinates).map(|registration| self.judge(coordinates, &registration, None))
+    }
+
+    /// First step: the pose relative to the origin of `coordinates`.
+    ///
+    /// # Errors
+    /// As [`Self::solve`].
+    pub fn search(&self, coordinates: &SceneCoordinates) -> Result<Registration, NoRegistration> {
+        self.search_wider(coordinates, 1.0)
+    }
+
+    /// The same with cells that may be off by `factor` times as much. Who agrees is counted as in [`Self::search`].
+    ///
+    /// # Errors
+    /// As [`Self::solve`].
+    pub(super) fn search_wider(
+        &self,
+        coordinates: &SceneCoordinates,
+        factor: f64,
+    ) -> Result<Registration, NoRegistration> {
+        let pairs = coordinates.correspondences();
+        if pairs.len() < MIN_CELLS {
+            let (usable, given) = (pairs.len(), pairs.len());
+            return Err(NoRegistration::TooFewCorrespondences { usable, given, required: MIN_CELLS });
+        }
+        let (found, threshold_m) = match &self.solver {
+            Solver::Ransac(config) => (ransac::solve(&pairs, &config.wider(factor))?, config.inlier_threshold_m),
+            Solver::Sc2Pcr(config) => (sc2pcr::solve(&pairs, &config.wider(factor))?, config.inlier_threshold_m),
+        };
+        let is_wider = factor > 1.0;
+        Ok(if is_wider { Registration::judge(&pairs, found.target_from_source, threshold_m) } else { found })
+    }
+
+    /// Last step: how far to trust what was found, and found again by a second look where there was one.
+    pub(super) fn judge(
+        &self,
+        coordinates: &SceneCoordinates,
+        registration: &Registration,
+        second: Option<&SecondLook>,
+    ) -> FoundPose {
+        let evidence = PoseEvidence::gather(coordinates, registration, second);
+        let sigma = self.confidence.sigma(&evidence);
+        let last = second.map_or(registration, |second| &second.registration);
+        let mut world_from_sensor = last.target_from_source;
+        world_from_sensor.translation.vector += Vector3::from(coordinates.origin_m);
+        FoundPose { world_from_sensor, evidence, sigma, is_withheld: self.confidence.withholds(sigma) }
+    }
+}
+
+/// What is told to others of a sweep.
+#[must_use]
+pub fn estimate(solved: &Solved) -> PoseEstimate {
+    let none = |reason, inliers: usize| PoseEstimate::NoPose {
+        reason,
+        inlier_count: u32::try_from(inliers).unwrap_or(u32::MAX),
+    };
+    match solved {
+        Ok(found) if found.is_withheld => none(NoPoseReason::LowConfidence, found.evidence.inliers),
+        Ok(found) => PoseEstimate::new(found.world_from_sensor.into(), found.sigma as f32),
+        Err(error @ NoRegistration::TooFewCorrespondences { .. }) => {
+            none(NoPoseReason::TooFewPoints, error.inlier_count())
+        }
+        Err(error) => none(NoPoseReason::TooFewInliers, error.inlier_count()),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::pgc::confidence::ConfidenceModel;
+    use crate::pgc::synthetic::SyntheticTown;
+
+    #[test]
+    fn a_sweep_is_found_far_from_the_origin_of_the_world() {
+        let town = SyntheticTown::default();
+        for solver in [Solver::default(), Solver::Sc2Pcr(Sc2PcrConfig::default())] {
+            let solver = PoseSolver { solver, ..PoseSolver::default() };
+            for seed in 0..5 {
+                let solved = solver.solve(&town.coordinates(seed));
+                let found = solved.as_ref().unwrap();
+                let off = town.world_from_sensor(seed).inv_mul(&found.world_from_sensor);
+                assert!(off.translation.vector.norm() < 0.1, "{off}");
+                assert_eq!(estimate(&solved).confidence(), found.sigma as f32);
+                assert!(found.sigma > 0.5);
+            }
+        }
+    }
+
+    #[test]
+    fn cells_that_are_metres_off_are_found_by_a_wider_search() {
+        let town = SyntheticTown { noise_m: 2.5, outliers: 0.3, ..SyntheticTown::default() };
+        let solver = PoseSolver::default();
+        let off_m = |factor| {
+            let errors = (0..6).map(|seed| match solver.search_wider(&town.coordinates(seed), factor) {
+                Ok(found) => {
+                    let truth = town.world_from_sensor(seed).translation.vector
+                        - Vector3::from(town.coordinates(seed).origin_m);
+                    (found.target_from_source.translation.vector - truth).norm()
+                }
+                Err(_) => f64::INFINITY,
+            });
+            errors.fold(0.0, f64::max)
+        };
+        assert!(off_m(4.0) < 1.5 && off_m(4.0) < off_m(1.0), "{} {}", off_m(4.0), off_m(1.0));
+    }
+
+    #[test]
+    fn what_is_thin_is_no_pose_and_says_why() {
+        let reason = |town: &SyntheticTown| match estimate(&PoseSolver::default().solve(&town.coordinates(3))) {
+            PoseEstimate::NoPose { reason, .. } => Some(reason),
+            PoseEstimate::Pose { .. } => None,
+        };
+        let town = SyntheticTown::default();
+        assert_eq!(reason(&town), None);
+        assert_eq!(reason(&SyntheticTown { cells: 0, ..town.clone() }), Some(NoPoseReason::TooFewPoints));
+        assert_eq!(reason(&SyntheticTown { cells: 10, ..town.clone() }), Some(NoPoseReason::TooFewPoints));
+        assert_eq!(reason(&SyntheticTown { outliers: 1.0, ..town }), Some(NoPoseReason::TooFewInliers));
+    }
+
+    #[test]
+    fn numbers_that_are_none_are_no_pose() {
+        let mut coordinates = SyntheticTown::default().coordinates(1);
+        coordinates.world_m.iter_mut().for_each(|point| point[1] = f32::NAN);
+        let none = estimate(&PoseSolver::default().solve(&coordinates));
+        assert!(matches!(none, PoseEstimate::NoPose { reason: NoPoseReason::TooFewPoints, .. }));
+        let mut coordinates = SyntheticTown::default().coordinates(1);
+        coordinates.epsilon_m.iter_mut().for_each(|epsilon| *epsilon = f32::NAN);
+        assert!(PoseSolver::default().solve(&coordinates).is_err());
+    }
+
+    #[test]
+    fn a_pose_that_little_speaks_for_is_withheld_with_its_inliers() {
+        let strict = ConfidenceModel { withhold_below: 0.99, ..ConfidenceModel::example() };
+        let solver = PoseSolver { confidence: Confidence::Calibrated(strict), ..PoseSolver::default() };
+        let town = SyntheticTown { outliers: 0.8, noise_m: 0.6, ..SyntheticTown::default() };
+        let solved = solver.solve(&town.coordinates(1));
+        let found = solved.as_ref().unwrap();
+        let PoseEstimate::NoPose { reason, inlier_count } = estimate(&solved) else { panic!("{solved:?}") };
+        assert_eq!((reason, inlier_count as usize), (NoPoseReason::LowConfidence, found.evidence.inliers));
+    }
+}

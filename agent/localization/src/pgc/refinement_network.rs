@@ -1,0 +1,208 @@
+//! The second look: once a sweep's pose is known to a metre or two, where exactly is each cell.
+//!
+//! The head answers from the whole town; the refiner only looks around. A lattice over the town holds a learnt key for
+//! every corner. What the cell looks like is the query, the corners around the place where the pose puts the cell are
+//! the candidates, and the answer is their mean by attention. Neither the paper nor LightLoc has this stage; the
+//! solver's 'final refinement' is run on its answers.
+
+use tch::nn::{self, Init};
+use tch::{Kind, TchError, Tensor};
+
+use super::dense::Dense;
+use super::error::LocalizerError;
+use super::head_config::RefinerConfig;
+use super::scene_regression::Regression;
+
+/// Similarities are multiplied by this at first; learnt from there on.
+const FIRST_SHARPNESS: f64 = 2.0;
+
+/// Finds cells on a learnt lattice over the town.
+#[derive(Debug)]
+pub struct Refiner {
+    config: RefinerConfig,
+    /// `[corners, keys]`.
+    keys: Tensor,
+    /// `[corners, 1]`: height of what stands there, metres.
+    heights: Tensor,
+    sharpness: Tensor,
+    inward: Dense,
+    query: Dense,
+    height: Dense,
+    epsilon: [Dense; 2],
+}
+
+impl Refiner {
+    /// Builds the layers below `path`.
+    ///
+    /// # Errors
+    /// [`LocalizerError::Config`] names the field that is wrong.
+    pub fn new(path: &nn::Path<'_>, config: &RefinerConfig) -> Result<Self, LocalizerError> {
+        config.validate().map_err(LocalizerError::Config)?;
+        let [columns, rows] = config.corners();
+        let corners = columns * rows;
+        let RefinerConfig { local_channels, keys, width, .. } = *config;
+        Ok(Self {
+            config: config.clone(),
+            keys: path.var("keys", &[corners, keys], Init::Randn { mean: 0.0, stdev: 0.2 }),
+            heights: path.var("heights", &[corners, 1], Init::Const(0.0)),
+            sharpness: path.var("sharpness", &[1], Init::Const(FIRST_SHARPNESS)),
+            inward: Dense::new(&(path / "inward"), local_channels + 3, width, 1.0),
+            query: Dense::new(&(path / "query"), width, keys, 0.5),
+            height: Dense::new(&(path / "height"), width, 1, 0.1),
+            epsilon: [
+                Dense::new(&(path / "epsilon" / 0), width + 2, 32, 1.0),
+                Dense::new(&(path / "epsilon" / 1), 32, 1, 0.1),
+            ],
+        })
+    }
+
+    /// What it was built from.
+    #[must_use]
+    pub fn config(&self) -> &RefinerConfig {
+        &self.config
+    }
+
+    /// Where cells really are, given where a pose puts them.
+    ///
+    /// # Shapes and frames
+    /// - `cells`: `[N, channels >= local_channels]`, normalised features; the first `local_channels` are used
+    /// - `assumed_m`: `[N, 3]`, world coordinates relative to the head's origin, metres
+    /// - `heading`: `[N, 2]`, cosine and sine of the sensor's heading in the world
+    ///
+    /// # Errors
+    /// The tensor library's.
+    pub fn look(
+        &self,
+        cells: &Tensor,
+        assumed_m: &Tensor,
+        heading: &Tensor,
+        kind: Kind,
+    ) -> Result<Regression, TchError> {
+        let local = cells.f_narrow(1, 0, self.config.local_channels)?;
+        let height = assumed_m.f_narrow(1, 2, 1)? / 10.0;
+        let input = Tensor::f_cat(&[&local, heading, &height], 1)?.f_to_kind(kind)?;
+        let hidden = self.inward.forward(&input)?.f_relu()?;
+        let query = self.query.forward(&hidden)?.f_to_kind(Kind::Float)?.f_unsqueeze(2)?;
+
+        let window = self.window(assumed_m)?;
+        let similarity = gather(&self.keys, &window.corners)?.f_bmm(&query)?.f_squeeze_dim(2)? * &self.sharpness;
+        let shares = similarity.f_softmax(1, Kind::Float)?.f_unsqueeze(1)?;
+        let plane_m = shares.f_bmm(&window.places_m)?.f_squeeze_dim(1)?;
+        let floor_m = shares.f_bmm(&gather(&self.heights, &window.corners)?)?.f_squeeze_dim(1)?;
+        let above_m = self.height.forward(&hidden)?.f_to_kind(Kind::Float)?;
+        // How far the shares are spread, and how large the largest is, tell how sure the answer is.
+        let square = shares.f_bmm(&window.places_m.f_square()?)?.f_squeeze_dim(1)?;
+        let spread =
+            (square - plane_m.f_square()?).f_sum_dim_intlist(1_i64, true, Kind::Float)?.f_clamp_min(1e-6)?.f_sqrt()?;
+        let largest = shares.f_amax([2_i64], false)?;
+        let evidence = Tensor::f_cat(&[hidden.f_to_kind(Kind::Float)?, spread, largest], 1)?;
+        let epsilon = self.epsilon[1].forward(&self.epsilon[0].forward(&evidence)?.f_relu()?)?;
+        Ok(Regression {
+            coordinates_m: Tensor::f_cat(&[plane_m + window.middle_m, floor_m + above_m], 1)?,
+            epsilon_m: epsilon.f_squeeze_dim(1)?.f_softplus()?,
+        })
+    }
+
+    /// The corners around each place.
+    fn window(&self, assumed_m: &Tensor) -> Result<Window, TchError> {
+        let RefinerConfig { spacing_m, reach, low_m, .. } = &self.config;
+        let [columns, rows] = self.config.corners();
+        let device = assumed_m.device();
+        let axis = |axis: usize, size: i64| {
+            let steps = ((assumed_m.f_select(1, axis as i64)? - low_m[axis]) / *spacing_m).f_round()?;
+            steps.f_clamp(*reach as f64, (size - 1 - reach) as f64)
+        };
+        let (column, row) = (axis(0, columns)?, axis(1, rows)?);
+        let middle = [&column * *spacing_m + low_m[0], &row * *spacing_m + low_m[1]];
+        let first = (row * columns as f64 + column).f_to_kind(Kind::Int64)?.f_unsqueeze(1)?;
+        let around = || (-reach..=*reach).flat_map(move |y| (-reach..=*reach).map(move |x| (x, y)));
+        let shifts: Vec<i64> = around().map(|(x, y)| y * columns + x).collect();
+        let places: Vec<f32> =
+            around().flat_map(|(x, y)| [(x as f64 * spacing_m) as f32, (y as f64 * spacing_m) as f32]).collect();
+        let count = assumed_m.size()[0];
+        let places_m = Tensor::f_from_slice(&places)?.f_view([1, -1, 2])?.f_to_device(device)?;
+        Ok(Window {
+            corners: first + Tensor::f_from_slice(&shifts)?.f_to_device(device)?,
+            places_m: places_m.f_expand([count, -1, -1], false)?,
+            middle_m: Tensor::f_stack(&middle, 1)?,
+        })
+    }
+}
+
+/// Candidates of some cells.
+struct Window {
+    /// `[N, K]` rows of keys.
+    corners: Tensor,
+    /// `[N, K, 2]`: where they are relative to the middle, metres.
+    places_m: Tensor,
+    /// `[N, 2]`: the corner in the middle, metres relative to the head's origin.
+    middle_m: Tensor,
+}
+
+/// `[N, K, C]` rows of `[R, C]` by `[N, K]`; its gradient is fast because the index is expanded, not written out.
+fn gather(rows: &Tensor, index: &Tensor) -> Result<Tensor, TchError> {
+    let channels = rows.size()[1];
+    let flat = index.f_reshape([-1, 1])?.f_expand([-1, channels], false)?;
+    rows.f_gather(0, &flat, false)?.f_view([index.size()[0], index.size()[1], channels])
+}
+
+#[cfg(test)]
+mod tests {
+    use tch::Device;
+    use tch::nn::VarStore;
+
+    use super::*;
+
+    fn config() -> RefinerConfig {
+        RefinerConfig {
+            local_channels: 4,
+            low_m: [-20.0, -10.0],
+            high_m: [20.0, 30.0],
+            spacing_m: 2.0,
+            reach: 2,
+            keys: 4,
+            width: 8,
+        }
+    }
+
+    fn refiner() -> (VarStore, Refiner) {
+        tch::set_num_threads(1);
+        tch::manual_seed(1);
+        let network = VarStore::new(Device::Cpu);
+        let refiner = Refiner::new(&network.root(), &config()).unwrap();
+        (network, refiner)
+    }
+
+    #[test]
+    fn answers_lie_within_the_window_around_the_assumption() {
+        let (_network, refiner) = refiner();
+        let assumed = Tensor::from_slice(&[1.3f32, 2.2, 3.0, -7.9, 11.0, 0.0]).view([2, 3]);
+        let cells = Tensor::randn([2, 6], (Kind::Float, Device::Cpu)) * 5.0;
+        let heading = Tensor::from_slice(&[1.0f32, 0.0, 0.0, 1.0]).view([2, 2]);
+        let answer = refiner.look(&cells, &assumed, &heading, Kind::Float).unwrap();
+        let off = (answer.coordinates_m - assumed).narrow(1, 0, 2).abs().max().double_value(&[]);
+        assert!(off <= 5.0, "{off}");
+        assert!(answer.epsilon_m.min().double_value(&[]) > 0.0);
+    }
+
+    #[test]
+    fn the_corner_whose_key_is_like_the_query_wins() {
+        let (_network, refiner) = refiner();
+        let assumed = Tensor::from_slice(&[0.2f32, 0.1, 0.0]).view([1, 3]);
+        let window = refiner.window(&assumed).unwrap();
+        assert_eq!(Vec::<f32>::try_from(window.middle_m.view([-1])).unwrap(), [0.0, 0.0]);
+        let corner: i64 = window.corners.int64_value(&[0, 2 * 5 + 3]);
+        assert_eq!(window.corners.int64_value(&[0, 12]) + 1, corner, "one step along x");
+        let places: Vec<f32> = Vec::try_from(window.places_m.get(0).get(13)).unwrap();
+        assert_eq!(places, [2.0, 0.0]);
+    }
+
+    #[test]
+    fn places_outside_are_sought_at_the_edge() {
+        let (_network, refiner) = refiner();
+        let assumed = Tensor::from_slice(&[1e4f32, -1e4, 0.0, f32::MAX, f32::MIN, 0.0]).view([2, 3]);
+        let window = refiner.window(&assumed).unwrap();
+        let [columns, rows] = config().corners();
+        assert!(window.corners.min().int64_value(&[]) >= 0 && window.corners.max().int64_value(&[]) < columns * rows);
+    }
+}

@@ -1,0 +1,179 @@
+//! The head that belongs to one town: which part of it a sweep was made in, and where in the world each cell lies.
+
+use tch::nn::{self, LinearConfig, Module};
+use tch::{Kind, TchError, Tensor};
+
+use super::dense::Dense;
+use super::error::LocalizerError;
+use super::feature_norm::FeatureNorm;
+use super::head_config::SceneHeadConfig;
+use super::refinement_network::Refiner;
+use perception::layers::convolution::Norm;
+
+/// Hidden layers of the classifier of sweeps, as in LightLoc.
+const CLASSIFIER_WIDTHS: [i64; 2] = [512, 256];
+/// Share of channels that the classifier is trained without.
+const DROPOUT: f64 = 0.5;
+/// Unit of the offset from the weighted centres, metres.
+const OFFSET_SCALE_M: f64 = 10.0;
+
+/// What the head says of some cells.
+#[derive(Debug)]
+pub struct Regression {
+    /// `[N, 3]`: world coordinates relative to the origin, metres.
+    pub coordinates_m: Tensor,
+    /// `[N]`: predicted L1 error, metres, not negative.
+    pub epsilon_m: Tensor,
+}
+
+/// Classifier of sweeps and regressor of cells.
+#[derive(Debug)]
+pub struct SceneHead {
+    config: SceneHeadConfig,
+    /// Mean and scale of features over the training sweeps.
+    cell_norm: FeatureNorm,
+    sweep_norm: FeatureNorm,
+    classifier: Classifier,
+    /// `[centres, 3]`, metres relative to the origin.
+    centres: Tensor,
+    inward: Dense,
+    blocks: Vec<[Dense; 3]>,
+    outward: Dense,
+    refiner: Option<Refiner>,
+}
+
+impl SceneHead {
+    /// Kind of the weights, as their file says it.
+    pub const KIND: &'static str = "scene head";
+
+    /// Builds the layers below `path`.
+    ///
+    /// # Errors
+    /// [`LocalizerError::Config`] names the field that is wrong.
+    pub fn new(path: &nn::Path<'_>, config: &SceneHeadConfig) -> Result<Self, LocalizerError> {
+        config.validate().map_err(LocalizerError::Config)?;
+        let SceneHeadConfig { cell_channels, sweep_channels, classes, centres, width, blocks, .. } = *config;
+        let block = |number: usize| {
+            let layer = |layer: usize| Dense::new(&(path / "blocks" / number / layer), width, width, 1.0);
+            [layer(0), layer(1), layer(2)]
+        };
+        Ok(Self {
+            config: config.clone(),
+            cell_norm: FeatureNorm::new(&(path / "cell_norm"), cell_channels),
+            sweep_norm: FeatureNorm::new(&(path / "sweep_norm"), sweep_channels),
+            classifier: Classifier::new(&(path / "classifier"), sweep_channels, classes),
+            centres: (path / "centres").zeros_no_train("position", &[centres, 3]),
+            inward: Dense::new(&(path / "inward"), cell_channels + classes, width, 1.0),
+            blocks: (0..blocks).map(block).collect(),
+            outward: Dense::new(&(path / "outward"), width, centres + 4, 0.1),
+            refiner: config.refiner.as_ref().map(|config| Refiner::new(&(path / "refiner"), config)).transpose()?,
+        })
+    }
+
+    /// What it was built from.
+    #[must_use]
+    pub fn config(&self) -> &SceneHeadConfig {
+        &self.config
+    }
+
+    /// The second look, where there is one.
+    #[must_use]
+    pub fn refiner(&self) -> Option<&Refiner> {
+        self.refiner.as_ref()
+    }
+
+    /// Features of cells with mean 0 and deviation 1 over the training sweeps.
+    ///
+    /// # Errors
+    /// The tensor library's.
+    pub fn normalise(&self, cells: &Tensor) -> Result<Tensor, TchError> {
+        self.cell_norm.forward(cells)
+    }
+
+    /// Which part of town, `[sweeps, classes]` logits of `[sweeps, sweep_channels]`; with `train` channels drop out.
+    ///
+    /// # Errors
+    /// The tensor library's.
+    pub fn classify(&self, sweeps: &Tensor, train: bool) -> Result<Tensor, TchError> {
+        self.classifier.forward(&self.sweep_norm.forward(sweeps)?, train)
+    }
+
+    /// World coordinates of `[N, cell_channels]` normalised features, given the logits `[N, classes]` of the sweep that each is part of.
+    ///
+    /// # Errors
+    /// The tensor library's.
+    pub fn regress(&self, cells: &Tensor, logits: &Tensor, kind: Kind) -> Result<Regression, TchError> {
+        Ok(self.regress_among_centres(cells, logits, kind)?.0)
+    }
+
+    /// The same, and the logarithms `[N, centres]` of the shares that the centres have in each answer.
+    ///
+    /// # Errors
+    /// The tensor library's.
+    pub fn regress_among_centres(
+        &self,
+        cells: &Tensor,
+        logits: &Tensor,
+        kind: Kind,
+    ) -> Result<(Regression, Tensor), TchError> {
+        let norm = logits.f_square()?.f_sum_dim_intlist(1_i64, true, Kind::Float)?.f_add_scalar(1e-12)?.f_sqrt()?;
+        let input = Tensor::f_cat(&[cells, &(logits / norm)], 1)?.f_to_kind(kind)?;
+        let mut x = self.inward.forward(&input)?.f_relu()?;
+        for [first, second, third] in &self.blocks {
+            let inner = second.forward(&first.forward(&x)?.f_relu()?)?.f_relu()?;
+            x = (x + third.forward(&inner)?).f_relu()?;
+        }
+        let output = self.outward.forward(&x)?.f_to_kind(Kind::Float)?;
+        let centres = self.config.centres;
+        let log_shares = output.f_narrow(1, 0, centres)?.f_log_softmax(1, Kind::Float)?;
+        let offset = output.f_narrow(1, centres, 3)? * OFFSET_SCALE_M;
+        let coordinates_m = log_shares.f_exp()?.f_matmul(&self.centres)? + offset;
+        let epsilon_m = output.f_narrow(1, centres + 3, 1)?.f_squeeze_dim(1)?.f_softplus()?;
+        Ok((Regression { coordinates_m, epsilon_m }, log_shares))
+    }
+
+    /// `[centres, 3]`: what cells are placed among, metres relative to the origin.
+    pub fn centres_m(&self) -> &Tensor {
+        &self.centres
+    }
+
+    /// Sets what is computed from the training data, not learnt: statistics of the features `[N, cell_channels]` and
+    /// `[S, sweep_channels]`, and the centres.
+    ///
+    /// # Errors
+    /// The tensor library's, when shapes do not fit.
+    pub fn set_statistics(&mut self, cells: &Tensor, sweeps: &Tensor, centres: &Tensor) -> Result<(), TchError> {
+        self.cell_norm.fit(cells)?;
+        self.sweep_norm.fit(sweeps)?;
+        tch::no_grad(|| self.centres.f_copy_(centres))
+    }
+}
+
+/// Two hidden layers with batch norm and dropout.
+#[derive(Debug)]
+struct Classifier {
+    layers: [nn::Linear; 2],
+    norms: [Norm; 2],
+    last: nn::Linear,
+}
+
+impl Classifier {
+    fn new(path: &nn::Path<'_>, inputs: i64, classes: i64) -> Self {
+        let [first, second] = CLASSIFIER_WIDTHS;
+        let linear = |layer: usize, from, to| nn::linear(path / layer, from, to, LinearConfig::default());
+        let norm = |layer: usize, width| Norm::with_eps(&(path / "norms" / layer), width, 1e-5, 0.1);
+        Self {
+            layers: [linear(0, inputs, first), linear(1, first, second)],
+            norms: [norm(0, first), norm(1, second)],
+            last: linear(2, second, classes),
+        }
+    }
+
+    fn forward(&self, x: &Tensor, train: bool) -> Result<Tensor, TchError> {
+        let mut x = x.shallow_clone();
+        for (layer, norm) in self.layers.iter().zip(&self.norms) {
+            x = norm.forward(&layer.forward(&x), train).f_relu()?.f_dropout(DROPOUT, train)?;
+        }
+        Ok(self.last.forward(&x))
+    }
+}

@@ -1,0 +1,89 @@
+//! Synthetic scene coordinates: a town without a network whose cells have drawn errors, for tests and benches.
+
+use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
+use protocol::PointCloud;
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use rand_distr::{Distribution, Normal};
+
+use super::error::LocalizerError;
+use super::localize::{Localization, Localize, LocalizerTimes, SceneCoordinates};
+use super::pose_solver::PoseSolver;
+
+/// Where the world's coordinates begin: far away, as in maps in UTM coordinates.
+const ORIGIN_M: [f64; 3] = [500_000.0, 5_700_000.0, 100.0];
+
+/// What the cells of its sweeps are like.
+#[derive(Debug, Clone)]
+pub struct SyntheticTown {
+    /// Cells of a sweep.
+    pub cells: usize,
+    /// Share of cells that are anywhere in town.
+    pub outliers: f64,
+    /// Share of the others that are taken for another place that looks alike, 25 m away.
+    pub twins: f64,
+    /// Standard deviation of the rest per axis, metres.
+    pub noise_m: f64,
+    /// Seed of the next sweep that is asked for; the sweep itself does not count.
+    pub next_seed: u64,
+}
+
+impl Default for SyntheticTown {
+    fn default() -> Self {
+        Self { cells: 300, outliers: 0.2, twins: 0.0, noise_m: 0.2, next_seed: 0 }
+    }
+}
+
+impl SyntheticTown {
+    /// Where the sweep of a seed was made.
+    pub fn world_from_sensor(&self, seed: u64) -> Isometry3<f64> {
+        let mut local = local_pose(seed);
+        local.translation.vector += Vector3::from(ORIGIN_M);
+        local
+    }
+
+    /// The cells of a seed's sweep.
+    pub fn coordinates(&self, seed: u64) -> SceneCoordinates {
+        let pose = local_pose(seed);
+        let mut random = ChaCha8Rng::seed_from_u64(seed ^ 0x5eed);
+        let noise = Normal::new(0.0, self.noise_m).expect("a standard deviation");
+        let mut coordinates = SceneCoordinates { origin_m: ORIGIN_M, ..SceneCoordinates::default() };
+        for _ in 0..self.cells {
+            let mut within = |reach: f64| random.random_range(-reach..reach);
+            let sensor = Point3::new(within(50.0), within(50.0), within(5.0));
+            let mut believed = pose * sensor;
+            if random.random_bool(self.twins) {
+                // The network does not know that it is wrong.
+                believed += Vector3::new(24.0, 7.0, 0.0);
+            }
+            let world = if random.random_bool(self.outliers) {
+                let mut within = |reach: f64| random.random_range(-reach..reach);
+                Point3::new(within(200.0), within(200.0), within(5.0))
+            } else {
+                believed + Vector3::from_fn(|_, _| noise.sample(&mut random))
+            };
+            let off_m = (world - believed).abs().sum().min(10.0);
+            coordinates.epsilon_m.push((off_m * random.random_range(0.5..1.5)) as f32);
+            coordinates.sensor_m.push(sensor.coords.map(|axis| axis as f32).into());
+            coordinates.world_m.push(world.coords.map(|axis| axis as f32).into());
+        }
+        coordinates
+    }
+}
+
+impl Localize for SyntheticTown {
+    fn localize(&mut self, _: &PointCloud) -> Result<Localization, LocalizerError> {
+        self.next_seed += 1;
+        let solved = PoseSolver::default().solve(&self.coordinates(self.next_seed - 1));
+        Ok(Localization::new(&solved, LocalizerTimes::default()))
+    }
+}
+
+fn local_pose(seed: u64) -> Isometry3<f64> {
+    let mut random = ChaCha8Rng::seed_from_u64(seed);
+    let mut within = |reach: f64| random.random_range(-reach..reach);
+    Isometry3::from_parts(
+        Translation3::new(within(150.0), within(150.0), 2.0 + within(0.5)),
+        UnitQuaternion::from_euler_angles(within(0.03), within(0.03), within(3.1)),
+    )
+}

@@ -1,0 +1,94 @@
+//! Sweeps as the tensors of one forward pass.
+
+use std::ops::Range;
+
+use tch::{Device, TchError, Tensor};
+
+use super::encoder_config::SceneEncoderConfig;
+use super::voxelise::{SweepVoxels, plane_edge};
+use perception::sparse::{GatherIndex, Rulebook};
+
+/// One or more sweeps, their rows one after another. No sweep sees another.
+#[derive(Debug)]
+pub struct VoxelBatch {
+    pub(super) input: Tensor,
+    pub(super) first: GatherIndex,
+    pub(super) down: Vec<GatherIndex>,
+    pub(super) fine: Option<GatherIndex>,
+    pub(super) coarse: GatherIndex,
+    /// `[cells]` of rows of the last level.
+    pub(super) coarse_of_cell: Tensor,
+    /// `[rows of the last level]`: place in the planes of all sweeps.
+    pub(super) columns: Tensor,
+    /// Edge of a plane, cells of the last level.
+    pub(super) plane_edge: i64,
+    /// Rows of the last level by sweep.
+    pub(super) coarse_rows: Vec<Range<i64>>,
+    /// Cells by sweep.
+    pub(super) cell_rows: Vec<Range<i64>>,
+}
+
+impl VoxelBatch {
+    /// Puts sweeps together.
+    ///
+    /// # Errors
+    /// The tensor library's.
+    pub fn new(sweeps: &[&SweepVoxels], config: &SceneEncoderConfig, device: Device) -> Result<Self, TchError> {
+        let input: Vec<f32> = sweeps.iter().flat_map(|sweep| &sweep.input).copied().collect();
+        let input = Tensor::f_from_slice(&input)?.f_view([-1, config.input.channels()])?.f_to_device(device)?;
+        let stacked = |book: fn(&SweepVoxels) -> &Rulebook| Rulebook::stacked(sweeps.iter().map(|s| book(s)), device);
+        let down = (0..config.levels() - 1)
+            .map(|level| Rulebook::stacked(sweeps.iter().map(|sweep| &sweep.down[level]), device))
+            .collect::<Result<_, _>>()?;
+        let fine = match config.fine_cells {
+            true => Some(Rulebook::stacked(sweeps.iter().filter_map(|sweep| sweep.fine.as_ref()), device)?),
+            false => None,
+        };
+        let edge = i64::from(plane_edge(config));
+        let coarse_rows = ranges(sweeps, |sweep| sweep.columns.len());
+        let shifted = |values: fn(&SweepVoxels) -> &[u32], shifts: Vec<i64>| {
+            let rows = sweeps.iter().zip(shifts);
+            let rows: Vec<i64> =
+                rows.flat_map(|(sweep, shift)| values(sweep).iter().map(move |&row| shift + i64::from(row))).collect();
+            Tensor::f_from_slice(&rows)?.f_to_device(device)
+        };
+        let planes = (0..sweeps.len() as i64).map(|sweep| sweep * edge * edge).collect();
+        Ok(Self {
+            input,
+            first: stacked(|sweep| &sweep.first)?,
+            down,
+            fine,
+            coarse: stacked(|sweep| &sweep.coarse)?,
+            coarse_of_cell: shifted(
+                |sweep| &sweep.coarse_of_cell,
+                coarse_rows.iter().map(|rows| rows.start).collect(),
+            )?,
+            columns: shifted(|sweep| &sweep.columns, planes)?,
+            plane_edge: edge,
+            coarse_rows,
+            cell_rows: ranges(sweeps, |sweep| sweep.cells.len()),
+        })
+    }
+
+    /// Number of sweeps.
+    #[must_use]
+    pub fn sweeps(&self) -> i64 {
+        self.cell_rows.len() as i64
+    }
+
+    /// The rows of a sweep's cells.
+    #[must_use]
+    pub fn cell_rows(&self, sweep: usize) -> Range<i64> {
+        self.cell_rows[sweep].clone()
+    }
+}
+
+fn ranges(sweeps: &[&SweepVoxels], count: impl Fn(&SweepVoxels) -> usize) -> Vec<Range<i64>> {
+    let mut end = 0;
+    let range = |sweep: &&SweepVoxels| {
+        let start = end;
+        end += count(sweep) as i64;
+        start..end
+    };
+    sweeps.iter().map(range).collect()
+}

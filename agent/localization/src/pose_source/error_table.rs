@@ -1,0 +1,181 @@
+//! Pose errors that a pose generator really made, one row per sweep.
+
+use std::io;
+use std::path::{Path, PathBuf};
+
+use support::bounded_file;
+
+use super::noise::PlanarError;
+
+/// The first line of a table.
+const HEADER: &str = "x_m,y_m,z_m,yaw_deg,confidence";
+
+/// Errors beyond this are no errors of a pose but of a file, metres.
+const MAX_ERROR_M: f64 = 1e5;
+/// Largest file that is read, bytes.
+const MAX_BYTES: u64 = 64 << 20;
+
+/// Why a table of errors cannot be read.
+#[derive(Debug, thiserror::Error)]
+pub enum ErrorTableError {
+    /// The file is missing or not readable.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// The first line is another.
+    #[error("{}:1: header is {found:?}, must be {HEADER:?}", path.display())]
+    Header {
+        /// The file.
+        path: PathBuf,
+        /// The line found.
+        found: String,
+    },
+    /// A line is neither five numbers nor `no_pose`.
+    #[error("{}:{line}: {field} is {found:?}, must be {must}", path.display())]
+    Row {
+        /// The file.
+        path: PathBuf,
+        /// Line number, from 1.
+        line: usize,
+        /// Column.
+        field: &'static str,
+        /// What stood there.
+        found: String,
+        /// What would be right.
+        must: &'static str,
+    },
+    /// There is no row.
+    #[error("{}: no row below the header", path.display())]
+    Empty {
+        /// The file.
+        path: PathBuf,
+    },
+}
+
+/// What happened to one sweep.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub enum TableRow {
+    /// A pose with this error, in the vehicle's frame (x forward, y left).
+    Pose {
+        /// How far off.
+        error: PlanarError,
+        /// What the generator thought of it, 0..=1.
+        confidence: f32,
+    },
+    /// None was found.
+    NoPose,
+}
+
+/// Rows in the order of the sweeps they were measured on.
+///
+/// The file is text: the header `x_m,y_m,z_m,yaw_deg,confidence`, then a line of five numbers per sweep, or `no_pose`.
+#[derive(Debug, Clone, PartialEq)]
+pub struct ErrorTable {
+    rows: Vec<TableRow>,
+}
+
+impl ErrorTable {
+    /// Reads a table.
+    ///
+    /// # Errors
+    /// [`ErrorTableError`] names the file, the line and the column.
+    pub fn read(path: &Path) -> Result<Self, ErrorTableError> {
+        let text = bounded_file::read_text(path, MAX_BYTES)
+            .map_err(|source| ErrorTableError::Io { path: path.to_owned(), source })?;
+        let mut lines = text.lines().enumerate();
+        let header = lines.next().map_or("", |(_, line)| line.trim());
+        if header != HEADER {
+            let found = header.chars().take(80).collect();
+            return Err(ErrorTableError::Header { path: path.to_owned(), found });
+        }
+        let rows: Result<Vec<_>, _> = lines
+            .filter(|(_, line)| !line.trim().is_empty())
+            .map(|(index, line)| parse_row(line.trim()).map_err(|problem| problem.at(path, index + 1)))
+            .collect();
+        let rows = rows?;
+        if rows.is_empty() { Err(ErrorTableError::Empty { path: path.to_owned() }) } else { Ok(Self { rows }) }
+    }
+
+    /// The row of a step when the first step takes row `start`; the table is read round and round.
+    #[must_use]
+    pub fn row(&self, start: u64, step: u64) -> TableRow {
+        let length = self.rows.len() as u64;
+        self.rows[((start % length + step % length) % length) as usize]
+    }
+}
+
+/// What is wrong with a line.
+struct RowProblem {
+    field: &'static str,
+    found: String,
+    must: &'static str,
+}
+
+impl RowProblem {
+    fn at(self, path: &Path, line: usize) -> ErrorTableError {
+        let Self { field, found, must } = self;
+        let found = found.chars().take(80).collect();
+        ErrorTableError::Row { path: path.to_owned(), line, field, found, must }
+    }
+}
+
+fn parse_row(line: &str) -> Result<TableRow, RowProblem> {
+    if line == "no_pose" {
+        return Ok(TableRow::NoPose);
+    }
+    let columns: Vec<&str> = line.split(',').map(str::trim).collect();
+    let &[x, y, z, yaw, confidence] = columns.as_slice() else {
+        return Err(RowProblem { field: "line", found: line.to_owned(), must: "five numbers or no_pose" });
+    };
+    let number = |field, text: &str, low: f64, high: f64, must| match text.parse::<f64>() {
+        Ok(value) if (low..=high).contains(&value) => Ok(value),
+        _ => Err(RowProblem { field, found: text.to_owned(), must }),
+    };
+    let metres = |field, text| number(field, text, -MAX_ERROR_M, MAX_ERROR_M, "metres within 100 km");
+    let position_m = [metres("x_m", x)?, metres("y_m", y)?, metres("z_m", z)?];
+    let yaw_rad = number("yaw_deg", yaw, -360.0, 360.0, "degrees within a turn")?.to_radians();
+    let confidence = number("confidence", confidence, 0.0, 1.0, "0 to 1")? as f32;
+    Ok(TableRow::Pose { error: PlanarError { position_m, yaw_rad }, confidence })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn read(text: &str) -> Result<ErrorTable, ErrorTableError> {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("errors.csv");
+        std::fs::write(&path, text).unwrap();
+        ErrorTable::read(&path)
+    }
+
+    #[test]
+    fn rows_follow_each_other_round_and_round() {
+        let table = read("x_m,y_m,z_m,yaw_deg,confidence\n0.1,0,0,180,0.5\nno_pose\n\n").unwrap();
+        let TableRow::Pose { error, confidence } = table.row(1, 1) else { panic!("{table:?}") };
+        assert!((error.yaw_rad - std::f64::consts::PI).abs() < 1e-12 && confidence == 0.5);
+        assert_eq!(table.row(0, 1), TableRow::NoPose);
+        assert_eq!(table.row(u64::MAX, u64::MAX), table.row(0, 0));
+    }
+
+    #[test]
+    fn what_is_wrong_is_named_with_file_line_and_column() {
+        let header = "x_m,y_m,z_m,yaw_deg,confidence\n";
+        for (text, parts) in [
+            ("a,b\n".to_owned(), ["errors.csv:1", "a,b"]),
+            (format!("{header}1,2,3\n"), ["errors.csv:2", "1,2,3"]),
+            (format!("{header}0,0,0,0,1\n0,NaN,0,0,1\n"), ["errors.csv:3", "y_m is \"NaN\""]),
+            (format!("{header}0,0,0,0,1.5\n"), ["errors.csv:2", "confidence is \"1.5\""]),
+            (header.to_owned(), ["errors.csv", "no row"]),
+        ] {
+            let message = read(&text).unwrap_err().to_string();
+            assert!(parts.iter().all(|part| message.contains(part)), "{message}");
+        }
+        let message = ErrorTable::read(Path::new("/nowhere/errors.csv")).unwrap_err().to_string();
+        assert!(message.contains("/nowhere/errors.csv"), "{message}");
+    }
+}

@@ -1,0 +1,159 @@
+//! The pose from the sweep alone: no receiver, no recording.
+
+use std::path::PathBuf;
+
+use protocol::{NoPoseReason, PoseEstimate, StageTiming};
+use serde::{Deserialize, Serialize};
+use tch::Device;
+
+use super::motion_gate::{MotionSanity, SanityConfig};
+use super::{PoseInput, PoseSource};
+use crate::competitors::EndToEndLocalizer;
+use crate::pgc::{Localize, Localizer, LocalizerError};
+
+/// The networks of a pose generator.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PgcConfig {
+    /// Weights of the encoder, the same for all towns.
+    pub encoder: PathBuf,
+    /// Weights of the town's head.
+    pub head: PathBuf,
+    /// What the vehicle can do.
+    #[serde(default)]
+    pub sanity: SanityConfig,
+}
+
+/// A network that was trained end to end, to compare a pose generator with.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct EndToEndPoseConfig {
+    /// Weights of the town; they say what is regressed.
+    pub weights: PathBuf,
+    /// What the vehicle can do.
+    #[serde(default)]
+    pub sanity: SanityConfig,
+}
+
+/// Localises every sweep and judges the pose by those before it.
+#[derive(Debug)]
+pub struct LocalizedPose {
+    localizer: Box<dyn Localize>,
+    sanity: MotionSanity,
+    times: Vec<StageTiming>,
+}
+
+impl LocalizedPose {
+    /// Reads the networks of a pose generator, to compute with on the CPU.
+    ///
+    /// # Errors
+    /// [`LocalizerError`] names the file and what is wrong with it.
+    pub fn pgc(config: &PgcConfig) -> Result<Self, LocalizerError> {
+        let localizer = Localizer::load(&config.encoder, &config.head, Device::Cpu)?;
+        Ok(Self::new(Box::new(localizer), config.sanity.clone()))
+    }
+
+    /// Reads a network that was trained end to end, to compute with on the CPU.
+    ///
+    /// # Errors
+    /// [`LocalizerError`] names the file and what is wrong with it.
+    pub fn end_to_end(config: &EndToEndPoseConfig) -> Result<Self, LocalizerError> {
+        let localizer = EndToEndLocalizer::load(&config.weights, Device::Cpu)?;
+        Ok(Self::new(Box::new(localizer), config.sanity.clone()))
+    }
+
+    /// The same with another way to localise.
+    #[must_use]
+    pub fn new(localizer: Box<dyn Localize>, sanity: SanityConfig) -> Self {
+        Self { localizer, sanity: MotionSanity::new(sanity), times: Vec::new() }
+    }
+}
+
+impl PoseSource for LocalizedPose {
+    /// Does not look at the measured pose.
+    fn estimate(&mut self, input: &PoseInput<'_>) -> PoseEstimate {
+        self.times.clear();
+        let estimate = match self.localizer.localize(input.cloud) {
+            Ok(localization) => {
+                self.times = localization.times.stages();
+                localization.estimate
+            }
+            Err(error) => {
+                tracing::error!(cav = %input.cav, capture_nanos = input.capture_nanos, "no pose: {error}");
+                return PoseEstimate::NoPose { reason: NoPoseReason::Failed, inlier_count: 0 };
+            }
+        };
+        match estimate {
+            PoseEstimate::Pose { world_from_cav, confidence } => {
+                let verdict = self.sanity.judge(input.capture_nanos, &world_from_cav.isometry());
+                PoseEstimate::new(world_from_cav, confidence * self.sanity.factor(verdict) as f32)
+            }
+            none @ PoseEstimate::NoPose { .. } => none,
+        }
+    }
+
+    fn stages(&self) -> &[StageTiming] {
+        &self.times
+    }
+
+    fn jumps(&self) -> u64 {
+        self.sanity.jumps()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use protocol::{CavId, PointCloud, Pose};
+
+    use super::*;
+    use crate::pgc::synthetic::SyntheticTown;
+    use crate::pgc::{Localization, LocalizerTimes};
+
+    fn estimates(source: &mut LocalizedPose, count: u64) -> Vec<PoseEstimate> {
+        let cav = CavId::new("7").unwrap();
+        let cloud = PointCloud::default();
+        // A measured pose that is nowhere near: it must not matter.
+        let measured = Pose::from_xyz_yaw([1.0, 2.0, 3.0], 0.4);
+        let input =
+            |step| PoseInput { cav: &cav, capture_nanos: step * 100_000_000, cloud: &cloud, measured: Some(&measured) };
+        (0..count).map(|step| source.estimate(&input(step))).collect()
+    }
+
+    #[test]
+    fn the_pose_comes_from_the_sweep_and_jumps_cost_confidence() {
+        let town = SyntheticTown::default();
+        let mut source = LocalizedPose::new(Box::new(town.clone()), SanityConfig::default());
+        let found = estimates(&mut source, 2);
+        for (seed, estimate) in found.iter().enumerate() {
+            let off = town.world_from_sensor(seed as u64).inv_mul(&estimate.world_from_cav().unwrap().isometry());
+            assert!(off.translation.vector.norm() < 0.2);
+        }
+        // Two places of a town at random, a tenth of a second apart.
+        assert!(found[1].confidence() < 0.3 * found[0].confidence());
+        assert_eq!(source.jumps(), 1);
+        assert_eq!(source.stages().len(), 5);
+    }
+
+    #[derive(Debug)]
+    struct Broken;
+
+    impl Localize for Broken {
+        fn localize(&mut self, _: &PointCloud) -> Result<Localization, LocalizerError> {
+            Err(LocalizerError::Config("broken".into()))
+        }
+    }
+
+    #[test]
+    fn a_localizer_that_fails_gives_no_pose() {
+        let none = PoseEstimate::NoPose { reason: NoPoseReason::Failed, inlier_count: 0 };
+        assert_eq!(estimates(&mut LocalizedPose::new(Box::new(Broken), SanityConfig::default()), 1), [none]);
+        assert_eq!(LocalizerTimes::default().stages().len(), 5);
+    }
+
+    #[test]
+    fn no_pose_stays_no_pose() {
+        let empty = SyntheticTown { cells: 0, ..SyntheticTown::default() };
+        let found = estimates(&mut LocalizedPose::new(Box::new(empty), SanityConfig::default()), 3);
+        assert!(found.iter().all(|estimate| estimate.world_from_cav().is_none()));
+    }
+}

@@ -1,0 +1,257 @@
+//! Where an agent's pose comes from.
+//!
+//! One door for every source: the recording's own pose, that pose with an error of a chosen kind, and an estimate from
+//! the sweep alone. A source that has no pose says so; nothing is made up.
+
+mod error_table;
+mod localized;
+pub mod motion_gate;
+mod noise;
+mod noisy;
+mod numpy_normals;
+mod pose_table;
+
+use std::path::{Path, PathBuf};
+
+use protocol::{CavId, NoPoseReason, PointCloud, Pose, PoseEstimate, StageTiming};
+use serde::{Deserialize, Serialize};
+
+pub use error_table::{ErrorTable, ErrorTableError, TableRow};
+pub use localized::{EndToEndPoseConfig, LocalizedPose, PgcConfig};
+pub use noise::{PlanarError, PoseNoise};
+pub use noisy::NoisyPose;
+pub use pose_table::{CachedPose, CachedPoseConfig, PoseRow, PoseTable, PoseTableError};
+
+use crate::pgc::LocalizerError;
+
+/// What a source may look at for one sweep.
+#[derive(Debug, Clone, Copy)]
+pub struct PoseInput<'a> {
+    /// Whose sweep.
+    pub cav: &'a CavId,
+    /// Capture time on the clock of the scene, nanoseconds.
+    pub capture_nanos: u64,
+    /// The sweep, in the LiDAR frame.
+    pub cloud: &'a PointCloud,
+    /// `world_from_lidar` as recorded, or as a receiver measured it.
+    pub measured: Option<&'a Pose>,
+}
+
+/// Says where an agent is.
+pub trait PoseSource: std::fmt::Debug + Send {
+    /// The pose of one sweep with its confidence, or why there is none.
+    fn estimate(&mut self, input: &PoseInput<'_>) -> PoseEstimate;
+
+    /// Where the time of the last estimate went, for sources that compute.
+    fn stages(&self) -> &[StageTiming] {
+        &[]
+    }
+
+    /// Poses so far that the vehicle cannot have driven to from those before.
+    fn jumps(&self) -> u64 {
+        0
+    }
+}
+
+/// Takes the measured pose as it is, fully trusted.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct RecordedPose;
+
+impl PoseSource for RecordedPose {
+    fn estimate(&mut self, input: &PoseInput<'_>) -> PoseEstimate {
+        match input.measured {
+            Some(pose) => PoseEstimate::new(*pose, 1.0),
+            None => NO_SOURCE,
+        }
+    }
+}
+
+/// There is nothing to take a pose from.
+pub const NO_SOURCE: PoseEstimate = PoseEstimate::NoPose { reason: NoPoseReason::NoSource, inlier_count: 0 };
+
+/// Which source, as a scenario file names it.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case", deny_unknown_fields)]
+pub enum PoseSourceConfig {
+    /// The measured pose.
+    #[default]
+    Recorded,
+    /// The measured pose with an error.
+    Noisy(NoisyPoseConfig),
+    /// From the sweep alone, by networks.
+    Pgc(PgcConfig),
+    /// From the sweep alone, by a network that was trained end to end.
+    EndToEnd(EndToEndPoseConfig),
+    /// From a table that `agent localize` wrote.
+    Cached(CachedPoseConfig),
+}
+
+/// An error on the measured pose.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct NoisyPoseConfig {
+    /// Which kind of error.
+    pub mode: NoiseMode,
+    /// Standard deviation of x, y and z, metres.
+    pub position_std_m: f64,
+    /// Standard deviation of yaw, degrees.
+    pub heading_std_deg: f64,
+    /// Same seed, same errors.
+    pub seed: u64,
+    /// Time between two draws of the modes that depend on time, seconds.
+    pub step_s: f64,
+    /// `autoregressive`: time after which an error has decayed to 1/e, seconds.
+    pub decay_s: f64,
+    /// `replayed`: the table of errors.
+    pub table: Option<PathBuf>,
+}
+
+impl Default for NoisyPoseConfig {
+    /// OpenCOOD's: 0.2 m, 0.2 degrees, one fixed offset, seed 25.
+    fn default() -> Self {
+        Self {
+            mode: NoiseMode::Fixed,
+            position_std_m: 0.2,
+            heading_std_deg: 0.2,
+            seed: 25,
+            step_s: 0.1,
+            decay_s: 5.0,
+            table: None,
+        }
+    }
+}
+
+/// The four kinds of pose error.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum NoiseMode {
+    /// One offset, the same for all agents and frames: what the reference code does, which seeds anew at every call.
+    /// There the ego stays exact; give its agent the `recorded` source to repeat that.
+    #[default]
+    Fixed,
+    /// Drawn anew for every agent and frame.
+    Independent,
+    /// First-order autoregressive per agent: it wanders, as a filter's error does.
+    Autoregressive,
+    /// The errors that a pose generator really made, from a table.
+    Replayed,
+}
+
+/// Why a pose source cannot be set up.
+#[derive(Debug, thiserror::Error)]
+pub enum PoseSourceError {
+    /// A number is negative, not finite or absurd.
+    #[error("pose source: {field} is {value}, must be {must}")]
+    Value {
+        /// Name of the field.
+        field: &'static str,
+        /// What stood there.
+        value: f64,
+        /// What would be right.
+        must: &'static str,
+    },
+    /// `replayed` without a table.
+    #[error("pose source: mode replayed needs `table`, the file of errors")]
+    NoTable,
+    /// The table is not readable.
+    #[error(transparent)]
+    Table(#[from] ErrorTableError),
+    /// The networks cannot be used.
+    #[error(transparent)]
+    Localizer(#[from] LocalizerError),
+    /// The table of poses is not readable.
+    #[error(transparent)]
+    PoseTable(#[from] PoseTableError),
+}
+
+impl PoseSourceConfig {
+    /// The name in files and on command lines.
+    #[must_use]
+    pub fn name(&self) -> &'static str {
+        match self {
+            Self::Recorded => "recorded",
+            Self::Noisy(_) => "noisy",
+            Self::Pgc(_) => "pgc",
+            Self::EndToEnd(_) => "end_to_end",
+            Self::Cached(_) => "cached",
+        }
+    }
+
+    /// The same for one scenario of many: only tables of poses tell scenarios apart.
+    #[must_use]
+    pub fn for_scenario(&self, name: &str) -> Self {
+        match self {
+            Self::Cached(config) => {
+                Self::Cached(CachedPoseConfig { scenario: Some(name.to_owned()), ..config.clone() })
+            }
+            other => other.clone(),
+        }
+    }
+
+    /// The files that poses come from.
+    #[must_use]
+    pub fn files(&self) -> Vec<&Path> {
+        match self {
+            Self::Recorded => vec![],
+            Self::Noisy(noisy) => noisy.table.iter().map(PathBuf::as_path).collect(),
+            Self::Pgc(pgc) => vec![&pgc.encoder, &pgc.head],
+            Self::EndToEnd(network) => vec![&network.weights],
+            Self::Cached(cached) => vec![&cached.file],
+        }
+    }
+
+    /// Whether poses are found in the sweep: without its points there are none.
+    #[must_use]
+    pub fn looks_at_sweeps(&self) -> bool {
+        matches!(self, Self::Pgc(_) | Self::EndToEnd(_))
+    }
+
+    /// Sets the source up, files read.
+    ///
+    /// # Errors
+    /// [`PoseSourceError`] names the field or the file.
+    pub fn build(&self) -> Result<Box<dyn PoseSource>, PoseSourceError> {
+        Ok(match self {
+            Self::Recorded => Box::new(RecordedPose),
+            Self::Noisy(config) => Box::new(NoisyPose::new(config)?),
+            Self::Pgc(config) => Box::new(LocalizedPose::pgc(config)?),
+            Self::EndToEnd(config) => Box::new(LocalizedPose::end_to_end(config)?),
+            Self::Cached(config) => Box::new(CachedPose::new(config)?),
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_recorded_pose_passes_unchanged_and_a_missing_one_is_said() {
+        let cav = CavId::new("7").unwrap();
+        let cloud = PointCloud::default();
+        let pose = Pose::from_xyz_yaw([1.0, 2.0, 3.0], 0.4);
+        let mut input = PoseInput { cav: &cav, capture_nanos: 5, cloud: &cloud, measured: Some(&pose) };
+        let mut source = PoseSourceConfig::default().build().unwrap();
+        assert_eq!(source.estimate(&input), PoseEstimate::new(pose, 1.0));
+        input.measured = None;
+        assert_eq!(source.estimate(&input), NO_SOURCE);
+    }
+
+    #[test]
+    fn a_scenario_file_names_the_source() {
+        let config: PoseSourceConfig =
+            serde_saphyr::from_str("noisy:\n  mode: autoregressive\n  position_std_m: 0.5\n").unwrap();
+        let PoseSourceConfig::Noisy(noisy) = &config else { panic!("{config:?}") };
+        assert_eq!((noisy.mode, noisy.position_std_m, noisy.seed), (NoiseMode::Autoregressive, 0.5, 25));
+        assert_eq!(serde_saphyr::from_str::<PoseSourceConfig>("recorded").unwrap(), PoseSourceConfig::Recorded);
+        assert!(serde_saphyr::from_str::<PoseSourceConfig>("noisy:\n  posision_std_m: 0.5\n").is_err());
+        let config: PoseSourceConfig =
+            serde_saphyr::from_str("pgc:\n  encoder: e.safetensors\n  head: h.safetensors\n").unwrap();
+        assert_eq!(config.name(), "pgc");
+        let message = config.build().unwrap_err().to_string();
+        assert!(message.starts_with("e.safetensors"), "{message}");
+        let config: PoseSourceConfig = serde_saphyr::from_str("end_to_end:\n  weights: w.safetensors\n").unwrap();
+        let message = config.build().unwrap_err().to_string();
+        assert!(config.name() == "end_to_end" && message.starts_with("w.safetensors"), "{message}");
+    }
+}

@@ -1,0 +1,317 @@
+//! Poses that were found once, one row per sweep, on disk and by name.
+
+use std::collections::HashMap;
+use std::fmt::Write as _;
+use std::fs::OpenOptions;
+use std::io::{self, Write as _};
+use std::path::{Path, PathBuf};
+
+use protocol::{CavId, NoPoseReason, Pose, PoseEstimate};
+use serde::{Deserialize, Serialize};
+use support::bounded_file;
+
+/// The first line of a table.
+const HEADER: &str = "scenario,cav,capture_nanos,x_m,y_m,z_m,qw,qx,qy,qz,confidence,no_pose,inliers";
+const COLUMNS: usize = 13;
+/// Largest file that is read, bytes: two million sweeps.
+const MAX_BYTES: u64 = 256 << 20;
+
+/// Why a table of poses cannot be read or written.
+#[derive(Debug, thiserror::Error)]
+pub enum PoseTableError {
+    /// The system refused.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// A line is no row of a table.
+    #[error("{}:{line}: {problem}", path.display())]
+    Line {
+        /// The file.
+        path: PathBuf,
+        /// Line number, from 1.
+        line: usize,
+        /// What is wrong with it.
+        problem: String,
+    },
+    /// A scenario that was asked for has no row.
+    #[error("{}: there is no pose of scenario {scenario} in it", path.display())]
+    NoScenario {
+        /// The file.
+        path: PathBuf,
+        /// The scenario.
+        scenario: String,
+    },
+    /// Which of several scenarios is meant is not said.
+    #[error("{}: it has poses of {count} scenarios, and `scenario` does not say of which", path.display())]
+    WhichScenario {
+        /// The file.
+        path: PathBuf,
+        /// How many there are.
+        count: usize,
+    },
+}
+
+/// A sweep within its scenario.
+type SweepKey = (CavId, u64);
+
+/// Poses of scenarios, sweep by sweep; a sweep without a pose says why.
+///
+/// The file is text: a header, then per sweep the last part of the scenario's name, vehicle, capture time, translation,
+/// quaternion and confidence, or the reason for no pose and the correspondences that agreed.
+#[derive(Debug, Clone, Default)]
+pub struct PoseTable {
+    path: PathBuf,
+    scenarios: HashMap<String, HashMap<SweepKey, PoseEstimate>>,
+}
+
+/// One row on its way to a file.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct PoseRow<'a> {
+    /// Whose sweep.
+    pub cav: &'a CavId,
+    /// When, nanoseconds.
+    pub capture_nanos: u64,
+    /// Where, or why nobody knows.
+    pub estimate: PoseEstimate,
+}
+
+impl PoseTable {
+    /// Reads a table.
+    ///
+    /// # Errors
+    /// [`PoseTableError`] names the file and the line.
+    pub fn read(path: &Path) -> Result<Self, PoseTableError> {
+        let text = bounded_file::read_text(path, MAX_BYTES)
+            .map_err(|source| PoseTableError::Io { path: path.to_owned(), source })?;
+        let at = |line, problem| PoseTableError::Line { path: path.to_owned(), line, problem };
+        let mut lines = text.lines().enumerate();
+        let header = lines.next().map_or("", |(_, line)| line);
+        if header.trim() != HEADER {
+            let found: String = header.chars().take(80).collect();
+            return Err(at(1, format!("header is {found:?}, must be {HEADER:?}")));
+        }
+        let mut table = Self { path: path.to_owned(), ..Self::default() };
+        for (index, line) in lines.filter(|(_, line)| !line.trim().is_empty()) {
+            let (scenario, sweep, estimate) = parse(line.trim()).map_err(|problem| at(index + 1, problem))?;
+            let of_scenario = table.scenarios.entry(scenario).or_default();
+            if of_scenario.insert(sweep, estimate).is_some() {
+                return Err(at(index + 1, "the sweep has a row already".into()));
+            }
+        }
+        Ok(table)
+    }
+
+    /// Whether there are poses of a scenario, by its name or the path that ends in it.
+    #[must_use]
+    pub fn has(&self, scenario: &str) -> bool {
+        self.scenarios.contains_key(last_part(scenario))
+    }
+
+    /// Number of rows.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.scenarios.values().map(HashMap::len).sum()
+    }
+
+    /// Whether there is no row.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.scenarios.is_empty()
+    }
+
+    /// What is known of a sweep.
+    #[must_use]
+    pub fn get(&self, scenario: &str, cav: &CavId, capture_nanos: u64) -> Option<&PoseEstimate> {
+        self.scenarios.get(last_part(scenario))?.get(&(cav.clone(), capture_nanos))
+    }
+
+    /// Appends the rows of a scenario to a file, which gets its header where it is new.
+    ///
+    /// # Errors
+    /// [`PoseTableError::Io`] when the file cannot be written.
+    pub fn append(path: &Path, scenario: &str, rows: &[PoseRow<'_>]) -> Result<(), PoseTableError> {
+        let mut text = if path.exists() { String::new() } else { format!("{HEADER}\n") };
+        rows.iter().for_each(|row| write_row(&mut text, last_part(scenario), row));
+        let append = |path: &Path| OpenOptions::new().create(true).append(true).open(path)?.write_all(text.as_bytes());
+        append(path).map_err(|source| PoseTableError::Io { path: path.to_owned(), source })
+    }
+
+    /// The poses of one scenario: the one asked for, or the only one there is.
+    ///
+    /// # Errors
+    /// [`PoseTableError`] when there is none, or several and none is asked for.
+    fn of_scenario(mut self, scenario: Option<&str>) -> Result<HashMap<SweepKey, PoseEstimate>, PoseTableError> {
+        let path = self.path.clone();
+        match scenario {
+            Some(name) => self
+                .scenarios
+                .remove(last_part(name))
+                .ok_or_else(|| PoseTableError::NoScenario { path, scenario: name.to_owned() }),
+            None if self.scenarios.len() == 1 => Ok(self.scenarios.into_values().next().unwrap_or_default()),
+            None => Err(PoseTableError::WhichScenario { path, count: self.scenarios.len() }),
+        }
+    }
+}
+
+/// Which table, and of which scenario.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CachedPoseConfig {
+    /// The table, as `agent localize` writes it.
+    pub file: PathBuf,
+    /// The scenario that is replayed; needed where the table has several.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub scenario: Option<String>,
+}
+
+/// Looks poses up that were found before.
+#[derive(Debug, Clone)]
+pub struct CachedPose {
+    poses: HashMap<SweepKey, PoseEstimate>,
+}
+
+impl CachedPose {
+    /// Reads the table.
+    ///
+    /// # Errors
+    /// [`PoseTableError`] names the file and what is wrong with it.
+    pub fn new(config: &CachedPoseConfig) -> Result<Self, PoseTableError> {
+        Ok(Self { poses: PoseTable::read(&config.file)?.of_scenario(config.scenario.as_deref())? })
+    }
+}
+
+impl super::PoseSource for CachedPose {
+    /// Looks at neither sweep nor measured pose; a sweep that is not in the table has no source.
+    fn estimate(&mut self, input: &super::PoseInput<'_>) -> PoseEstimate {
+        self.poses.get(&(input.cav.clone(), input.capture_nanos)).copied().unwrap_or(super::NO_SOURCE)
+    }
+}
+
+/// Scenarios are known by the folder they lie in, wherever that folder lies.
+fn last_part(scenario: &str) -> &str {
+    scenario.rsplit('/').next().unwrap_or(scenario)
+}
+
+fn write_row(text: &mut String, scenario: &str, row: &PoseRow<'_>) {
+    let PoseRow { cav, capture_nanos, estimate } = row;
+    // Writing to a string cannot fail.
+    let _ = write!(text, "{scenario},{cav},{capture_nanos},");
+    let _ = match estimate {
+        PoseEstimate::Pose { world_from_cav: Pose { translation_m, rotation_wxyz }, confidence } => {
+            let [x, y, z] = translation_m;
+            let [qw, qx, qy, qz] = rotation_wxyz;
+            writeln!(text, "{x:.5},{y:.5},{z:.5},{qw:.9},{qx:.9},{qy:.9},{qz:.9},{confidence:.6},,")
+        }
+        PoseEstimate::NoPose { reason, inlier_count } => {
+            let reason = serde_json::to_value(reason).ok();
+            let reason = reason.as_ref().and_then(serde_json::Value::as_str).unwrap_or_default();
+            writeln!(text, ",,,,,,,,{reason},{inlier_count}")
+        }
+    };
+}
+
+fn parse(line: &str) -> Result<(String, SweepKey, PoseEstimate), String> {
+    let columns: Vec<&str> = line.split(',').map(str::trim).collect();
+    if columns.len() != COLUMNS {
+        return Err(format!("{} columns, must be {COLUMNS}", columns.len()));
+    }
+    let cav = CavId::new(columns[1]).map_err(|error| format!("cav: {error}"))?;
+    let capture_nanos = columns[2].parse().map_err(|_| format!("capture_nanos is {:?}", columns[2]))?;
+    let estimate = if columns[11].is_empty() { pose(&columns[3..11])? } else { no_pose(columns[11], columns[12])? };
+    Ok((columns[0].to_owned(), (cav, capture_nanos), estimate))
+}
+
+fn pose(columns: &[&str]) -> Result<PoseEstimate, String> {
+    let number = |column: usize| {
+        columns[column].parse::<f64>().map_err(|_| format!("{:?} is no number of a pose", columns[column]))
+    };
+    let translation_m = [number(0)?, number(1)?, number(2)?];
+    let rotation_wxyz = [number(3)?, number(4)?, number(5)?, number(6)?];
+    let world_from_cav = Pose { translation_m, rotation_wxyz };
+    world_from_cav.validate().map_err(|error| error.to_string())?;
+    let confidence = number(7)?;
+    if !(0.0..=1.0).contains(&confidence) {
+        return Err(format!("confidence is {confidence}, must be 0 to 1"));
+    }
+    Ok(PoseEstimate::new(world_from_cav, confidence as f32))
+}
+
+fn no_pose(reason: &str, inliers: &str) -> Result<PoseEstimate, String> {
+    let reason: NoPoseReason = serde_json::from_value(serde_json::Value::String(reason.to_owned()))
+        .map_err(|_| format!("no_pose is {reason:?}, which is no reason"))?;
+    let inlier_count = inliers.parse().map_err(|_| format!("inliers is {inliers:?}"))?;
+    Ok(PoseEstimate::NoPose { reason, inlier_count })
+}
+
+#[cfg(test)]
+mod tests {
+    use protocol::PointCloud;
+
+    use super::super::{PoseInput, PoseSourceConfig};
+    use super::*;
+
+    fn cav(name: &str) -> CavId {
+        CavId::new(name).unwrap()
+    }
+
+    fn found() -> PoseEstimate {
+        PoseEstimate::new(Pose::from_xyz_yaw([101.25, -7.5, 1.9], 0.7), 0.875)
+    }
+
+    const LOST: PoseEstimate = PoseEstimate::NoPose { reason: NoPoseReason::LowConfidence, inlier_count: 12 };
+
+    #[test]
+    fn rows_come_back_by_scenario_vehicle_and_time() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("poses.csv");
+        let (a, b) = (cav("a"), cav("b"));
+        let row = |cav, capture_nanos, estimate| PoseRow { cav, capture_nanos, estimate };
+        PoseTable::append(&file, "towns/one", &[row(&a, 100, found()), row(&b, 100, LOST)]).unwrap();
+        PoseTable::append(&file, "two", &[row(&a, 100, LOST)]).unwrap();
+        let table = PoseTable::read(&file).unwrap();
+        assert_eq!((table.len(), table.has("elsewhere/one"), table.has("three")), (3, true, false));
+        let PoseEstimate::Pose { world_from_cav, confidence } = table.get("one", &a, 100).unwrap() else { panic!() };
+        let apart = found().world_from_cav().unwrap().from_world(world_from_cav).isometry();
+        assert!(apart.translation.vector.norm() < 1e-4 && apart.rotation.angle() < 1e-6 && *confidence == 0.875);
+        assert_eq!(table.get("one", &b, 100), Some(&LOST));
+        assert_eq!(table.get("one", &b, 200), None);
+
+        let config = |scenario: Option<&str>| {
+            PoseSourceConfig::Cached(CachedPoseConfig { file: file.clone(), scenario: scenario.map(str::to_owned) })
+        };
+        let mut source = config(Some("one")).build().unwrap();
+        let cloud = PointCloud::default();
+        let mut ask = |cav, capture_nanos| {
+            source.estimate(&PoseInput { cav, capture_nanos, cloud: &cloud, measured: Some(&Pose::IDENTITY) })
+        };
+        assert_eq!((ask(&b, 100), ask(&b, 300)), (LOST, super::super::NO_SOURCE));
+        assert!(config(None).build().unwrap_err().to_string().contains("2 scenarios"));
+        assert!(config(Some("three")).build().unwrap_err().to_string().contains("three"));
+        assert_eq!(config(None).for_scenario("two"), config(Some("two")));
+    }
+
+    #[test]
+    fn what_is_wrong_is_named_with_file_and_line() {
+        let folder = tempfile::tempdir().unwrap();
+        let file = folder.path().join("poses.csv");
+        let good = "s,a,1,0,0,0,1,0,0,0,0.5,,";
+        for (text, part) in [
+            ("a,b\n".to_owned(), "poses.csv:1"),
+            (format!("{HEADER}\n{good}\n{good}\n"), "poses.csv:3: the sweep has a row already"),
+            (format!("{HEADER}\ns,a,1,0\n"), "4 columns"),
+            (format!("{HEADER}\ns,a,1,0,0,0,1,0,0,0,1.5,,\n"), "confidence is 1.5"),
+            (format!("{HEADER}\ns,a,1,0,0,NaN,1,0,0,0,0.5,,\n"), "poses.csv:2"),
+            (format!("{HEADER}\ns,a,1,0,0,0,9,0,0,0,0.5,,\n"), "poses.csv:2"),
+            (format!("{HEADER}\ns,a,1,,,,,,,,,tired,0\n"), "tired"),
+            (format!("{HEADER}\ns,A/b,1,0,0,0,1,0,0,0,0.5,,\n"), "cav"),
+        ] {
+            std::fs::write(&file, text).unwrap();
+            let message = PoseTable::read(&file).unwrap_err().to_string();
+            assert!(message.contains(part), "{message}");
+        }
+    }
+}

@@ -1,0 +1,219 @@
+//! A point cloud as small planes: one per voxel, where the points in and around it are flat.
+//!
+//! Coordinates are to be near zero, some kilometres, or sums of squares lose what planes are made of.
+
+use nalgebra::{Matrix3, SymmetricEigen, Vector3};
+
+use perception::sparse::Sites;
+
+/// Fewest points that a plane is fitted to.
+const MIN_POINTS: f64 = 6.0;
+/// A plane is at most this thick: its smallest variance as a share of the middle one.
+const MAX_THICKNESS: f64 = 0.08;
+/// And at least this wide: its middle variance as a share of the largest. Below it the points lie on one scan line, and
+/// any plane through that line fits.
+const MIN_WIDTH: f64 = 0.02;
+
+/// A small plane.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(super) struct Surfel {
+    /// Mean of the voxel's own points, metres.
+    pub centre_m: Vector3<f64>,
+    /// Unit normal, of either sign.
+    pub normal: Vector3<f64>,
+}
+
+/// Sums over the points of a voxel.
+#[derive(Debug, Clone, Copy, Default)]
+struct Moments {
+    count: f64,
+    sum: Vector3<f64>,
+    /// Sum of `p p^T`.
+    outer: Matrix3<f64>,
+}
+
+impl Moments {
+    fn add(&mut self, point: &Vector3<f64>) {
+        self.count += 1.0;
+        self.sum += point;
+        self.outer += point * point.transpose();
+    }
+
+    fn merge(&mut self, other: &Self) {
+        self.count += other.count;
+        self.sum += other.sum;
+        self.outer += other.outer;
+    }
+
+    fn mean(&self) -> Vector3<f64> {
+        self.sum / self.count
+    }
+
+    /// The normal of the plane that the points lie in, if they lie in one.
+    fn normal(&self) -> Option<Vector3<f64>> {
+        if self.count < MIN_POINTS {
+            return None;
+        }
+        let mean = self.mean();
+        let eigen = SymmetricEigen::new(self.outer / self.count - mean * mean.transpose());
+        let mut order = [0, 1, 2];
+        order.sort_by(|&a, &b| eigen.eigenvalues[a].total_cmp(&eigen.eigenvalues[b]));
+        let [thin, middle, wide] = order.map(|axis| eigen.eigenvalues[axis].max(0.0));
+        let flat = thin <= MAX_THICKNESS * middle && middle >= MIN_WIDTH * wide && wide > 0.0;
+        flat.then(|| eigen.eigenvectors.column(order[0]).into_owned())
+    }
+}
+
+/// A cloud, or many clouds in one frame, as planes on a lattice of voxels.
+#[derive(Debug, Clone)]
+pub(super) struct Surfels {
+    voxel_m: f64,
+    sites: Sites,
+    moments: Vec<Moments>,
+    /// By row of `sites`; made by [`Self::fit`].
+    planes: Vec<Option<Surfel>>,
+}
+
+impl Surfels {
+    pub(super) fn new(voxel_m: f64) -> Self {
+        Self { voxel_m, sites: Sites::default(), moments: Vec::new(), planes: Vec::new() }
+    }
+
+    /// Adds a point; those that no voxel can hold (not finite, hundreds of kilometres out) are left out.
+    pub(super) fn add(&mut self, point_m: &Vector3<f64>) {
+        let Some(voxel) = voxel_of(point_m, self.voxel_m) else { return };
+        let row = self.sites.add(voxel) as usize;
+        if row == self.moments.len() {
+            self.moments.push(Moments::default());
+        }
+        self.moments[row].add(point_m);
+    }
+
+    /// Fits the planes: each to the points of its voxel and of the 26 around it, since one sweep leaves a line or two in
+    /// a voxel.
+    pub(super) fn fit(&mut self) {
+        let around = |coord: &[i32; 3]| {
+            let mut moments = Moments::default();
+            for offset in 0..27 {
+                let shifted = [coord[0] + offset % 3 - 1, coord[1] + offset / 3 % 3 - 1, coord[2] + offset / 9 - 1];
+                if let Some(row) = self.sites.row(shifted) {
+                    moments.merge(&self.moments[row as usize]);
+                }
+            }
+            moments
+        };
+        let plane = |(coord, own): (&[i32; 3], &Moments)| {
+            Some(Surfel { centre_m: own.mean(), normal: around(coord).normal()? })
+        };
+        self.planes = self.sites.coords().iter().zip(&self.moments).map(plane).collect();
+    }
+
+    /// Voxels that are planes.
+    pub(super) fn len(&self) -> usize {
+        self.planes.iter().flatten().count()
+    }
+
+    /// The plane whose centre is nearest to a point, of the eight voxels on the point's side: complete to half a voxel,
+    /// good enough to one and a half.
+    pub(super) fn near(&self, point_m: &Vector3<f64>) -> Option<Surfel> {
+        let first = voxel_of(&point_m.add_scalar(-self.voxel_m / 2.0), self.voxel_m)?;
+        let mut nearest = None;
+        let mut least = f64::INFINITY;
+        for offset in 0..8 {
+            let voxel = [first[0] + (offset & 1), first[1] + (offset >> 1 & 1), first[2] + (offset >> 2)];
+            let Some(plane) = self.sites.row(voxel).and_then(|row| self.planes.get(row as usize)?.as_ref()) else {
+                continue;
+            };
+            let distance = (plane.centre_m - point_m).norm_squared();
+            if distance < least {
+                (nearest, least) = (Some(plane), distance);
+            }
+        }
+        nearest.copied()
+    }
+}
+
+/// One point for every occupied voxel: the mean of the points in it, in order of first appearance.
+pub(super) fn thinned(points_m: impl IntoIterator<Item = Vector3<f64>>, voxel_m: f64) -> Vec<Vector3<f64>> {
+    let mut sites = Sites::default();
+    let mut sums: Vec<(Vector3<f64>, f64)> = Vec::new();
+    for point in points_m {
+        let Some(voxel) = voxel_of(&point, voxel_m) else { continue };
+        let row = sites.add(voxel) as usize;
+        if row == sums.len() {
+            sums.push(Default::default());
+        }
+        sums[row].0 += point;
+        sums[row].1 += 1.0;
+    }
+    sums.into_iter().map(|(sum, count)| sum / count).collect()
+}
+
+/// The voxel a point lies in; `None` where there is none.
+fn voxel_of(point_m: &Vector3<f64>, voxel_m: f64) -> Option<[i32; 3]> {
+    let voxel = (point_m / voxel_m).map(f64::floor);
+    // One voxel of margin, since neighbours are looked up. Also refuses what is not finite.
+    let held = voxel.iter().all(|axis| axis.abs() < f64::from((1 << 20) - 2));
+    held.then(|| [voxel.x as i32, voxel.y as i32, voxel.z as i32])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Points 0.1 m apart on the plane through `at` spanned by `u` and `v`.
+    fn patch(at: [f64; 3], u: [f64; 3], v: [f64; 3]) -> impl Iterator<Item = Vector3<f64>> {
+        let [at, u, v] = [at, u, v].map(Vector3::from);
+        (0..1600).map(move |k| at + u * (f64::from(k % 40) * 0.1) + v * (f64::from(k / 40) * 0.1))
+    }
+
+    #[test]
+    fn a_wall_has_its_normal() {
+        for at in [[0.0, 0.0, 0.0], [-300.0, 4400.0, 120.0]] {
+            let mut surfels = Surfels::new(0.5);
+            patch(at, [0.6, 0.8, 0.0], [0.0, 0.0, 1.0]).for_each(|point| surfels.add(&point));
+            surfels.fit();
+            assert!(surfels.len() > 30);
+            let beside = Vector3::from(at) + Vector3::new(1.2 - 0.16, 1.6 + 0.12, 1.0);
+            let plane = surfels.near(&beside).unwrap();
+            assert!((plane.normal.dot(&Vector3::new(0.8, -0.6, 0.0)).abs() - 1.0).abs() < 1e-6);
+            assert!(((beside - plane.centre_m).dot(&plane.normal).abs() - 0.2).abs() < 1e-6);
+        }
+    }
+
+    #[test]
+    fn a_scan_line_and_a_few_points_are_no_plane() {
+        let mut surfels = Surfels::new(1.0);
+        for k in 0..200 {
+            surfels.add(&Vector3::new(f64::from(k) * 0.05, 20.0, 0.3));
+        }
+        for k in 0..4 {
+            surfels.add(&Vector3::new(50.0 + f64::from(k), f64::from(k * k), 0.0));
+        }
+        surfels.fit();
+        assert_eq!(surfels.len(), 0);
+        assert_eq!(surfels.near(&Vector3::new(5.0, 20.0, 0.3)), None);
+    }
+
+    #[test]
+    fn what_is_no_place_is_left_out() {
+        let mut surfels = Surfels::new(0.5);
+        surfels.add(&Vector3::new(f64::NAN, 0.0, 0.0));
+        surfels.add(&Vector3::new(0.0, f64::INFINITY, 0.0));
+        patch([0.0; 3], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]).for_each(|point| surfels.add(&point));
+        surfels.add(&Vector3::new(1e9, 0.0, 0.0));
+        surfels.fit();
+        assert!(surfels.len() > 30);
+        assert_eq!(surfels.near(&Vector3::new(f64::NAN, 0.0, 0.0)), None);
+        assert!(thinned([Vector3::new(f64::NAN, 0.0, 0.0)], 0.5).is_empty());
+    }
+
+    #[test]
+    fn thinning_leaves_one_mean_a_voxel() {
+        let points = [[0.1, 0.1, 0.1], [0.3, 0.1, 0.1], [0.6, 0.1, 0.1], [-0.1, 0.1, 0.1]].map(Vector3::from);
+        let thin = thinned(points, 0.5);
+        let expected = [[0.2, 0.1, 0.1], [0.6, 0.1, 0.1], [-0.1, 0.1, 0.1]].map(Vector3::from);
+        assert_eq!(thin.len(), 3);
+        assert!(thin.iter().zip(&expected).all(|(a, b)| (a - b).norm() < 1e-12));
+    }
+}

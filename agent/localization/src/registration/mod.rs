@@ -1,0 +1,157 @@
+//! Rigid registration of correspondences: where is the sensor, given points it measured and where they are in the world.
+//!
+//! Clouds against clouds without correspondences: [`icp`].
+//!
+//! Pure geometry: [`ransac`] and [`sc2pcr`] find the motion among outliers, [`kabsch`] fits it to pairs that are right and
+//! [`refine`] sharpens it. All of them answer with a [`Registration`] or say why there is none.
+//!
+//! ```
+//! use localization::registration::{Correspondence, ransac};
+//! let points = (0..60).map(|k| [(k % 8) as f32 * 4.0, (k / 8) as f32 * 5.0 - 20.0, (k % 3) as f32]);
+//! let pairs: Vec<_> = points
+//!     .map(|[x, y, z]| Correspondence { source_m: [x, y, z], target_m: [100.0 - y, x, z + 2.0], weight: 1.0 })
+//!     .collect();
+//! let found = ransac::solve(&pairs, &ransac::RansacConfig::default()).unwrap();
+//! assert!((found.target_from_source.translation.vector.x - 100.0).abs() < 1e-3);
+//! assert_eq!(found.inliers.len(), 60);
+//! ```
+
+pub mod icp;
+pub mod kabsch;
+pub mod ransac;
+pub mod refine;
+pub mod sc2pcr;
+
+mod compatibility;
+mod pairs;
+mod sampling;
+#[cfg(test)]
+pub(crate) mod synthetic;
+
+use nalgebra::{Isometry3, Point3, Vector3};
+
+use kabsch::Degenerate;
+
+/// Coordinates beyond this are no places but errors, metres.
+const MAX_ABS_M: f32 = 1e7;
+
+/// A point as the sensor measured it, and where it is believed to be.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Correspondence {
+    /// In the source frame, the sensor's: metres.
+    pub source_m: [f32; 3],
+    /// In the target frame, the world's: metres.
+    pub target_m: [f32; 3],
+    /// How far to trust it, above 0; only ratios matter. Zero, negative and not finite weights take no part.
+    pub weight: f32,
+}
+
+impl Correspondence {
+    /// Whether it can take part: finite places and a positive finite weight.
+    #[must_use]
+    pub fn usable(&self) -> bool {
+        let bounded = |point: &[f32; 3]| point.iter().all(|coordinate| coordinate.abs() <= MAX_ABS_M);
+        self.weight > 0.0 && self.weight.is_finite() && bounded(&self.source_m) && bounded(&self.target_m)
+    }
+
+    /// Distance between the target and the moved source, metres.
+    #[must_use]
+    pub fn residual_m(&self, target_from_source: &Isometry3<f64>) -> f64 {
+        let moved = target_from_source * Point3::from(self.source_m.map(f64::from));
+        (Vector3::from(self.target_m.map(f64::from)) - moved.coords).norm()
+    }
+}
+
+/// The motion that correspondences agree on.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Registration {
+    /// Takes points of the source frame to the target frame.
+    pub target_from_source: Isometry3<f64>,
+    /// Places of the agreeing correspondences in the list that was given, ascending.
+    pub inliers: Vec<u32>,
+    /// Share of the given correspondences that agree.
+    pub inlier_ratio: f64,
+    /// Root mean square of the inliers' residuals, metres.
+    pub rms_m: f64,
+}
+
+impl Registration {
+    /// Counts who agrees with a motion within `threshold_m`.
+    #[must_use]
+    pub fn judge(pairs: &[Correspondence], target_from_source: Isometry3<f64>, threshold_m: f64) -> Self {
+        let mut inliers = Vec::new();
+        let mut squares = 0.0;
+        for (index, pair) in pairs.iter().enumerate().filter(|(_, pair)| pair.usable()) {
+            let residual_m = pair.residual_m(&target_from_source);
+            if residual_m < threshold_m {
+                inliers.push(u32::try_from(index).unwrap_or(u32::MAX));
+                squares += residual_m * residual_m;
+            }
+        }
+        let count = inliers.len().max(1) as f64;
+        let inlier_ratio = inliers.len() as f64 / pairs.len().max(1) as f64;
+        Self { target_from_source, inliers, inlier_ratio, rms_m: (squares / count).sqrt() }
+    }
+
+    /// Itself if at least `required` correspondences agree.
+    fn with_at_least(self, required: usize, given: usize) -> Result<Self, NoRegistration> {
+        if self.inliers.len() < required {
+            return Err(NoRegistration::TooFewInliers { found: self.inliers.len(), required, given });
+        }
+        Ok(self)
+    }
+}
+
+/// Why correspondences give no motion.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum NoRegistration {
+    /// There is too little to start from.
+    #[error("{usable} of {given} correspondences are usable, at least {required} are needed")]
+    TooFewCorrespondences {
+        /// With finite places and a positive weight.
+        usable: usize,
+        /// All.
+        given: usize,
+        /// What it takes.
+        required: usize,
+    },
+    /// Too few agree on any motion.
+    #[error("at most {found} of {given} correspondences agree on one motion, at least {required} must")]
+    TooFewInliers {
+        /// Largest number that agreed.
+        found: usize,
+        /// What it takes.
+        required: usize,
+        /// All.
+        given: usize,
+    },
+    /// Those that agree do not fix the motion.
+    #[error("{inliers} agreeing correspondences do not fix a motion: {reason}")]
+    Degenerate {
+        /// How many agreed.
+        inliers: usize,
+        /// What is wrong with them.
+        reason: Degenerate,
+    },
+}
+
+impl NoRegistration {
+    /// The largest number of correspondences that agreed.
+    #[must_use]
+    pub fn inlier_count(&self) -> usize {
+        match self {
+            Self::TooFewCorrespondences { .. } => 0,
+            Self::TooFewInliers { found, .. } => *found,
+            Self::Degenerate { inliers, .. } => *inliers,
+        }
+    }
+}
+
+/// `Err` when fewer than `required` can take part.
+fn check_enough(pairs: &[Correspondence], required: usize) -> Result<(), NoRegistration> {
+    let usable = pairs.iter().filter(|pair| pair.usable()).count();
+    if usable < required {
+        return Err(NoRegistration::TooFewCorrespondences { usable, given: pairs.len(), required });
+    }
+    Ok(())
+}

@@ -1,0 +1,299 @@
+//! `agent eval`: how well a localizer finds poses on recorded sweeps.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use agent_offline::evaluation::{
+    Evaluated, EvaluatedSweep, EvaluationError, EvaluationOptions, LocalizationSummary, evaluate, evaluate_source,
+    reliability_charts, write_csv, write_error_table,
+};
+use agent_offline::icp_map::{IcpMapPose, read_map};
+use anyhow::Context;
+use clap::ValueEnum;
+use dataset::LeftOut;
+use figures::chart;
+use indicatif::{ProgressBar, ProgressStyle};
+use localization::competitors::EndToEndLocalizer;
+use localization::pgc::confidence::{CONFIDENCE_KEY, Confidence, ConfidenceModel, FitReport, check_good_loss};
+use localization::pgc::pose_solver::{PoseSolver, Solver};
+use localization::pgc::{Localize, Localizer, LocalizerError};
+use localization::pose_source::PoseSource;
+use localization::registration::icp::IcpConfig;
+use localization::registration::ransac::RansacConfig;
+use localization::registration::sc2pcr::Sc2PcrConfig;
+use perception::train::cuda_device;
+use perception::weights::annotate;
+use support::output;
+use tch::Device;
+
+use super::scene_heads::{TownHead, by_head};
+use crate::cli::{BadInput, Outcome};
+
+/// Localise recorded sweeps and compare with their true poses.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// Data sets, splits or scenarios of the heads' towns; the layout is found out.
+    #[arg(long, value_name = "DIR", num_args = 1.., required = true)]
+    scene: Vec<PathBuf>,
+    /// Weights of the encoder [default: pgc-encoder.safetensors beside each head].
+    #[arg(long, value_name = "FILE")]
+    encoder: Option<PathBuf>,
+    /// Weights of the heads: FILE for all scenes, or TOWN=FILE and TOWN:SEED=FILE for generated ones [SEED: 0]. What is
+    /// reported is of all scenes together.
+    #[arg(
+        long,
+        visible_alias = "weights",
+        value_name = "[TOWN=]FILE",
+        num_args = 1..,
+        default_value = "deploy/weights/pgc-town1.safetensors"
+    )]
+    head: Vec<TownHead>,
+    /// Instead of encoder and head: weights of a network that `agent train end-to-end` wrote.
+    #[arg(long, value_name = "FILE", conflicts_with_all = ["encoder", "head", "fit_confidence"])]
+    end_to_end: Option<PathBuf>,
+    /// Instead of networks: register every sweep against a map of these drives through the same town (ICP), beginning where
+    /// the GNSS receiver believes to be.
+    #[arg(
+        long,
+        value_name = "DIR",
+        num_args = 1..,
+        conflicts_with_all = ["encoder", "head", "end_to_end", "fit_confidence", "solver"]
+    )]
+    icp_map: Vec<PathBuf>,
+    /// Way between two sweeps on that map, metres.
+    #[arg(long, value_name = "METRES", default_value_t = 5.0, requires = "icp_map")]
+    map_spacing: f64,
+    /// Sweeps of another weather, where the data set has them, for example fog_0.060.
+    #[arg(long, value_name = "NAME")]
+    variant: Option<String>,
+    /// Take every N-th sweep of each vehicle.
+    #[arg(long, value_name = "N", default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
+    every: u32,
+    /// Most sweeps for each head, evenly over all there are [default: all].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..))]
+    sweeps: Option<u32>,
+    /// Which search finds the pose.
+    #[arg(long, value_enum, default_value_t = Search::Ransac)]
+    solver: Search,
+    /// Seed of the search.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Fit the confidence and the threshold below which poses are withheld to these sweeps, and write them into the head.
+    /// Not on sweeps that results are reported on.
+    #[arg(long)]
+    fit_confidence: bool,
+    /// Largest share of poses less than 3 m off that --fit-confidence may withhold.
+    #[arg(long, value_name = "SHARE", default_value_t = 0.01, requires = "fit_confidence")]
+    good_loss: f64,
+    /// Write a row per sweep.
+    #[arg(long, value_name = "FILE")]
+    csv: Option<PathBuf>,
+    /// Write the reliability curve as PNG.
+    #[arg(long, value_name = "FILE")]
+    plot: Option<PathBuf>,
+    /// Write the errors as a table that --pose-source noisy replays.
+    #[arg(long, value_name = "FILE")]
+    error_table: Option<PathBuf>,
+    /// Where to compute.
+    #[arg(long, value_enum, default_value_t = ComputeOn::Cpu)]
+    device: ComputeOn,
+    /// Threads to compute with.
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
+    threads: u16,
+    /// Print JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Search {
+    /// Random samples with local optimisation.
+    Ransac,
+    /// Second-order spatial compatibility.
+    Sc2pcr,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum ComputeOn {
+    /// The processor.
+    Cpu,
+    /// The first CUDA device.
+    Cuda,
+}
+
+/// What is evaluated.
+enum Subject {
+    /// Looks at sweeps alone.
+    Localizer(Box<dyn Localize>),
+    /// Is told where the GNSS receiver believes to be.
+    Source(Box<dyn PoseSource>),
+}
+
+/// Localises, fits, writes and prints.
+pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
+    tch::set_num_threads(i32::from(args.threads));
+    check_good_loss(args.good_loss).map_err(|error| BadInput(anyhow::anyhow!("--good-loss: {error}")))?;
+    let groups = by_head(&args.head, &args.scene)?;
+    if args.fit_confidence && groups.len() > 1 {
+        let count = groups.len();
+        return Err(BadInput(anyhow::anyhow!("--fit-confidence fits one head, and {count} are asked for")).into());
+    }
+    let (mut sweeps, mut left_out) = (Vec::new(), LeftOut::default());
+    for (head, scenes) in &groups {
+        let evaluated = args.evaluate(args.subject(head)?, scenes)?;
+        sweeps.extend(evaluated.sweeps);
+        left_out.merge(&evaluated.left_out);
+    }
+    if let ([(head, _)], true) = (&groups[..], args.fit_confidence) {
+        let report = args.fit(head, &mut sweeps)?;
+        output::note(report_line(&report));
+    }
+    args.write(&sweeps)?;
+    let summary = LocalizationSummary::of(&sweeps);
+    if args.json {
+        output::line(serde_json::to_string_pretty(&summary)?)?;
+    } else {
+        output::text(table(&summary))?;
+    }
+    Ok(Outcome::of(&left_out))
+}
+
+impl Args {
+    fn subject(&self, head: &Path) -> Result<Subject, BadInput> {
+        if self.icp_map.is_empty() {
+            let device = match self.device {
+                ComputeOn::Cpu => Device::Cpu,
+                ComputeOn::Cuda => cuda_device().map_err(|error| BadInput(error.into()))?,
+            };
+            return Ok(Subject::Localizer(self.localizer(head, device).map_err(|error| BadInput(error.into()))?));
+        }
+        if !self.map_spacing.is_finite() || self.map_spacing < 0.0 {
+            return Err(BadInput(anyhow::anyhow!("--map-spacing is {}, must be 0 or more", self.map_spacing)));
+        }
+        let config = IcpConfig::default();
+        let map = read_map(&self.icp_map, self.map_spacing, &config).map_err(|error| BadInput(error.into()))?;
+        Ok(Subject::Source(Box::new(IcpMapPose::new(Arc::new(map), config))))
+    }
+
+    fn localizer(&self, head: &Path, device: Device) -> Result<Box<dyn Localize>, LocalizerError> {
+        let solver = match self.solver {
+            Search::Ransac => Solver::Ransac(RansacConfig { seed: self.seed, ..RansacConfig::default() }),
+            Search::Sc2pcr => Solver::Sc2Pcr(Sc2PcrConfig::default()),
+        };
+        if let Some(weights) = &self.end_to_end {
+            let mut localizer = EndToEndLocalizer::load(weights, device)?;
+            localizer.set_solver(PoseSolver { solver, ..PoseSolver::default() });
+            return Ok(Box::new(localizer));
+        }
+        let load = if self.fit_confidence { Localizer::load_without_confidence } else { Localizer::load };
+        let mut localizer = load(&self.encoder(head), head, device)?;
+        let confidence = localizer.solver().confidence.clone();
+        localizer.set_solver(PoseSolver { solver, confidence });
+        Ok(Box::new(localizer))
+    }
+
+    fn encoder(&self, head: &Path) -> PathBuf {
+        self.encoder.clone().unwrap_or_else(|| head.with_file_name("pgc-encoder.safetensors"))
+    }
+
+    fn evaluate(&self, subject: Subject, scenes: &[PathBuf]) -> anyhow::Result<Evaluated> {
+        let count = |number: u32| usize::try_from(number).unwrap_or(usize::MAX);
+        let options = EvaluationOptions {
+            scenes: scenes.to_vec(),
+            variant: self.variant.clone(),
+            every: count(self.every),
+            sweeps: self.sweeps.map(count),
+        };
+        let bar =
+            ProgressBar::new(0).with_style(ProgressStyle::with_template("{bar:30} {pos}/{len} sweeps  {eta} left")?);
+        let mut on_sweep = |done, all| {
+            bar.set_length(all as u64);
+            bar.set_position(done as u64);
+        };
+        let evaluated = match subject {
+            Subject::Localizer(mut localizer) => evaluate(localizer.as_mut(), &options, &mut on_sweep),
+            Subject::Source(mut source) => evaluate_source(source.as_mut(), &options, &mut on_sweep),
+        };
+        bar.finish_and_clear();
+        match evaluated {
+            Ok(evaluated) => Ok(evaluated),
+            Err(error @ EvaluationError::Localizer(_)) => Err(error.into()),
+            Err(error) => Err(BadInput(error.into()).into()),
+        }
+    }
+
+    fn fit(&self, head: &Path, sweeps: &mut [EvaluatedSweep]) -> anyhow::Result<FitReport> {
+        let labelled: Vec<_> = sweeps.iter().filter_map(EvaluatedSweep::labelled).collect();
+        let (model, report) =
+            ConfidenceModel::fit(&labelled, self.good_loss).map_err(|error| BadInput(error.into()))?;
+        let sha256 = annotate(head, CONFIDENCE_KEY, &serde_json::to_string(&model)?)?;
+        output::note(format_args!("{}: confidence written, SHA-256 is now {sha256}", head.display()));
+        let confidence = Confidence::Calibrated(model);
+        sweeps.iter_mut().for_each(|sweep| sweep.judge_again(&confidence));
+        Ok(report)
+    }
+
+    fn write(&self, sweeps: &[EvaluatedSweep]) -> anyhow::Result<()> {
+        let writing = |path: &Path| format!("writing {}", path.display());
+        if let Some(path) = &self.csv {
+            write_csv(path, sweeps).with_context(|| writing(path))?;
+        }
+        if let Some(path) = &self.error_table {
+            write_error_table(path, sweeps).with_context(|| writing(path))?;
+        }
+        if let Some(path) = &self.plot {
+            chart::save(&reliability_charts(sweeps), path).with_context(|| writing(path))?;
+        }
+        Ok(())
+    }
+}
+
+fn report_line(report: &FitReport) -> String {
+    let FitReport { sweeps, bad, bad_withheld, good_withheld } = report;
+    let good = sweeps - bad;
+    format!("fitted to {sweeps} poses: withholds {bad_withheld} of {bad} bad ones, {good_withheld} of {good} good ones")
+}
+
+/// The numbers for a person.
+fn table(summary: &LocalizationSummary) -> String {
+    let number = |value: Option<f64>, digits: usize| value.map_or("-".into(), |value| format!("{value:.digits$}"));
+    let percent = |share: f64| format!("{:.1} %", 100.0 * share);
+    let share = |value: Option<f64>| value.map_or("-".into(), percent);
+    let LocalizationSummary { sweeps, no_pose, withheld, ms, .. } = summary;
+    let total = ms.get("total").copied();
+    let stages: Vec<String> =
+        ms.iter().filter(|(stage, _)| *stage != "total").map(|(s, ms)| format!("{s} {ms:.1}")).collect();
+    let lines = [
+        format!("sweeps     {sweeps}, {no_pose} without a pose {:?}", summary.outcomes),
+        format!("success    {} under 3 m, {} under 1 m", percent(summary.success_3m), percent(summary.success_1m)),
+        format!(
+            "position   mean {} m, median {}, 95 % {}, largest {}",
+            number(summary.mean_m, 2),
+            number(summary.p50_m, 3),
+            number(summary.p95_m, 2),
+            number(summary.max_m, 1)
+        ),
+        format!(
+            "rotation   mean {} degrees, median {}, 95 % {}, largest {}",
+            number(summary.mean_deg, 2),
+            number(summary.p50_deg, 3),
+            number(summary.p95_deg, 2),
+            number(summary.max_deg, 1)
+        ),
+        format!(
+            "sigma      rank correlation {} (share of inliers {}), calibration error {}",
+            number(summary.sigma_spearman, 2),
+            number(summary.inlier_ratio_spearman, 2),
+            number(summary.calibration_error, 3)
+        ),
+        format!(
+            "withheld   {} poses: {} of {} errors above 3 m, {} of the others",
+            withheld.poses,
+            share(withheld.bad_share),
+            withheld.bad,
+            share(withheld.good_share)
+        ),
+        format!("time       {} ms median: {}", number(total, 1), stages.join(", ")),
+    ];
+    lines.join("\n") + "\n"
+}

@@ -1,0 +1,109 @@
+//! `agent localize`: the poses of recorded sweeps, found once and kept.
+
+use std::path::{Path, PathBuf};
+
+use dataset::{self, LeftOut, LoadOptions, Problem, Scenario};
+use indicatif::{ProgressBar, ProgressStyle};
+use localization::pose_source::motion_gate::SanityConfig;
+use localization::pose_source::{LocalizedPose, PgcConfig, PoseInput, PoseRow, PoseSource, PoseTable};
+use protocol::PoseEstimate;
+use support::output;
+
+use super::scene_heads::{TownHead, head_of};
+use crate::cli::{BadInput, Outcome};
+
+/// Localise every sweep of scenes once and write poses and confidences as a table, for trainings and evaluations.
+///
+/// Scenarios that the table has already are left alone, so an interrupted run goes on where it was.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// Data sets, splits or scenarios.
+    #[arg(long, value_name = "DIR", num_args = 1.., required = true)]
+    scene: Vec<PathBuf>,
+    /// Weights of the encoder.
+    #[arg(long, value_name = "FILE")]
+    encoder: PathBuf,
+    /// Weights of the heads: FILE for all scenes, or TOWN=FILE and TOWN:SEED=FILE for generated ones [SEED: 0].
+    #[arg(long, value_name = "[TOWN=]FILE", num_args = 1.., required = true)]
+    head: Vec<TownHead>,
+    /// The table.
+    #[arg(long, value_name = "FILE")]
+    out: PathBuf,
+    /// Threads to compute with.
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
+    threads: u16,
+}
+
+/// Localises what the table does not have yet.
+pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
+    tch::set_num_threads(i32::from(args.threads));
+    let done = if args.out.exists() { PoseTable::read(&args.out).map_err(bad)? } else { PoseTable::default() };
+    let mut scenarios = Vec::new();
+    for folder in &args.scene {
+        scenarios.extend(dataset::open(folder).map_err(bad)?.scenarios);
+    }
+    scenarios.retain(|scenario| !done.has(&scenario.name));
+    // Which head each needs is known before any is computed with.
+    let heads: Vec<&Path> = scenarios.iter().map(|scenario| head_of(&args.head, scenario)).collect::<Result<_, _>>()?;
+    let sweeps: usize = scenarios.iter().map(frames).sum();
+    if sweeps == 0 && done.is_empty() {
+        let scenes: Vec<String> = args.scene.iter().map(|scene| scene.display().to_string()).collect();
+        return Err(bad(anyhow::anyhow!("there is no sweep in {}", scenes.join(", "))));
+    }
+    let bar = ProgressBar::new(sweeps as u64)
+        .with_style(ProgressStyle::with_template("{bar:30} {pos}/{len} sweeps  {eta} left")?);
+    let mut found = 0;
+    let mut left_out = LeftOut::default();
+    for (scenario, head) in scenarios.iter().zip(heads) {
+        found += args.localize(scenario, head, &mut left_out, &bar)?;
+    }
+    bar.finish_and_clear();
+    output::line(format_args!(
+        "{sweeps} sweeps, {found} with a pose; {} were there before: {}",
+        done.len(),
+        args.out.display()
+    ))?;
+    Ok(Outcome::of(&left_out))
+}
+
+impl Args {
+    /// Localises a scenario, vehicle by vehicle in the order of time, and appends it; how many sweeps have a pose.
+    fn localize(
+        &self,
+        scenario: &Scenario,
+        head: &Path,
+        left_out: &mut LeftOut,
+        bar: &ProgressBar,
+    ) -> anyhow::Result<usize> {
+        let sanity = SanityConfig::default();
+        let config = PgcConfig { encoder: self.encoder.clone(), head: head.to_owned(), sanity };
+        let mut rows: Vec<PoseRow<'_>> = Vec::new();
+        for (agent, cav) in scenario.agents.iter().enumerate() {
+            let mut source = LocalizedPose::pgc(&config).map_err(bad)?;
+            for tick in (0..scenario.ticks.len()).filter(|&tick| scenario.is_present(agent, tick)) {
+                bar.inc(1);
+                let frame = match scenario.load(agent, tick, &LoadOptions::default()) {
+                    Ok(frame) => frame,
+                    Err(error) => {
+                        left_out.add_unreadable(agent, Problem::from(&error));
+                        continue;
+                    }
+                };
+                let capture_nanos = frame.capture_nanos;
+                let input = PoseInput { cav, capture_nanos, cloud: &frame.points, measured: None };
+                rows.push(PoseRow { cav, capture_nanos, estimate: source.estimate(&input) });
+            }
+        }
+        PoseTable::append(&self.out, &scenario.name, &rows)?;
+        Ok(rows.iter().filter(|row| matches!(row.estimate, PoseEstimate::Pose { .. })).count())
+    }
+}
+
+/// Frames that there are in a scenario.
+fn frames(scenario: &Scenario) -> usize {
+    scenario.agents.len() * scenario.ticks.len() - scenario.absent_frames()
+}
+
+fn bad(error: impl Into<anyhow::Error>) -> anyhow::Error {
+    BadInput(error.into()).into()
+}

@@ -1,0 +1,6 @@
+//! Subcommands: one file each, with its arguments and its `run`.
+
+pub(crate) mod eval;
+pub(crate) mod localize;
+mod scene_heads;
+pub(crate) mod train;

@@ -1,0 +1,104 @@
+//! `agent train encoder`.
+
+use std::path::PathBuf;
+
+use agent_offline::training::{EncoderAccuracy, EncoderReport, EncoderSummary, EncoderTrainConfig, train_encoder};
+use localization::pgc::SceneEncoderConfig;
+use perception::train::{ModelCard, TrainingBar, TrainingOptions};
+
+use super::options::{bad, check_folders, run_config, say_left_out};
+
+/// Train a scene encoder on sweeps that overlap; writes checkpoint, curve.csv, weights.safetensors and model-card.md.
+///
+/// Nothing of a town stays in it: a head for any town is trained on its features afterwards.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// Folders of scenes, one town each; drives through the same town belong into one folder.
+    #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
+    scenes: Vec<PathBuf>,
+    /// Folders of scenes to validate on, one town each.
+    #[arg(long, num_args = 1.., value_name = "DIR")]
+    validation: Vec<PathBuf>,
+    /// Network.
+    #[arg(long, default_value = "lean", value_parser = parse_config)]
+    config: SceneEncoderConfig,
+    /// Pairs of sweeps of a step.
+    #[arg(long, default_value_t = 4)]
+    batch: usize,
+    /// Highest learning rate.
+    #[arg(long, default_value_t = 2e-3)]
+    lr: f64,
+    /// Steps between two validations and checkpoints.
+    #[arg(long, default_value_t = 500)]
+    validate_every: u64,
+    #[command(flatten)]
+    options: TrainingOptions,
+}
+
+fn parse_config(name: &str) -> Result<SceneEncoderConfig, String> {
+    SceneEncoderConfig::preset(name).ok_or_else(|| "there are lean and full".to_owned())
+}
+
+pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
+    let config = args.config()?;
+    let bar = TrainingBar::of(config.run.length);
+    let summary = train_encoder(&config, &mut |report| tell(&bar, report))?;
+    bar.finish();
+    card(&config, &summary).write(&config.run.out)?;
+    args.options.print(&summary.trained, &serde_json::json!({"accuracy": summary.accuracy}))?;
+    Ok(())
+}
+
+fn tell(bar: &TrainingBar, report: &EncoderReport) {
+    match report {
+        EncoderReport::Read(data) => say_left_out(bar, data),
+        EncoderReport::Stepped { step, share_done, seconds, loss, accuracy } => {
+            let EncoderAccuracy { top1, offset_m } = accuracy;
+            let text = format!("step {step} loss {loss:.3} top-1 {:.1} % offset {offset_m:.2} m", 100.0 * top1);
+            bar.report(*share_done, *seconds, &text);
+        }
+        EncoderReport::Validated(step, EncoderAccuracy { top1, offset_m }) => {
+            bar.say(&format!("step {step}: validation top-1 {:.1} % offset {offset_m:.2} m", 100.0 * top1));
+        }
+    }
+}
+
+impl Args {
+    fn config(&self) -> anyhow::Result<EncoderTrainConfig> {
+        if self.validate_every == 0 {
+            return Err(bad("--validate-every is above zero"));
+        }
+        check_folders(self.scenes.iter().chain(&self.validation))?;
+        Ok(EncoderTrainConfig {
+            scenes: self.scenes.clone(),
+            validation: self.validation.clone(),
+            encoder: self.config.clone(),
+            run: run_config(&self.options, self.batch, self.lr)?,
+            validate_every: self.validate_every,
+        })
+    }
+}
+
+fn card(config: &EncoderTrainConfig, summary: &EncoderSummary) -> ModelCard {
+    let mut card = ModelCard::new(
+        &format!("Scene encoder `{}`", config.encoder.name),
+        &format!(
+            "Sparse 3-D convolutions over voxels of {} m; trained on correspondences between overlapping sweeps.",
+            config.encoder.voxel_m
+        ),
+    );
+    let data = format!("{} sweeps of {} towns", summary.sweeps, config.scenes.len());
+    card.trained(&config.run, &summary.trained, &data, "pairs");
+    if let Some(accuracy) = summary.accuracy {
+        card.row(
+            "validation",
+            format_args!(
+                "{:.1} % of cells find their match among those of two pairs, offset known to {:.2} m (L1)",
+                100.0 * accuracy.top1,
+                accuracy.offset_m
+            ),
+        );
+    }
+    card.configuration(&config.encoder);
+    card
+}

@@ -1,0 +1,79 @@
+//! `agent train end-to-end`.
+
+use std::path::PathBuf;
+
+use agent_offline::training::{EncoderStart, EndToEndReport, EndToEndTrainConfig, train_end_to_end};
+use localization::competitors::EndToEndKind;
+use localization::pgc::SceneEncoderConfig;
+use perception::train::{ModelCard, TrainingBar, TrainingOptions};
+
+use super::options::{check_folders, run_config, say_left_out};
+
+/// Train a competitor of the localizer on one town; writes checkpoint, weights.safetensors and model-card.md.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// Folders of scenes, all of the same town.
+    #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
+    scenes: Vec<PathBuf>,
+    /// What is regressed: scene-coordinates stands for SGLoc, pose for HypLiLoc and DiffLoc.
+    #[arg(long, value_enum)]
+    regresses: Regresses,
+    /// Name of the town, for messages and the model card.
+    #[arg(long, default_value = "town")]
+    town: String,
+    /// Weights of an encoder that stays as it is [default: the encoder is trained with the rest, from nothing].
+    #[arg(long, value_name = "FILE")]
+    encoder: Option<PathBuf>,
+    /// Sweeps of a step; with --encoder, 400 cells for each.
+    #[arg(long, default_value_t = 6)]
+    batch: usize,
+    /// Highest learning rate.
+    #[arg(long, default_value_t = 1e-3)]
+    lr: f64,
+    #[command(flatten)]
+    options: TrainingOptions,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+enum Regresses {
+    /// World coordinates of cells, without classification and confidence.
+    SceneCoordinates,
+    /// The pose itself.
+    Pose,
+}
+
+pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
+    check_folders(&args.scenes)?;
+    let config = EndToEndTrainConfig {
+        scenes: args.scenes.clone(),
+        regresses: match args.regresses {
+            Regresses::SceneCoordinates => EndToEndKind::SceneCoordinates,
+            Regresses::Pose => EndToEndKind::Pose,
+        },
+        town: args.town.clone(),
+        encoder: match &args.encoder {
+            Some(path) => EncoderStart::Frozen(path.clone()),
+            None => EncoderStart::Untrained(SceneEncoderConfig::lean()),
+        },
+        run: run_config(&args.options, args.batch, args.lr)?,
+    };
+    let bar = TrainingBar::of(config.run.length);
+    let trained = train_end_to_end(&config, &mut |report| match report {
+        EndToEndReport::Encoding(done, total) => bar.encoded(*done, *total),
+        EndToEndReport::Stepped { step, share_done, seconds, error_m } => {
+            bar.report(*share_done, *seconds, &format!("step {step} error {error_m:.2} m"));
+        }
+    })?;
+    bar.finish();
+    say_left_out(&bar, &trained.data);
+    let title = format!("End-to-end regressor of {}: {:?}", config.town, config.regresses);
+    let how = match args.encoder {
+        Some(_) => "Last layers on the features of a frozen encoder, trained on the sweeps of one town.",
+        None => "Trained from nothing on the sweeps of one town.",
+    };
+    let mut card = ModelCard::new(&title, how);
+    card.trained(&config.run, &trained, "all sweeps", "sweeps");
+    card.write(&config.run.out)?;
+    args.options.print(&trained, &serde_json::json!({}))?;
+    Ok(())
+}

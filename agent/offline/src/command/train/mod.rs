@@ -1,0 +1,34 @@
+//! `agent train`: the two stages of a localizer.
+
+mod encoder;
+mod end_to_end;
+mod options;
+mod scene;
+
+use anyhow::Context;
+use bus::malloc_settings;
+use clap::Subcommand;
+
+/// Train a localizer: an encoder once, over many towns; then a head for each town.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    #[command(subcommand)]
+    stage: Stage,
+}
+
+#[derive(Debug, Subcommand)]
+enum Stage {
+    Encoder(encoder::Args),
+    Scene(scene::Args),
+    EndToEnd(end_to_end::Args),
+}
+
+/// Trains what was asked for.
+pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
+    malloc_settings::ensure(&malloc_settings::FEW_PRODUCTS).context("this program again")?;
+    match &args.stage {
+        Stage::Encoder(args) => encoder::run(args),
+        Stage::Scene(args) => scene::run(args),
+        Stage::EndToEnd(args) => end_to_end::run(args),
+    }
+}

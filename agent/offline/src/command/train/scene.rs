@@ -1,0 +1,150 @@
+//! `agent train scene`.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use agent_offline::training::{
+    RedundancyConfig, SceneReport, SceneSummary, SceneTrainConfig, SweepAugmentation, train_scene,
+};
+use perception::train::{ModelCard, TrainingBar, TrainingOptions};
+
+use super::options::{bad, check_folders, run_config, say_left_out};
+
+/// Train the head of one town on the features of a frozen encoder; writes checkpoint, curve.csv, weights.safetensors and
+/// model-card.md.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Args {
+    /// Folders of scenes, all of the same town.
+    #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
+    scenes: Vec<PathBuf>,
+    /// Folders of other scenes of the town to validate on.
+    #[arg(long, num_args = 1.., value_name = "DIR")]
+    validation: Vec<PathBuf>,
+    /// Sweeps of a validation.
+    #[arg(long, default_value_t = 120)]
+    validation_sweeps: usize,
+    /// Seconds between two validations and checkpoints.
+    #[arg(long, default_value_t = 120)]
+    validate_every: u64,
+    /// Weights of the encoder.
+    #[arg(long, value_name = "FILE")]
+    encoder: PathBuf,
+    /// Name of the town, for messages and the model card.
+    #[arg(long, default_value = "town")]
+    town: String,
+    /// Clusters of sensor positions that a sweep is classified into.
+    #[arg(long, default_value_t = 50)]
+    classes: i64,
+    /// Clusters of world coordinates that a cell is placed among.
+    #[arg(long, default_value_t = 500)]
+    centres: i64,
+    /// Channels of the head.
+    #[arg(long, default_value_t = 512)]
+    width: i64,
+    /// Residual blocks of three layers.
+    #[arg(long, default_value_t = 3)]
+    blocks: usize,
+    /// Leave the second look out.
+    #[arg(long)]
+    no_refiner: bool,
+    /// Copies of every sweep, all but the first turned and thinned out at random.
+    #[arg(long, default_value_t = 1)]
+    copies: usize,
+    /// Largest turn of such copies, degrees.
+    #[arg(long, default_value_t = 10.0)]
+    turn: f64,
+    /// Leave out sweeps that are learnt evenly (RSD); trainings of fewer than some 14 passes have no time to judge that.
+    #[arg(long)]
+    rsd: bool,
+    /// Cells of a step.
+    #[arg(long, default_value_t = 4096)]
+    batch: usize,
+    /// Highest learning rate.
+    #[arg(long, default_value_t = 2e-3)]
+    lr: f64,
+    #[command(flatten)]
+    options: TrainingOptions,
+}
+
+pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
+    let config = args.config()?;
+    let bar = TrainingBar::of(config.run.length);
+    let summary = train_scene(&config, &mut |report| tell(&bar, report))?;
+    bar.finish();
+    card(&config, &summary).write(&config.run.out)?;
+    let SceneSummary { preparing_seconds, accuracy, cells_shown, .. } = summary;
+    let more =
+        serde_json::json!({"preparing_seconds": preparing_seconds, "accuracy": accuracy, "cells_shown": cells_shown});
+    args.options.print(&summary.trained, &more)?;
+    Ok(())
+}
+
+fn tell(bar: &TrainingBar, report: &SceneReport) {
+    match report {
+        SceneReport::Encoding(done, total) => bar.encoded(*done, *total),
+        SceneReport::Encoded(data) => say_left_out(bar, data),
+        SceneReport::Classified(share) => {
+            bar.say(&format!("{:.1} % of the training sweeps are put into their cluster", 100.0 * share));
+        }
+        SceneReport::Stepped { step, epoch, share_done, seconds, error_m, epsilon_m, refined_m } => {
+            let text = format!(
+                "step {step} epoch {epoch:.2} error {error_m:.2} m, predicted {epsilon_m:.2} m, refined {refined_m:.2} m"
+            );
+            bar.report(*share_done, *seconds, &text);
+        }
+        SceneReport::Validated(seconds, accuracy) => bar.say(&format!(
+            "{seconds:.0} s: cells {:.2} m, poses {:.3} m {:.3} degrees, under 3 m {:.1} %, under 1 m {:.1} %",
+            accuracy.cell_p50_m,
+            accuracy.pose_p50_m,
+            accuracy.pose_p50_deg,
+            100.0 * accuracy.success_3m,
+            100.0 * accuracy.success_1m
+        )),
+    }
+}
+
+impl Args {
+    fn config(&self) -> anyhow::Result<SceneTrainConfig> {
+        if self.copies == 0 || self.validation_sweeps == 0 {
+            return Err(bad("--copies and --validation-sweeps are above zero"));
+        }
+        check_folders(self.scenes.iter().chain(&self.validation))?;
+        Ok(SceneTrainConfig {
+            scenes: self.scenes.clone(),
+            validation: self.validation.clone(),
+            validation_sweeps: self.validation_sweeps,
+            encoder: self.encoder.clone(),
+            town: self.town.clone(),
+            classes: self.classes,
+            centres: self.centres,
+            width: self.width,
+            blocks: self.blocks,
+            refiner: !self.no_refiner,
+            augmentation: SweepAugmentation { copies: self.copies, turn_rad: self.turn.to_radians(), keep: 0.7 },
+            redundancy: self.rsd.then(RedundancyConfig::default),
+            run: run_config(&self.options, self.batch, self.lr)?,
+            validate_every: Duration::from_secs(self.validate_every),
+        })
+    }
+}
+
+fn card(config: &SceneTrainConfig, summary: &SceneSummary) -> ModelCard {
+    let title = format!("Scene head of {}", config.town);
+    let mut card = ModelCard::new(&title, "World coordinates of cells on the features of a frozen encoder.");
+    card.trained(&config.run, &summary.trained, &format!("{} sweeps", summary.sweeps), "cells");
+    card.row("of which reading and encoding", format_args!("{:.0} s", summary.preparing_seconds));
+    if let Some(accuracy) = summary.accuracy {
+        card.row(
+            "validation",
+            format_args!(
+                "poses: median {:.3} m and {:.3} degrees, under 3 m {:.1} %, under 1 m {:.1} %; cells: median {:.2} m (L1)",
+                accuracy.pose_p50_m,
+                accuracy.pose_p50_deg,
+                100.0 * accuracy.success_3m,
+                100.0 * accuracy.success_1m,
+                accuracy.cell_p50_m
+            ),
+        );
+    }
+    card
+}

@@ -1,0 +1,263 @@
+//! A localizer on recorded sweeps whose poses are known.
+
+mod summary;
+mod table;
+
+use std::path::PathBuf;
+use std::time::Instant;
+
+use dataset::frame::Frame;
+use dataset::{self, LeftOut, LoadOptions, Problem, ReadError, Scenario};
+use protocol::{CavId, Pose, PoseEstimate};
+
+pub use summary::{CalibrationBin, LocalizationSummary, WithheldSummary, reliability_charts};
+pub use table::{write_csv, write_error_table};
+
+use localization::pgc::LocalizerError;
+use localization::pgc::confidence::{Confidence, Labelled};
+use localization::pgc::{Localization, Localize, LocalizerTimes};
+use localization::pose_error::PoseError;
+use localization::pose_source::{PoseInput, PoseSource};
+
+/// Which sweeps.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct EvaluationOptions {
+    /// Datasets, splits or scenarios, all of one world.
+    pub scenes: Vec<PathBuf>,
+    /// A variant of the sweeps, for example `fog_0.060`.
+    pub variant: Option<String>,
+    /// Every how many ticks a sweep is taken.
+    pub every: usize,
+    /// Most sweeps, evenly over all there are.
+    pub sweeps: Option<usize>,
+}
+
+/// Why an evaluation ended early.
+#[derive(Debug, thiserror::Error)]
+pub enum EvaluationError {
+    /// A dataset or a frame cannot be read.
+    #[error(transparent)]
+    Read(#[from] ReadError),
+    /// There is nothing to evaluate on.
+    #[error("there is no sweep in {0:?}")]
+    Empty(Vec<PathBuf>),
+    /// A sweep has no pose to compare with.
+    #[error("{scenario}: {cav} at {stem}: there is no true pose to compare with (agent localize finds poses without)")]
+    NoTruth {
+        /// The scenario.
+        scenario: String,
+        /// The vehicle.
+        cav: CavId,
+        /// The frame's name.
+        stem: String,
+    },
+    /// The localizer refused.
+    #[error(transparent)]
+    Localizer(#[from] LocalizerError),
+}
+
+/// What came of one sweep.
+#[derive(Debug, Clone, PartialEq)]
+pub struct EvaluatedSweep {
+    /// The scenario.
+    pub scenario: String,
+    /// The vehicle.
+    pub cav: CavId,
+    /// The frame's name.
+    pub stem: String,
+    /// True `world_from_lidar`.
+    pub truth: Pose,
+    /// What the localizer said.
+    pub localization: Localization,
+}
+
+impl EvaluatedSweep {
+    /// Error of the pose that was found, withheld or not.
+    #[must_use]
+    pub fn error(&self) -> Option<PoseError> {
+        self.localization.found.map(|found| PoseError::between(&found.world_from_sensor.into(), &self.truth))
+    }
+
+    /// Error of the pose that was told, if one was.
+    #[must_use]
+    pub fn told_error(&self) -> Option<PoseError> {
+        self.localization.estimate.world_from_cav().map(|pose| PoseError::between(pose, &self.truth))
+    }
+
+    /// What a confidence is fitted on.
+    #[must_use]
+    pub fn labelled(&self) -> Option<Labelled> {
+        let found = self.localization.found?;
+        Some(Labelled { evidence: found.evidence, error_m: self.error()?.distance_m })
+    }
+
+    /// Applies another confidence to what was found.
+    pub fn judge_again(&mut self, confidence: &Confidence) {
+        let Some(found) = &mut self.localization.found else { return };
+        found.sigma = confidence.sigma(&found.evidence);
+        found.is_withheld = confidence.withholds(found.sigma);
+        self.localization.estimate = localization::pgc::pose_solver::estimate(&Ok(*found));
+    }
+}
+
+/// What came of all sweeps.
+#[derive(Debug, Default)]
+pub struct Evaluated {
+    /// Each in turn, vehicle by vehicle.
+    pub sweeps: Vec<EvaluatedSweep>,
+    /// Sweeps and other data that could not be used.
+    pub left_out: LeftOut,
+}
+
+/// A sweep that is there.
+struct Sweep<'a> {
+    scenario: &'a Scenario,
+    agent: usize,
+    tick: usize,
+}
+
+/// Localises every sweep of the scenes in turn; `on_sweep` is told how many there are and how many are done.
+///
+/// # Errors
+/// [`EvaluationError`] when a data set cannot be opened, and at the first sweep without a true pose. Sweeps that cannot be
+/// read are left out and counted.
+pub fn evaluate(
+    localizer: &mut dyn Localize,
+    options: &EvaluationOptions,
+    on_sweep: &mut dyn FnMut(usize, usize),
+) -> Result<Evaluated, EvaluationError> {
+    evaluate_with(&mut |frame| localizer.localize(&frame.points), options, on_sweep)
+}
+
+/// The same for a pose source, which is shown what the GNSS receiver believed.
+///
+/// # Errors
+/// As [`evaluate`].
+pub fn evaluate_source(
+    source: &mut dyn PoseSource,
+    options: &EvaluationOptions,
+    on_sweep: &mut dyn FnMut(usize, usize),
+) -> Result<Evaluated, EvaluationError> {
+    let mut ask = |frame: &Frame| {
+        let measured = frame.gnss_world_from_lidar();
+        let Frame { cav, capture_nanos, points, .. } = frame;
+        let start = Instant::now();
+        let input = PoseInput { cav, capture_nanos: *capture_nanos, cloud: points, measured: measured.as_ref() };
+        let estimate = source.estimate(&input);
+        Ok(Localization::told(estimate, LocalizerTimes { solve: start.elapsed(), ..LocalizerTimes::default() }))
+    };
+    evaluate_with(&mut ask, options, on_sweep)
+}
+
+fn evaluate_with(
+    localize: &mut dyn FnMut(&Frame) -> Result<Localization, LocalizerError>,
+    options: &EvaluationOptions,
+    on_sweep: &mut dyn FnMut(usize, usize),
+) -> Result<Evaluated, EvaluationError> {
+    let datasets = options.scenes.iter().map(|dir| dataset::open(dir)).collect::<Result<Vec<_>, _>>()?;
+    let scenarios = datasets.iter().flat_map(|dataset| &dataset.scenarios);
+    let all: Vec<Sweep<'_>> = scenarios.flat_map(|scenario| sweeps_of(scenario, options.every)).collect();
+    let count = options.sweeps.map_or(all.len(), |most| most.min(all.len()));
+    if count == 0 {
+        return Err(EvaluationError::Empty(options.scenes.clone()));
+    }
+    let load = LoadOptions { lidar_variant: options.variant.clone(), ..LoadOptions::default() };
+    let mut evaluated = Evaluated { sweeps: Vec::with_capacity(count), left_out: LeftOut::default() };
+    datasets.iter().for_each(|dataset| evaluated.left_out.add_files(&dataset.problems));
+    for place in 0..count {
+        let Sweep { scenario, agent, tick } = all[place * all.len() / count];
+        on_sweep(place + 1, count);
+        let frame = match scenario.load(agent, tick, &load) {
+            Ok(frame) => frame,
+            Err(error @ ReadError::NoSuch { .. }) => return Err(error.into()),
+            Err(error) => {
+                evaluated.left_out.add_unreadable(agent, Problem::from(&error));
+                continue;
+            }
+        };
+        let stem = scenario.ticks[tick].stem.clone();
+        let Some(truth) = frame.world_from_lidar else {
+            return Err(EvaluationError::NoTruth { scenario: scenario.name.clone(), cav: frame.cav, stem });
+        };
+        let localization = localize(&frame)?;
+        let scenario = scenario.name.clone();
+        evaluated.sweeps.push(EvaluatedSweep { scenario, cav: frame.cav, stem, truth, localization });
+    }
+    if evaluated.sweeps.is_empty() {
+        return Err(EvaluationError::Empty(options.scenes.clone()));
+    }
+    Ok(evaluated)
+}
+
+/// Vehicle by vehicle, in the order of time.
+fn sweeps_of(scenario: &Scenario, every: usize) -> impl Iterator<Item = Sweep<'_>> {
+    let ticks = move |agent| {
+        (0..scenario.ticks.len()).step_by(every.max(1)).filter(move |&tick| scenario.is_present(agent, tick))
+    };
+    (0..scenario.agents.len()).flat_map(move |agent| ticks(agent).map(move |tick| Sweep { scenario, agent, tick }))
+}
+
+/// A word for what became of a sweep.
+fn outcome(estimate: &PoseEstimate) -> &'static str {
+    use protocol::NoPoseReason::{Failed, LowConfidence, NoSource, TooFewInliers, TooFewPoints};
+    match estimate {
+        PoseEstimate::Pose { .. } => "pose",
+        PoseEstimate::NoPose { reason, .. } => match reason {
+            TooFewPoints => "too_few_points",
+            TooFewInliers => "too_few_inliers",
+            NoSource => "no_source",
+            LowConfidence => "low_confidence",
+            Failed => "failed",
+        },
+    }
+}
+
+#[cfg(test)]
+pub(super) mod tests {
+    use super::*;
+    use localization::pgc::synthetic::SyntheticTown;
+    use protocol::PointCloud;
+
+    /// Sweeps of a town that gets harder and harder; every tenth is empty.
+    pub(crate) fn evaluated(count: u64) -> Vec<EvaluatedSweep> {
+        (0..count)
+            .map(|seed| {
+                let hardness = seed as f64 / count as f64;
+                let outliers = 0.1 + 0.85 * hardness;
+                let twins = 0.6 * hardness;
+                let cells = if seed % 10 == 9 { 0 } else { 300 };
+                let mut town = SyntheticTown { cells, outliers, twins, next_seed: seed, ..SyntheticTown::default() };
+                EvaluatedSweep {
+                    scenario: "town".into(),
+                    cav: CavId::new("7").unwrap(),
+                    stem: format!("{seed:06}"),
+                    truth: town.world_from_sensor(seed).into(),
+                    localization: town.localize(&PointCloud::default()).unwrap(),
+                }
+            })
+            .collect()
+    }
+
+    #[test]
+    fn another_confidence_changes_what_is_told_and_not_what_was_found() {
+        let mut sweep = evaluated(10).swap_remove(0);
+        let found = sweep.error().unwrap();
+        assert_eq!(sweep.told_error(), Some(found));
+        let strict = localization::pgc::confidence::ConfidenceModel {
+            withhold_below: 1.0,
+            ..localization::pgc::confidence::ConfidenceModel::example()
+        };
+        sweep.judge_again(&Confidence::Calibrated(strict));
+        assert_eq!((sweep.error(), sweep.told_error()), (Some(found), None));
+        assert_eq!(outcome(&sweep.localization.estimate), "low_confidence");
+    }
+
+    #[test]
+    fn folders_without_sweeps_are_named() {
+        let empty = tempfile::tempdir().unwrap();
+        let options =
+            EvaluationOptions { scenes: vec![empty.path().to_owned()], variant: None, every: 1, sweeps: None };
+        let error = evaluate(&mut SyntheticTown::default(), &options, &mut |_, _| {}).unwrap_err().to_string();
+        assert!(error.contains(&empty.path().display().to_string()), "{error}");
+    }
+}

@@ -1,0 +1,278 @@
+//! The numbers of an evaluation, and its reliability curve.
+
+use std::collections::BTreeMap;
+
+use protocol::PoseEstimate;
+use serde::Serialize;
+
+use super::{EvaluatedSweep, outcome};
+use figures::chart::{Axis, Chart, Mark, Series};
+use localization::pgc::confidence::{BAD_M, observed};
+use localization::statistics::{mean, quantile, sorted, spearman};
+
+/// Groups of equally many sweeps that calibration is judged by.
+const BINS: usize = 10;
+
+/// What an evaluation comes to. Errors are those of poses that were told; a sweep without one is no success.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct LocalizationSummary {
+    /// Sweeps.
+    pub sweeps: usize,
+    /// Share of sweeps whose pose is less than 3 m off.
+    pub success_3m: f64,
+    /// Share less than 1 m off.
+    pub success_1m: f64,
+    /// Mean distance, metres.
+    pub mean_m: Option<f64>,
+    /// Median.
+    pub p50_m: Option<f64>,
+    /// 95th percentile.
+    pub p95_m: Option<f64>,
+    /// Largest.
+    pub max_m: Option<f64>,
+    /// Mean angle, degrees.
+    pub mean_deg: Option<f64>,
+    /// Median.
+    pub p50_deg: Option<f64>,
+    /// 95th percentile.
+    pub p95_deg: Option<f64>,
+    /// Largest.
+    pub max_deg: Option<f64>,
+    /// Sweeps without a pose, withheld ones included.
+    pub no_pose: usize,
+    /// What became of the sweeps.
+    pub outcomes: BTreeMap<&'static str, usize>,
+    /// Spearman's correlation of sigma and distance over all poses found, withheld ones included; -1 is perfect.
+    pub sigma_spearman: Option<f64>,
+    /// The same of the share of inliers alone.
+    pub inlier_ratio_spearman: Option<f64>,
+    /// Mean absolute difference of sigma from what it should be, over groups of equally many poses.
+    pub calibration_error: Option<f64>,
+    /// Those groups, by rising sigma.
+    pub calibration: Vec<CalibrationBin>,
+    /// What is withheld, and at which price.
+    pub withheld: WithheldSummary,
+    /// Median milliseconds by stage; `total` is that of whole sweeps.
+    pub ms: BTreeMap<String, f64>,
+}
+
+/// Poses of similar sigma.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct CalibrationBin {
+    /// Poses.
+    pub poses: usize,
+    /// Their mean sigma.
+    pub sigma: f64,
+    /// What it should be: the mean of `1 / (1 + e^2)` of their errors in metres.
+    pub observed: f64,
+    /// Their median distance, metres.
+    pub p50_m: f64,
+    /// Share of them less than 3 m off.
+    pub success_3m: f64,
+}
+
+/// How well withholding works.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct WithheldSummary {
+    /// Poses found and withheld.
+    pub poses: usize,
+    /// Poses found that are more than 3 m off.
+    pub bad: usize,
+    /// Share of them that is withheld.
+    pub bad_share: Option<f64>,
+    /// Share of the others that is withheld.
+    pub good_share: Option<f64>,
+}
+
+/// Sigma and error of a pose that was found.
+#[derive(Debug, Clone, Copy)]
+struct Judged {
+    sigma: f64,
+    error_m: f64,
+    is_withheld: bool,
+}
+
+impl LocalizationSummary {
+    /// Sums sweeps up.
+    #[must_use]
+    pub fn of(sweeps: &[EvaluatedSweep]) -> Self {
+        let told: Vec<_> = sweeps.iter().filter_map(EvaluatedSweep::told_error).collect();
+        let metres = sorted(&told.iter().map(|error| error.distance_m).collect::<Vec<_>>());
+        let degrees = sorted(&told.iter().map(|error| error.angle_deg).collect::<Vec<_>>());
+        let success = |limit_m: f64| {
+            metres.iter().filter(|&&error_m| error_m < limit_m).count() as f64 / sweeps.len().max(1) as f64
+        };
+        let judged = judged(sweeps);
+        let sigmas: Vec<f64> = judged.iter().map(|pose| pose.sigma).collect();
+        let errors: Vec<f64> = judged.iter().map(|pose| pose.error_m).collect();
+        let ratios: Vec<f64> = (sweeps.iter().filter_map(|sweep| sweep.localization.found))
+            .map(|found| found.evidence.inlier_ratio)
+            .collect();
+        let calibration = calibration(&judged);
+        let mut outcomes = BTreeMap::new();
+        for sweep in sweeps {
+            *outcomes.entry(outcome(&sweep.localization.estimate)).or_default() += 1;
+        }
+        let gaps: Vec<f64> = calibration.iter().map(|bin| (bin.sigma - bin.observed).abs()).collect();
+        Self {
+            sweeps: sweeps.len(),
+            success_3m: success(3.0),
+            success_1m: success(1.0),
+            mean_m: mean(&metres),
+            p50_m: quantile(&metres, 0.5),
+            p95_m: quantile(&metres, 0.95),
+            max_m: metres.last().copied(),
+            mean_deg: mean(&degrees),
+            p50_deg: quantile(&degrees, 0.5),
+            p95_deg: quantile(&degrees, 0.95),
+            max_deg: degrees.last().copied(),
+            no_pose: sweeps.len() - told.len(),
+            outcomes,
+            sigma_spearman: spearman(&sigmas, &errors),
+            inlier_ratio_spearman: spearman(&ratios, &errors),
+            calibration_error: mean(&gaps),
+            calibration,
+            withheld: withheld(&judged),
+            ms: median_times(sweeps),
+        }
+    }
+}
+
+fn judged(sweeps: &[EvaluatedSweep]) -> Vec<Judged> {
+    let judged = |sweep: &EvaluatedSweep| {
+        let (found, error) = (sweep.localization.found?, sweep.error()?);
+        Some(Judged { sigma: found.sigma, error_m: error.distance_m, is_withheld: found.is_withheld })
+    };
+    sweeps.iter().filter_map(judged).collect()
+}
+
+fn calibration(judged: &[Judged]) -> Vec<CalibrationBin> {
+    let mut by_sigma = judged.to_vec();
+    by_sigma.sort_by(|a, b| a.sigma.total_cmp(&b.sigma));
+    let bin = |poses: &[Judged]| {
+        let of = |value: fn(&Judged) -> f64| poses.iter().map(value).collect::<Vec<f64>>();
+        CalibrationBin {
+            poses: poses.len(),
+            sigma: mean(&of(|pose| pose.sigma)).unwrap_or(0.0),
+            observed: mean(&of(|pose| observed(pose.error_m))).unwrap_or(0.0),
+            p50_m: quantile(&sorted(&of(|pose| pose.error_m)), 0.5).unwrap_or(0.0),
+            success_3m: mean(&of(|pose| f64::from(u8::from(pose.error_m < BAD_M)))).unwrap_or(0.0),
+        }
+    };
+    let cut = |bin: usize| bin * by_sigma.len() / BINS;
+    (0..BINS).map(|place| &by_sigma[cut(place)..cut(place + 1)]).filter(|poses| !poses.is_empty()).map(bin).collect()
+}
+
+fn withheld(judged: &[Judged]) -> WithheldSummary {
+    let (good, bad): (Vec<&Judged>, Vec<&Judged>) = judged.iter().partition(|pose| pose.error_m <= BAD_M);
+    let count = |poses: &[&Judged]| poses.iter().filter(|pose| pose.is_withheld).count();
+    let share = |poses: &[&Judged]| (!poses.is_empty()).then(|| count(poses) as f64 / poses.len() as f64);
+    WithheldSummary {
+        poses: count(&good) + count(&bad),
+        bad: bad.len(),
+        bad_share: share(&bad),
+        good_share: share(&good),
+    }
+}
+
+fn median_times(sweeps: &[EvaluatedSweep]) -> BTreeMap<String, f64> {
+    let mut times: BTreeMap<String, Vec<f64>> = BTreeMap::new();
+    for sweep in sweeps {
+        let stages = sweep.localization.times;
+        let mut add = |stage: &str, ms: f64| times.entry(stage.to_owned()).or_default().push(ms);
+        for timing in stages.stages() {
+            add(timing.stage.trim_start_matches("pose "), timing.nanos as f64 * 1e-6);
+        }
+        add("total", stages.total().as_secs_f64() * 1e3);
+    }
+    let median = |ms: Vec<f64>| quantile(&sorted(&ms), 0.5).unwrap_or(0.0);
+    times.into_iter().map(|(stage, ms)| (stage, median(ms))).collect()
+}
+
+/// The reliability curve, and every pose by sigma and error.
+#[must_use]
+pub fn reliability_charts(sweeps: &[EvaluatedSweep]) -> Vec<Chart> {
+    let judged = judged(sweeps);
+    let bins = calibration(&judged);
+    let told = sweeps.iter().filter(|sweep| matches!(sweep.localization.estimate, PoseEstimate::Pose { .. })).count();
+    let cloud = |name: &str, is_withheld: bool| Series {
+        name: name.into(),
+        points: (judged.iter().filter(|pose| pose.is_withheld == is_withheld))
+            .map(|pose| (pose.sigma, pose.error_m.clamp(0.01, 1000.0)))
+            .collect(),
+        mark: Mark::Dots,
+    };
+    let reliability = Chart {
+        title: format!("Reliability, {} sweeps, {told} poses told", sweeps.len()),
+        x: Axis::linear("sigma", [0.0, 1.0]),
+        y: Axis::linear("mean of 1 / (1 + e^2), e in m", [0.0, 1.0]),
+        series: vec![
+            Series {
+                name: "poses in groups of equal size".into(),
+                points: bins.iter().map(|bin| (bin.sigma, bin.observed)).collect(),
+                mark: Mark::LineAndDots,
+            },
+            Series { name: "perfectly calibrated".into(), points: vec![(0.0, 0.0), (1.0, 1.0)], mark: Mark::Line },
+        ],
+    };
+    let errors = Chart {
+        title: "Error of every pose found".into(),
+        x: Axis::linear("sigma", [0.0, 1.0]),
+        y: Axis::logarithmic("distance to the true position, m", [0.01, 1000.0]),
+        series: vec![
+            cloud("told", false),
+            Series { name: "3 m".into(), points: vec![(0.0, BAD_M), (1.0, BAD_M)], mark: Mark::Line },
+            cloud("withheld", true),
+        ],
+    };
+    vec![reliability, errors]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::tests::evaluated;
+    use super::*;
+    use localization::pgc::confidence::{Confidence, ConfidenceModel};
+
+    #[test]
+    fn shares_count_all_sweeps_and_errors_only_poses() {
+        let mut sweeps = evaluated(40);
+        let summary = LocalizationSummary::of(&sweeps);
+        assert_eq!(summary.sweeps, 40);
+        assert_eq!(summary.outcomes.values().sum::<usize>(), 40);
+        assert!(summary.success_1m <= summary.success_3m && summary.success_3m < 1.0);
+        assert!(summary.p50_m < summary.p95_m && summary.p95_m <= summary.max_m);
+        assert_eq!(summary.calibration.iter().map(|bin| bin.poses).sum::<usize>(), 40 - summary.no_pose);
+        assert!(summary.sigma_spearman.unwrap() < -0.5);
+        assert_eq!((summary.withheld.poses, summary.withheld.good_share), (0, Some(0.0)));
+        assert_eq!(summary.ms.len(), 6);
+        // Withholding everything makes every sweep one without pose, and errors nobody was told vanish.
+        let all = Confidence::Calibrated(ConfidenceModel { withhold_below: 1.1, ..ConfidenceModel::example() });
+        sweeps.iter_mut().for_each(|sweep| sweep.judge_again(&all));
+        let silent = LocalizationSummary::of(&sweeps);
+        assert_eq!((silent.no_pose, silent.success_3m, silent.mean_m), (40, 0.0, None));
+        assert_eq!(silent.withheld.bad_share, Some(1.0));
+        assert!(silent.sigma_spearman.is_some());
+    }
+
+    #[test]
+    fn the_names_that_others_read_are_there() {
+        let json = serde_json::to_value(LocalizationSummary::of(&evaluated(12))).unwrap();
+        for name in
+            ["sweeps", "success_3m", "success_1m", "mean_m", "p50_m", "p95_m", "mean_deg", "p50_deg", "sigma_spearman"]
+        {
+            assert!(json[name].is_number(), "{name}: {}", json[name]);
+        }
+        assert!(json["no_pose"].is_u64() && json["ms"]["total"].is_number());
+        assert!(LocalizationSummary::of(&[]).mean_m.is_none());
+    }
+
+    #[test]
+    fn the_charts_show_every_pose() {
+        let sweeps = evaluated(30);
+        let charts = reliability_charts(&sweeps);
+        let found = sweeps.iter().filter(|sweep| sweep.localization.found.is_some()).count();
+        assert_eq!(charts[1].series[0].points.len() + charts[1].series[2].points.len(), found);
+        assert_eq!(charts[0].series[0].points.len(), BINS);
+    }
+}

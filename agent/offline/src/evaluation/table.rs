@@ -1,0 +1,133 @@
+//! Every sweep of an evaluation as a row of text.
+
+use std::fmt::Write as _;
+use std::fs;
+use std::io;
+use std::path::Path;
+
+use protocol::{Pose, PoseEstimate};
+
+use super::{EvaluatedSweep, outcome};
+
+const HEADER: &str = "scenario,cav,frame,true_x_m,true_y_m,true_z_m,true_yaw_deg,x_m,y_m,z_m,yaw_deg,error_m,error_deg,\
+    sigma,outcome,cells,inliers,inlier_ratio,rms_m,inlier_epsilon_m,median_epsilon_m,position_std_m,rotation_std_deg,\
+    second_inlier_ratio,second_rms_m,second_epsilon_m,moved_m,residual_quartile_m,information_per_m2,worst_axis_std_m,ms";
+
+/// Writes one row per sweep; fields of sweeps without a pose are empty.
+///
+/// # Errors
+/// The system's, when the file cannot be written.
+pub fn write_csv(path: &Path, sweeps: &[EvaluatedSweep]) -> io::Result<()> {
+    fs::write(path, csv(sweeps))
+}
+
+/// Writes the errors of all sweeps as the table that the pose source `noisy` replays.
+///
+/// # Errors
+/// The system's, when the file cannot be written.
+pub fn write_error_table(path: &Path, sweeps: &[EvaluatedSweep]) -> io::Result<()> {
+    fs::write(path, error_table(sweeps))
+}
+
+fn csv(sweeps: &[EvaluatedSweep]) -> String {
+    let mut text = format!("{HEADER}\n");
+    for sweep in sweeps {
+        let EvaluatedSweep { scenario, cav, stem, truth, localization } = sweep;
+        // Writing to a string cannot fail.
+        let _ = write!(text, "{scenario},{cav},{stem},{}", pose(truth));
+        match (&localization.found, sweep.error()) {
+            (Some(found), Some(error)) => {
+                let evidence = &found.evidence;
+                let _ = write!(
+                    text,
+                    ",{},{:.4},{:.4},{:.4},{},{},{},{:.4},{:.4},{:.4},{:.4},{:.4},{:.4}",
+                    pose(&found.world_from_sensor.into()),
+                    error.distance_m,
+                    error.angle_deg,
+                    found.sigma,
+                    outcome(&localization.estimate),
+                    evidence.cells,
+                    evidence.inliers,
+                    evidence.inlier_ratio,
+                    evidence.rms_m,
+                    evidence.inlier_epsilon_m,
+                    evidence.median_epsilon_m,
+                    evidence.position_std_m,
+                    evidence.rotation_std_rad.to_degrees(),
+                );
+                let _ = match &evidence.second {
+                    Some(second) => write!(
+                        text,
+                        ",{:.4},{:.4},{:.4},{:.4},{:.4},{:.3},{:.4}",
+                        second.inlier_ratio,
+                        second.rms_m,
+                        second.median_epsilon_m,
+                        second.moved_m,
+                        second.residual_quartile_m,
+                        second.information_per_m2,
+                        second.worst_axis_std_m
+                    ),
+                    None => write!(text, ",,,,,,,"),
+                };
+            }
+            _ => {
+                let _ = write!(text, ",,,,,,,,{},,,,,,,,,,,,,,,", outcome(&localization.estimate));
+            }
+        }
+        let _ = writeln!(text, ",{:.3}", localization.times.total().as_secs_f64() * 1e3);
+    }
+    text
+}
+
+fn pose(pose: &Pose) -> String {
+    let [x, y, z] = pose.translation_m;
+    format!("{x:.4},{y:.4},{z:.4},{:.4}", pose.yaw_rad().to_degrees())
+}
+
+fn error_table(sweeps: &[EvaluatedSweep]) -> String {
+    let mut text = String::from("x_m,y_m,z_m,yaw_deg,confidence\n");
+    for sweep in sweeps {
+        let _ = match &sweep.localization.estimate {
+            PoseEstimate::Pose { world_from_cav, confidence } => {
+                let error: Pose = sweep.truth.isometry().inv_mul(&world_from_cav.isometry()).into();
+                writeln!(text, "{},{confidence:.4}", pose(&error))
+            }
+            PoseEstimate::NoPose { .. } => writeln!(text, "no_pose"),
+        };
+    }
+    text
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::tests::evaluated;
+    use super::*;
+    use localization::pose_source::{ErrorTable, TableRow};
+
+    #[test]
+    fn every_row_has_every_column() {
+        let sweeps = evaluated(40);
+        assert!(sweeps.iter().any(|sweep| sweep.localization.found.is_none()));
+        let text = csv(&sweeps);
+        let columns: Vec<usize> = text.lines().map(|line| line.split(',').count()).collect();
+        assert!(columns.len() == 41 && columns.iter().all(|&count| count == columns[0]), "{columns:?}");
+    }
+
+    #[test]
+    fn errors_are_replayed_as_they_were() {
+        let sweeps = evaluated(40);
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("errors.csv");
+        write_error_table(&path, &sweeps).unwrap();
+        let table = ErrorTable::read(&path).unwrap();
+        for (step, sweep) in sweeps.iter().enumerate() {
+            match (table.row(0, step as u64), sweep.told_error()) {
+                (TableRow::Pose { error, .. }, Some(told)) => {
+                    assert!((error.distance_m() - told.distance_m).abs() < 1e-3);
+                }
+                (TableRow::NoPose, None) => {}
+                other => panic!("{other:?}"),
+            }
+        }
+    }
+}

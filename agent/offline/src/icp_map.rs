@@ -1,0 +1,135 @@
+//! A pose from a map of points: the sweep is registered against everything that earlier drives have seen.
+//!
+//! What pose generators are compared with: exact where it starts near enough, but the map has to be carried along and a
+//! receiver has to say where to begin.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use dataset::{self, LoadOptions, ReadError};
+use nalgebra::Isometry3;
+use protocol::{NoPoseReason, PoseEstimate};
+
+use localization::pose_source::{NO_SOURCE, PoseInput, PoseSource};
+use localization::registration::icp::{self, IcpConfig, IcpSource, IcpTarget, NoIcpFit};
+
+/// Registers every sweep against a map, beginning at the measured pose.
+#[derive(Debug, Clone)]
+pub struct IcpMapPose {
+    map: Arc<IcpTarget>,
+    config: IcpConfig,
+}
+
+impl IcpMapPose {
+    /// Takes a map that was made with the same settings.
+    #[must_use]
+    pub fn new(map: Arc<IcpTarget>, config: IcpConfig) -> Self {
+        Self { map, config }
+    }
+}
+
+impl PoseSource for IcpMapPose {
+    /// The confidence is the share of points that found their place.
+    fn estimate(&mut self, input: &PoseInput<'_>) -> PoseEstimate {
+        let Some(start) = input.measured else { return NO_SOURCE };
+        let source = IcpSource::of_sweep(&input.cloud.xyzi, &self.config);
+        match icp::register(&source, &self.map, &start.isometry(), &self.config) {
+            Ok(fit) => PoseEstimate::new(fit.target_from_source.into(), fit.overlap.clamp(0.0, 1.0) as f32),
+            Err(NoIcpFit::TooFew { .. }) => no_pose(NoPoseReason::TooFewPoints),
+            Err(NoIcpFit::TooLittleOverlap { .. } | NoIcpFit::Unconstrained { .. }) => {
+                no_pose(NoPoseReason::TooFewInliers)
+            }
+        }
+    }
+}
+
+fn no_pose(reason: NoPoseReason) -> PoseEstimate {
+    PoseEstimate::NoPose { reason, inlier_count: 0 }
+}
+
+/// Why there is no map.
+#[derive(Debug, thiserror::Error)]
+pub enum MapError {
+    /// A scene is not readable.
+    #[error(transparent)]
+    Read(#[from] ReadError),
+    /// None of the sweeps has a pose.
+    #[error("{}: no sweep has a true pose to put it on the map with", .0.display())]
+    NoPoses(PathBuf),
+}
+
+/// Makes a map of drives with true poses: of every agent a sweep each `spacing_m` metres of way.
+///
+/// # Errors
+/// [`MapError`] names the file.
+pub fn read_map(folders: &[impl AsRef<Path>], spacing_m: f64, config: &IcpConfig) -> Result<IcpTarget, MapError> {
+    let mut map = IcpTarget::new(config);
+    for folder in folders {
+        let mut sweeps = 0;
+        for scenario in dataset::open(folder.as_ref())?.scenarios {
+            for agent in 0..scenario.agents.len() {
+                let mut last: Option<Isometry3<f64>> = None;
+                for tick in (0..scenario.ticks.len()).filter(|&tick| scenario.is_present(agent, tick)) {
+                    let without_points = LoadOptions { points: false, ..LoadOptions::default() };
+                    let Some(pose) = scenario.load(agent, tick, &without_points)?.world_from_lidar else { continue };
+                    let pose = pose.isometry();
+                    let way_m =
+                        last.map_or(f64::INFINITY, |last| (last.translation.vector - pose.translation.vector).norm());
+                    if way_m >= spacing_m {
+                        map.add(&scenario.load(agent, tick, &LoadOptions::default())?.points.xyzi, &pose);
+                        last = Some(pose);
+                        sweeps += 1;
+                    }
+                }
+            }
+        }
+        if sweeps == 0 {
+            return Err(MapError::NoPoses(folder.as_ref().to_owned()));
+        }
+    }
+    map.fit();
+    Ok(map)
+}
+
+#[cfg(test)]
+mod tests {
+    use protocol::{CavId, PointCloud, Pose};
+
+    use super::*;
+
+    /// Ground and two pairs of walls around the origin, as seen from there.
+    fn yard() -> PointCloud {
+        let ground = (0..6400).map(|k| [(k % 80) as f32 * 0.5 - 20.0, (k / 80) as f32 * 0.5 - 20.0, -2.0, 0.1]);
+        let wall = (0..4000).map(|k| {
+            let (along, up, side) = ((k % 100) as f32 * 0.35 - 17.5, (k / 100 % 20) as f32 * 0.3 - 2.0, k / 2000);
+            if side == 0 { [along, 12.0, up, 0.1] } else { [-15.0, along, up, 0.1] }
+        });
+        PointCloud { xyzi: ground.chain(wall).collect() }
+    }
+
+    #[test]
+    fn a_vehicle_is_put_where_the_map_says() {
+        let config = IcpConfig::default();
+        let truth = Pose::from_xyz_yaw([1200.0, -340.0, 20.0], 0.8);
+        let mut map = IcpTarget::new(&config);
+        map.add(&yard().xyzi, &truth.isometry());
+        map.fit();
+        let mut source = IcpMapPose::new(Arc::new(map), config);
+        let (cav, cloud) = (CavId::new("7").unwrap(), yard());
+        let measured = Pose::from_xyz_yaw([1200.7, -340.9, 20.3], 0.83);
+        let mut input = PoseInput { cav: &cav, capture_nanos: 0, cloud: &cloud, measured: Some(&measured) };
+        let estimate = source.estimate(&input);
+        let off = truth.from_world(estimate.world_from_cav().unwrap()).isometry();
+        assert!(off.translation.vector.norm() < 0.01 && off.rotation.angle() < 1e-3, "{off}");
+        assert!(estimate.confidence() > 0.9);
+
+        let empty = PointCloud::default();
+        input.cloud = &empty;
+        assert_eq!(source.estimate(&input), no_pose(NoPoseReason::TooFewPoints));
+        let elsewhere = Pose::from_xyz_yaw([5000.0, 0.0, 0.0], 0.0);
+        input = PoseInput { cloud: &cloud, measured: Some(&elsewhere), ..input };
+        assert_eq!(source.estimate(&input), no_pose(NoPoseReason::TooFewInliers));
+        input.measured = None;
+        assert_eq!(source.estimate(&input), NO_SOURCE);
+    }
+}

@@ -1,0 +1,182 @@
+//! Features of a town's sweeps, computed once: the encoder is frozen, so only the head needs them again and again.
+
+use std::f64::consts::PI;
+use std::sync::Arc;
+
+use nalgebra::{Isometry3, Point3};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use tch::{Device, Kind, TchError, Tensor, no_grad};
+
+use super::error::LocalizerTrainError;
+use super::sweep_store::{SweepList, yaw};
+use super::turned_sweep::{CELLS, TurnedSweep};
+use localization::pgc::{Cell, SceneEncoder, SweepVoxels, VoxelBatch};
+use perception::train::{Prefetch, RunConfig};
+
+/// Sweeps of one forward pass.
+const BATCH: u64 = 4;
+
+/// How sweeps are changed before they are encoded.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct SweepAugmentation {
+    /// Copies of every sweep; the first is unchanged.
+    pub copies: usize,
+    /// Largest turn of the other copies, radians: a car does not always stand along its lane.
+    pub turn_rad: f64,
+    /// Least share of points that is kept in the other copies.
+    pub keep: f64,
+}
+
+/// Cached features of cells, with what they should be regressed to.
+#[derive(Debug)]
+pub struct FeatureCache {
+    /// `[N, cell_channels]`, half precision.
+    pub cells: Tensor,
+    /// `[N]`: the sweep of each cell.
+    pub sweep_of_cell: Tensor,
+    /// `[N, 3]`: true world coordinates relative to the origin, metres.
+    pub targets_m: Tensor,
+    /// `[N, 3]`: where the cell is in the sensor frame, metres.
+    pub sensor_m: Tensor,
+    /// `[S, sweep_channels]`, single precision.
+    pub sweeps: Tensor,
+    /// `[S]`: true poses.
+    pub world_from_sensor: Vec<Isometry3<f64>>,
+    /// Middle of the sensor positions, metres.
+    pub origin_m: [f64; 3],
+}
+
+impl FeatureCache {
+    /// Encodes every sweep of `list` once per copy, where and in which numbers `run` says; `progress` hears how many of how
+    /// many sweeps are done.
+    ///
+    /// # Errors
+    /// [`LocalizerTrainError`] when a sweep cannot be read or encoded, or none has a pose.
+    pub fn build(
+        list: &Arc<SweepList>,
+        encoder: &SceneEncoder,
+        augmentation: SweepAugmentation,
+        run: &RunConfig,
+        progress: &mut dyn FnMut(usize, usize),
+    ) -> Result<Self, LocalizerTrainError> {
+        let RunConfig { seed, loader_threads, precision, device, .. } = *run;
+        let total = list.len() * augmentation.copies.max(1);
+        let config = encoder.config().clone();
+        let source = Arc::clone(list);
+        let prepare = move |batch: u64| -> Result<Vec<TurnedSweep>, LocalizerTrainError> {
+            let numbers = (batch * BATCH..(batch + 1) * BATCH).filter(|&number| (number as usize) < total);
+            let prepared = numbers.map(|number| {
+                let (index, copy) = (number as usize % source.len(), number as usize / source.len());
+                let Some(stored) = source.read(index, config.range_m)? else { return Ok(None) };
+                let mut rng = ChaCha8Rng::seed_from_u64(seed);
+                rng.set_stream(number);
+                let (turn, keep) = match copy {
+                    0 => (Isometry3::identity(), 1.0),
+                    _ => {
+                        let angle = augmentation.turn_rad.clamp(1e-6, PI);
+                        (yaw(rng.random_range(-angle..angle)), rng.random_range(augmentation.keep..=1.0))
+                    }
+                };
+                Ok(Some(TurnedSweep::new(&stored, &turn, keep, &mut rng, &config)))
+            });
+            prepared.filter_map(Result::transpose).collect()
+        };
+        let mut loader = Prefetch::start(loader_threads, 0, prepare);
+        let rows = (total * CELLS) as i64;
+        let mut builder = Builder::new(rows, encoder.config().cell_channels(), device)?;
+        let mut done = 0;
+        while done < total {
+            let batch = loader.next_batch()??;
+            if !batch.is_empty() {
+                builder.add(&batch, encoder, precision.kind(), device)?;
+            }
+            done = (done + BATCH as usize).min(total);
+            progress(done, total);
+        }
+        builder.finish(device)
+    }
+
+    /// Number of sweeps.
+    #[must_use]
+    pub fn sweep_count(&self) -> usize {
+        self.world_from_sensor.len()
+    }
+
+    /// Number of cells.
+    #[must_use]
+    pub fn cell_count(&self) -> i64 {
+        self.sweep_of_cell.size()[0]
+    }
+}
+
+struct Builder {
+    /// One block from the start: thousands of pieces would stay in the allocator's lists for the whole training.
+    cells: Tensor,
+    sweeps: Vec<Tensor>,
+    sweep_of_cell: Vec<i64>,
+    places: Vec<Cell>,
+    poses: Vec<Isometry3<f64>>,
+}
+
+impl Builder {
+    fn new(rows: i64, channels: i64, device: Device) -> Result<Self, TchError> {
+        let cells = Tensor::f_empty([rows, channels], (Kind::Half, device))?;
+        Ok(Self { cells, sweeps: Vec::new(), sweep_of_cell: Vec::new(), places: Vec::new(), poses: Vec::new() })
+    }
+
+    fn add(
+        &mut self,
+        batch: &[TurnedSweep],
+        encoder: &SceneEncoder,
+        kind: Kind,
+        device: Device,
+    ) -> Result<(), TchError> {
+        let sweeps: Vec<&SweepVoxels> = batch.iter().map(|prepared| &prepared.voxels).collect();
+        let voxels = VoxelBatch::new(&sweeps, encoder.config(), device)?;
+        let features = encoder.encode(&voxels, kind)?;
+        let mut rows = Vec::new();
+        let filled = self.places.len() as i64;
+        for (number, prepared) in batch.iter().enumerate() {
+            let first = voxels.cell_rows(number).start;
+            rows.extend(prepared.rows.iter().map(|&row| first + row as i64));
+            self.sweep_of_cell.extend(prepared.rows.iter().map(|_| (self.poses.len()) as i64));
+            self.places.extend(prepared.rows.iter().map(|&row| prepared.voxels.cells()[row]));
+            self.poses.push(prepared.world_from_sensor);
+        }
+        let rows = Tensor::f_from_slice(&rows)?.f_to_device(device)?;
+        no_grad(|| {
+            let mut place = self.cells.f_narrow(0, filled, rows.size()[0])?;
+            place.f_copy_(&features.cells.f_index_select(0, &rows)?)?;
+            self.sweeps.push(features.sweeps);
+            Ok(())
+        })
+    }
+
+    fn finish(self, device: Device) -> Result<FeatureCache, LocalizerTrainError> {
+        if self.poses.is_empty() || self.places.is_empty() {
+            return Err(LocalizerTrainError::NoSweeps(Vec::new()));
+        }
+        let count = self.poses.len() as f64;
+        let origin_m: [f64; 3] = std::array::from_fn(|axis| {
+            self.poses.iter().map(|pose| pose.translation.vector[axis]).sum::<f64>() / count
+        });
+        let mut targets = Vec::with_capacity(3 * self.places.len());
+        for (cell, &sweep) in self.places.iter().zip(&self.sweep_of_cell) {
+            let [x, y, z] = cell.centroid_m.map(f64::from);
+            let place = self.poses[sweep as usize] * Point3::new(x, y, z);
+            targets.extend((0..3).map(|axis| (place[axis] - origin_m[axis]) as f32));
+        }
+        let sensor: Vec<f32> = self.places.iter().flat_map(|cell| cell.centroid_m).collect();
+        let columns = |values: &[f32]| Tensor::f_from_slice(values)?.f_view([-1, 3])?.f_to_device(device);
+        Ok(FeatureCache {
+            cells: self.cells.f_narrow(0, 0, self.places.len() as i64)?,
+            sweep_of_cell: Tensor::f_from_slice(&self.sweep_of_cell)?.f_to_device(device)?,
+            targets_m: columns(&targets)?,
+            sensor_m: columns(&sensor)?,
+            sweeps: Tensor::f_cat(&self.sweeps, 0)?,
+            world_from_sensor: self.poses,
+            origin_m,
+        })
+    }
+}

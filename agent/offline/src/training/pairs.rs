@@ -1,0 +1,267 @@
+//! Pairs of sweeps that see the same place, and which of their cells lie at the same spot.
+
+use std::collections::HashMap;
+use std::f64::consts::PI;
+use std::sync::Arc;
+
+use nalgebra::{Isometry3, Point3};
+use rand::seq::{IndexedRandom, SliceRandom};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+
+use super::error::LocalizerTrainError;
+use super::sweep_store::{SweepStore, heading_rad, yaw};
+use localization::pgc::{Cell, SceneEncoderConfig, SweepVoxels};
+
+/// Sensors of a pair are at most so far apart in the plane, metres.
+pub(super) const PAIR_RANGE_M: f64 = 12.0;
+/// Cells closer than this are at the same spot, metres.
+const MATCH_M: f32 = 1.5;
+/// Probability that the partner comes from another drive, where there is one: other traffic, often the other way.
+const OTHER_DRIVE: f64 = 0.7;
+/// Least share of points that is kept.
+const MIN_KEPT: f64 = 0.6;
+/// Cells of each sweep that take part in one loss.
+const CELLS: usize = 640;
+/// Pairs that are tried before the data are given up.
+const TRIES: usize = 200;
+/// Share of those that may be flat ground.
+const FLAT_SHARE: f64 = 0.25;
+
+/// Cells of one sweep of a pair that take part in the loss.
+#[derive(Debug)]
+pub struct ChosenCells {
+    /// The sweep, turned at random.
+    pub sweep: SweepVoxels,
+    /// `[n]` of its cells.
+    pub rows: Vec<usize>,
+    /// `[n]` of where they are, metres in the world of the pair (its origin near the sensors).
+    pub places_m: Vec<[f32; 3]>,
+    /// Rotation part of `sensor_from_world`, row-major.
+    pub sensor_from_world: [f32; 9],
+}
+
+/// Two sweeps of the same place.
+#[derive(Debug)]
+pub struct Pair {
+    /// The sweep whose cells are sought.
+    pub anchor: ChosenCells,
+    /// The sweep that they are sought in.
+    pub partner: ChosenCells,
+    /// For each chosen cell of the anchor the place in `partner.rows` of the cell at the same spot.
+    pub matches: Vec<usize>,
+    /// Heading of the partner relative to the anchor, radians.
+    pub relative_yaw_rad: f64,
+}
+
+/// Makes pairs, each a function of the seed and its number.
+#[derive(Debug, Clone)]
+pub struct PairMaker {
+    store: Arc<SweepStore>,
+    config: SceneEncoderConfig,
+    seed: u64,
+    /// For each sweep those in range, of its own drive and of others.
+    partners: Arc<Vec<[Vec<u32>; 2]>>,
+    anchors: Arc<Vec<u32>>,
+}
+
+impl PairMaker {
+    /// Finds who sees the same place as whom.
+    ///
+    /// # Errors
+    /// [`LocalizerTrainError::NoPairs`] when nobody does.
+    pub fn new(store: Arc<SweepStore>, config: SceneEncoderConfig, seed: u64) -> Result<Self, LocalizerTrainError> {
+        let partners = partners(&store);
+        let anchors: Vec<u32> = (0..)
+            .zip(&partners)
+            .filter(|(_, [own, other])| own.len() + other.len() > 0)
+            .map(|(index, _)| index)
+            .collect();
+        if anchors.is_empty() {
+            return Err(LocalizerTrainError::NoPairs(PAIR_RANGE_M));
+        }
+        Ok(Self { store, config, seed, partners: Arc::new(partners), anchors: Arc::new(anchors) })
+    }
+
+    /// Number of sweeps that have a partner.
+    #[must_use]
+    pub fn anchors(&self) -> usize {
+        self.anchors.len()
+    }
+
+    /// Pair `number`.
+    ///
+    /// # Errors
+    /// [`LocalizerTrainError::NoMatches`] when sweeps that stand side by side show no cell at the same spot, for example
+    /// because they are empty.
+    pub fn pair(&self, number: u64) -> Result<Pair, LocalizerTrainError> {
+        let mut rng = ChaCha8Rng::seed_from_u64(self.seed);
+        rng.set_stream(number);
+        for _ in 0..TRIES {
+            let anchor = self.anchors[rng.random_range(0..self.anchors.len())] as usize;
+            let [own, other] = &self.partners[anchor];
+            let takes_other = own.is_empty() || (!other.is_empty() && rng.random_bool(OTHER_DRIVE));
+            let among = if takes_other { other } else { own };
+            let Some(&partner) = among.choose(&mut rng) else { continue };
+            let pair = self.build(anchor, partner as usize, &mut rng);
+            if !pair.matches.is_empty() {
+                return Ok(pair);
+            }
+        }
+        Err(LocalizerTrainError::NoMatches(TRIES))
+    }
+
+    fn build(&self, anchor: usize, partner: usize, rng: &mut ChaCha8Rng) -> Pair {
+        let origin = self.store.sweeps[anchor].world_from_sensor.translation;
+        let mut turned = |index: usize| {
+            let stored = &self.store.sweeps[index];
+            // A car leans and pitches a little, whatever the maps say.
+            let lean = UnitLean::random(rng);
+            let turned_from_sensor = lean.isometry() * yaw(rng.random_range(-PI..PI));
+            let keep = rng.random_range(MIN_KEPT..1.0);
+            let sweep = stored.turned_voxels(&turned_from_sensor, keep, rng, &self.config);
+            (sweep, origin.inverse() * stored.world_from_sensor * turned_from_sensor.inverse())
+        };
+        let (anchor_sweep, world_from_anchor) = turned(anchor);
+        let (partner_sweep, world_from_partner) = turned(partner);
+        let anchor_places = places(anchor_sweep.cells(), &world_from_anchor);
+        let partner_places = places(partner_sweep.cells(), &world_from_partner);
+        let grid = Grid::new(&partner_places);
+        let candidates = choose(anchor_sweep.cells(), CELLS, rng);
+        let matched: Vec<(usize, usize)> =
+            candidates.into_iter().filter_map(|cell| Some((cell, grid.nearest(anchor_places[cell])?))).collect();
+        // The partners of the anchor's cells, and others among which they are to be found.
+        let mut rows: Vec<usize> = matched.iter().map(|&(_, partner)| partner).collect();
+        rows.extend(choose(partner_sweep.cells(), CELLS, rng));
+        let mut seen = HashMap::new();
+        let mut distinct = Vec::new();
+        for row in rows {
+            seen.entry(row).or_insert_with(|| {
+                distinct.push(row);
+                distinct.len() - 1
+            });
+        }
+        let matches = matched.iter().map(|(_, partner)| seen[partner]).collect();
+        let anchor_rows: Vec<usize> = matched.iter().map(|&(cell, _)| cell).collect();
+        let relative_yaw_rad = heading_rad(&world_from_partner) - heading_rad(&world_from_anchor);
+        Pair {
+            anchor: chosen(anchor_sweep, anchor_rows, &anchor_places, &world_from_anchor),
+            partner: chosen(partner_sweep, distinct, &partner_places, &world_from_partner),
+            matches,
+            relative_yaw_rad,
+        }
+    }
+}
+
+fn chosen(
+    sweep: SweepVoxels,
+    rows: Vec<usize>,
+    places_m: &[[f32; 3]],
+    world_from_sensor: &Isometry3<f64>,
+) -> ChosenCells {
+    let places_m = rows.iter().map(|&row| places_m[row]).collect();
+    let rotation = world_from_sensor.rotation.inverse().to_rotation_matrix().into_inner().transpose();
+    // Column-major storage of the transpose is row-major storage of the matrix.
+    let sensor_from_world = std::array::from_fn(|place| rotation.as_slice()[place] as f32);
+    ChosenCells { sweep, rows, places_m, sensor_from_world }
+}
+
+/// A small roll and pitch.
+struct UnitLean([f64; 2]);
+
+impl UnitLean {
+    /// Largest angle, radians.
+    const MOST_RAD: f64 = 0.03;
+
+    fn random(rng: &mut impl Rng) -> Self {
+        Self(std::array::from_fn(|_| rng.random_range(-Self::MOST_RAD..Self::MOST_RAD)))
+    }
+
+    fn isometry(&self) -> Isometry3<f64> {
+        Isometry3::rotation(nalgebra::Vector3::new(self.0[0], self.0[1], 0.0))
+    }
+}
+
+/// Up to `count` cells at random, flat ground no more than its share.
+pub(super) fn choose(cells: &[Cell], count: usize, rng: &mut impl Rng) -> Vec<usize> {
+    let (mut flat, mut high): (Vec<usize>, Vec<usize>) = (0..cells.len()).partition(|&cell| cells[cell].is_flat());
+    high.shuffle(rng);
+    flat.shuffle(rng);
+    high.truncate(count - (count as f64 * FLAT_SHARE) as usize);
+    flat.truncate((count as f64 * FLAT_SHARE) as usize);
+    high.extend(flat);
+    high
+}
+
+fn places(cells: &[Cell], world_from_sensor: &Isometry3<f64>) -> Vec<[f32; 3]> {
+    let place = |cell: &Cell| {
+        let [x, y, z] = cell.centroid_m.map(f64::from);
+        let point = world_from_sensor * Point3::new(x, y, z);
+        [point.x as f32, point.y as f32, point.z as f32]
+    };
+    cells.iter().map(place).collect()
+}
+
+/// Places by cubes of [`MATCH_M`].
+struct Grid<'a> {
+    places_m: &'a [[f32; 3]],
+    cubes: HashMap<[i32; 3], Vec<u32>>,
+}
+
+impl<'a> Grid<'a> {
+    fn new(places_m: &'a [[f32; 3]]) -> Self {
+        let mut cubes: HashMap<[i32; 3], Vec<u32>> = HashMap::new();
+        for (index, &place) in (0..).zip(places_m) {
+            cubes.entry(cube(place)).or_default().push(index);
+        }
+        Self { places_m, cubes }
+    }
+
+    /// The nearest place within [`MATCH_M`].
+    fn nearest(&self, point: [f32; 3]) -> Option<usize> {
+        let [x, y, z] = cube(point);
+        let mut best = (MATCH_M * MATCH_M, None);
+        for dx in -1..=1 {
+            for dy in -1..=1 {
+                for dz in -1..=1 {
+                    for &index in self.cubes.get(&[x + dx, y + dy, z + dz]).into_iter().flatten() {
+                        let place = self.places_m[index as usize];
+                        let square: f32 = (0..3).map(|axis| (place[axis] - point[axis]).powi(2)).sum();
+                        if square < best.0 {
+                            best = (square, Some(index as usize));
+                        }
+                    }
+                }
+            }
+        }
+        best.1
+    }
+}
+
+fn cube(place: [f32; 3]) -> [i32; 3] {
+    place.map(|axis| (axis / MATCH_M).floor() as i32)
+}
+
+/// For each sweep those of the same world in range: of its own drive, and of others.
+fn partners(store: &SweepStore) -> Vec<[Vec<u32>; 2]> {
+    let bucket = |index: usize, dx: i32, dy: i32| {
+        let sweep = &store.sweeps[index];
+        let place = sweep.world_from_sensor.translation.vector / PAIR_RANGE_M;
+        (sweep.world, place.x.floor() as i32 + dx, place.y.floor() as i32 + dy)
+    };
+    let mut buckets: HashMap<(usize, i32, i32), Vec<u32>> = HashMap::new();
+    (0..store.sweeps.len()).for_each(|index| buckets.entry(bucket(index, 0, 0)).or_default().push(index as u32));
+    let near = |index: usize| {
+        let own = &store.sweeps[index];
+        let around = (-1..=1).flat_map(|dx| (-1..=1).map(move |dy| (dx, dy)));
+        let candidates = around.filter_map(|(dx, dy)| buckets.get(&bucket(index, dx, dy))).flatten().copied();
+        let in_range = candidates.filter(|&other| {
+            let offset = store.sweeps[other as usize].world_from_sensor.translation.vector
+                - own.world_from_sensor.translation.vector;
+            other as usize != index && offset.xy().norm() <= PAIR_RANGE_M && offset.z.abs() <= 2.0
+        });
+        let (same, other) = in_range.partition(|&other| store.sweeps[other as usize].drive == own.drive);
+        [same, other]
+    };
+    (0..store.sweeps.len()).map(near).collect()
+}

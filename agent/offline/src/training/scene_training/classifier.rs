@@ -1,0 +1,47 @@
+//! The classifier of a head, trained before its regressor: which cluster of sensor positions a sweep is of.
+
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use tch::nn::VarStore;
+use tch::{Kind, TchError, Tensor, no_grad};
+
+use crate::training::FeatureCache;
+use localization::pgc::SceneHead;
+use perception::train::{AdamW, AdamWConfig, OneCycle};
+
+/// Steps and sweeps per step that it is trained with.
+const STEPS: usize = 1500;
+const BATCH: usize = 256;
+/// Highest learning rate.
+const LEARNING_RATE: f64 = 2e-3;
+/// LightLoc's.
+const LABEL_SMOOTHING: f64 = 0.1;
+
+/// Cross entropy with label smoothing; the share of training sweeps that end up in their class.
+pub(super) fn train_classifier(
+    head: &SceneHead,
+    variables: &VarStore,
+    cache: &FeatureCache,
+    class_of_sweep: &[usize],
+    seed: u64,
+) -> Result<f64, TchError> {
+    let classes: Vec<i64> = class_of_sweep.iter().map(|&class| class as i64).collect();
+    let classes = Tensor::f_from_slice(&classes)?.f_to_device(variables.device())?;
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    let mut optimizer = AdamW::new(variables, AdamWConfig::default());
+    for step in 0..STEPS {
+        let rows: Vec<i64> = (0..BATCH).map(|_| rng.random_range(0..cache.sweep_count()) as i64).collect();
+        let rows = Tensor::f_from_slice(&rows)?.f_to_device(variables.device())?;
+        let logits = head.classify(&cache.sweeps.f_index_select(0, &rows)?, true)?;
+        let log_shares = logits.f_log_softmax(1, Kind::Float)?;
+        let wanted = classes.f_index_select(0, &rows)?;
+        let hit = log_shares.f_gather(1, &wanted.f_unsqueeze(1)?, false)?.f_mean(Kind::Float)?;
+        let even = log_shares.f_mean(Kind::Float)?;
+        let loss = -(hit * (1.0 - LABEL_SMOOTHING) + even * LABEL_SMOOTHING);
+        optimizer.zero_grad();
+        loss.f_backward()?;
+        optimizer.step(OneCycle { peak: LEARNING_RATE }.at(step as f64 / STEPS as f64))?;
+    }
+    let found = no_grad(|| head.classify(&cache.sweeps, false)?.f_argmax(1, false)?.f_eq_tensor(&classes))?;
+    found.f_to_kind(Kind::Float)?.f_mean(Kind::Float)?.f_double_value(&[])
+}

@@ -1,0 +1,64 @@
+//! The lattice of the refiner: laid over all cells before the training, cut to where cells are after it.
+
+use tch::nn::VarStore;
+use tch::{TchError, Tensor, no_grad};
+
+use localization::pgc::LocalizerError;
+use localization::pgc::SceneHead;
+use localization::pgc::{RefinerConfig, SceneHeadConfig};
+
+/// Distance between corners, metres, and how many corners there may be: larger towns have a wider lattice.
+const SPACING_M: f64 = 1.5;
+const CORNERS: f64 = 110_000.0;
+/// How far the refiner looks to each side, metres.
+const REACH_M: f64 = 3.0;
+/// Channels of a key.
+const KEYS: i64 = 16;
+/// Share of the cells that may lie beyond each edge of the lattice that is kept in the end.
+const EDGE_SHARE: f64 = 0.003;
+/// What lies this far beyond the outermost cell is still town, metres.
+const MARGIN_M: f64 = 8.0;
+
+/// A lattice that covers all cells, whose world coordinates `targets_m` `[N, 3]` are.
+pub(super) fn covering(targets_m: &Tensor, local_channels: i64) -> Result<RefinerConfig, TchError> {
+    let bound = |extreme: Tensor, margin_m: f64| -> Result<[f64; 2], TchError> {
+        let values: Vec<f32> = Vec::try_from(&extreme)?;
+        Ok([f64::from(values[0]) + margin_m, f64::from(values[1]) + margin_m])
+    };
+    let low_m = bound(targets_m.f_amin([0_i64], false)?, -MARGIN_M)?;
+    let high_m = bound(targets_m.f_amax([0_i64], false)?, MARGIN_M)?;
+    let area_m2 = (high_m[0] - low_m[0]) * (high_m[1] - low_m[1]);
+    let spacing_m = (area_m2 / CORNERS).sqrt().max(SPACING_M);
+    let reach = (REACH_M / spacing_m).ceil() as i64;
+    Ok(RefinerConfig { local_channels, low_m, high_m, spacing_m, reach, keys: KEYS, width: 256 })
+}
+
+/// Cuts the edges of the lattice off that hardly any cell comes near, so that they need not be shipped; the trained
+/// variables that are left.
+pub(super) fn crop(
+    head: &mut SceneHeadConfig,
+    variables: VarStore,
+    targets_m: &Tensor,
+) -> Result<VarStore, LocalizerError> {
+    let Some(full) = &head.refiner else { return Ok(variables) };
+    let bound = |share: f64, axis: i64| -> Result<f64, TchError> {
+        let values = targets_m.f_select(1, axis)?;
+        let rank = ((values.size()[0] - 1) as f64 * share).round() as i64 + 1;
+        values.f_kthvalue(rank, 0, false)?.0.f_double_value(&[])
+    };
+    let low_m = [bound(EDGE_SHARE, 0)?, bound(EDGE_SHARE, 1)?];
+    let high_m = [bound(1.0 - EDGE_SHARE, 0)?, bound(1.0 - EDGE_SHARE, 1)?];
+    let (cropped, rows) = full.cropped(low_m, high_m);
+    let rows = Tensor::f_from_slice(&rows)?.f_to_device(variables.device())?;
+    head.refiner = Some(cropped);
+    let kept = VarStore::new(variables.device());
+    SceneHead::new(&kept.root(), head)?;
+    let trained = variables.variables();
+    for (name, mut variable) in kept.variables() {
+        let source = &trained[&name];
+        let is_lattice = matches!(name.as_str(), "refiner.keys" | "refiner.heights");
+        let source = if is_lattice { source.f_index_select(0, &rows)? } else { source.shallow_clone() };
+        no_grad(|| variable.f_copy_(&source))?;
+    }
+    Ok(kept)
+}

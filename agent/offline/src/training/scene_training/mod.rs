@@ -1,0 +1,265 @@
+//! Second stage: the head of one town, on features of the frozen encoder that are computed once.
+
+mod cell_order;
+mod classifier;
+mod config;
+mod features;
+mod lattice;
+mod losses;
+mod rough_pose;
+mod statistics;
+
+use std::collections::BTreeMap;
+use std::time::Instant;
+
+use tch::nn::VarStore;
+use tch::{Kind, Tensor, no_grad};
+
+pub use self::config::{SceneReport, SceneSummary, SceneTrainConfig};
+
+use self::cell_order::CellOrder;
+use self::features::Features;
+use self::losses::{centre_loss, weighted_loss};
+use self::rough_pose::RoughPoses;
+use super::error::LocalizerTrainError;
+use super::feature_cache::FeatureCache;
+use super::kmeans::kmeans;
+use super::redundancy::Redundancy;
+use super::scene_validation::{SceneAccuracy, validate};
+use localization::pgc::SceneHead;
+use localization::pgc::SceneHeadConfig;
+use perception::train::{Curve, DataListing, Length, Trainer};
+use perception::weights::{CONFIG_KEY, KIND_KEY};
+
+/// What a unit of cross entropy over the centres weighs, metres.
+const CENTRE_WEIGHT_M: f64 = 5.0;
+/// Steps between two draws of what drops out of the classifier.
+const LOGITS_EVERY: u64 = 50;
+/// Steps between two reports.
+const REPORT_EVERY: u64 = 20;
+/// Cells of a sweep that a head regresses at most.
+const MAX_CELLS: usize = 1024;
+
+/// Trains a head; writes checkpoint, curve and weights into `config.run.out`.
+///
+/// # Errors
+/// [`LocalizerTrainError`]; the last checkpoint stays.
+pub fn train_scene(
+    config: &SceneTrainConfig,
+    observe: &mut dyn FnMut(&SceneReport),
+) -> Result<SceneSummary, LocalizerTrainError> {
+    let mut training = Training::prepare(config, observe)?;
+    let mut last_validation = Instant::now();
+    while training.share_done() < 1.0 {
+        training.step()?;
+        if training.trainer.steps().is_multiple_of(REPORT_EVERY) {
+            observe(&training.report());
+        }
+        if last_validation.elapsed() >= config.validate_every {
+            training.look_back(observe)?;
+            last_validation = Instant::now();
+        }
+    }
+    training.look_back(observe)?;
+    training.finish()
+}
+
+struct Training<'a> {
+    config: &'a SceneTrainConfig,
+    head_config: SceneHeadConfig,
+    cache: FeatureCache,
+    validation: Option<FeatureCache>,
+    variables: VarStore,
+    head: SceneHead,
+    trainer: Trainer,
+    order: CellOrder,
+    rough_poses: RoughPoses,
+    /// What the classifier says of each sweep at the moment.
+    logits: Option<Tensor>,
+    cells_shown: u64,
+    window: Window,
+    /// The window of the last report.
+    told: Window,
+    accuracy: Option<SceneAccuracy>,
+    curve: Curve,
+    data: DataListing,
+    preparing_seconds: f64,
+}
+
+impl<'a> Training<'a> {
+    fn prepare(
+        config: &'a SceneTrainConfig,
+        observe: &mut dyn FnMut(&SceneReport),
+    ) -> Result<Self, LocalizerTrainError> {
+        let started = Instant::now();
+        let run = &config.run;
+        run.start()?;
+        let features = Features::compute(config, observe)?;
+        let head_config = head_config(config, &features)?;
+        let Features { training: cache, validation, data, .. } = features;
+        let variables = VarStore::new(run.device);
+        let mut head = SceneHead::new(&variables.root(), &head_config)?;
+        let positions: Vec<[f64; 3]> =
+            cache.world_from_sensor.iter().map(|pose| pose.translation.vector.into()).collect();
+        let (_, class_of_sweep) = kmeans(&positions, config.classes as usize, run.seed);
+        statistics::set_statistics(&mut head, &cache, run.seed)?;
+        if !run.resume {
+            let share = classifier::train_classifier(&head, &variables, &cache, &class_of_sweep, run.seed)?;
+            observe(&SceneReport::Classified(share));
+        }
+        let trainer = Trainer::begin(run, &variables, None, started)?;
+        let redundancy = config.redundancy.map(|redundancy| Redundancy::new(redundancy, class_of_sweep));
+        let header = "step,seconds,error_m,epsilon_m,cell_p50_m,pose_p50_m,pose_p50_deg,success_3m,success_1m";
+        Ok(Self {
+            config,
+            head_config,
+            variables,
+            head,
+            order: CellOrder::new(&cache, redundancy, run.batch, run.seed, trainer.steps())?,
+            rough_poses: RoughPoses::new(&cache.world_from_sensor, run.device)?,
+            cache,
+            validation,
+            logits: None,
+            cells_shown: 0,
+            window: Window::default(),
+            told: Window::default(),
+            accuracy: None,
+            curve: trainer.curve(header)?,
+            trainer,
+            data,
+            preparing_seconds: started.elapsed().as_secs_f64(),
+        })
+    }
+
+    fn share_done(&self) -> f64 {
+        match self.config.run.length {
+            Length::Time(limit) => {
+                // The schedule of the head begins when the features are there.
+                let limit = (limit.as_secs_f64() - self.preparing_seconds).max(1.0);
+                (self.trainer.seconds() - self.preparing_seconds) / limit
+            }
+            _ => self.trainer.share_done(self.order.passes()),
+        }
+    }
+
+    /// Eq. 4 and 5.
+    fn step(&mut self) -> Result<(), LocalizerTrainError> {
+        let share_done = self.share_done();
+        let rows = self.order.next_batch(share_done)?;
+        let sweeps = self.cache.sweep_of_cell.f_index_select(0, &rows)?;
+        let cells = self.head.normalise(&self.cache.cells.f_index_select(0, &rows)?)?;
+        let logits = match self.logits.take() {
+            Some(logits) if !self.trainer.steps().is_multiple_of(LOGITS_EVERY) => logits,
+            // Channels drop out here too: where nobody has driven the classifier is less sure than on what it has seen.
+            _ => no_grad(|| self.head.classify(&self.cache.sweeps, true))?,
+        };
+        let kind = self.config.run.precision.kind();
+        let (regression, log_shares) =
+            self.head.regress_among_centres(&cells, &logits.f_index_select(0, &sweeps)?, kind)?;
+        self.logits = Some(logits);
+        let targets = self.cache.targets_m.f_index_select(0, &rows)?;
+        let weights = self.order.weights(&sweeps)?;
+        let (mut loss, error) = weighted_loss(&regression, &targets, &weights)?;
+        loss += centre_loss(&log_shares, &targets, self.head.centres_m(), &weights)? * CENTRE_WEIGHT_M;
+        if let Some(refiner) = self.head.refiner() {
+            let (assumed, heading) = self.rough_poses.draw(&targets, &sweeps)?;
+            let answer = refiner.look(&cells, &assumed, &heading, kind)?;
+            let (refiner_loss, refined) = weighted_loss(&answer, &targets, &weights)?;
+            loss += refiner_loss;
+            self.window.refined_m += mean(&refined)?;
+        }
+        self.trainer.step(&loss, self.share_done())?;
+        self.window.error_m += mean(&error)?;
+        self.window.epsilon_m += mean(&regression.epsilon_m)?;
+        self.window.steps += 1;
+        self.cells_shown += self.config.run.batch as u64;
+        let share_done = self.share_done();
+        Ok(self.order.watch(share_done, &sweeps, &error)?)
+    }
+
+    fn report(&mut self) -> SceneReport {
+        // A validation right after a report has nothing newer to tell.
+        if self.window.steps > 0 {
+            self.told = std::mem::take(&mut self.window);
+        }
+        let mean = |sum: f64| sum / f64::from(self.told.steps.max(1));
+        SceneReport::Stepped {
+            step: self.trainer.steps(),
+            epoch: self.order.passes(),
+            share_done: self.share_done().min(1.0),
+            seconds: self.trainer.seconds(),
+            error_m: mean(self.told.error_m),
+            epsilon_m: mean(self.told.epsilon_m),
+            refined_m: mean(self.told.refined_m),
+        }
+    }
+
+    /// Validation and checkpoint.
+    fn look_back(&mut self, observe: &mut dyn FnMut(&SceneReport)) -> Result<(), LocalizerTrainError> {
+        let report = self.report();
+        let SceneReport::Stepped { error_m, epsilon_m, .. } = report else { unreachable!("a report of steps") };
+        let seconds = self.trainer.seconds();
+        let mut row = vec![self.trainer.steps() as f64, seconds, error_m, epsilon_m];
+        if let Some(validation) = &self.validation {
+            let accuracy = validate(&self.head, validation, self.config.run.precision.kind())?;
+            row.extend([
+                accuracy.cell_p50_m,
+                accuracy.pose_p50_m,
+                accuracy.pose_p50_deg,
+                accuracy.success_3m,
+                accuracy.success_1m,
+            ]);
+            observe(&SceneReport::Validated(seconds, accuracy));
+            self.accuracy = Some(accuracy);
+        }
+        self.curve.numbers(&row)?;
+        Ok(self.trainer.checkpoint(&self.variables)?)
+    }
+
+    fn finish(mut self) -> Result<SceneSummary, LocalizerTrainError> {
+        let variables = lattice::crop(&mut self.head_config, self.variables, &self.cache.targets_m)?;
+        let about = BTreeMap::from([
+            (CONFIG_KEY.to_owned(), serde_json::to_string(&self.head_config).expect("a configuration is JSON")),
+            (KIND_KEY.to_owned(), SceneHead::KIND.to_owned()),
+        ]);
+        Ok(SceneSummary {
+            trained: self.trainer.save_weights(&variables, about, self.data)?,
+            preparing_seconds: self.preparing_seconds,
+            sweeps: self.cache.sweep_count(),
+            cells_shown: self.cells_shown,
+            accuracy: self.accuracy,
+        })
+    }
+}
+
+/// The head that `config` asks for, for these features.
+fn head_config(config: &SceneTrainConfig, features: &Features) -> Result<SceneHeadConfig, LocalizerTrainError> {
+    let Features { training, encoder, encoder_sha256, .. } = features;
+    let refiner = || lattice::covering(&training.targets_m, encoder.local_channels());
+    Ok(SceneHeadConfig {
+        town: config.town.clone(),
+        encoder_sha256: encoder_sha256.clone(),
+        cell_channels: encoder.cell_channels(),
+        sweep_channels: encoder.sweep_channels(),
+        classes: config.classes,
+        centres: config.centres,
+        width: config.width,
+        blocks: config.blocks,
+        origin_m: training.origin_m,
+        max_cells: MAX_CELLS,
+        refiner: config.refiner.then(refiner).transpose()?,
+    })
+}
+
+/// Sums since the last report.
+#[derive(Default)]
+struct Window {
+    steps: u32,
+    error_m: f64,
+    epsilon_m: f64,
+    refined_m: f64,
+}
+
+fn mean(values: &Tensor) -> Result<f64, tch::TchError> {
+    values.f_mean(Kind::Float)?.f_double_value(&[])
+}

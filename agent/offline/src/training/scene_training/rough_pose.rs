@@ -1,0 +1,40 @@
+//! Poses as rough as those that the refiner meets, made from true ones.
+
+use nalgebra::Isometry3;
+use tch::{Device, Kind, TchError, Tensor};
+
+use crate::training::sweep_store::heading_rad;
+
+/// Deviation of the largest errors that the refiner starts from, metres.
+const MAX_ERROR_M: f64 = 2.5;
+/// Deviation of the heading that it starts from, radians.
+const TURN_RAD: f64 = 0.015;
+
+/// Where a rough pose would put cells.
+#[derive(Debug)]
+pub(super) struct RoughPoses {
+    /// `[S]`: true heading of each sweep's sensor, radians.
+    headings: Tensor,
+}
+
+impl RoughPoses {
+    pub(super) fn new(world_from_sensor: &[Isometry3<f64>], device: Device) -> Result<Self, TchError> {
+        let headings: Vec<f32> = world_from_sensor.iter().map(|pose| heading_rad(pose) as f32).collect();
+        Ok(Self { headings: Tensor::f_from_slice(&headings)?.f_to_device(device)? })
+    }
+
+    /// Places of cells `[N, 3]` moved at random, and cosine and sine of the heading `[N, 2]` turned at random; `sweeps`
+    /// `[N]` says which sweep a cell is of.
+    pub(super) fn draw(&self, targets_m: &Tensor, sweeps: &Tensor) -> Result<(Tensor, Tensor), TchError> {
+        let like = (Kind::Float, targets_m.device());
+        let count = targets_m.size()[0];
+        // Small and large errors both occur: the second round starts from a better pose than the first.
+        let scale = Tensor::f_rand([count, 1], like)?.f_square()? * MAX_ERROR_M;
+        let shift = Tensor::f_randn([count, 3], like)?
+            * scale
+            * Tensor::f_from_slice(&[1.0f32, 1.0, 0.3])?.f_to_device(like.1)?;
+        let turn = Tensor::f_randn([count], like)? * TURN_RAD;
+        let yaw = self.headings.f_index_select(0, sweeps)? + turn;
+        Ok((targets_m + shift, Tensor::f_stack(&[yaw.f_cos()?, yaw.f_sin()?], 1)?))
+    }
+}

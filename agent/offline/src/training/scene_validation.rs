@@ -1,0 +1,96 @@
+//! How good a head is, on cached features of sweeps it was not trained on.
+
+use serde::Serialize;
+use tch::{Kind, Tensor, no_grad};
+
+use super::error::LocalizerTrainError;
+use super::feature_cache::FeatureCache;
+use localization::pgc::SceneCoordinates;
+use localization::pgc::SceneHead;
+use localization::pgc::pose_refinement::SweepCells;
+use localization::pgc::pose_search::{PoseSearch, SearchTimes};
+use localization::pgc::pose_solver::PoseSolver;
+use localization::pose_error::PoseError;
+
+/// Errors on sweeps that were not trained on.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct SceneAccuracy {
+    /// Median L1 error of a cell, metres.
+    pub cell_p50_m: f64,
+    /// Median translation error, metres.
+    pub pose_p50_m: f64,
+    /// Median rotation error, degrees.
+    pub pose_p50_deg: f64,
+    /// Share of sweeps with a translation error under 3 m; those without a pose are failures.
+    pub success_3m: f64,
+    /// Share under 1 m.
+    pub success_1m: f64,
+}
+
+/// Regresses and solves every sweep of `cache`.
+///
+/// # Errors
+/// The tensor library's.
+pub(super) fn validate(
+    head: &SceneHead,
+    cache: &FeatureCache,
+    kind: Kind,
+) -> Result<SceneAccuracy, LocalizerTrainError> {
+    let regression = no_grad(|| {
+        let logits = head.classify(&cache.sweeps, false)?.f_index_select(0, &cache.sweep_of_cell)?;
+        head.regress(&head.normalise(&cache.cells)?, &logits, kind)
+    })?;
+    // Coordinates are relative to the origin of the head's town.
+    let origin = head.config().origin_m;
+    let moved: [f32; 3] = std::array::from_fn(|axis| (cache.origin_m[axis] - origin[axis]) as f32);
+    let targets = &cache.targets_m + Tensor::f_from_slice(&moved)?.f_to_device(cache.targets_m.device())?;
+    let error = (&regression.coordinates_m - targets).f_abs()?.f_sum_dim_intlist(1_i64, false, Kind::Float)?;
+    let mut cell_errors: Vec<f64> = Vec::try_from(&error.f_to_kind(Kind::Double)?)?;
+    let world: Vec<f32> = Vec::try_from(&regression.coordinates_m.f_reshape([-1])?)?;
+    let sensor: Vec<f32> = Vec::try_from(&cache.sensor_m.f_reshape([-1])?)?;
+    let epsilon: Vec<f32> = Vec::try_from(&regression.epsilon_m)?;
+    let sweeps: Vec<i64> = Vec::try_from(&cache.sweep_of_cell)?;
+    let solver = PoseSolver::default();
+    let search = PoseSearch { head, solver: &solver, kind };
+    let mut translations = Vec::new();
+    let mut rotations = Vec::new();
+    let mut first = 0;
+    for (sweep, truth) in cache.world_from_sensor.iter().enumerate() {
+        let count = sweeps[first..].iter().take_while(|&&of| of == sweep as i64).count();
+        let rows = first..first + count;
+        let features = cache.cells.f_narrow(0, first as i64, count as i64)?;
+        first += count;
+        let coordinates = SceneCoordinates {
+            sensor_m: sensor.as_chunks().0[rows.clone()].to_vec(),
+            world_m: world.as_chunks().0[rows.clone()].to_vec(),
+            epsilon_m: epsilon[rows].to_vec(),
+            origin_m: head.config().origin_m,
+        };
+        let again = SweepCells { features, sensor_m: coordinates.sensor_m.clone() };
+        let found = search.run(&coordinates, &again, &mut SearchTimes::default())?;
+        let (metres, degrees) = found.map_or((f64::INFINITY, 180.0), |found| {
+            let error = PoseError::between(&found.world_from_sensor.into(), &(*truth).into());
+            (error.distance_m, error.angle_deg)
+        });
+        translations.push(metres);
+        rotations.push(degrees);
+    }
+    let share =
+        |limit: f64| translations.iter().filter(|&&error| error < limit).count() as f64 / translations.len() as f64;
+    let (success_3m, success_1m) = (share(3.0), share(1.0));
+    Ok(SceneAccuracy {
+        cell_p50_m: median(&mut cell_errors),
+        pose_p50_m: median(&mut translations),
+        pose_p50_deg: median(&mut rotations),
+        success_3m,
+        success_1m,
+    })
+}
+
+fn median(values: &mut [f64]) -> f64 {
+    if values.is_empty() {
+        return f64::NAN;
+    }
+    let middle = values.len() / 2;
+    *values.select_nth_unstable_by(middle, f64::total_cmp).1
+}

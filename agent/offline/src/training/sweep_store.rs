@@ -1,0 +1,239 @@
+//! Sweeps with true poses, kept in memory: centimetres as 16-bit integers, a third of a megabyte each.
+
+use std::collections::BTreeSet;
+use std::path::PathBuf;
+use std::sync::{Arc, Mutex, PoisonError};
+
+use dataset::{self, LoadOptions, Scenario};
+use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
+use rand::Rng;
+
+use super::error::LocalizerTrainError;
+use localization::pgc::{SceneEncoderConfig, SweepVoxels};
+use perception::train::{DataListing, Prefetch};
+
+/// Units of stored coordinates, metres.
+const UNIT_M: f32 = 0.01;
+
+/// One sweep.
+#[derive(Debug, Clone)]
+pub struct StoredSweep {
+    /// Which world it was made in: place of its folder on the command line.
+    pub world: usize,
+    /// Which drive it belongs to.
+    pub drive: usize,
+    /// True pose.
+    pub world_from_sensor: Isometry3<f64>,
+    /// x, y, z in [`UNIT_M`].
+    points: Vec<[i16; 3]>,
+}
+
+impl StoredSweep {
+    /// A sweep from points in metres.
+    #[must_use]
+    pub fn new(world: usize, drive: usize, world_from_sensor: Isometry3<f64>, points: &[[f32; 4]]) -> Self {
+        let stored = |point: &[f32; 4]| std::array::from_fn(|axis| (point[axis] / UNIT_M).round() as i16);
+        Self { world, drive, world_from_sensor, points: points.iter().map(stored).collect() }
+    }
+
+    /// x, y, z of every point, metres in the sensor frame.
+    pub fn points(&self) -> impl Iterator<Item = [f32; 3]> + '_ {
+        self.points.iter().map(|point| point.map(|axis| f32::from(axis) * UNIT_M))
+    }
+
+    /// The sweep as another sensor would have it that stands `turned_from_sensor` differently: voxels of the turned
+    /// points, each kept with a probability.
+    pub fn turned_voxels(
+        &self,
+        turned_from_sensor: &Isometry3<f64>,
+        keep: f64,
+        rng: &mut impl Rng,
+        config: &SceneEncoderConfig,
+    ) -> SweepVoxels {
+        let turn: Isometry3<f32> = turned_from_sensor.cast();
+        // 32 decisions from one draw of the generator would be faster still; this is not what takes the time.
+        let kept = self.points().filter(|_| keep >= 1.0 || rng.random_bool(keep));
+        SweepVoxels::new(kept.map(|[x, y, z]| (turn * nalgebra::Point3::new(x, y, z)).into()), config)
+    }
+}
+
+/// A turn about the vertical, and where the sensor then stands.
+#[must_use]
+pub(super) fn yaw(angle_rad: f64) -> Isometry3<f64> {
+    Isometry3::from_parts(Translation3::identity(), UnitQuaternion::from_axis_angle(&Vector3::z_axis(), angle_rad))
+}
+
+/// Heading of what stands at a pose, radians.
+#[must_use]
+pub(super) fn heading_rad(world_from_sensor: &Isometry3<f64>) -> f64 {
+    let ahead = world_from_sensor.rotation * Vector3::x();
+    ahead.y.atan2(ahead.x)
+}
+
+/// Where sweeps with true poses lie on disk. Each folder is one world: poses in different folders have nothing to do with
+/// each other.
+#[derive(Debug)]
+pub struct SweepList {
+    places: Vec<Place>,
+    sha256: String,
+    problems: Vec<String>,
+    /// Of those read so far.
+    without_pose: Mutex<BTreeSet<usize>>,
+}
+
+#[derive(Debug)]
+struct Place {
+    scenario: Arc<Scenario>,
+    agent: usize,
+    tick: usize,
+    world: usize,
+    drive: usize,
+}
+
+impl SweepList {
+    /// Lists every sweep of every agent.
+    ///
+    /// # Errors
+    /// [`LocalizerTrainError`] when a folder cannot be read or holds no sweep.
+    pub fn open(folders: &[PathBuf]) -> Result<Self, LocalizerTrainError> {
+        let (mut places, mut scenarios, mut problems) = (Vec::new(), Vec::new(), Vec::new());
+        let mut drive = 0;
+        for (world, folder) in folders.iter().enumerate() {
+            let dataset = dataset::open(folder)?;
+            problems.extend(dataset.problems.iter().map(ToString::to_string));
+            for scenario in dataset.scenarios.into_iter().map(Arc::new) {
+                for agent in 0..scenario.agents.len() {
+                    let place = |tick| Place { scenario: Arc::clone(&scenario), agent, tick, world, drive };
+                    let ticks = (0..scenario.ticks.len()).filter(|&tick| scenario.is_present(agent, tick));
+                    places.extend(ticks.map(place));
+                    drive += 1;
+                }
+                scenarios.push(scenario);
+            }
+        }
+        if places.is_empty() {
+            return Err(LocalizerTrainError::NoSweeps(folders.to_vec()));
+        }
+        let sha256 = dataset::content_sha256(scenarios.iter().map(AsRef::as_ref));
+        Ok(Self { places, sha256, problems, without_pose: Mutex::default() })
+    }
+
+    /// Which data it is, and what of it has been found to be of no use so far.
+    #[must_use]
+    pub fn data(&self) -> DataListing {
+        let without_pose = self.without_pose.lock().unwrap_or_else(PoisonError::into_inner).len();
+        DataListing { sha256: self.sha256.clone(), without_pose, problems: self.problems.clone() }
+    }
+
+    /// Keeps at most `count` sweeps, evenly spread.
+    pub fn thin_out(&mut self, count: usize) {
+        let total = self.places.len();
+        if total > count {
+            let mut index = 0;
+            // Sweep k of n stays where the running share passes a whole number.
+            self.places.retain(|_| {
+                index += 1;
+                index * count / total > (index - 1) * count / total
+            });
+        }
+    }
+
+    /// Number of sweeps.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.places.len()
+    }
+
+    /// Whether there is none.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.places.is_empty()
+    }
+
+    /// Reads one sweep, points within `range_m` of the sensor; nothing when its pose is not known.
+    ///
+    /// # Errors
+    /// [`LocalizerTrainError::Read`] names the file.
+    pub fn read(&self, index: usize, range_m: f64) -> Result<Option<StoredSweep>, LocalizerTrainError> {
+        let Place { scenario, agent, tick, world, drive } = &self.places[index];
+        let mut frame = scenario.load(*agent, *tick, &LoadOptions::default())?;
+        let Some(pose) = frame.world_from_lidar else {
+            self.without_pose.lock().unwrap_or_else(PoisonError::into_inner).insert(index);
+            return Ok(None);
+        };
+        let range = range_m as f32;
+        frame.points.xyzi.retain(|[x, y, z, _]| x * x + y * y <= range * range && z.is_finite());
+        Ok(Some(StoredSweep::new(*world, *drive, pose.isometry(), &frame.points.xyzi)))
+    }
+}
+
+/// All sweeps of some folders in memory.
+#[derive(Debug)]
+pub struct SweepStore {
+    /// The sweeps, drive after drive.
+    pub sweeps: Vec<StoredSweep>,
+    /// Which data it is.
+    pub data: DataListing,
+}
+
+impl SweepStore {
+    /// Reads every sweep that has a pose.
+    ///
+    /// # Errors
+    /// [`LocalizerTrainError`] when a folder cannot be read or holds no sweep with a pose.
+    pub fn read(folders: &[PathBuf], range_m: f64) -> Result<Self, LocalizerTrainError> {
+        let list = Arc::new(SweepList::open(folders)?);
+        let count = list.len();
+        let source = Arc::clone(&list);
+        let threads = std::thread::available_parallelism().map_or(1, usize::from);
+        let mut reader = Prefetch::start(threads, 0, move |number| match (number as usize) < count {
+            true => source.read(number as usize, range_m),
+            false => Ok(None),
+        });
+        let mut sweeps = Vec::with_capacity(count);
+        for _ in 0..count {
+            sweeps.extend(reader.next_batch()??);
+        }
+        match sweeps.is_empty() {
+            true => Err(LocalizerTrainError::NoSweeps(folders.to_vec())),
+            false => Ok(Self { sweeps, data: list.data() }),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+    use std::path::Path;
+
+    use super::*;
+
+    /// A KITTI sequence of two sweeps of one point each, with or without poses.
+    fn sequence(folder: &Path, poses: &str) {
+        fs::create_dir_all(folder.join("velodyne")).unwrap();
+        for scan in ["000000", "000001"] {
+            let point: Vec<u8> = [7.0f32, 1.0, 0.5, 0.1].iter().flat_map(|axis| axis.to_le_bytes()).collect();
+            fs::write(folder.join("velodyne").join(format!("{scan}.bin")), point).unwrap();
+        }
+        fs::write(folder.join("calib.txt"), "Tr: 1 0 0 0 0 1 0 0 0 0 1 0\n").unwrap();
+        if !poses.is_empty() {
+            fs::write(folder.join("poses.txt"), poses).unwrap();
+        }
+    }
+
+    #[test]
+    fn sweeps_without_a_pose_are_counted() {
+        let folder = tempfile::tempdir().unwrap();
+        let (known, unknown) = (folder.path().join("00"), folder.path().join("11"));
+        sequence(&known, "1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 2 0 1 0 0 0 0 1 0\n");
+        sequence(&unknown, "");
+        let store = SweepStore::read(&[known.clone(), unknown.clone()], 50.0).unwrap();
+        assert_eq!((store.sweeps.len(), store.data.without_pose), (2, 2));
+        assert_eq!(store.data.left_out().unwrap(), "2 sweeps without a pose left out");
+        let alone = SweepStore::read(&[known], 50.0).unwrap();
+        assert_eq!((alone.sweeps.len(), alone.data.left_out()), (2, None));
+        assert_ne!(alone.data.sha256, store.data.sha256);
+        let error = SweepStore::read(&[unknown], 50.0).unwrap_err();
+        assert!(matches!(error, LocalizerTrainError::NoSweeps(_)), "{error}");
+    }
+}

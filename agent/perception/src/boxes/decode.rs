@@ -1,0 +1,137 @@
+//! From what the head says to boxes.
+
+use protocol::Box3d;
+
+use crate::boxes::anchors::Anchors;
+
+/// Why the output of a head cannot be decoded.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("head output {field} has {found} values, {anchors} anchors need {expected}")]
+pub struct DecodeError {
+    field: &'static str,
+    found: usize,
+    anchors: usize,
+    expected: usize,
+}
+
+/// A decoded box of one anchor.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Decoded {
+    /// Index of the anchor, see [`Anchors`].
+    pub anchor: usize,
+    /// Sigmoid of its logit.
+    pub score: f32,
+    /// The box in the frame of the map.
+    pub box3d: Box3d,
+}
+
+/// The largest exponent of a size that is decoded: a box of `e^8` times the anchor is no vehicle, but a finite number.
+const MAX_LOG_SIZE: f32 = 8.0;
+
+/// Decodes the anchors whose score is above `threshold`; the others, nearly all, cost one comparison each.
+///
+/// x and y are offsets in diagonals of the anchor, z in its heights; sizes are logarithms; yaw is added and not wrapped.
+/// Values that are not finite are no detection.
+///
+/// # Shapes
+/// - `scores`: `[A, H, W]` logits
+/// - `offsets`: `[7 A, H, W]`, channel `7 * anchor + component` of x, y, z, h, w, l, yaw
+/// - returns: in the order of the anchors
+///
+/// # Errors
+/// [`DecodeError`] when the number of values does not fit the anchors.
+pub fn decode(scores: &[f32], offsets: &[f32], anchors: &Anchors, threshold: f32) -> Result<Vec<Decoded>, DecodeError> {
+    let check = |field, found, expected| {
+        if found == expected { Ok(()) } else { Err(DecodeError { field, found, anchors: anchors.len(), expected }) }
+    };
+    check("scores", scores.len(), anchors.len())?;
+    check("offsets", offsets.len(), anchors.len() * 7)?;
+    let per_cell = anchors.yaws_rad.len();
+    let cells = anchors.len() / per_cell.max(1);
+    // Sigmoid rises: a logit clearly below the threshold's needs no exponential.
+    let lowest = logit(threshold) - 1e-3;
+    let mut decoded = Vec::new();
+    for cell in 0..cells {
+        for anchor in 0..per_cell {
+            let logit = scores[anchor * cells + cell];
+            if logit < lowest || sigmoid(logit) <= threshold || logit.is_nan() {
+                continue;
+            }
+            let offsets: [f32; 7] = std::array::from_fn(|component| offsets[(7 * anchor + component) * cells + cell]);
+            let index = cell * per_cell + anchor;
+            if let Some(box3d) = decode_box(offsets, anchors.get(index)) {
+                decoded.push(Decoded { anchor: index, score: sigmoid(logit), box3d });
+            }
+        }
+    }
+    Ok(decoded)
+}
+
+/// One box from its offsets and its anchor, both x, y, z, h, w, l, yaw; `None` when an offset is not finite.
+#[must_use]
+pub fn decode_box(offsets: [f32; 7], anchor: [f64; 7]) -> Option<Box3d> {
+    if offsets.iter().any(|offset| !offset.is_finite()) {
+        return None;
+    }
+    let [x, y, z, h, w, l, yaw] = anchor;
+    let diagonal = (l * l + w * w).sqrt();
+    let [dx, dy, dz, _, _, _, dyaw] = offsets.map(f64::from);
+    let size = |component: usize, prior: f64| f64::from(offsets[component].min(MAX_LOG_SIZE)).exp() * prior;
+    Some(Box3d {
+        center_m: [dx * diagonal + x, dy * diagonal + y, dz * h + z],
+        size_m: [size(5, l), size(4, w), size(3, h)],
+        heading_rad: dyaw + yaw,
+    })
+}
+
+/// `1 / (1 + e^-x)`.
+#[must_use]
+pub fn sigmoid(logit: f32) -> f32 {
+    (1.0 / (1.0 + (-f64::from(logit)).exp())) as f32
+}
+
+fn logit(probability: f32) -> f32 {
+    (probability / (1.0 - probability)).ln()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::model_config::DetectorConfig;
+
+    fn anchors() -> Anchors {
+        let config = DetectorConfig { lidar_range_m: [0.0, 0.0, -3.0, 3.2, 3.2, 1.0], ..DetectorConfig::lean() };
+        Anchors::for_detector(&config)
+    }
+
+    #[test]
+    fn only_what_is_above_the_threshold_is_decoded() {
+        let anchors = anchors();
+        let cells = anchors.len() / 2;
+        let mut scores = vec![-5.0; anchors.len()];
+        scores[cells + 3] = 2.0; // anchor 1 of cell 3
+        scores[4] = 0.0; // exactly 0.5
+        scores[5] = f32::NAN;
+        let decoded = decode(&scores, &vec![0.0; anchors.len() * 7], &anchors, 0.5).unwrap();
+        assert_eq!(decoded.len(), 1);
+        assert_eq!(decoded[0].anchor, 7);
+        assert!((decoded[0].score - 0.880_797).abs() < 1e-6);
+        assert_eq!(decoded[0].box3d.size_m, [3.9, 1.6, 1.56]);
+    }
+
+    #[test]
+    fn offsets_scale_with_the_anchor() {
+        let anchor = [1.0, 2.0, -1.0, 1.5, 3.0, 4.0, 0.5];
+        let box3d = decode_box([1.0, -1.0, 2.0, 0.0, 0.0, 2.0_f32.ln(), 0.25], anchor).unwrap();
+        assert_eq!(box3d.center_m, [6.0, -3.0, 2.0]);
+        assert!((box3d.size_m[0] - 8.0).abs() < 1e-6 && box3d.heading_rad == 0.75);
+        assert!(decode_box([0.0, 0.0, f32::NAN, 0.0, 0.0, 0.0, 0.0], anchor).is_none());
+        assert!(decode_box([0.0, 0.0, 0.0, f32::MAX, 0.0, 0.0, 0.0], anchor).unwrap().size_m[2].is_finite());
+    }
+
+    #[test]
+    fn a_map_of_another_size_is_refused() {
+        let message = decode(&[0.0; 3], &[], &anchors(), 0.5).unwrap_err().to_string();
+        assert!(message.contains("scores has 3") && message.contains("32"), "{message}");
+    }
+}

@@ -1,0 +1,6 @@
+//! Boxes: from the outputs of the heads to detections.
+
+pub mod anchors;
+pub mod decode;
+pub mod nms;
+pub mod postprocess;

@@ -1,0 +1,223 @@
+//! From decoded boxes of one or more agents to the detections that count.
+
+use nalgebra::{Isometry3, Point3};
+use protocol::rotated_iou::Polygon;
+use protocol::{Box3d, CavId, Detection};
+use serde::{Deserialize, Serialize};
+
+use crate::boxes::decode::Decoded;
+use crate::boxes::nms::rotated_nms;
+use crate::model_config::DetectorConfig;
+
+/// Boxes at or below this score are not judged. It holds for every method: a box that a vehicle sends counts as one that
+/// the ego finds in a fused map.
+pub const SCORE_THRESHOLD: f32 = 0.1;
+
+/// Limits of the clean-up, with the reference's numbers as defaults but for the score, which is that of all methods here.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct PostprocessConfig {
+    /// Anchors at or below this score are no candidates.
+    pub score_threshold: f32,
+    /// A box goes when a better one overlaps it more, IoU from above.
+    pub nms_iou: f64,
+    /// Candidates that suppression looks at.
+    pub nms_max_candidates: usize,
+    /// Boxes with a longer axis-aligned side go, metres: no vehicle is so long unless it stands askew.
+    pub max_extent_m: f64,
+    /// All corners lie between these heights, metres in the output frame.
+    pub z_range_m: [f64; 2],
+    /// All corners lie within: x, y of the lower, then of the upper corner, metres in the output frame.
+    pub keep_range_m: [f64; 4],
+}
+
+impl Default for PostprocessConfig {
+    fn default() -> Self {
+        Self {
+            score_threshold: SCORE_THRESHOLD,
+            nms_iou: 0.15,
+            nms_max_candidates: 1000,
+            max_extent_m: 6.0,
+            z_range_m: [-3.0, 1.0],
+            keep_range_m: [-140.0, -40.0, 140.0, 40.0],
+        }
+    }
+}
+
+impl PostprocessConfig {
+    /// The default numbers with the range of a detector instead of the fixed one.
+    #[must_use]
+    pub fn for_detector(config: &DetectorConfig) -> Self {
+        let [x_low, y_low, z_low, x_high, y_high, z_high] = config.lidar_range_m;
+        Self { z_range_m: [z_low, z_high], keep_range_m: [x_low, y_low, x_high, y_high], ..Self::default() }
+    }
+
+    /// For boxes that another vehicle will merge: what counts as within range is the receiver's to say.
+    #[must_use]
+    pub fn for_late_fusion(config: &DetectorConfig) -> Self {
+        Self { keep_range_m: [f64::MIN, f64::MIN, f64::MAX, f64::MAX], ..Self::for_detector(config) }
+    }
+}
+
+/// A box by its corners: after a transform with roll or pitch it is not upright any more.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Candidate {
+    /// Corners in the order of [`Box3d::corners`], metres in the output frame.
+    pub corners: [[f64; 3]; 8],
+    /// Confidence, 0..1.
+    pub score: f32,
+    /// Index of the agent it comes from.
+    pub agent: usize,
+}
+
+/// Boxes that one agent decoded, and how its frame lies in that of the output.
+#[derive(Debug, Clone, Copy)]
+pub struct AgentBoxes<'a> {
+    /// Its decoded boxes, above the score threshold.
+    pub boxes: &'a [Decoded],
+    /// Takes points of the boxes' frame to the output's.
+    pub output_from_agent: Isometry3<f64>,
+}
+
+/// The whole chain: project, drop what is no vehicle, suppress, drop what reaches out of the range.
+///
+/// Returns the detections by falling score.
+#[must_use]
+pub fn postprocess(agents: &[AgentBoxes<'_>], config: &PostprocessConfig) -> Vec<Candidate> {
+    let mut candidates: Vec<Candidate> =
+        agents.iter().enumerate().flat_map(|(agent, boxes)| project(agent, boxes)).collect();
+    candidates.retain(|candidate| is_vehicle_sized(&candidate.corners, config));
+    let mut kept = suppress(&candidates, config);
+    kept.retain(|candidate| is_within(&candidate.corners, config.keep_range_m));
+    kept
+}
+
+/// The candidates of one agent in the output frame.
+fn project<'a>(agent: usize, boxes: &'a AgentBoxes<'_>) -> impl Iterator<Item = Candidate> + use<'a> {
+    boxes.boxes.iter().map(move |decoded| Candidate {
+        corners: (decoded.box3d.corners()).map(|corner| (boxes.output_from_agent * Point3::from(corner)).into()),
+        score: decoded.score,
+        agent,
+    })
+}
+
+/// Size and height of a vehicle: no side over the limit, not flat, all corners between the heights.
+#[must_use]
+pub fn is_vehicle_sized(corners: &[[f64; 3]; 8], config: &PostprocessConfig) -> bool {
+    let [x, y, z] = bounds(corners);
+    let extent = |[low, high]: [f64; 2]| high - low;
+    let sized = extent(x) <= config.max_extent_m && extent(y) <= config.max_extent_m && extent(z) > 0.0;
+    sized && z[0] >= config.z_range_m[0] && z[1] <= config.z_range_m[1]
+}
+
+/// Rotated suppression on the footprints, by falling score.
+#[must_use]
+pub fn suppress(candidates: &[Candidate], config: &PostprocessConfig) -> Vec<Candidate> {
+    let polygons: Vec<Polygon> = candidates.iter().map(|candidate| footprint(&candidate.corners)).collect();
+    let scores: Vec<f32> = candidates.iter().map(|candidate| candidate.score).collect();
+    let kept = rotated_nms(&polygons, &scores, config.nms_iou, config.nms_max_candidates);
+    kept.into_iter().map(|index| candidates[index].clone()).collect()
+}
+
+/// Whether all corners lie within x, y of the lower and the upper corner of `range_m`, edges included.
+#[must_use]
+pub fn is_within(corners: &[[f64; 3]; 8], range_m: [f64; 4]) -> bool {
+    let [x_low, y_low, x_high, y_high] = range_m;
+    corners.iter().all(|&[x, y, _]| (x_low..=x_high).contains(&x) && (y_low..=y_high).contains(&y))
+}
+
+/// The footprint of a box: its first four corners from above.
+#[must_use]
+pub fn footprint(corners: &[[f64; 3]; 8]) -> Polygon {
+    Polygon::new(std::array::from_fn(|corner| [corners[corner][0], corners[corner][1]]))
+}
+
+/// The upright box of eight corners.
+///
+/// Centre and sizes are means over the corners and the parallel edges. The heading is the direction of the sum of the
+/// four edges along the length: unlike a mean of four angles it does not break at half a turn.
+#[must_use]
+pub fn corners_to_box(corners: &[[f64; 3]; 8]) -> Box3d {
+    let center_m = std::array::from_fn(|axis| corners.iter().map(|corner| corner[axis]).sum::<f64>() / 8.0);
+    let edge = |from: usize, to: usize| [corners[to][0] - corners[from][0], corners[to][1] - corners[from][1]];
+    let mean_length = |edges: [[f64; 2]; 4]| edges.iter().map(|[x, y]| x.hypot(*y)).sum::<f64>() / 4.0;
+    let along = [edge(3, 0), edge(2, 1), edge(7, 4), edge(6, 5)];
+    let across = [edge(0, 1), edge(3, 2), edge(4, 5), edge(7, 6)];
+    let height = (0..4).map(|corner| (corners[corner + 4][2] - corners[corner][2]).abs()).sum::<f64>() / 4.0;
+    let sum = |axis: usize| along.iter().map(|edge| edge[axis]).sum::<f64>();
+    Box3d { center_m, size_m: [mean_length(along), mean_length(across), height], heading_rad: sum(1).atan2(sum(0)) }
+}
+
+impl Candidate {
+    /// The detection that goes out. `source` names the CAV where one alone saw it.
+    #[must_use]
+    pub fn detection(&self, source: Option<CavId>) -> Detection {
+        Detection { box3d: corners_to_box(&self.corners), score: self.score, source }
+    }
+}
+
+/// Lowest and highest x, y, z.
+fn bounds(corners: &[[f64; 3]; 8]) -> [[f64; 2]; 3] {
+    std::array::from_fn(|axis| {
+        let values = || corners.iter().map(|corner| corner[axis]);
+        [values().fold(f64::INFINITY, f64::min), values().fold(f64::NEG_INFINITY, f64::max)]
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use std::f64::consts::PI;
+
+    use nalgebra::Vector3;
+
+    use super::*;
+
+    const CAR: Box3d = Box3d { center_m: [10.0, 2.0, -1.0], size_m: [4.0, 2.0, 1.5], heading_rad: 0.3 };
+
+    fn decoded(box3d: Box3d, score: f32) -> Decoded {
+        Decoded { anchor: 0, score, box3d }
+    }
+
+    fn run(boxes: &[Decoded]) -> Vec<Candidate> {
+        let agent = AgentBoxes { boxes, output_from_agent: Isometry3::identity() };
+        postprocess(&[agent], &PostprocessConfig::default())
+    }
+
+    #[test]
+    fn corners_give_the_box_back_at_any_heading() {
+        for heading_rad in [0.3, -2.0, PI, -PI + 1e-7, PI - 1e-7] {
+            let back = corners_to_box(&Box3d { heading_rad, ..CAR }.corners());
+            let turn = (back.heading_rad - heading_rad).rem_euclid(2.0 * PI);
+            assert!(turn.min(2.0 * PI - turn) < 1e-9, "{heading_rad}: {}", back.heading_rad);
+            assert!((0..3).all(|axis| (back.size_m[axis] - CAR.size_m[axis]).abs() < 1e-9));
+            assert!((0..3).all(|axis| (back.center_m[axis] - CAR.center_m[axis]).abs() < 1e-9));
+        }
+    }
+
+    #[test]
+    fn what_is_no_vehicle_goes() {
+        let long = Box3d { size_m: [7.0, 2.0, 1.5], heading_rad: 0.0, ..CAR };
+        let high = Box3d { center_m: [10.0, 2.0, 0.5], ..CAR };
+        let flat = Box3d { size_m: [4.0, 2.0, 0.0], ..CAR };
+        let far = Box3d { center_m: [10.0, 39.5, -1.0], ..CAR };
+        for odd in [long, high, flat, far] {
+            assert_eq!(run(&[decoded(odd, 0.9)]), [], "{odd:?}");
+        }
+        assert_eq!(run(&[decoded(CAR, 0.9)]).len(), 1);
+    }
+
+    #[test]
+    fn two_agents_that_see_one_car_give_one_detection() {
+        let ego_from_other = Isometry3::new(Vector3::new(5.0, -1.0, 0.0), Vector3::z() * 0.7);
+        let seen_by_other = CAR.transformed(&ego_from_other.inverse());
+        let (ego, other) = ([decoded(CAR, 0.6)], [decoded(seen_by_other, 0.8)]);
+        let agents = [
+            AgentBoxes { boxes: &ego, output_from_agent: Isometry3::identity() },
+            AgentBoxes { boxes: &other, output_from_agent: ego_from_other },
+        ];
+        let found = postprocess(&agents, &PostprocessConfig::default());
+        assert_eq!((found.len(), found[0].agent, found[0].score), (1, 1, 0.8));
+        let back = corners_to_box(&found[0].corners);
+        assert!((back.center_m[0] - 10.0).abs() < 1e-9 && (back.heading_rad - 0.3).abs() < 1e-9);
+    }
+}

@@ -1,0 +1,485 @@
+//! The detector for inference: one sweep in, the map for the air and boxes out.
+
+mod error;
+mod output;
+
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use protocol::message::ModelHash;
+use protocol::{BevFeatures, BevGrid, DecodedFeatures, PointCloud};
+use tch::nn::VarStore;
+use tch::{Device, Kind, Tensor};
+
+pub use error::DetectorError;
+pub use output::{EncodeTimes, Encoded, Heads};
+
+use output::flat;
+
+use crate::boxes::anchors::Anchors;
+use crate::boxes::decode::{Decoded, decode};
+use crate::crop::Crop;
+use crate::layers::backbone::BevBackbone;
+use crate::layers::head::DetectionHead;
+use crate::layers::shrink::{Compressor, Shrink};
+use crate::model_config::{DetectorConfig, YAxis};
+use crate::pillars::batch::PillarLattice;
+use crate::pillars::point_pillars::PointPillars;
+use crate::pillars::projection::PillarProjection;
+use crate::pillars::voxels::Voxeliser;
+use crate::weights::Weights;
+
+/// A trained PointPillars network in its fastest form, for one sweep at a time.
+///
+/// The same sweep gives the same bits, whoever computes it, as long as the number of torch threads is the same
+/// (`tch::set_num_threads`; 1 is what live and offline runs use).
+#[derive(Debug)]
+pub struct Detector {
+    config: DetectorConfig,
+    sha256: String,
+    crop: Crop,
+    voxeliser: Voxeliser,
+    lattice: PillarLattice,
+    projection: PillarProjection,
+    backbone: BevBackbone,
+    shrink: Option<Shrink>,
+    compressor: Option<Compressor>,
+    head: DetectionHead,
+    anchors: Anchors,
+    cropped: Vec<[f32; 4]>,
+    canvas: Vec<f32>,
+}
+
+impl Detector {
+    /// Reads a weights file, configuration included.
+    ///
+    /// # Errors
+    /// [`DetectorError`] names the file, the tensor and both shapes.
+    pub fn load(path: &Path) -> Result<Self, DetectorError> {
+        let weights = Weights::load(path)?;
+        Self::from_weights(&weights, &weights.config()?)
+    }
+
+    /// Builds the detector that `config` describes from a file already read.
+    ///
+    /// # Errors
+    /// See [`Self::load`].
+    pub fn from_weights(weights: &Weights, config: &DetectorConfig) -> Result<Self, DetectorError> {
+        let network = VarStore::new(Device::Cpu);
+        let pillars = PointPillars::new(&network.root(), config)?;
+        weights.copy_into(&network)?;
+        Ok(Self { sha256: weights.sha256().to_owned(), ..Self::from_network(pillars) })
+    }
+
+    /// Takes over a network on the CPU, trained or not; its norms are folded into the convolutions.
+    #[must_use]
+    pub fn from_network(network: PointPillars) -> Self {
+        let lattice = *network.lattice();
+        let projection = PillarProjection::new(&network.encoder);
+        tch::no_grad(|| Self {
+            sha256: String::new(),
+            crop: Crop::for_detector(&network.config),
+            voxeliser: Voxeliser::for_detector(&network.config),
+            backbone: network.backbone.folded(),
+            shrink: network.shrink.as_ref().map(Shrink::folded),
+            compressor: network.compressor.as_ref().map(Compressor::folded),
+            anchors: Anchors::for_detector(&network.config),
+            head: network.head,
+            config: network.config,
+            cropped: Vec::new(),
+            canvas: vec![0.0; lattice.width * lattice.height * projection.channels()],
+            lattice,
+            projection,
+        })
+    }
+
+    /// The numbers it was built from.
+    #[must_use]
+    pub fn config(&self) -> &DetectorConfig {
+        &self.config
+    }
+
+    /// SHA-256 of its weights file; empty when it was not read from one.
+    #[must_use]
+    pub fn sha256(&self) -> &str {
+        &self.sha256
+    }
+
+    /// The same for the wire, where it tells whose maps belong together; all zeros when it was not read from a file.
+    #[must_use]
+    pub fn model_hash(&self) -> ModelHash {
+        self.sha256.parse().unwrap_or(ModelHash([0; 32]))
+    }
+
+    /// The lattice of its maps.
+    #[must_use]
+    pub fn grid(&self) -> BevGrid {
+        self.config.feature_grid()
+    }
+
+    /// Channels, height and width of its maps, as they are fused.
+    #[must_use]
+    pub fn map_shape(&self) -> [i64; 3] {
+        let grid = self.grid();
+        [self.config.feature_channels(), i64::from(grid.height), i64::from(grid.width)]
+    }
+
+    /// The same as they are transmitted: with a compressor, of the code.
+    #[must_use]
+    pub fn sent_shape(&self) -> [i64; 3] {
+        let [_, height, width] = self.map_shape();
+        [self.config.sent_channels(), height, width]
+    }
+
+    /// Channels of the map that the code stands for, where there is a compressor: [`BevFeatures::code_of`] of its messages.
+    #[must_use]
+    pub fn code_of(&self) -> Option<u32> {
+        self.compressor.as_ref().and_then(|_| u32::try_from(self.config.feature_channels()).ok())
+    }
+
+    /// Encodes one sweep.
+    ///
+    /// Points outside the area, on the own body or not finite do not count; a sweep without any other gives the map of
+    /// an empty world.
+    ///
+    /// # Errors
+    /// The tensor library's.
+    pub fn encode(&mut self, cloud: &PointCloud) -> Result<Encoded, DetectorError> {
+        let crop = self.crop;
+        self.encode_within(&crop, cloud)
+    }
+
+    /// Encodes the points of several vehicles in one frame, for early fusion.
+    ///
+    /// Nothing is cut out around the origin: others see the body that stands there, and it is to be found. Each sweep's
+    /// own body must have been cut out in its own frame, see [`Crop::without_own_body`].
+    ///
+    /// # Errors
+    /// The tensor library's.
+    pub fn encode_merged(&mut self, cloud: &PointCloud) -> Result<Encoded, DetectorError> {
+        let crop = self.crop.range_only();
+        self.encode_within(&crop, cloud)
+    }
+
+    /// Which points it looks at.
+    #[must_use]
+    pub fn crop(&self) -> &Crop {
+        &self.crop
+    }
+
+    fn encode_within(&mut self, crop: &Crop, cloud: &PointCloud) -> Result<Encoded, DetectorError> {
+        let mut clock = StageClock::start();
+        self.cropped.clear();
+        crop.keep(&cloud.xyzi, &mut self.cropped);
+        if self.config.y_axis == YAxis::Right {
+            self.cropped.iter_mut().for_each(|point| point[1] = -point[1]);
+        }
+        let pillars = self.voxeliser.voxelise(&self.cropped);
+        let voxelise = clock.lap();
+        self.canvas.fill(0.0);
+        self.projection.scatter(&pillars, &self.lattice, &mut self.canvas);
+        let (height, width) = (self.lattice.height as i64, self.lattice.width as i64);
+        let canvas = Tensor::f_from_slice(&self.canvas)?.f_view([1, height, width, -1])?.f_permute([0, 3, 1, 2])?;
+        let pillar_time = clock.lap();
+        let features = tch::no_grad(|| {
+            let wide = self.backbone.forward(&canvas, false);
+            match &self.shrink {
+                Some(shrink) => shrink.forward_contiguous(&wide),
+                None => wide.f_contiguous(),
+            }
+        })?;
+        let times = EncodeTimes { voxelise, pillars: pillar_time, backbone: clock.lap() };
+        Ok(Encoded { features, points: self.cropped.len(), pillars: pillars.len(), times })
+    }
+
+    /// The transmitted part of an encoded map `[1, C, H, W]`: the compressor's code `[1, C / ratio, H, W]`; the map itself where
+    /// the configuration has none.
+    ///
+    /// # Errors
+    /// [`DetectorError::Shape`] when there is a compressor and the map is not one of this detector's.
+    pub fn squeezed(&self, features: &Tensor) -> Result<Tensor, DetectorError> {
+        let Some(compressor) = &self.compressor else { return Ok(features.shallow_clone()) };
+        let map = one_map(features, self.map_shape())?;
+        Ok(tch::no_grad(|| compressor.encode(&map, false).f_contiguous())?)
+    }
+
+    /// What head and fusion have learnt to read, `[1, C, H, W]`, from what was transmitted.
+    ///
+    /// # Errors
+    /// [`DetectorError::Shape`] when there is a compressor and it is no code of this detector's.
+    pub fn widened(&self, sent: &Tensor) -> Result<Tensor, DetectorError> {
+        let Some(compressor) = &self.compressor else { return Ok(sent.shallow_clone()) };
+        let code = one_map(sent, self.sent_shape())?;
+        Ok(tch::no_grad(|| compressor.decode(&code, false).f_contiguous())?)
+    }
+
+    /// What is left of an encoded map `[1, C, H, W]` behind the compressor: compressed and expanded again.
+    ///
+    /// Maps are encoded and kept without: whoever reads one that was not transmitted calls this once.
+    ///
+    /// # Errors
+    /// As [`Self::squeezed`].
+    pub fn through_compressor(&self, features: &Tensor) -> Result<Tensor, DetectorError> {
+        self.widened(&self.squeezed(features)?)
+    }
+
+    /// The map `[1, C, H, W]` of a message, widened where it is a code, and zero where nothing was sent.
+    ///
+    /// # Errors
+    /// [`DetectorError::Shape`] when it is not one of this detector's; its lattice is the caller's affair.
+    pub fn received(&self, message: &DecodedFeatures) -> Result<Tensor, DetectorError> {
+        let DecodedFeatures { features: BevFeatures { grid, channels, values, .. }, sent } = message;
+        let [expected, height, width] = self.sent_shape();
+        let found = [*channels, grid.height, grid.width].map(i64::from);
+        if found != self.sent_shape() || values.len() as i64 != expected * height * width {
+            return Err(DetectorError::Shape {
+                what: "map of a message",
+                found: found.into(),
+                expected: self.sent_shape(),
+            });
+        }
+        let widened = self.widened(&Tensor::f_from_slice(values)?.f_view([1, expected, height, width])?)?;
+        match (sent, &self.compressor) {
+            // Widening spreads what was sent to its neighbours, and the bias everywhere.
+            (Some(sent), Some(_)) => {
+                let sent = Tensor::f_from_slice(sent)?.f_to_kind(Kind::Float)?.f_view([1, 1, height, width])?;
+                Ok(widened.f_mul(&sent)?)
+            }
+            _ => Ok(widened),
+        }
+    }
+
+    /// Scores, offsets and confidence of a map `[1, C, H, W]` or `[C, H, W]`, own or fused.
+    ///
+    /// # Errors
+    /// [`DetectorError::Shape`] when the map is not one of this detector's.
+    pub fn heads(&self, features: &Tensor) -> Result<Heads, DetectorError> {
+        let map = one_map(features, self.map_shape())?;
+        tch::no_grad(|| Heads::new(&self.head.forward(&map)?))
+    }
+
+    /// Boxes above a score, in the frame of the vehicle whose map it is, not yet suppressed.
+    ///
+    /// # Errors
+    /// [`DetectorError::Decode`] when the heads are of another detector.
+    pub fn boxes(&self, heads: &Heads, score_threshold: f32) -> Result<Vec<Decoded>, DetectorError> {
+        let mut boxes = decode(&heads.scores, &heads.offsets, &self.anchors, score_threshold)?;
+        if self.config.y_axis == YAxis::Right {
+            for found in &mut boxes {
+                found.box3d = found.box3d.mirrored_y();
+            }
+        }
+        Ok(boxes)
+    }
+
+    /// The message of the transmitted map, see [`Self::squeezed`].
+    ///
+    /// # Errors
+    /// [`DetectorError::Shape`] when the tensor is not one of this detector.
+    pub fn to_message(&self, sent: &Tensor) -> Result<BevFeatures, DetectorError> {
+        let sent = one_map(sent, self.sent_shape())?;
+        let channels = self.config.sent_channels() as u32;
+        Ok(BevFeatures { grid: self.grid(), channels, code_of: self.code_of(), values: flat(&sent)? })
+    }
+
+    /// An encoded map `[1, C, H, W]` as it is kept, before the compressor.
+    ///
+    /// # Errors
+    /// [`DetectorError::Shape`] when the tensor is not a map of this detector.
+    pub fn to_kept(&self, features: &Tensor) -> Result<BevFeatures, DetectorError> {
+        let map = one_map(features, self.map_shape())?;
+        let channels = self.config.feature_channels() as u32;
+        Ok(BevFeatures { grid: self.grid(), channels, code_of: None, values: flat(&map)? })
+    }
+}
+
+/// A map `[1, C, H, W]` or `[C, H, W]` of the expected shape as `[1, C, H, W]`.
+fn one_map(features: &Tensor, expected: [i64; 3]) -> Result<Tensor, DetectorError> {
+    let found = features.size();
+    if found != expected && found.split_first() != Some((&1, expected.as_slice())) {
+        return Err(DetectorError::Shape { what: "feature map", found, expected });
+    }
+    let [channels, height, width] = expected;
+    // One memory layout, or the same values would give other last bits.
+    Ok(features.f_contiguous()?.f_view([1, channels, height, width])?)
+}
+
+/// Time from lap to lap.
+struct StageClock(Instant);
+
+impl StageClock {
+    fn start() -> Self {
+        Self(Instant::now())
+    }
+
+    fn lap(&mut self) -> Duration {
+        let now = Instant::now();
+        let lap = now - self.0;
+        self.0 = now;
+        lap
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+
+    use super::*;
+    use crate::pillars::batch::PillarBatch;
+    use crate::weights::{self, CONFIG_KEY, Precision};
+
+    fn config() -> DetectorConfig {
+        DetectorConfig { lidar_range_m: [-12.8, -6.4, -3.0, 12.8, 6.4, 1.0], ..DetectorConfig::lean() }
+    }
+
+    /// A network with running statistics that are not those of a new one, so that folding has something to do.
+    fn network() -> (VarStore, PointPillars) {
+        network_of(&config())
+    }
+
+    fn network_of(config: &DetectorConfig) -> (VarStore, PointPillars) {
+        tch::set_num_threads(1);
+        tch::manual_seed(5);
+        let network = VarStore::new(Device::Cpu);
+        let pillars = PointPillars::new(&network.root(), config).unwrap();
+        for (name, mut variable) in network.variables() {
+            if name.contains("running_var") {
+                let _ = tch::no_grad(|| variable.uniform_(0.3, 1.5));
+            } else if variable.dim() == 1 {
+                let _ = tch::no_grad(|| variable.uniform_(-0.2, 0.8));
+            }
+        }
+        (network, pillars)
+    }
+
+    fn cloud() -> PointCloud {
+        let points = (0..4000).map(|k| [(k % 89) as f32 * 0.3 - 13.0, (k % 53) as f32 * 0.25 - 6.5, -1.0, 0.4]);
+        PointCloud { xyzi: points.collect() }
+    }
+
+    #[test]
+    fn it_is_the_trained_network_only_faster() {
+        let (_store, pillars) = network();
+        let cloud = cloud();
+        let mut cropped = Vec::new();
+        Crop::for_detector(&config()).keep(&cloud.xyzi, &mut cropped);
+        let sweep = Voxeliser::for_detector(&config()).voxelise(&cropped);
+        let batch = PillarBatch::new(&[&sweep], pillars.lattice());
+        let (expected, scores) = tch::no_grad(|| {
+            let features = pillars.features(&batch, false);
+            let scores = pillars.heads(&features).unwrap().scores;
+            (features, scores)
+        });
+        let mut detector = Detector::from_network(pillars);
+        let encoded = detector.encode(&cloud).unwrap();
+        assert_eq!((encoded.points, encoded.pillars), (cropped.len(), sweep.len()));
+        assert!(encoded.features.allclose(&expected, 1e-4, 1e-4, false));
+        let heads = detector.heads(&encoded.features).unwrap();
+        let close = Tensor::from_slice(&heads.scores).allclose(&scores.reshape([-1]), 1e-4, 1e-4, false);
+        assert!(close && heads.confidence.iter().all(|value| (0.0..=1.0).contains(value)));
+    }
+
+    #[test]
+    fn what_is_left_behind_the_compressor_is_what_the_training_saw() {
+        let (_store, pillars) = network_of(&DetectorConfig { compress_ratio: Some(4), ..config() });
+        let mut cropped = Vec::new();
+        Crop::for_detector(&config()).keep(&cloud().xyzi, &mut cropped);
+        let sweep = Voxeliser::for_detector(&config()).voxelise(&cropped);
+        let batch = PillarBatch::new(&[&sweep], pillars.lattice());
+        let expected = tch::no_grad(|| pillars.through_compressor(&pillars.features(&batch, false), false));
+        let mut detector = Detector::from_network(pillars);
+        let encoded = detector.encode(&cloud()).unwrap().features;
+        let left = detector.through_compressor(&encoded).unwrap();
+        assert!(left.allclose(&expected, 1e-4, 1e-4, false) && !left.allclose(&encoded, 1e-2, 1e-2, false));
+        let other = Tensor::zeros([1, 64, 8, 8], (Kind::Float, Device::Cpu));
+        assert!(matches!(detector.through_compressor(&other), Err(DetectorError::Shape { .. })));
+        let plain = Detector::from_network(network().1);
+        assert!(plain.through_compressor(&encoded).unwrap().equal(&encoded), "there is nothing to lose");
+        assert_eq!((plain.sent_shape(), plain.code_of()), (plain.map_shape(), None));
+    }
+
+    #[test]
+    fn the_code_crosses_the_air_and_its_receiver_widens_it_to_the_same_bits() {
+        let (_store, pillars) = network_of(&DetectorConfig { compress_ratio: Some(16), ..config() });
+        let mut detector = Detector::from_network(pillars);
+        let encoded = detector.encode(&cloud()).unwrap().features;
+        let features = detector.to_message(&detector.squeezed(&encoded).unwrap()).unwrap();
+        let cells = detector.grid().cells();
+        assert_eq!((features.channels, features.code_of, features.values.len()), (4, Some(64), 4 * cells));
+        let whole = detector.through_compressor(&encoded).unwrap();
+        let received = |sent| detector.received(&DecodedFeatures { features: features.clone(), sent }).unwrap();
+        assert!(received(None).equal(&whole));
+        let half = received(Some((0..cells).map(|cell| cell < cells / 2).collect()));
+        let values: Vec<f32> = Vec::try_from(half.view([-1])).unwrap();
+        assert!(values.chunks(cells).all(|channel| channel[cells / 2..].iter().all(|value| *value == 0.0)));
+        assert_eq!(&values[..10], &Vec::<f32>::try_from(whole.view([-1])).unwrap()[..10]);
+        let map = DecodedFeatures { features: detector.to_kept(&encoded).unwrap(), sent: None };
+        let message = detector.received(&map).unwrap_err().to_string();
+        assert!(message.contains("[64, 16, 32]") && message.contains("[4, 16, 32]"), "{message}");
+        assert!(detector.to_message(&encoded).is_err());
+    }
+
+    #[test]
+    fn the_same_sweep_gives_the_same_bits_whatever_came_before() {
+        let (_store, pillars) = network();
+        let mut detector = Detector::from_network(pillars);
+        let first = detector.encode(&cloud()).unwrap().features;
+        let nothing = detector.encode(&PointCloud::default()).unwrap();
+        assert_eq!((nothing.points, nothing.pillars), (0, 0));
+        let odd = PointCloud { xyzi: vec![[f32::NAN; 4], [5.0, f32::INFINITY, 0.0, 0.0]] };
+        assert!(detector.encode(&odd).unwrap().features.equal(&nothing.features));
+        assert!(detector.encode(&cloud()).unwrap().features.equal(&first));
+        let message = detector.to_message(&first).unwrap();
+        let [channels, height, width] = detector.map_shape();
+        let back = Tensor::from_slice(&message.values).view([channels, height, width]);
+        assert_eq!(detector.heads(&back).unwrap(), detector.heads(&first).unwrap());
+    }
+
+    #[test]
+    fn a_network_of_a_mirrored_world_sees_the_mirrored_cloud() {
+        let (store, pillars) = network();
+        let _ = tch::no_grad(|| store.variables()["cls_head.bias"].shallow_clone().fill_(0.5));
+        let mut plain = Detector::from_network(pillars);
+        let (mirrored_store, mut pillars) = network();
+        for (name, mut variable) in mirrored_store.variables() {
+            tch::no_grad(|| variable.copy_(&store.variables()[&name]));
+        }
+        pillars.config.y_axis = YAxis::Right;
+        let mut mirrored = Detector::from_network(pillars);
+        let flip =
+            |cloud: PointCloud| PointCloud { xyzi: cloud.xyzi.iter().map(|&[x, y, z, i]| [x, -y, z, i]).collect() };
+        let (there, here) = (plain.encode(&cloud()).unwrap(), mirrored.encode(&flip(cloud())).unwrap());
+        assert!(there.features.equal(&here.features));
+        let boxes = |detector: &Detector, features| detector.boxes(&detector.heads(features).unwrap(), 0.3).unwrap();
+        let (theirs, ours) = (boxes(&plain, &there.features), boxes(&mirrored, &here.features));
+        assert!(!theirs.is_empty() && theirs.len() == ours.len());
+        for (theirs, ours) in theirs.iter().zip(&ours) {
+            assert_eq!(theirs.box3d.center_m[1], -ours.box3d.center_m[1]);
+            assert_eq!(theirs.box3d.heading_rad, -ours.box3d.heading_rad);
+            assert_eq!(theirs.box3d.center_m[0], ours.box3d.center_m[0]);
+        }
+    }
+
+    #[test]
+    fn it_comes_back_from_its_file_bit_for_bit() {
+        let (store, pillars) = network();
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("lean.safetensors");
+        let metadata: BTreeMap<_, _> = [(CONFIG_KEY.to_owned(), serde_json::to_string(&config()).unwrap())].into();
+        let sha256 = weights::save(&path, &store, &metadata, Precision::Single).unwrap();
+        let mut loaded = Detector::load(&path).unwrap();
+        assert_eq!((loaded.sha256(), loaded.config()), (sha256.as_str(), &config()));
+        let mut original = Detector::from_network(pillars);
+        assert!(loaded.encode(&cloud()).unwrap().features.equal(&original.encode(&cloud()).unwrap().features));
+    }
+
+    #[test]
+    fn maps_of_other_detectors_are_refused_with_both_shapes() {
+        let (_store, pillars) = network();
+        let detector = Detector::from_network(pillars);
+        let other = Tensor::zeros([1, 64, 8, 8], (Kind::Float, Device::Cpu));
+        let message = detector.heads(&other).unwrap_err().to_string();
+        assert!(message.contains("[1, 64, 8, 8]") && message.contains("[64, 16, 32]"), "{message}");
+        assert!(detector.to_message(&other).is_err());
+    }
+}

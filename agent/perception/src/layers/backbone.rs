@@ -1,0 +1,135 @@
+//! The 2D backbone: blocks that halve the map, each brought back to one lattice and concatenated.
+
+use tch::{TchError, Tensor, nn};
+
+use crate::layers::agent_attention::attend_samples;
+use crate::layers::convolution::ConvLayer;
+use crate::layers::residual::ResidualBlock;
+use crate::model_config::{BlockKind, DetectorConfig};
+
+/// Blocks of 3x3 convolutions and their up-sampling branches.
+#[derive(Debug)]
+pub struct BevBackbone {
+    blocks: Vec<Block>,
+    deblocks: Vec<ConvLayer>,
+}
+
+/// The layers of one level.
+#[derive(Debug)]
+enum Block {
+    Plain(Vec<ConvLayer>),
+    Residual(Vec<ResidualBlock>),
+}
+
+impl BevBackbone {
+    /// Parameters `blocks.<level>.<position>.*` (with residual blocks `resnet.layer<level>.<position>.*`) and
+    /// `deblocks.<level>.<0|1>.*` under `path`.
+    #[must_use]
+    pub fn new(path: &nn::Path<'_>, config: &DetectorConfig) -> Self {
+        let mut input = config.pillar_channels;
+        let mut backbone = Self { blocks: Vec::new(), deblocks: Vec::new() };
+        for (level, &filters) in config.num_filters.iter().enumerate() {
+            let (layers, stride) = (config.layer_nums[level], config.layer_strides[level]);
+            backbone.blocks.push(match config.blocks {
+                BlockKind::Plain => Block::Plain(block(&(path / "blocks" / level), [input, filters], layers, stride)),
+                BlockKind::Residual => {
+                    let path = path / "resnet" / format!("layer{level}");
+                    Block::Residual(ResidualBlock::chain(&path, [input, filters], layers, stride))
+                }
+            });
+            let deblock = path / "deblocks" / level;
+            let io = [filters, config.num_upsample_filters[level]];
+            let layer = ConvLayer::upsampling(&(&deblock / 0), &(&deblock / 1), io, config.upsample_strides[level]);
+            backbone.deblocks.push(layer);
+            input = filters;
+        }
+        backbone
+    }
+
+    /// `[N, C, H, W]` to the concatenated levels `[N, sum of C_up, H', W']`.
+    pub fn forward(&self, x: &Tensor, train: bool) -> Tensor {
+        let unfused = |level: &Tensor| Ok(level.shallow_clone());
+        self.run(x, train, unfused).expect("a backbone without fusion has no shape from outside")
+    }
+
+    /// AttFuse's backbone: after every level the agents of a sample are fused on their way to the up-sampling branch,
+    /// while every agent's own features go on down.
+    ///
+    /// # Shapes
+    /// - `x`: `[sum of record_len, C, H, W]`, all agents on their ego's lattice, ego first in each sample
+    /// - returns: `[B, sum of C_up, H', W']`
+    ///
+    /// # Errors
+    /// The tensor library's, when `record_len` does not add up to the number of maps.
+    pub fn forward_fused(&self, x: &Tensor, record_len: &[i64], train: bool) -> Result<Tensor, TchError> {
+        self.run(x, train, |level| attend_samples(level, record_len))
+    }
+
+    /// Number of levels.
+    #[must_use]
+    pub fn levels(&self) -> usize {
+        self.blocks.len()
+    }
+
+    /// What one level makes of the output of the level above it, or of the canvas.
+    ///
+    /// # Panics
+    /// When there is no such level.
+    pub fn level(&self, level: usize, x: &Tensor, train: bool) -> Tensor {
+        match &self.blocks[level] {
+            Block::Plain(layers) => layers.iter().fold(x.shallow_clone(), |x, layer| layer.forward(&x, train)),
+            Block::Residual(blocks) => blocks.iter().fold(x.shallow_clone(), |x, block| block.forward(&x, train)),
+        }
+    }
+
+    /// Brings the outputs of all levels, own or fused, to one lattice: `[N, sum of C_up, H', W']`.
+    pub fn upsampled(&self, levels: &[Tensor], train: bool) -> Tensor {
+        let mut levels: Vec<Tensor> =
+            self.deblocks.iter().zip(levels).map(|(deblock, level)| deblock.forward(level, train)).collect();
+        if levels.len() == 1 { levels.remove(0) } else { Tensor::cat(&levels, 1) }
+    }
+
+    /// The same backbone for inference, norms folded into the convolutions.
+    #[must_use]
+    pub fn folded(&self) -> Self {
+        let fold = |block: &Block| match block {
+            Block::Plain(layers) => Block::Plain(layers.iter().map(ConvLayer::folded).collect()),
+            Block::Residual(blocks) => Block::Residual(blocks.iter().map(ResidualBlock::folded).collect()),
+        };
+        Self {
+            blocks: self.blocks.iter().map(fold).collect(),
+            deblocks: self.deblocks.iter().map(ConvLayer::folded).collect(),
+        }
+    }
+
+    fn run(
+        &self,
+        x: &Tensor,
+        train: bool,
+        fuse: impl Fn(&Tensor) -> Result<Tensor, TchError>,
+    ) -> Result<Tensor, TchError> {
+        let mut x = x.shallow_clone();
+        let mut levels = Vec::with_capacity(self.blocks.len());
+        for level in 0..self.blocks.len() {
+            x = self.level(level, &x, train);
+            levels.push(fuse(&x)?);
+        }
+        Ok(self.upsampled(&levels, train))
+    }
+}
+
+/// One strided convolution and `layers` more.
+///
+/// The reference numbers zero padding, convolution, norm and ReLU in one list, so the first convolution is 1, its norm
+/// 2, and each later pair is three further.
+fn block(path: &nn::Path<'_>, [input, filters]: [i64; 2], layers: usize, stride: i64) -> Vec<ConvLayer> {
+    (0..=layers)
+        .map(|layer| {
+            let (position, io, stride) = match layer {
+                0 => (1, [input, filters], stride),
+                _ => (3 * layer + 1, [filters, filters], 1),
+            };
+            ConvLayer::normed(&(path / position), &(path / (position + 1)), io, 3, stride)
+        })
+        .collect()
+}

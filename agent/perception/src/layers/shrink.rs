@@ -1,0 +1,98 @@
+//! From the wide backbone map to the one that crosses the air, and a learnt compressor of its channels.
+
+use tch::{TchError, Tensor, nn};
+
+use crate::layers::convolution::ConvLayer;
+use crate::model_config::ShrinkConfig;
+
+/// Reduces the concatenated backbone levels.
+#[derive(Debug)]
+pub struct Shrink {
+    layers: Vec<ConvLayer>,
+}
+
+impl Shrink {
+    /// Parameters `layers.0.double_conv.{0,2}.*` (OpenCOOD) or `layers.0.{0,1}.*` (pointwise) under `path`.
+    #[must_use]
+    pub fn new(path: &nn::Path<'_>, input: i64, config: &ShrinkConfig) -> Self {
+        let layer = path / "layers" / 0;
+        let layers = match *config {
+            ShrinkConfig::DoubleConv { channels, stride } => {
+                let double = layer / "double_conv";
+                let first = ConvLayer::biased(&(&double / 0), [input, channels], 3, stride).with_relu();
+                vec![first, ConvLayer::biased(&(&double / 2), [channels, channels], 3, 1).with_relu()]
+            }
+            ShrinkConfig::Pointwise { channels } => {
+                vec![ConvLayer::normed(&(&layer / 0), &(&layer / 1), [input, channels], 1, 1)]
+            }
+        };
+        Self { layers }
+    }
+
+    /// `[N, C_in, H, W]` to `[N, C, H', W']`.
+    pub fn forward(&self, x: &Tensor, train: bool) -> Tensor {
+        chain(&self.layers, x, train)
+    }
+
+    /// [`Self::forward`] of one map in inference, contiguous.
+    ///
+    /// # Errors
+    /// The tensor library's.
+    pub fn forward_contiguous(&self, x: &Tensor) -> Result<Tensor, TchError> {
+        match self.layers.split_last() {
+            Some((last, rest)) => last.forward_contiguous(&chain(rest, x, false)),
+            None => x.f_contiguous(),
+        }
+    }
+
+    /// The same for inference, norms folded in.
+    #[must_use]
+    pub fn folded(&self) -> Self {
+        Self { layers: self.layers.iter().map(ConvLayer::folded).collect() }
+    }
+}
+
+/// Squeezes the channels before the air and widens them again behind it (OpenCOOD's `NaiveCompressor`): the sender has the
+/// first half, every receiver the second.
+#[derive(Debug)]
+pub struct Compressor {
+    encoder: ConvLayer,
+    decoder: Vec<ConvLayer>,
+}
+
+impl Compressor {
+    /// `channels` to `channels / ratio` and back; parameters `encoder.*` and `decoder.*` under `path`.
+    #[must_use]
+    pub fn new(path: &nn::Path<'_>, channels: i64, ratio: i64) -> Self {
+        let code = (channels / ratio).max(1);
+        let layer = |part: &nn::Path<'_>, position: i64, io: [i64; 2]| {
+            let conv = ConvLayer::biased(&(part / position), io, 3, 1);
+            conv.with_norm(&(part / (position + 1)), io[1]).with_relu()
+        };
+        let decoder = path / "decoder";
+        Self {
+            encoder: layer(&(path / "encoder"), 0, [channels, code]),
+            decoder: vec![layer(&decoder, 0, [code, channels]), layer(&decoder, 3, [channels, channels])],
+        }
+    }
+
+    /// `[N, C, H, W]` to the code `[N, C / ratio, H, W]`.
+    pub fn encode(&self, x: &Tensor, train: bool) -> Tensor {
+        self.encoder.forward(x, train)
+    }
+
+    /// The code back to `[N, C, H, W]`.
+    pub fn decode(&self, code: &Tensor, train: bool) -> Tensor {
+        chain(&self.decoder, code, train)
+    }
+
+    /// The same for inference, norms folded in.
+    #[must_use]
+    pub fn folded(&self) -> Self {
+        Self { encoder: self.encoder.folded(), decoder: self.decoder.iter().map(ConvLayer::folded).collect() }
+    }
+}
+
+fn chain(layers: &[ConvLayer], x: &Tensor, train: bool) -> Tensor {
+    layers.iter().fold(x.shallow_clone(), |x, layer| layer.forward(&x, train))
+}

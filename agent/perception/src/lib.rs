@@ -1,0 +1,22 @@
+//! Perception of one vehicle: a LiDAR detector on pillars, its layers, boxes, weights and training loop.
+//!
+//! - [`pillars`], [`layers`], [`detector`]: point cloud to BEV feature map to boxes.
+//! - [`boxes`]: anchors, decoding, non-maximum suppression and post-processing.
+//! - [`sparse`]: sparse convolution, for the scene encoder of the localization.
+//! - [`weights`], [`model_config`]: checkpoints and the sizes of a model.
+//! - [`train`]: optimiser, schedule, checkpoints and progress of every training.
+//!
+//! Tensors are `[N, C, H, W]`; the row of a BEV feature map grows with y, the column with x.
+
+#![warn(clippy::print_stdout, clippy::print_stderr)]
+
+pub mod boxes;
+pub mod crop;
+pub mod detector;
+pub mod layers;
+pub mod model_config;
+pub mod pillars;
+pub mod sparse;
+pub mod torch_error;
+pub mod train;
+pub mod weights;

@@ -1,0 +1,471 @@
+//! The numbers that define a detector: area, pillars, backbone, head.
+
+use protocol::BevGrid;
+use serde::{Deserialize, Serialize};
+
+use crate::layers::head::BOX_CODE;
+
+/// Why a [`DetectorConfig`] cannot be built.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum ConfigError {
+    /// The area, the pillar size or a count is empty, negative or not a number.
+    #[error("detector configuration: {field} is {value}, must be {must}")]
+    Value {
+        /// Name of the field.
+        field: &'static str,
+        /// What stood there.
+        value: String,
+        /// What would be right.
+        must: &'static str,
+    },
+    /// Lists that describe the same levels differ in length.
+    #[error("detector configuration: {field} has {got} entries, layer_nums has {levels}")]
+    Levels {
+        /// Name of the field.
+        field: &'static str,
+        /// Its length.
+        got: usize,
+        /// Number of levels.
+        levels: usize,
+    },
+}
+
+/// How the concatenated backbone levels become the map that crosses the air.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "kind", rename_all = "snake_case", deny_unknown_fields)]
+pub enum ShrinkConfig {
+    /// OpenCOOD's `DownsampleConv`: 3x3 convolution with `stride`, ReLU, 3x3 convolution, ReLU, both with bias.
+    DoubleConv {
+        /// Output channels.
+        channels: i64,
+        /// Stride of the first convolution.
+        stride: i64,
+    },
+    /// 1x1 convolution without bias, batch norm, ReLU: four times cheaper per cell and channel than 3x3.
+    Pointwise {
+        /// Output channels.
+        channels: i64,
+    },
+}
+
+/// What the blocks of the backbone are made of.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum BlockKind {
+    /// PointPillars: a strided convolution and `layer_nums` more.
+    #[default]
+    Plain,
+    /// CoAlign: `layer_nums` residual blocks, the first strided.
+    Residual,
+}
+
+/// Towards which side y grows in the world that a network was trained in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum YAxis {
+    /// Left, as everywhere in this program.
+    #[default]
+    Left,
+    /// Right, as in CARLA and the public reference codes: weights from there see a mirrored world. Clouds are mirrored
+    /// before such a network and boxes behind it; its maps lie mirrored on the air, among others of the same network.
+    Right,
+}
+
+/// The prior boxes at every cell of the head.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct AnchorConfig {
+    /// Length, width, height in metres.
+    pub size_lwh_m: [f64; 3],
+    /// Height of the centre above the LiDAR, metres.
+    pub center_z_m: f64,
+    /// Headings, degrees, in the order of the head's channels.
+    pub yaws_deg: Vec<f64>,
+}
+
+impl Default for AnchorConfig {
+    fn default() -> Self {
+        Self { size_lwh_m: [3.9, 1.6, 1.56], center_z_m: -1.0, yaws_deg: vec![0.0, 90.0] }
+    }
+}
+
+/// A PointPillars detector, from the area it looks at to its head.
+///
+/// It is stored as JSON in the metadata of a weights file, so that a file is complete alone.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DetectorConfig {
+    /// Name of the configuration, for reports.
+    pub name: String,
+    /// x, y, z of the lower corner, then of the upper, metres in the LiDAR frame.
+    pub lidar_range_m: [f64; 6],
+    /// Edges of a pillar along x, y, z, metres.
+    pub voxel_size_m: [f64; 3],
+    /// Points a pillar keeps at most; the first ones win.
+    pub max_points_per_pillar: usize,
+    /// Pillars a sweep has at most; the first ones win.
+    pub max_pillars: usize,
+    /// Channels of the pillar encoder.
+    pub pillar_channels: i64,
+    /// What blocks are made of.
+    #[serde(default)]
+    pub blocks: BlockKind,
+    /// Towards which side its world grows; a network that is mirrored has an area as wide to the left as to the right.
+    #[serde(default)]
+    pub y_axis: YAxis,
+    /// Layers of each block after its strided one; of residual ones: their number.
+    pub layer_nums: Vec<usize>,
+    /// Stride of each block.
+    pub layer_strides: Vec<i64>,
+    /// Channels of each block.
+    pub num_filters: Vec<i64>,
+    /// Up-sampling of each block on its way to the concatenation.
+    pub upsample_strides: Vec<i64>,
+    /// Channels of each up-sampled block.
+    pub num_upsample_filters: Vec<i64>,
+    /// Reduction of the concatenated map; absent: it crosses the air as it is.
+    pub shrink: Option<ShrinkConfig>,
+    /// The learnt channel compressor transmits one channel in so many; absent: none.
+    pub compress_ratio: Option<i64>,
+    /// Anchors of the head.
+    pub anchors: AnchorConfig,
+    /// Points of the carrier itself: x and y of the lower, then of the upper corner of a box that is cut out, metres.
+    pub own_body_m: Option<[f64; 4]>,
+}
+
+impl DetectorConfig {
+    /// OpenCOOD's numbers: x +-140.8 m, y +-38.4 m, a 256 x 48 x 176 map at 1.6 m.
+    #[must_use]
+    pub fn full() -> Self {
+        Self {
+            name: "full".into(),
+            lidar_range_m: [-140.8, -38.4, -3.0, 140.8, 38.4, 1.0],
+            voxel_size_m: [0.4, 0.4, 4.0],
+            max_points_per_pillar: 32,
+            max_pillars: 70_000,
+            pillar_channels: 64,
+            blocks: BlockKind::Plain,
+            y_axis: YAxis::Left,
+            layer_nums: vec![3, 5, 8],
+            layer_strides: vec![2, 2, 2],
+            num_filters: vec![64, 128, 256],
+            upsample_strides: vec![1, 2, 4],
+            num_upsample_filters: vec![128; 3],
+            shrink: Some(ShrinkConfig::DoubleConv { channels: 256, stride: 2 }),
+            compress_ratio: None,
+            anchors: AnchorConfig::default(),
+            own_body_m: Some(OWN_BODY_M),
+        }
+    }
+
+    /// Sized for two cores and live traffic: x +-51.2 m, y +-38.4 m, a 64 x 96 x 128 map at 0.8 m.
+    #[must_use]
+    pub fn lean() -> Self {
+        Self {
+            name: "lean".into(),
+            lidar_range_m: [-51.2, -38.4, -3.0, 51.2, 38.4, 1.0],
+            max_pillars: 20_000,
+            pillar_channels: 32,
+            layer_nums: vec![2, 3, 3],
+            num_filters: vec![32, 64, 128],
+            num_upsample_filters: vec![64; 3],
+            shrink: Some(ShrinkConfig::Pointwise { channels: 64 }),
+            ..Self::full()
+        }
+    }
+
+    /// The preset of that name: `full` or `lean`.
+    #[must_use]
+    pub fn preset(name: &str) -> Option<Self> {
+        match name {
+            "full" => Some(Self::full()),
+            "lean" => Some(Self::lean()),
+            _ => None,
+        }
+    }
+
+    /// Number of pillars along x, y, z.
+    #[must_use]
+    pub fn pillar_grid(&self) -> [usize; 3] {
+        std::array::from_fn(|axis| {
+            let extent = self.lidar_range_m[axis + 3] - self.lidar_range_m[axis];
+            (extent / self.voxel_size_m[axis]).round() as usize
+        })
+    }
+
+    /// Pillars per cell of the map that crosses the air, along one axis.
+    #[must_use]
+    pub fn feature_stride(&self) -> i64 {
+        let shrink = match self.shrink {
+            Some(ShrinkConfig::DoubleConv { stride, .. }) => stride,
+            Some(ShrinkConfig::Pointwise { .. }) | None => 1,
+        };
+        let first = |strides: &[i64]| strides.first().copied().unwrap_or(1);
+        first(&self.layer_strides) / first(&self.upsample_strides) * shrink
+    }
+
+    /// Channels of the concatenated backbone levels.
+    #[must_use]
+    pub fn backbone_channels(&self) -> i64 {
+        self.num_upsample_filters.iter().sum()
+    }
+
+    /// Channels of the map that is fused and of the head's input.
+    #[must_use]
+    pub fn feature_channels(&self) -> i64 {
+        match self.shrink {
+            Some(ShrinkConfig::DoubleConv { channels, .. } | ShrinkConfig::Pointwise { channels }) => channels,
+            None => self.backbone_channels(),
+        }
+    }
+
+    /// Channels of the map that is transmitted: of the code, where there is a compressor.
+    #[must_use]
+    pub fn sent_channels(&self) -> i64 {
+        self.compress_ratio.map_or(self.feature_channels(), |ratio| (self.feature_channels() / ratio).max(1))
+    }
+
+    /// The lattice of the map that crosses the air.
+    #[must_use]
+    pub fn feature_grid(&self) -> BevGrid {
+        let [width, height, _] = self.pillar_grid().map(|count| u32::try_from(count).unwrap_or(u32::MAX));
+        let pillars = BevGrid {
+            x_min_m: self.lidar_range_m[0],
+            y_min_m: self.lidar_range_m[1],
+            cell_m: self.voxel_size_m[0],
+            width,
+            height,
+        };
+        pillars.downsampled(u32::try_from(self.feature_stride()).unwrap_or(1).max(1))
+    }
+
+    /// Checks that a network can be built and that the levels meet on one lattice.
+    ///
+    /// # Errors
+    /// [`ConfigError`] names the field, its value and what it must be.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        self.check_area()?;
+        self.check_levels()?;
+        let positive = |field, value: i64| {
+            let error = ConfigError::Value { field, value: value.to_string(), must: "1 to 4096" };
+            if (1..=4096).contains(&value) { Ok(()) } else { Err(error) }
+        };
+        positive("max_points_per_pillar", i64::try_from(self.max_points_per_pillar).unwrap_or(0))?;
+        positive("pillar_channels", self.pillar_channels)?;
+        positive("shrink channels", self.feature_channels())?;
+        positive("number of anchor yaws", self.anchors.yaws_deg.len() as i64)?;
+        positive("compress_ratio", self.compress_ratio.unwrap_or(1))?;
+        if let Some(ShrinkConfig::DoubleConv { stride, .. }) = self.shrink {
+            positive("shrink stride", stride)?;
+        }
+        if !(1..=MAX_CELLS).contains(&self.max_pillars) {
+            return Err(value_error("max_pillars", self.max_pillars, "1 to 16777216"));
+        }
+        if self.anchors.size_lwh_m.iter().any(|size| !(size.is_finite() && *size > 0.0)) {
+            return Err(value_error("anchors.size_lwh_m", self.anchors.size_lwh_m, "positive"));
+        }
+        self.check_sizes()
+    }
+
+    /// Checked before anything of such a size is allocated: the file that the numbers come from may be anybody's.
+    fn check_sizes(&self) -> Result<(), ConfigError> {
+        let [x, y, _] = self.pillar_grid().map(|count| count as i64);
+        let canvas = x * y * self.pillar_channels;
+        if canvas > MAX_VALUES {
+            return Err(value_error("pillar grid times pillar_channels", canvas, "268435456 values at most"));
+        }
+        let step = self.layer_strides[0] / self.upsample_strides[0];
+        let layers = [self.backbone_channels(), self.feature_channels(), self.head_channels()];
+        let widest = self.num_filters.iter().chain(&layers).copied().max().unwrap_or(0);
+        let map = (x / step) * (y / step) * widest;
+        if map > MAX_VALUES {
+            let field = "cells of a map times the most of num_filters, num_upsample_filters, shrink and anchors";
+            return Err(value_error(field, map, "268435456 values at most"));
+        }
+        let parameters = self.parameters();
+        if parameters > MAX_PARAMETERS {
+            let field = "layer_nums, num_filters, upsample_strides and shrink: number of parameters";
+            return Err(value_error(field, parameters, "256000000 at most"));
+        }
+        Ok(())
+    }
+
+    /// Channels of the head's output.
+    fn head_channels(&self) -> i64 {
+        (1 + BOX_CODE) * self.anchors.yaws_deg.len() as i64
+    }
+
+    /// Parameters of the convolutions, nearly all there are.
+    fn parameters(&self) -> i64 {
+        let mut input = self.pillar_channels;
+        let mut count = 0;
+        for (level, &filters) in self.num_filters.iter().enumerate() {
+            let layers = self.layer_nums[level] as i64;
+            let more = if self.blocks == BlockKind::Residual { 2 * layers - 1 } else { layers };
+            count += 9 * filters * (input + more * filters);
+            count += self.upsample_strides[level].pow(2) * filters * self.num_upsample_filters[level];
+            input = filters;
+        }
+        let channels = self.feature_channels();
+        count += match self.shrink {
+            Some(ShrinkConfig::DoubleConv { .. }) => 9 * channels * (self.backbone_channels() + channels),
+            Some(ShrinkConfig::Pointwise { .. }) => channels * self.backbone_channels(),
+            None => 0,
+        };
+        if self.compress_ratio.is_some() {
+            count += 9 * channels * (2 * self.sent_channels() + channels);
+        }
+        count + channels * self.head_channels()
+    }
+
+    fn check_area(&self) -> Result<(), ConfigError> {
+        let range = self.lidar_range_m;
+        if range.iter().any(|edge| !edge.is_finite()) || (0..3).any(|axis| range[axis] >= range[axis + 3]) {
+            return Err(value_error("lidar_range_m", range, "finite, lower below upper"));
+        }
+        if self.voxel_size_m.iter().any(|size| !(size.is_finite() && *size > 0.0)) {
+            return Err(value_error("voxel_size_m", self.voxel_size_m, "positive"));
+        }
+        if (self.voxel_size_m[0] - self.voxel_size_m[1]).abs() > 1e-9 {
+            return Err(value_error("voxel_size_m", self.voxel_size_m, "equal along x and y"));
+        }
+        if self.y_axis == YAxis::Right && (range[1] + range[4]).abs() > 1e-9 {
+            return Err(value_error(
+                "lidar_range_m",
+                range,
+                "as wide to the left as to the right where y_axis is right",
+            ));
+        }
+        let [x, y, z] = self.pillar_grid();
+        if z != 1 {
+            return Err(value_error("pillar layers along z", z, "1"));
+        }
+        if !(1..=MAX_CELLS).contains(&x.saturating_mul(y)) {
+            return Err(value_error("pillar grid", [x, y], "1 to 16777216 cells"));
+        }
+        Ok(())
+    }
+
+    fn check_levels(&self) -> Result<(), ConfigError> {
+        let levels = self.layer_nums.len();
+        if !(1..=8).contains(&levels) {
+            return Err(value_error("layer_nums", &self.layer_nums, "1 to 8 blocks"));
+        }
+        let lists: [(&'static str, &[i64]); 4] = [
+            ("layer_strides", &self.layer_strides),
+            ("num_filters", &self.num_filters),
+            ("upsample_strides", &self.upsample_strides),
+            ("num_upsample_filters", &self.num_upsample_filters),
+        ];
+        for (field, list) in lists {
+            if list.len() != levels {
+                return Err(ConfigError::Levels { field, got: list.len(), levels });
+            }
+            if list.iter().any(|value| !(1..=4096).contains(value)) {
+                return Err(value_error(field, list, "1 to 4096 each"));
+            }
+        }
+        let fewest = if self.blocks == BlockKind::Residual { 1 } else { 0 };
+        if self.layer_nums.iter().any(|layers| !(fewest..=64).contains(layers)) {
+            return Err(value_error("layer_nums", &self.layer_nums, "at most 64 each, residual blocks at least 1"));
+        }
+        self.check_strides()
+    }
+
+    /// Every level must come back to the same lattice, without a rest.
+    fn check_strides(&self) -> Result<(), ConfigError> {
+        let mut down = 1;
+        for (stride, up) in self.layer_strides.iter().zip(&self.upsample_strides) {
+            down *= stride;
+            if down % up != 0 || down / up != self.layer_strides[0] / self.upsample_strides[0] {
+                return Err(value_error("upsample_strides", &self.upsample_strides, "bring all levels to one lattice"));
+            }
+        }
+        let [x, y, _] = self.pillar_grid();
+        let down = usize::try_from(down).unwrap_or(usize::MAX);
+        if x % down != 0 || y % down != 0 {
+            return Err(value_error("pillar grid", [x, y], "a multiple of the product of layer_strides"));
+        }
+        Ok(())
+    }
+}
+
+/// The box that the LiDAR's own car fills, as OpenCOOD cuts it out: x and y of the lower and the upper corner, metres.
+pub const OWN_BODY_M: [f64; 4] = [-1.95, -1.1, 2.95, 1.1];
+
+/// More cells than any map in the field has; keeps a wrong number from taking all memory.
+const MAX_CELLS: usize = 1 << 24;
+/// Values of a map, for the same reason: 1 GiB.
+const MAX_VALUES: i64 = 1 << 28;
+/// Parameters of a network, for the same reason: nearly 1 GiB.
+const MAX_PARAMETERS: i64 = 256_000_000;
+
+fn value_error(field: &'static str, value: impl std::fmt::Debug, must: &'static str) -> ConfigError {
+    ConfigError::Value { field, value: format!("{value:?}"), must }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn presets_have_the_maps_they_promise() {
+        let full = DetectorConfig::full();
+        full.validate().unwrap();
+        let grid = full.feature_grid();
+        assert_eq!((full.feature_channels(), grid.height, grid.width, grid.cell_m), (256, 48, 176, 1.6));
+        let lean = DetectorConfig::lean();
+        lean.validate().unwrap();
+        let grid = lean.feature_grid();
+        assert_eq!((lean.feature_channels(), grid.height, grid.width, grid.cell_m), (64, 96, 128, 0.8));
+        assert_eq!((lean.pillar_grid(), lean.sent_channels()), ([256, 192, 1], 64));
+        let squeezed = |ratio| DetectorConfig { compress_ratio: Some(ratio), ..DetectorConfig::lean() };
+        assert_eq!([1, 32, 100].map(|ratio| squeezed(ratio).sent_channels()), [64, 2, 1]);
+        assert_eq!(squeezed(32).feature_channels(), 64, "behind the air the map is whole again");
+    }
+
+    #[test]
+    fn json_round_trip_keeps_everything_and_refuses_misspelt_fields() {
+        let full = DetectorConfig::full();
+        let mut json = serde_json::to_value(&full).unwrap();
+        assert_eq!(serde_json::from_value::<DetectorConfig>(json.clone()).unwrap(), full);
+        json["max_pilars"] = 7.into();
+        assert!(serde_json::from_value::<DetectorConfig>(json).unwrap_err().to_string().contains("max_pilars"));
+    }
+
+    #[test]
+    fn what_does_not_fit_into_memory_is_refused_before_it_is_asked_for() {
+        let refused = |config: DetectorConfig, field: &str, value: &str| {
+            let message = config.validate().unwrap_err().to_string();
+            assert!(message.contains(field) && message.contains(value), "{message}");
+        };
+        let wide = [-819.2, -819.2, -3.0, 819.2, 819.2, 1.0];
+        let lean = || DetectorConfig { lidar_range_m: wide, pillar_channels: 8, ..DetectorConfig::lean() };
+        refused(DetectorConfig { pillar_channels: 4096, ..lean() }, "pillar_channels", "68719476736");
+        refused(DetectorConfig { num_filters: vec![4096; 3], ..lean() }, "num_filters", "17179869184");
+        refused(
+            DetectorConfig { layer_nums: vec![64; 3], num_filters: vec![1024; 3], ..DetectorConfig::lean() },
+            "layer_nums",
+            "256000000",
+        );
+        let ratio = DetectorConfig {
+            shrink: Some(ShrinkConfig::Pointwise { channels: 4096 }),
+            compress_ratio: Some(1),
+            ..DetectorConfig::lean()
+        };
+        refused(ratio, "number of parameters", "256000000");
+    }
+
+    #[test]
+    fn refuses_levels_that_do_not_meet() {
+        let mut config = DetectorConfig::lean();
+        config.upsample_strides = vec![1, 2, 2];
+        let message = config.validate().unwrap_err().to_string();
+        assert!(message.contains("upsample_strides") && message.contains("[1, 2, 2]"), "{message}");
+        config.upsample_strides.pop();
+        assert_eq!(config.validate(), Err(ConfigError::Levels { field: "upsample_strides", got: 2, levels: 3 }));
+        let mut config = DetectorConfig::lean();
+        config.lidar_range_m[3] = f64::NAN;
+        assert!(config.validate().is_err());
+    }
+}

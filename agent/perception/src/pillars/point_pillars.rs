@@ -1,0 +1,159 @@
+//! PointPillars as one network, for training and for inference.
+
+use tch::{Kind, TchError, Tensor, nn};
+
+use crate::layers::backbone::BevBackbone;
+use crate::layers::head::{DetectionHead, HeadOutput};
+use crate::layers::shrink::{Compressor, Shrink};
+use crate::model_config::{ConfigError, DetectorConfig};
+use crate::pillars::batch::{PillarBatch, PillarLattice};
+use crate::pillars::encoder::PillarEncoder;
+
+/// The detector's network. Parameter names are those of the reference's state dictionary.
+#[derive(Debug)]
+pub struct PointPillars {
+    /// The numbers it was built from.
+    pub config: DetectorConfig,
+    lattice: PillarLattice,
+    /// Precision of the convolutions in training: `Float`, or `BFloat16` where the processor computes it several times
+    /// as fast. Parameters, norms, pillar features and heads are `f32` in any case.
+    pub compute: Kind,
+    /// `pillar_vfe`: points to pillar features.
+    pub encoder: PillarEncoder,
+    /// `backbone`: the 2D convolutions.
+    pub backbone: BevBackbone,
+    /// `shrink_conv`: the last step before the air.
+    pub shrink: Option<Shrink>,
+    /// `naive_compressor`: fewer channels on the air.
+    pub compressor: Option<Compressor>,
+    /// `cls_head` and `reg_head`.
+    pub head: DetectionHead,
+}
+
+impl PointPillars {
+    /// Builds the network under `path` with random parameters (`tch::manual_seed` makes them repeatable).
+    ///
+    /// # Errors
+    /// [`ConfigError`] when no network can be built from `config`.
+    pub fn new(path: &nn::Path<'_>, config: &DetectorConfig) -> Result<Self, ConfigError> {
+        config.validate()?;
+        let channels = config.feature_channels();
+        Ok(Self {
+            lattice: PillarLattice::new(config),
+            compute: Kind::Float,
+            encoder: PillarEncoder::new(&(path / "pillar_vfe"), config.pillar_channels),
+            backbone: BevBackbone::new(&(path / "backbone"), config),
+            shrink: (config.shrink.as_ref())
+                .map(|shrink| Shrink::new(&(path / "shrink_conv"), config.backbone_channels(), shrink)),
+            compressor: (config.compress_ratio)
+                .map(|ratio| Compressor::new(&(path / "naive_compressor"), channels, ratio)),
+            head: DetectionHead::new(path, channels, config.anchors.yaws_deg.len() as i64),
+            config: config.clone(),
+        })
+    }
+
+    /// Where pillars stand on the canvas.
+    #[must_use]
+    pub fn lattice(&self) -> &PillarLattice {
+        &self.lattice
+    }
+
+    /// The map of every sweep that crosses the air: `[B, C, H, W]`, before the compressor.
+    pub fn features(&self, batch: &PillarBatch, train: bool) -> Tensor {
+        let canvas = batch.scatter(&self.encoder.forward(batch, train), &self.lattice);
+        self.features_of_canvas(&canvas, train)
+    }
+
+    /// From the canvas `[B, C_pillar, H, W]` on: backbone and shrink, `f32`.
+    pub fn features_of_canvas(&self, canvas: &Tensor, train: bool) -> Tensor {
+        let wide = self.backbone.forward(&canvas.to_kind(self.compute), train);
+        let features = match &self.shrink {
+            Some(shrink) => shrink.forward(&wide, train),
+            None => wide,
+        };
+        features.to_kind(Kind::Float)
+    }
+
+    /// What the compressor leaves: `[B, C, H, W]` compressed and expanded again; unchanged without a compressor.
+    pub fn through_compressor(&self, features: &Tensor, train: bool) -> Tensor {
+        match &self.compressor {
+            Some(compressor) => compressor.decode(&compressor.encode(features, train), train),
+            None => features.shallow_clone(),
+        }
+    }
+
+    /// Scores and offsets of `[B, C, H, W]` features, of one agent or fused.
+    ///
+    /// # Errors
+    /// The tensor library's, when the features have another number of channels than the head.
+    pub fn heads(&self, features: &Tensor) -> Result<HeadOutput, TchError> {
+        self.head.forward(features)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use tch::Device;
+    use tch::nn::{OptimizerConfig, VarStore};
+
+    use super::*;
+    use crate::pillars::voxels::Voxeliser;
+
+    fn small() -> DetectorConfig {
+        DetectorConfig { lidar_range_m: [-6.4, -6.4, -3.0, 6.4, 6.4, 1.0], ..DetectorConfig::lean() }
+    }
+
+    fn batch(config: &DetectorConfig) -> PillarBatch {
+        let points: Vec<[f32; 4]> =
+            (0..500).map(|k| [k as f32 * 0.02 - 5.0, (k % 50) as f32 * 0.2 - 5.0, -1.0, 0.5]).collect();
+        let pillars = Voxeliser::for_detector(config).voxelise(&points);
+        PillarBatch::new(&[&pillars, &pillars], &PillarLattice::new(config))
+    }
+
+    /// Loss before and after a few steps towards an arbitrary map.
+    fn train(compute: Kind) -> (f64, f64) {
+        tch::set_num_threads(1);
+        tch::manual_seed(7);
+        let network = VarStore::new(Device::Cpu);
+        let mut pillars = PointPillars::new(&network.root(), &small()).unwrap();
+        pillars.compute = compute;
+        let batch = batch(&small());
+        let mut optimizer = tch::nn::Adam::default().build(&network, 1e-2).unwrap();
+        let mut losses = Vec::new();
+        for _ in 0..20 {
+            let heads = pillars.heads(&pillars.features(&batch, true)).unwrap();
+            let loss = (heads.scores - 1.0).square().mean(Kind::Float) + heads.offsets.square().mean(Kind::Float);
+            optimizer.backward_step(&loss);
+            losses.push(loss.double_value(&[]));
+        }
+        let running = network.variables()["backbone.blocks.0.2.running_mean"].abs().sum(Kind::Float);
+        assert!(running.double_value(&[]) > 0.0, "training moves the running statistics");
+        (losses[0], losses[losses.len() - 1])
+    }
+
+    #[test]
+    fn it_learns_in_both_precisions() {
+        let (first, last) = train(Kind::Float);
+        assert!(last < 0.5 * first, "{first} {last}");
+        let (first_half, last_half) = train(Kind::BFloat16);
+        assert!(
+            (first_half - first).abs() < 0.02 * first && (last_half - last).abs() < 0.2 * first,
+            "{first_half} {last_half}"
+        );
+    }
+
+    #[test]
+    fn maps_have_the_promised_shape_and_heads_refuse_others() {
+        tch::set_num_threads(1);
+        let network = VarStore::new(Device::Cpu);
+        let config = small();
+        let pillars = PointPillars::new(&network.root(), &config).unwrap();
+        let features = tch::no_grad(|| pillars.features(&batch(&config), false));
+        let grid = config.feature_grid();
+        assert_eq!(features.size(), [2, config.feature_channels(), i64::from(grid.height), i64::from(grid.width)]);
+        let heads = pillars.heads(&features).unwrap();
+        assert_eq!(heads.offsets.size()[1], 14);
+        assert_eq!(heads.confidence().size(), [2, i64::from(grid.height), i64::from(grid.width)]);
+        assert!(pillars.heads(&features.narrow(1, 0, 8)).is_err());
+    }
+}

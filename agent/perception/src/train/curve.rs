@@ -1,0 +1,95 @@
+//! The course of a training as CSV.
+
+use std::fs::{self, File, OpenOptions};
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+use support::atomic_file;
+
+use super::error::TrainingError;
+
+/// Appends rows, the first cell of which is the step; every row is on disk when the call returns.
+#[derive(Debug)]
+pub struct Curve {
+    path: PathBuf,
+    file: File,
+}
+
+impl Curve {
+    /// Begins a file, or goes on with what it holds up to the step of a checkpoint: later rows are of steps that are about
+    /// to be done again.
+    ///
+    /// # Errors
+    /// [`TrainingError::Io`] when the file cannot be read or written.
+    pub fn open(path: &Path, header: &str, checkpoint: Option<u64>) -> Result<Self, TrainingError> {
+        let io = |source| TrainingError::Io { path: path.to_owned(), source };
+        let kept = match checkpoint {
+            Some(step) if path.exists() => rows_until(&fs::read_to_string(path).map_err(io)?, step),
+            _ => format!("{header}\n"),
+        };
+        atomic_file::write(path, kept).map_err(io)?;
+        let file = OpenOptions::new().append(true).open(path).map_err(io)?;
+        Ok(Self { path: path.to_owned(), file })
+    }
+
+    /// Where it lies.
+    #[must_use]
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Appends a row of cells that are written already.
+    ///
+    /// # Errors
+    /// [`TrainingError::Io`] when the file cannot be written.
+    pub fn row(&mut self, row: &str) -> Result<(), TrainingError> {
+        writeln!(self.file, "{row}").map_err(|source| TrainingError::Io { path: self.path.clone(), source })
+    }
+
+    /// Appends a row of numbers.
+    ///
+    /// # Errors
+    /// As [`Self::row`].
+    pub fn numbers(&mut self, values: &[f64]) -> Result<(), TrainingError> {
+        let cells: Vec<String> = values.iter().map(|value| format!("{value:.5}")).collect();
+        self.row(&cells.join(","))
+    }
+}
+
+/// The header and all rows up to `step`; a row that the end of a process has cut off is none.
+fn rows_until(csv: &str, step: u64) -> String {
+    let is_kept = |row: &str| {
+        let first = row.split(',').next().and_then(|cell| cell.parse::<f64>().ok());
+        row.ends_with('\n') && first.is_some_and(|found| found <= step as f64)
+    };
+    let rows = csv.split_inclusive('\n').enumerate();
+    rows.filter(|(place, row)| *place == 0 || is_kept(row)).map(|(_, row)| row).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_training_that_goes_on_writes_no_step_twice() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("curve.csv");
+        let mut first = Curve::open(&path, "step,loss", None).unwrap();
+        for step in [10.0, 20.0, 30.0] {
+            first.numbers(&[step, 0.5]).unwrap();
+        }
+        // The process ended here, in the middle of a row.
+        write!(first.file, "4").unwrap();
+        drop(first);
+        let mut resumed = Curve::open(&path, "step,loss", Some(20)).unwrap();
+        resumed.row("30,again").unwrap();
+        let text = fs::read_to_string(&path).unwrap();
+        assert_eq!(text, "step,loss\n10.00000,0.50000\n20.00000,0.50000\n30,again\n");
+
+        drop(Curve::open(&path, "step,loss", None).unwrap());
+        assert_eq!(fs::read_to_string(&path).unwrap(), "step,loss\n", "a new training begins a new curve");
+        let elsewhere = folder.path().join("other.csv");
+        drop(Curve::open(&elsewhere, "step,loss", Some(7)).unwrap());
+        assert_eq!(fs::read_to_string(&elsewhere).unwrap(), "step,loss\n");
+    }
+}

@@ -1,0 +1,240 @@
+//! The part of the command line that all trainings share.
+
+use std::io;
+use std::path::PathBuf;
+use std::time::Duration;
+
+use clap::ValueEnum;
+use support::output;
+use tch::{Cuda, Device};
+
+use super::run_config::{ComputePrecision, Length, RunConfig};
+use super::trainer::Trained;
+
+/// Options that no training can run with.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum OptionsError {
+    /// No length, or none at all.
+    #[error("one of --steps, --epochs and --minutes is needed, above zero")]
+    Length,
+    /// Steps without samples.
+    #[error("--batch is above zero")]
+    Batch,
+    /// A training lies in the folder of the results already.
+    #[error("{}: a training lies there already; --resume goes on with it, --force begins anew over it", .0.display())]
+    Trained(PathBuf),
+    /// There is no such device.
+    #[error("no CUDA device, or a libtorch without CUDA")]
+    NoCuda,
+}
+
+/// How long, where, and in which numbers.
+#[derive(Debug, clap::Args)]
+pub struct TrainingOptions {
+    /// Length in steps.
+    #[arg(long, group = "length")]
+    steps: Option<u64>,
+    /// Length in passes over the data.
+    #[arg(long, group = "length")]
+    epochs: Option<f64>,
+    /// Length in minutes; the learning rate follows the clock, so the result is not repeatable to the bit.
+    #[arg(long, group = "length")]
+    minutes: Option<f64>,
+    /// Seed of parameters, order and augmentation.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Where to compute.
+    #[arg(long, value_enum, default_value_t = DeviceName::Cpu)]
+    device: DeviceName,
+    /// Threads of the network on the CPU.
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u16).range(1..=256))]
+    threads: u16,
+    /// Threads that prepare batches.
+    #[arg(long, default_value_t = 1)]
+    loader_threads: usize,
+    /// Numbers that products are computed in; on a processor without bfloat16 of its own, bf16 is f32.
+    #[arg(long, value_enum, default_value_t = ComputePrecision::F32)]
+    precision: ComputePrecision,
+    /// Folder of the results.
+    #[arg(long, value_name = "DIR")]
+    out: PathBuf,
+    /// Go on from the checkpoint in --out.
+    #[arg(long)]
+    resume: bool,
+    /// Begin anew where a training lies in --out already; its files are overwritten.
+    #[arg(long, conflicts_with = "resume")]
+    force: bool,
+    /// Print the summary as JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum DeviceName {
+    /// The processor.
+    Cpu,
+    /// The first CUDA device.
+    Cuda,
+}
+
+impl TrainingOptions {
+    /// What a training is told; sets the tensor library's number of threads on the way. A line on standard error where the
+    /// processor cannot do what was asked for.
+    ///
+    /// # Errors
+    /// [`OptionsError`] says which option is at fault.
+    pub fn run_config(&self, batch: usize, learning_rate: f64) -> Result<RunConfig, OptionsError> {
+        if batch == 0 {
+            return Err(OptionsError::Batch);
+        }
+        self.check_out()?;
+        tch::set_num_threads(i32::from(self.threads));
+        let device = self.device()?;
+        Ok(RunConfig {
+            batch,
+            learning_rate,
+            seed: self.seed,
+            device,
+            precision: self.precision_on(device, has_bfloat16()),
+            loader_threads: self.loader_threads,
+            resume: self.resume,
+            command: std::env::args().collect::<Vec<_>>().join(" "),
+            ..RunConfig::new(self.length()?, &self.out)
+        })
+    }
+
+    /// Prints how a training ended; `more` is an object of what JSON has beside steps, time and weights.
+    ///
+    /// # Errors
+    /// As [`output::line`].
+    pub fn print(&self, trained: &Trained, more: &serde_json::Value) -> io::Result<()> {
+        let Trained { steps, seconds, weights, sha256, .. } = trained;
+        if self.json {
+            let mut report =
+                serde_json::json!({"steps": steps, "seconds": seconds, "weights": weights, "sha256": sha256});
+            if let (Some(report), Some(more)) = (report.as_object_mut(), more.as_object()) {
+                report.extend(more.clone());
+            }
+            output::line(report)
+        } else {
+            output::line(format_args!("{steps} steps in {seconds:.0} s: {}", weights.display()))
+        }
+    }
+
+    /// Refuses to overwrite a training, unless told to.
+    fn check_out(&self) -> Result<(), OptionsError> {
+        let files = ["weights.safetensors", "checkpoint.safetensors"].map(|name| self.out.join(name));
+        match files.into_iter().find(|file| file.exists()) {
+            Some(file) if !self.resume && !self.force => Err(OptionsError::Trained(file)),
+            _ => Ok(()),
+        }
+    }
+
+    /// The numbers to compute in on a device, where the processor may have no bfloat16 of its own: it would take many times
+    /// longer then.
+    fn precision_on(&self, device: Device, has_bfloat16: bool) -> ComputePrecision {
+        if self.precision == ComputePrecision::Bf16 && device == Device::Cpu && !has_bfloat16 {
+            output::note(
+                "--precision bf16: this processor has no bfloat16 of its own, so f32 is used, which is faster here",
+            );
+            return ComputePrecision::F32;
+        }
+        self.precision
+    }
+
+    fn length(&self) -> Result<Length, OptionsError> {
+        match (self.steps, self.epochs, self.minutes) {
+            (Some(steps), _, _) if steps > 0 => Ok(Length::Steps(steps)),
+            (_, Some(epochs), _) if epochs > 0.0 => Ok(Length::Epochs(epochs)),
+            (_, _, Some(minutes)) => match Duration::try_from_secs_f64(60.0 * minutes) {
+                Ok(time) if !time.is_zero() => Ok(Length::Time(time)),
+                _ => Err(OptionsError::Length),
+            },
+            _ => Err(OptionsError::Length),
+        }
+    }
+
+    fn device(&self) -> Result<Device, OptionsError> {
+        match self.device {
+            DeviceName::Cpu => Ok(Device::Cpu),
+            DeviceName::Cuda => cuda_device(),
+        }
+    }
+}
+
+/// Whether the processor multiplies in bfloat16 itself.
+fn has_bfloat16() -> bool {
+    #[cfg(target_arch = "x86_64")]
+    return std::arch::is_x86_feature_detected!("avx512bf16");
+    #[cfg(target_arch = "aarch64")]
+    return std::arch::is_aarch64_feature_detected!("bf16");
+    #[cfg(not(any(target_arch = "x86_64", target_arch = "aarch64")))]
+    false
+}
+
+/// The first CUDA device; without this question the tensor library panics where there is none.
+///
+/// # Errors
+/// [`OptionsError::NoCuda`] when there is none, or the tensor library is one without CUDA.
+pub fn cuda_device() -> Result<Device, OptionsError> {
+    if Cuda::is_available() { Ok(Device::Cuda(0)) } else { Err(OptionsError::NoCuda) }
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+
+    use super::*;
+
+    #[derive(Debug, Parser)]
+    struct Line {
+        #[command(flatten)]
+        options: TrainingOptions,
+    }
+
+    fn run_config(arguments: &str, batch: usize) -> Result<RunConfig, OptionsError> {
+        let line = Line::try_parse_from(arguments.split_whitespace()).unwrap();
+        line.options.run_config(batch, 1e-3)
+    }
+
+    #[test]
+    fn a_length_above_zero_is_needed() {
+        let run = run_config("train --minutes 1.5 --out runs/x", 4).unwrap();
+        assert_eq!(run.length, Length::Time(Duration::from_secs(90)));
+        assert_eq!((run.precision, run.batch, run.seed, run.resume), (ComputePrecision::F32, 4, 0, false));
+        for length in ["", "--steps 0", "--epochs=-1", "--minutes=-1", "--minutes 1e30", "--minutes nan"] {
+            let line = format!("train --out x {length}");
+            assert_eq!(run_config(&line, 4).unwrap_err(), OptionsError::Length, "{line}");
+        }
+        assert_eq!(run_config("train --out x --steps 3", 0).unwrap_err(), OptionsError::Batch);
+        assert!(Line::try_parse_from(["train", "--out", "x", "--steps", "3", "--minutes", "3"]).is_err());
+    }
+
+    #[test]
+    fn a_training_is_overwritten_only_where_that_is_asked_for() {
+        let folder = tempfile::tempdir().unwrap();
+        let line = |rest: &str| run_config(&format!("train --steps 3 --out {} {rest}", folder.path().display()), 4);
+        assert!(line("").is_ok());
+        for name in ["checkpoint.safetensors", "weights.safetensors"] {
+            let file = folder.path().join(name);
+            std::fs::write(&file, b"").unwrap();
+            assert_eq!(line("").unwrap_err(), OptionsError::Trained(file), "{name}");
+        }
+        let message = line("").unwrap_err().to_string();
+        assert!(message.contains("weights.safetensors") && message.contains("--resume") && message.contains("--force"));
+        assert!(line("--resume").unwrap().resume && !line("--force").unwrap().resume);
+        assert!(Line::try_parse_from(["train", "--steps", "3", "--out", "x", "--resume", "--force"]).is_err());
+    }
+
+    #[test]
+    fn bfloat16_is_used_where_the_device_has_it() {
+        let precision = |name: &str, device, has_bfloat16| {
+            let line = Line::try_parse_from(["train", "--out", "x", "--steps", "3", "--precision", name]).unwrap();
+            line.options.precision_on(device, has_bfloat16)
+        };
+        assert_eq!(precision("bf16", Device::Cpu, true), ComputePrecision::Bf16);
+        assert_eq!(precision("bf16", Device::Cpu, false), ComputePrecision::F32);
+        assert_eq!(precision("bf16", Device::Cuda(0), false), ComputePrecision::Bf16);
+        assert_eq!(precision("f32", Device::Cpu, true), ComputePrecision::F32);
+    }
+}

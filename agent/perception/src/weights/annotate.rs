@@ -1,0 +1,93 @@
+//! Adding a text to a weights file that is there.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::Path;
+
+use safetensors::tensor::SafeTensors;
+use serde_json::Value;
+use sha2::{Digest, Sha256};
+use support::atomic_file;
+
+use super::error::WeightsError;
+use super::hex;
+
+/// Key of the header that metadata lie under.
+const METADATA: &str = "__metadata__";
+
+/// Puts a text under a metadata key of a file, in place of one that is there. Tensors stay as they are; the file is
+/// replaced only when the new one is whole. Returns its SHA-256.
+///
+/// # Errors
+/// [`WeightsError`] when the file is missing, no whole safetensors file or not writable.
+pub fn annotate(path: &Path, key: &str, text: &str) -> Result<String, WeightsError> {
+    let io = |source| WeightsError::Io { path: path.to_owned(), source };
+    let old = fs::read(path).map_err(io)?;
+    let format = |source| WeightsError::Format { path: path.to_owned(), size: old.len(), source };
+    SafeTensors::deserialize(&old).map_err(format)?;
+    let new = annotated(&old, key, text).map_err(|source| WeightsError::Metadata {
+        path: path.to_owned(),
+        key: key.to_owned(),
+        source,
+    })?;
+    atomic_file::write(path, &new).map_err(io)?;
+    Ok(hex(&Sha256::digest(&new)))
+}
+
+/// `file` has been read by the library: its length, its header and its data are sound.
+fn annotated(file: &[u8], key: &str, text: &str) -> Result<Vec<u8>, serde_json::Error> {
+    let length: [u8; 8] = std::array::from_fn(|byte| file.get(byte).copied().unwrap_or(0));
+    let length = u64::from_le_bytes(length) as usize;
+    let (header, data) = file[8..].split_at(length);
+    let mut entries: BTreeMap<String, Value> = serde_json::from_slice(header)?;
+    let metadata = entries.entry(METADATA.to_owned()).or_insert_with(|| Value::Object(serde_json::Map::new()));
+    if let Value::Object(texts) = metadata {
+        texts.insert(key.to_owned(), Value::String(text.to_owned()));
+    }
+    entries.values_mut().for_each(Value::sort_all_objects);
+    let mut header = serde_json::to_vec(&entries)?;
+    // Tensor data begin at a multiple of eight.
+    header.resize(header.len().next_multiple_of(8), b' ');
+    Ok([&(header.len() as u64).to_le_bytes(), header.as_slice(), data].concat())
+}
+
+#[cfg(test)]
+mod tests {
+    use tch::nn::VarStore;
+    use tch::{Device, Kind};
+
+    use super::*;
+    use crate::weights::{Precision, Weights, save};
+
+    #[test]
+    fn a_text_is_added_and_replaced_and_nothing_else_changes() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("w.safetensors");
+        let network = VarStore::new(Device::Cpu);
+        let _ = network.root().ones("a", &[3]);
+        let _ = network.root().randn_standard("b", &[2, 2]);
+        let metadata = BTreeMap::from([("config".to_owned(), "{\"x\":1}".to_owned())]);
+        save(&path, &network, &metadata, Precision::Single).unwrap();
+        let before = network.variables()["b"].copy();
+        for text in ["first", "second \"text\""] {
+            let sha256 = annotate(&path, "confidence", text).unwrap();
+            let weights = Weights::load(&path).unwrap();
+            assert_eq!((weights.metadata("confidence"), weights.sha256()), (Some(text), sha256.as_str()));
+            assert_eq!(weights.metadata("config"), Some("{\"x\":1}"));
+            let _ = tch::no_grad(|| network.variables()["b"].shallow_clone().zero_());
+            weights.copy_into(&network).unwrap();
+            let off = (network.variables()["b"].shallow_clone() - &before).abs().max().to_kind(Kind::Double);
+            assert_eq!(off.double_value(&[]), 0.0);
+        }
+    }
+
+    #[test]
+    fn what_is_no_weights_file_is_left_alone() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("w.safetensors");
+        fs::write(&path, b"12345678 and no header").unwrap();
+        let message = annotate(&path, "a", "b").unwrap_err().to_string();
+        assert!(message.contains("w.safetensors"), "{message}");
+        assert_eq!(fs::read(&path).unwrap(), b"12345678 and no header");
+    }
+}

@@ -1,0 +1,336 @@
+//! Trained parameters on disk: safetensors in `f32` or `f16`, with the configuration beside them.
+//!
+//! A file is complete alone: the key `config` of its metadata holds the JSON of the configuration that the network is
+//! built from. Names of the tensors are those of the reference's state dictionary.
+
+mod annotate;
+mod error;
+mod save;
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+
+use half::{bf16, f16};
+use safetensors::tensor::{Dtype, SafeTensors, TensorView};
+use serde::de::DeserializeOwned;
+use sha2::{Digest, Sha256};
+use support::bounded_file;
+use tch::Tensor;
+use tch::nn::VarStore;
+
+pub use annotate::annotate;
+pub use error::WeightsError;
+pub use save::{Precision, save};
+
+/// Metadata key of the configuration.
+pub const CONFIG_KEY: &str = "config";
+/// Metadata key of what the network is for.
+pub const KIND_KEY: &str = "kind";
+
+/// One file of parameters, read and checked.
+#[derive(Debug)]
+pub struct Weights {
+    path: PathBuf,
+    metadata: BTreeMap<String, String>,
+    tensors: BTreeMap<String, Values>,
+    sha256: String,
+}
+
+#[derive(Debug)]
+struct Values {
+    shape: Vec<i64>,
+    values: Vec<f32>,
+}
+
+/// Largest file that is read, bytes: a hundred times the largest network here.
+const MAX_BYTES: u64 = 4 << 30;
+
+impl Weights {
+    /// Reads a whole file.
+    ///
+    /// Integer tensors, which only count batches in the reference, are passed over.
+    ///
+    /// # Errors
+    /// [`WeightsError`] when the file is missing, cut off, or holds values that are no parameters.
+    pub fn load(path: &Path) -> Result<Self, WeightsError> {
+        let io = |source| WeightsError::Io { path: path.to_owned(), source };
+        let bytes = bounded_file::read(path, MAX_BYTES).map_err(io)?;
+        let format = |source| WeightsError::Format { path: path.to_owned(), size: bytes.len(), source };
+        let (_, header) = SafeTensors::read_metadata(&bytes).map_err(format)?;
+        let file = SafeTensors::deserialize(&bytes).map_err(format)?;
+        let mut tensors = BTreeMap::new();
+        for (name, view) in file.iter() {
+            if let Some(values) = read_values(path, name, &view)? {
+                let shape = view.shape().iter().map(|&size| size as i64).collect();
+                tensors.insert(name.to_owned(), Values { shape, values });
+            }
+        }
+        let metadata = header.metadata().clone().unwrap_or_default().into_iter().collect();
+        Ok(Self { path: path.to_owned(), metadata, tensors, sha256: hex(&Sha256::digest(&bytes)) })
+    }
+
+    /// SHA-256 of the file, 64 hexadecimal digits: which model it was, for run records and descriptors.
+    #[must_use]
+    pub fn sha256(&self) -> &str {
+        &self.sha256
+    }
+
+    /// SHA-256 over the tensors whose name is `wanted`: the same for files that share these and differ in others.
+    #[must_use]
+    pub fn sha256_of(&self, wanted: impl Fn(&str) -> bool) -> String {
+        let mut hash = Sha256::new();
+        for (name, Values { shape, values }) in self.tensors.iter().filter(|(name, _)| wanted(name)) {
+            hash.update(format!("{name} {shape:?}\n"));
+            values.iter().for_each(|value| hash.update(value.to_le_bytes()));
+        }
+        hex(&hash.finalize())
+    }
+
+    /// The file.
+    #[must_use]
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Names of the tensors, in order.
+    pub fn names(&self) -> impl Iterator<Item = &str> {
+        self.tensors.keys().map(String::as_str)
+    }
+
+    /// Whether there is a tensor of that name.
+    #[must_use]
+    pub fn contains(&self, name: &str) -> bool {
+        self.tensors.contains_key(name)
+    }
+
+    /// Number of parameters.
+    #[must_use]
+    pub fn parameters(&self) -> usize {
+        self.tensors.values().map(|tensor| tensor.values.len()).sum()
+    }
+
+    /// The text under a metadata key.
+    #[must_use]
+    pub fn metadata(&self, key: &str) -> Option<&str> {
+        self.metadata.get(key).map(String::as_str)
+    }
+
+    /// Checks what the network is for, where the file says it.
+    ///
+    /// # Errors
+    /// [`WeightsError::Kind`] when it says something else.
+    pub fn check_kind(&self, expected: &'static str) -> Result<(), WeightsError> {
+        match self.metadata(KIND_KEY) {
+            Some(found) if found != expected => {
+                Err(WeightsError::Kind { path: self.path.clone(), found: found.to_owned(), expected })
+            }
+            _ => Ok(()),
+        }
+    }
+
+    /// The configuration under the key `config`.
+    ///
+    /// # Errors
+    /// See [`Self::metadata_json`].
+    pub fn config<T: DeserializeOwned>(&self) -> Result<T, WeightsError> {
+        self.metadata_json(CONFIG_KEY)
+    }
+
+    /// The JSON under a metadata key.
+    ///
+    /// # Errors
+    /// [`WeightsError::NoMetadata`] when the key is not there, [`WeightsError::Metadata`] when it says something else.
+    pub fn metadata_json<T: DeserializeOwned>(&self, key: &str) -> Result<T, WeightsError> {
+        let text = self.metadata.get(key).ok_or_else(|| WeightsError::NoMetadata {
+            path: self.path.clone(),
+            key: key.to_owned(),
+            found: self.metadata.keys().cloned().collect(),
+        })?;
+        serde_json::from_str(text).map_err(|source| WeightsError::Metadata {
+            path: self.path.clone(),
+            key: key.to_owned(),
+            source,
+        })
+    }
+
+    /// Copies the parameters into a network; tensors that the network does not have are left alone.
+    ///
+    /// # Errors
+    /// [`WeightsError::MissingTensor`] or [`WeightsError::Shape`] name what does not fit; nothing is copied then.
+    pub fn copy_into(&self, network: &VarStore) -> Result<(), WeightsError> {
+        self.copy_some_into(network, |_| true)
+    }
+
+    /// The same for the parameters whose name is `wanted`; the network's others keep their values.
+    ///
+    /// # Errors
+    /// As [`Self::copy_into`].
+    pub fn copy_some_into(&self, network: &VarStore, wanted: impl Fn(&str) -> bool) -> Result<(), WeightsError> {
+        let variables: BTreeMap<String, Tensor> =
+            network.variables().into_iter().filter(|(name, _)| wanted(name)).collect();
+        for (name, variable) in &variables {
+            self.checked(name, variable.size())?;
+        }
+        for (name, mut variable) in variables {
+            let source = self.checked(&name, variable.size())?;
+            let copied = tch::no_grad(|| {
+                let values = Tensor::f_from_slice(&source.values)?.f_view(source.shape.as_slice())?;
+                variable.f_copy_(&values)
+            });
+            copied.map_err(|source| WeightsError::Tensor { path: self.path.clone(), name, source })?;
+        }
+        Ok(())
+    }
+
+    fn checked(&self, name: &str, expected: Vec<i64>) -> Result<&Values, WeightsError> {
+        let missing = || WeightsError::MissingTensor {
+            path: self.path.clone(),
+            name: name.to_owned(),
+            expected: expected.clone(),
+        };
+        let tensor = self.tensors.get(name).ok_or_else(missing)?;
+        if tensor.shape == expected {
+            return Ok(tensor);
+        }
+        Err(WeightsError::Shape {
+            path: self.path.clone(),
+            name: name.to_owned(),
+            found: tensor.shape.clone(),
+            expected,
+        })
+    }
+}
+
+/// The values of one tensor as `f32`; `None` for integers.
+fn read_values(path: &Path, name: &str, view: &TensorView<'_>) -> Result<Option<Vec<f32>>, WeightsError> {
+    let data = view.data();
+    let values: Vec<f32> = match view.dtype() {
+        Dtype::F16 => data.as_chunks().0.iter().map(|&bytes| f16::from_le_bytes(bytes).to_f32()).collect(),
+        Dtype::BF16 => data.as_chunks().0.iter().map(|&bytes| bf16::from_le_bytes(bytes).to_f32()).collect(),
+        Dtype::F32 => data.as_chunks().0.iter().map(|&bytes| f32::from_le_bytes(bytes)).collect(),
+        Dtype::F64 => data.as_chunks().0.iter().map(|&bytes| f64::from_le_bytes(bytes) as f32).collect(),
+        Dtype::I64 | Dtype::I32 => return Ok(None),
+        dtype => return Err(WeightsError::Dtype { path: path.to_owned(), name: name.to_owned(), dtype }),
+    };
+    check_finite(path, name, &values)?;
+    Ok(Some(values))
+}
+
+fn check_finite(path: &Path, name: &str, values: &[f32]) -> Result<(), WeightsError> {
+    match values.iter().position(|value| !value.is_finite()) {
+        None => Ok(()),
+        Some(index) => {
+            let value = values[index];
+            Err(WeightsError::NotFinite { path: path.to_owned(), name: name.to_owned(), index, value })
+        }
+    }
+}
+
+fn hex(digest: &[u8]) -> String {
+    digest.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use tch::Device;
+
+    use super::*;
+    use crate::model_config::DetectorConfig;
+    use crate::pillars::point_pillars::PointPillars;
+
+    fn small() -> DetectorConfig {
+        DetectorConfig {
+            lidar_range_m: [-6.4, -6.4, -3.0, 6.4, 6.4, 1.0],
+            pillar_channels: 8,
+            num_filters: vec![8; 3],
+            num_upsample_filters: vec![8; 3],
+            ..DetectorConfig::lean()
+        }
+    }
+
+    fn network(config: &DetectorConfig) -> VarStore {
+        let network = VarStore::new(Device::Cpu);
+        PointPillars::new(&network.root(), config).unwrap();
+        network
+    }
+
+    fn metadata(config: &DetectorConfig) -> BTreeMap<String, String> {
+        [(CONFIG_KEY.to_owned(), serde_json::to_string(config).unwrap())].into()
+    }
+
+    #[test]
+    fn a_saved_network_comes_back_with_its_configuration() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("net.safetensors");
+        let config = small();
+        let first = network(&config);
+        let sha256 = save(&path, &first, &metadata(&config), Precision::Single).unwrap();
+        let weights = Weights::load(&path).unwrap();
+        assert_eq!(weights.sha256(), sha256);
+        assert_eq!(weights.config::<DetectorConfig>().unwrap(), config);
+        let is_head = |name: &str| name.starts_with("cls_head");
+        assert_ne!(weights.sha256_of(is_head), weights.sha256_of(|name| !is_head(name)));
+        let second = network(&config);
+        weights.copy_into(&second).unwrap();
+        let copies = second.variables();
+        assert!(first.variables().iter().all(|(name, tensor)| tensor.equal(&copies[name])));
+    }
+
+    #[test]
+    fn half_precision_halves_matrices_and_keeps_vectors() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("net.safetensors");
+        let first = network(&small());
+        save(&path, &first, &metadata(&small()), Precision::Half).unwrap();
+        let second = network(&small());
+        Weights::load(&path).unwrap().copy_into(&second).unwrap();
+        let copies = second.variables();
+        for (name, tensor) in first.variables() {
+            let tolerance = if tensor.dim() > 1 { 1e-3 } else { 0.0 };
+            assert!(tensor.allclose(&copies[&name], tolerance, 1e-6, false), "{name}");
+        }
+    }
+
+    #[test]
+    fn a_file_of_another_configuration_is_named_with_both_shapes() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("other.safetensors");
+        save(&path, &network(&small()), &metadata(&small()), Precision::Single).unwrap();
+        let weights = Weights::load(&path).unwrap();
+        let wide = DetectorConfig { pillar_channels: 16, ..small() };
+        let message = weights.copy_into(&network(&wide)).unwrap_err().to_string();
+        for part in ["other.safetensors", "backbone.blocks.0.1.weight", "[8, 8, 3, 3]", "[8, 16, 3, 3]"] {
+            assert!(message.contains(part), "{message}");
+        }
+        let deep = DetectorConfig { layer_nums: vec![2, 3, 4], ..small() };
+        let message = weights.copy_into(&network(&deep)).unwrap_err().to_string();
+        assert!(message.contains("backbone.blocks.2.13.weight") && message.contains("missing"), "{message}");
+        let message = weights.metadata_json::<DetectorConfig>("fusion").unwrap_err().to_string();
+        assert!(message.contains("fusion") && message.contains("config"), "{message}");
+    }
+
+    #[test]
+    fn missing_and_cut_files_are_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("cut.safetensors");
+        assert!(matches!(Weights::load(&path), Err(WeightsError::Io { .. })));
+        save(&path, &network(&small()), &metadata(&small()), Precision::Single).unwrap();
+        let bytes = std::fs::read(&path).unwrap();
+        for length in [0, 7, 100, bytes.len() - 1] {
+            std::fs::write(&path, &bytes[..length]).unwrap();
+            let message = Weights::load(&path).unwrap_err().to_string();
+            assert!(message.contains("cut.safetensors") && message.contains(&length.to_string()), "{message}");
+        }
+    }
+
+    #[test]
+    fn values_that_are_no_numbers_are_neither_written_nor_read() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("nan.safetensors");
+        let network = network(&small());
+        let _ = tch::no_grad(|| network.variables()["cls_head.bias"].get(1).fill_(f64::NAN));
+        let message = save(&path, &network, &metadata(&small()), Precision::Half).unwrap_err().to_string();
+        assert!(message.contains("cls_head.bias") && message.contains("index 1"), "{message}");
+        assert!(!path.exists());
+    }
+}

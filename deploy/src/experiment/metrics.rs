@@ -1,0 +1,279 @@
+//! `metrics.json`: what a run is judged by, and how each number comes about.
+
+mod answered;
+mod contribution;
+
+use std::collections::BTreeMap;
+
+use dataset::LeftOut;
+use dataset::evaluation_protocol::EvaluationProtocol;
+pub use localization::pose_error::PoseError;
+use localization::statistics::{quantile, sorted};
+use protocol::{CavId, Counts, DropReason, Ledger};
+use serde::{Deserialize, Serialize};
+
+use crate::experiment::score::{Board, NeighbourRecord};
+
+pub use answered::Answered;
+pub use contribution::Contribution;
+
+/// A pose nearer to the truth than this is a success, metres.
+const SUCCESS_M: f64 = 3.0;
+
+/// The numbers of one run.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Metrics {
+    /// Frames the ego reported on.
+    pub frames: u64,
+    /// From the first to the last detections, seconds of wall time.
+    pub seconds: f64,
+    /// Which clock the run kept.
+    pub clock: String,
+    /// Fusion method.
+    pub method: String,
+    /// Where poses came from.
+    pub pose_source: String,
+    /// Average precision with detections ordered by score over all frames, by IoU threshold. The headline.
+    pub ap_global: ByIou,
+    /// Average precision with detections in frame order, by score only within a frame, as the reference code does.
+    pub ap_frame_order: ByIou,
+    /// Average precision over all ticks, those without a report included; `null` where results have no time of publication.
+    #[serde(default)]
+    pub answered: Option<Answered>,
+    /// How far the poses that were fused with lie from the truth.
+    pub pose: PoseErrors,
+    /// Delays.
+    pub latency_ms: Latencies,
+    /// Age of what neighbours contributed: capture time of the ego's sweep less that of the neighbour's, per neighbour and
+    /// frame that was fused, milliseconds.
+    #[serde(default)]
+    pub age_ms: Percentiles,
+    /// What crossed the air.
+    pub comm: Communication,
+    /// What neighbours contributed.
+    #[serde(default)]
+    pub contribution: Contribution,
+    /// Every neighbour that the ego heard.
+    #[serde(default)]
+    pub neighbours: BTreeMap<CavId, NeighbourRecord>,
+    /// The ledger's totals.
+    pub messages: Messages,
+    /// The evaluation protocol, with the ground-truth range as it was applied.
+    #[serde(default)]
+    pub protocol: Option<EvaluationProtocol>,
+    /// Data of the scene that could not be used.
+    #[serde(default)]
+    pub left_out: LeftOut,
+}
+
+impl Metrics {
+    /// What a board has seen of a run of `seconds`; `sent_bytes` is the size of all that neighbours sent, where it is known.
+    pub(crate) fn of(
+        board: &Board,
+        clock: &str,
+        [method, pose_source]: [&str; 2],
+        seconds: f64,
+        books: &Ledger,
+        sent_bytes: Option<u64>,
+    ) -> Self {
+        let fused = board.records().iter().map(|record| record.fused).sum();
+        let (ap_global, ap_frame_order) = board.average_precision();
+        Self {
+            frames: board.records().len() as u64,
+            seconds,
+            clock: clock.into(),
+            method: method.into(),
+            pose_source: pose_source.into(),
+            ap_global,
+            ap_frame_order,
+            answered: board.answered(),
+            pose: board.pose_errors(),
+            latency_ms: board.latencies(),
+            age_ms: board.ages(),
+            comm: board.communication(),
+            contribution: Contribution::of(board.records().len(), fused, board.ego(), books, sent_bytes),
+            neighbours: board.neighbours().clone(),
+            messages: Messages::of(&books.total()),
+            protocol: None,
+            left_out: LeftOut::default(),
+        }
+    }
+}
+
+/// One number per IoU threshold; `null` where there was nothing to find.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+pub struct ByIou {
+    /// At IoU 0.3.
+    #[serde(rename = "0.3")]
+    pub at_30: Option<f64>,
+    /// At IoU 0.5.
+    #[serde(rename = "0.5")]
+    pub at_50: Option<f64>,
+    /// At IoU 0.7.
+    #[serde(rename = "0.7")]
+    pub at_70: Option<f64>,
+}
+
+/// Errors of the poses, over all vehicles and frames.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct PoseErrors {
+    /// Mean distance, metres.
+    pub mean_m: Option<f64>,
+    /// Median distance, metres.
+    pub p50_m: Option<f64>,
+    /// 95th percentile of the distance, metres.
+    pub p95_m: Option<f64>,
+    /// Mean angle, degrees.
+    pub mean_deg: Option<f64>,
+    /// Share of poses within 3 m of the truth; a vehicle without a pose fails.
+    pub success_3m: Option<f64>,
+    /// Frames of vehicles that had no pose.
+    pub no_pose: u64,
+}
+
+/// Delays of a run.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct Latencies {
+    /// From the publication of a sweep to the publication of the detections that come of it, milliseconds.
+    pub capture_to_detection: Percentiles,
+}
+
+/// Quantiles of a sample; `null` for an empty one.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct Percentiles {
+    /// Median.
+    pub p50: Option<f64>,
+    /// 95th percentile.
+    pub p95: Option<f64>,
+    /// 99th percentile.
+    pub p99: Option<f64>,
+}
+
+/// What crossed the air, per neighbour and frame that was fused.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+pub struct Communication {
+    /// Mean bytes of metadata and body of what was fused.
+    pub payload_bytes_mean: Option<f64>,
+    /// Mean bytes of everything a neighbour sent for a frame, headers and pose message included.
+    pub wire_bytes_mean: Option<f64>,
+    /// Base-2 logarithm of `payload_bytes_mean`, as papers give communication volume.
+    pub log2_payload: Option<f64>,
+    /// Base-2 logarithm of the bytes of an uncompressed `f32` feature map of this model.
+    pub nominal_fp32_log2: f64,
+}
+
+/// So many messages may be under way at the end of any run.
+const FEW: u64 = 20;
+
+/// Messages of all processes.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+pub struct Messages {
+    /// Published, once per receiver.
+    pub sent: u64,
+    /// Used.
+    pub received: u64,
+    /// Still under way at the end.
+    pub in_flight: u64,
+    /// Not used, by reason.
+    pub dropped: BTreeMap<DropReason, u64>,
+}
+
+impl Percentiles {
+    /// Quantiles of `sample`.
+    #[must_use]
+    pub fn of(sample: &[f64]) -> Self {
+        let sorted = sorted(sample);
+        Self { p50: quantile(&sorted, 0.50), p95: quantile(&sorted, 0.95), p99: quantile(&sorted, 0.99) }
+    }
+}
+
+impl Messages {
+    /// The totals of a ledger.
+    #[must_use]
+    pub fn of(total: &Counts) -> Self {
+        let Counts { sent, received, in_flight, dropped, adapted: _ } = total.clone();
+        Self { sent, received, in_flight, dropped }
+    }
+
+    /// Whether most of what was sent never arrived and was not lost either: then the link carries next to nothing.
+    #[must_use]
+    pub fn are_stuck(&self) -> bool {
+        self.in_flight >= FEW && self.in_flight > self.sent / 2
+    }
+}
+
+impl PoseErrors {
+    /// Sums up the errors of all poses; `no_pose` vehicles had none.
+    #[must_use]
+    pub fn of(errors: &[PoseError], no_pose: u64) -> Self {
+        let distances = sorted(&errors.iter().map(|error| error.distance_m).collect::<Vec<_>>());
+        let tried = errors.len() as u64 + no_pose;
+        let near = distances.iter().filter(|distance| **distance < SUCCESS_M).count();
+        Self {
+            mean_m: mean(distances.iter().copied()),
+            p50_m: quantile(&distances, 0.50),
+            p95_m: quantile(&distances, 0.95),
+            mean_deg: mean(errors.iter().map(|error| error.angle_deg)),
+            success_3m: (tried > 0).then(|| near as f64 / tried as f64),
+            no_pose,
+        }
+    }
+}
+
+impl Communication {
+    /// Sums up `(payload, wire)` bytes of every neighbour and frame; `nominal_values` is the size of a feature map.
+    #[must_use]
+    pub fn of(bytes: &[(u64, u64)], nominal_values: u64) -> Self {
+        let payload = mean(bytes.iter().map(|(payload, _)| *payload as f64));
+        Self {
+            payload_bytes_mean: payload,
+            wire_bytes_mean: mean(bytes.iter().map(|(_, wire)| *wire as f64)),
+            log2_payload: payload.filter(|bytes| *bytes > 0.0).map(f64::log2),
+            nominal_fp32_log2: (4.0 * nominal_values as f64).log2(),
+        }
+    }
+}
+
+fn mean(values: impl ExactSizeIterator<Item = f64>) -> Option<f64> {
+    let count = values.len();
+    (count > 0).then(|| values.sum::<f64>() / count as f64)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn quantiles_lie_between_neighbours() {
+        let percentiles = Percentiles::of(&[3.0, 1.0, 2.0, 4.0, 5.0]);
+        assert_eq!(percentiles.p50, Some(3.0));
+        assert!((percentiles.p95.unwrap() - 4.8).abs() < 1e-12);
+        assert_eq!(Percentiles::of(&[7.0]).p99, Some(7.0));
+        assert_eq!(Percentiles::of(&[]), Percentiles::default());
+    }
+
+    #[test]
+    fn a_vehicle_without_pose_is_no_success() {
+        let near = PoseError { distance_m: 0.5, angle_deg: 1.0 };
+        let far = PoseError { distance_m: 3.5, angle_deg: 2.0 };
+        let errors = PoseErrors::of(&[near, far, near], 1);
+        assert_eq!((errors.success_3m, errors.no_pose), (Some(0.5), 1));
+        assert_eq!(errors.mean_m, Some(1.5));
+        assert_eq!(PoseErrors::of(&[], 0).success_3m, None);
+    }
+
+    #[test]
+    fn volume_is_the_logarithm_of_the_mean() {
+        let comm = Communication::of(&[(1024, 1100), (1024, 1300)], 64 * 96 * 128);
+        assert_eq!((comm.payload_bytes_mean, comm.wire_bytes_mean), (Some(1024.0), Some(1200.0)));
+        assert_eq!(comm.log2_payload, Some(10.0));
+        assert!((comm.nominal_fp32_log2 - (4.0 * 64.0 * 96.0 * 128.0_f64).log2()).abs() < 1e-12);
+        assert_eq!(Communication::of(&[], 1).log2_payload, None);
+    }
+
+    #[test]
+    fn thresholds_are_named_by_their_numbers() {
+        let text = serde_json::to_string(&ByIou { at_50: Some(0.5), ..ByIou::default() }).unwrap();
+        assert_eq!(text, r#"{"0.3":null,"0.5":0.5,"0.7":null}"#);
+    }
+}

@@ -1,0 +1,121 @@
+//! What a person sees while a run goes: a live line on a terminal, plain lines elsewhere.
+
+use std::io::IsTerminal;
+use std::time::{Duration, Instant};
+
+use indicatif::{ProgressBar, ProgressStyle};
+use support::output;
+
+use crate::experiment::score::Progress;
+
+/// Between two plain lines.
+const LINE_PERIOD: Duration = Duration::from_secs(2);
+
+/// Shows a run on standard error.
+pub struct Display {
+    bar: Option<ProgressBar>,
+    last_line: Instant,
+    shown_frames: u64,
+}
+
+impl Display {
+    /// A display for `ticks` ticks, or for a run without end.
+    ///
+    /// # Panics
+    /// Never: the templates are fixed.
+    #[must_use]
+    pub fn new(ticks: Option<usize>) -> Self {
+        let bar = std::io::stderr().is_terminal().then(|| {
+            let (bar, template) = match ticks {
+                Some(ticks) => (ProgressBar::new(ticks as u64), "{bar:30} {pos}/{len} frames  {msg}"),
+                None => (ProgressBar::new_spinner(), "{spinner} {pos} frames  {msg}"),
+            };
+            bar.with_style(ProgressStyle::with_template(template).expect("the templates above are well formed"))
+        });
+        Self { bar, last_line: Instant::now(), shown_frames: 0 }
+    }
+
+    /// Shows how it goes.
+    pub fn update(&mut self, progress: &Progress) {
+        match &self.bar {
+            Some(bar) => {
+                bar.set_position(progress.frames);
+                bar.set_message(summary(progress));
+            }
+            None if self.last_line.elapsed() >= LINE_PERIOD && progress.frames != self.shown_frames => {
+                self.last_line = Instant::now();
+                self.shown_frames = progress.frames;
+                output::note(format_args!("{} frames  {}", progress.frames, summary(progress)));
+            }
+            None => {}
+        }
+    }
+
+    /// Says something that happened, above the live line.
+    pub fn say(&self, text: &str) {
+        match &self.bar {
+            Some(bar) => bar.suspend(|| output::note(text)),
+            None => output::note(text),
+        }
+    }
+
+    /// Takes the live line away.
+    pub fn finish(self) {
+        if let Some(bar) = self.bar {
+            bar.finish_and_clear();
+        }
+    }
+}
+
+/// Rate, latency, neighbours, bytes, drops.
+fn summary(progress: &Progress) -> String {
+    let rate = progress.rate_hz().map_or("-".into(), |rate| format!("{rate:.1}"));
+    let latency = progress.latency_ms.map_or("-".into(), |latency| format!("{latency:.0}"));
+    format!(
+        "{rate} Hz  latency {latency} ms  {} fused  {}  {} dropped",
+        progress.fused,
+        bytes(progress.wire_bytes as f64),
+        progress.dropped
+    )
+}
+
+/// A number of bytes for people.
+#[must_use]
+pub fn bytes(count: f64) -> String {
+    const UNITS: [&str; 4] = ["B", "kB", "MB", "GB"];
+    let mut value = count;
+    let mut unit = 0;
+    while value >= 1000.0 && unit + 1 < UNITS.len() {
+        value /= 1000.0;
+        unit += 1;
+    }
+    if unit == 0 { format!("{value:.0} B") } else { format!("{value:.1} {}", UNITS[unit]) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn bytes_are_for_people() {
+        assert_eq!(bytes(999.0), "999 B");
+        assert_eq!(bytes(1_572_864.0), "1.6 MB");
+        assert_eq!(bytes(5e12), "5000.0 GB");
+    }
+
+    #[test]
+    fn the_line_says_rate_latency_bytes_and_drops() {
+        let now = Instant::now();
+        let progress = Progress {
+            frames: 11,
+            span: Some((now, now + Duration::from_secs(1))),
+            latency_ms: Some(84.4),
+            fused: 1,
+            wire_bytes: 25_000,
+            dropped: 2,
+            ..Progress::default()
+        };
+        assert_eq!(summary(&progress), "10.0 Hz  latency 84 ms  1 fused  25.0 kB  2 dropped");
+        assert_eq!(summary(&Progress::default()), "- Hz  latency - ms  0 fused  0 B  0 dropped");
+    }
+}

@@ -1,0 +1,313 @@
+//! The score of a run, tick by tick, from what was detected and what was there. Knows no network and no file.
+
+use std::collections::BTreeMap;
+
+use dataset::ground_truth::GroundTruthRule;
+use protocol::{Box3d, CavId, Detection, Detections, DropReason, Pose, PoseEstimate, Stamp, Truth};
+use training::average_precision::{Ordering, Scorer};
+
+use super::frame_record::{FrameRecord, JudgedFrame};
+use super::live_precision::{LivePrecision, TickTruth, by_iou};
+use super::neighbours::{self, NeighbourRecord};
+use super::open_ticks::{OpenTicks, Part, Tick};
+use super::stage_stamps::StageStamps;
+use super::true_boxes::true_boxes;
+use crate::experiment::metrics::{Answered, ByIou, Communication, Latencies, Percentiles, PoseError, PoseErrors};
+
+/// Overlap from which a detection counts as found in `frames.csv`.
+const FOUND_IOU: f64 = 0.5;
+
+/// A longer time between two frames is between two scenarios, nanoseconds.
+const SCENARIO_GAP_NANOS: u64 = 10_000_000_000;
+
+/// The score so far. Ticks are judged in the order of their capture times, whatever order their parts come in.
+pub struct Board {
+    ego: CavId,
+    rule: GroundTruthRule,
+    nominal_values: u64,
+    open: OpenTicks,
+    scorer: Scorer,
+    live: LivePrecision,
+    records: Vec<FrameRecord>,
+    pose_errors: Vec<PoseError>,
+    no_pose: u64,
+    bytes: Vec<(u64, u64)>,
+    ages_ms: Vec<f64>,
+    neighbours: BTreeMap<CavId, NeighbourRecord>,
+    missed: u64,
+    best: Option<JudgedFrame>,
+}
+
+impl Board {
+    /// An empty board for the detections of `ego`, judged by `rule`; a feature map of the model has `nominal_values`
+    /// numbers.
+    #[must_use]
+    pub fn new(ego: CavId, rule: GroundTruthRule, nominal_values: u64) -> Self {
+        Self {
+            ego,
+            rule,
+            nominal_values,
+            open: OpenTicks::default(),
+            scorer: Scorer::default(),
+            live: LivePrecision::default(),
+            records: Vec::new(),
+            pose_errors: Vec::new(),
+            no_pose: 0,
+            bytes: Vec::new(),
+            ages_ms: Vec::new(),
+            neighbours: BTreeMap::new(),
+            missed: 0,
+            best: None,
+        }
+    }
+
+    /// Goes on with the results of another vehicle: in another scenario.
+    pub fn change_ego(&mut self, ego: &CavId) {
+        self.ego.clone_from(ego);
+        self.live.forget();
+    }
+
+    /// What was there at a tick.
+    pub fn truth(&mut self, stamp: &Stamp, truth: Truth) {
+        self.add(stamp, Part::Truth(truth));
+    }
+
+    /// What the ego makes of a tick. A second result of the same tick (of an ego started again) does not count.
+    pub fn result(&mut self, stamp: &Stamp, result: Detections) {
+        self.add(stamp, Part::Result(result));
+    }
+
+    /// Where a vehicle believes to be at a tick.
+    pub fn pose(&mut self, stamp: &Stamp, estimate: PoseEstimate) {
+        self.add(stamp, Part::Pose(estimate));
+    }
+
+    /// Judges what is still open: nothing more will come.
+    pub fn close(&mut self) {
+        while let Some((capture_nanos, tick)) = self.open.close_oldest() {
+            self.judge(capture_nanos, tick);
+        }
+    }
+
+    /// The frames judged so far, in order.
+    #[must_use]
+    pub fn records(&self) -> &[FrameRecord] {
+        &self.records
+    }
+
+    /// Ticks of which the ego never told anything.
+    #[must_use]
+    pub fn missed(&self) -> u64 {
+        self.missed
+    }
+
+    /// The frame most worth a picture so far: the one with the most neighbours, then true boxes.
+    #[must_use]
+    pub fn showpiece(&self) -> Option<&JudgedFrame> {
+        self.best.as_ref()
+    }
+
+    /// Average precision, ordered by score over all frames, and ordered by frame.
+    #[must_use]
+    pub fn average_precision(&self) -> (ByIou, ByIou) {
+        (by_iou(&self.scorer, Ordering::Global), by_iou(&self.scorer, Ordering::Frame))
+    }
+
+    /// Average precision over all ticks, answered or not; none where results have no time of publication.
+    #[must_use]
+    pub fn answered(&self) -> Option<Answered> {
+        self.live.answered()
+    }
+
+    /// Who is judged.
+    #[must_use]
+    pub fn ego(&self) -> &CavId {
+        &self.ego
+    }
+
+    /// Errors of all vehicles' poses.
+    #[must_use]
+    pub fn pose_errors(&self) -> PoseErrors {
+        PoseErrors::of(&self.pose_errors, self.no_pose)
+    }
+
+    /// Delays of all frames.
+    #[must_use]
+    pub fn latencies(&self) -> Latencies {
+        let sample: Vec<f64> = self.records.iter().filter_map(|record| record.latency_ms).collect();
+        Latencies { capture_to_detection: Percentiles::of(&sample) }
+    }
+
+    /// Ages of all that was fused.
+    #[must_use]
+    pub fn ages(&self) -> Percentiles {
+        Percentiles::of(&self.ages_ms)
+    }
+
+    /// From the first to the last frame on the scene's clock, seconds; scenarios that follow one another add up.
+    #[must_use]
+    pub fn seconds(&self) -> f64 {
+        let steps = self.records.windows(2).map(|pair| pair[1].capture_nanos.saturating_sub(pair[0].capture_nanos));
+        // Where another scenario begins the clock jumps, ahead or back.
+        steps.filter(|nanos| *nanos < SCENARIO_GAP_NANOS).map(|nanos| nanos as f64 * 1e-9).sum()
+    }
+
+    /// Bytes of all that was fused.
+    #[must_use]
+    pub fn communication(&self) -> Communication {
+        Communication::of(&self.bytes, self.nominal_values)
+    }
+
+    /// Every neighbour that was heard.
+    #[must_use]
+    pub fn neighbours(&self) -> &BTreeMap<CavId, NeighbourRecord> {
+        &self.neighbours
+    }
+
+    fn add(&mut self, stamp: &Stamp, part: Part) {
+        if let Some((capture_nanos, tick)) = self.open.add(stamp, part) {
+            self.judge(capture_nanos, tick);
+        }
+    }
+
+    fn judge(&mut self, capture_nanos: u64, tick: Tick) {
+        let Some((began_nanos, truth)) = tick.truth else { return };
+        let world_from_lidar: Vec<(CavId, Pose)> =
+            truth.agents.iter().map(|agent| (agent.cav.clone(), agent.world_from_lidar)).collect();
+        self.judge_poses(&tick.poses, &world_from_lidar);
+        let is_there = world_from_lidar.iter().any(|(cav, _)| *cav == self.ego);
+        if tick.result.is_none() && !is_there && !world_from_lidar.is_empty() {
+            // The ego takes no part at this tick, so nothing is missed.
+            return;
+        }
+        let boxes = true_boxes(&truth, &self.ego, &self.rule);
+        let answer = tick.result.as_ref().map(|(done_nanos, result)| (*done_nanos, &result.detections[..]));
+        self.judge_live(began_nanos, &world_from_lidar, &boxes, answer);
+        let Some((done_nanos, result)) = tick.result else {
+            self.missed += 1;
+            return;
+        };
+        let ego = tick.poses.iter().position(|(cav, _)| *cav == self.ego);
+        let posed_nanos = ego.and_then(|ego| tick.posed_nanos.get(ego).copied());
+        let stamps = StageStamps::of(began_nanos, posed_nanos, done_nanos, &result.stages);
+        self.judge_result((truth.tick, capture_nanos), stamps, result, boxes, world_from_lidar);
+    }
+
+    /// Judges a frame whose truth is known already, at once; `poses` are everyone's estimates. Nothing that
+    /// [`Self::truth`], [`Self::result`] and [`Self::pose`] take may be given for it.
+    pub fn judge_whole(
+        &mut self,
+        (tick, capture_nanos): (u64, u64),
+        latency_ms: Option<f64>,
+        result: Detections,
+        boxes: Vec<Box3d>,
+        poses: &[(CavId, PoseEstimate)],
+        world_from_lidar: Vec<(CavId, Pose)>,
+    ) {
+        self.judge_poses(poses, &world_from_lidar);
+        let stamps = StageStamps { detected_ms: latency_ms, ..StageStamps::default() };
+        if let Some(latency_ms) = latency_ms {
+            let done_nanos = capture_nanos.saturating_add((latency_ms * 1e6) as u64);
+            self.judge_live(capture_nanos, &world_from_lidar, &boxes, Some((done_nanos, &result.detections)));
+        }
+        self.judge_result((tick, capture_nanos), stamps, result, boxes, world_from_lidar);
+    }
+
+    /// Judges a tick by what was known when it began, answered or not.
+    fn judge_live(
+        &mut self,
+        began_nanos: u64,
+        world_from_lidar: &[(CavId, Pose)],
+        boxes: &[Box3d],
+        answer: Option<(u64, &[Detection])>,
+    ) {
+        let world_from_ego = true_pose(world_from_lidar, &self.ego).copied();
+        let ([x_low, x_high], [y_low, y_high]) = (self.rule.x_m, self.rule.y_m);
+        let area_m = [x_low, y_low, x_high, y_high];
+        self.live.add(&TickTruth { began_nanos, world_from_ego, boxes, area_m }, answer);
+    }
+
+    fn judge_result(
+        &mut self,
+        (tick, capture_nanos): (u64, u64),
+        stamps: StageStamps,
+        result: Detections,
+        boxes: Vec<Box3d>,
+        world_from_lidar: Vec<(CavId, Pose)>,
+    ) {
+        let found = self.score(&result, &boxes);
+        let bytes: Vec<(u64, u64)> =
+            result.fused.iter().map(|neighbour| (neighbour.payload_bytes, neighbour.wire_bytes)).collect();
+        let ages_ms = result.fused.iter().map(|neighbour| neighbour.age_nanos as f64 * 1e-6);
+        let ego_error = result.pose.world_from_cav().zip(true_pose(&world_from_lidar, &self.ego));
+        let ego_error = ego_error.map(|(found, truth)| PoseError::between(found, truth));
+        self.records.push(FrameRecord {
+            tick,
+            agent_frame: result.agent_frame,
+            capture_nanos,
+            latency_ms: stamps.detected_ms,
+            stamps,
+            detected: result.detections.len(),
+            truth: boxes.len(),
+            found,
+            fused: result.fused.len(),
+            skipped: result.skipped.len(),
+            oldest_ms: ages_ms.clone().max_by(f64::total_cmp),
+            stale: result.skipped.iter().filter(|left_out| left_out.reason == Some(DropReason::Stale)).count(),
+            payload_bytes: bytes.iter().map(|(payload, _)| payload).sum(),
+            wire_bytes: bytes.iter().map(|(_, wire)| wire).sum(),
+            ego_error_m: ego_error.map(|error| error.distance_m),
+            ego_error_deg: ego_error.map(|error| error.angle_deg),
+        });
+        neighbours::add(&mut self.neighbours, &result);
+        self.bytes.extend(bytes);
+        self.ages_ms.extend(ages_ms);
+        self.keep_showpiece(tick, result, boxes, world_from_lidar);
+    }
+
+    /// Adds a frame to the score; returns how many detections count as found.
+    fn score(&mut self, result: &Detections, boxes: &[Box3d]) -> usize {
+        let tally = |scorer: &Scorer| {
+            scorer.tallies().iter().find(|tally| tally.iou_threshold == FOUND_IOU).map_or(0, |tally| {
+                let first = tally.matched.len().saturating_sub(result.detections.len());
+                tally.matched[first..].iter().filter(|matched| matched.is_true).count()
+            })
+        };
+        self.scorer.add(&result.detections, boxes);
+        tally(&self.scorer)
+    }
+
+    fn judge_poses(&mut self, poses: &[(CavId, PoseEstimate)], truth: &[(CavId, Pose)]) {
+        for (cav, estimate) in poses {
+            match (estimate.world_from_cav(), true_pose(truth, cav)) {
+                (Some(found), Some(truth)) => self.pose_errors.push(PoseError::between(found, truth)),
+                (None, Some(_)) => self.no_pose += 1,
+                // A vehicle that the scene does not know has no truth to compare with.
+                (_, None) => {}
+            }
+        }
+    }
+
+    fn keep_showpiece(
+        &mut self,
+        tick: u64,
+        result: Detections,
+        boxes: Vec<Box3d>,
+        world_from_lidar: Vec<(CavId, Pose)>,
+    ) {
+        let worth = |fused: usize, boxes: usize| (fused, boxes);
+        let better = self.best.as_ref().is_none_or(|best| {
+            worth(result.fused.len(), boxes.len()) > worth(best.result.fused.len(), best.truth.len())
+        });
+        if better {
+            self.best = Some(JudgedFrame { tick, result, truth: boxes, world_from_lidar });
+        }
+    }
+}
+
+fn true_pose<'a>(truth: &'a [(CavId, Pose)], cav: &CavId) -> Option<&'a Pose> {
+    truth.iter().find(|(known, _)| known == cav).map(|(_, pose)| pose)
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,183 @@
+use dataset::class_set::ClassSet;
+use protocol::{AgentTruth, Detection, Doubt, FusedNeighbour, HeardNeighbour, SkippedNeighbour, TrueObject};
+
+use super::super::open_ticks::MOST_OPEN;
+use super::*;
+
+const RULE: GroundTruthRule = GroundTruthRule {
+    x_m: [-50.0, 50.0],
+    y_m: [-40.0, 40.0],
+    z_m: [-3.0, 1.0],
+    comm_range_m: 70.0,
+    min_corners: 8,
+    classes: ClassSet::VEHICLES,
+};
+
+fn cav(text: &str) -> CavId {
+    CavId::new(text).unwrap()
+}
+
+fn stamp(name: &str, tick: u64, publish_ms: u64) -> Stamp {
+    let publish_nanos = publish_ms * 1_000_000;
+    Stamp { cav: cav(name), epoch: 1, sequence: tick, capture_nanos: tick * 100_000_000, publish_nanos }
+}
+
+fn object(id: i64, class: &str, x: f64) -> TrueObject {
+    let world_from_object = Pose::from_xyz_yaw([x, 0.0, -1.0], 0.0);
+    TrueObject { id, class: class.into(), world_from_object, size_m: [4.0, 2.0, 1.5], speed_mps: None }
+}
+
+/// The ego at the origin sees 1 and a pedestrian, its neighbour at x = 20 m sees 1 and 2.
+fn truth(tick: u64) -> Truth {
+    let agent = |name: &str, x: f64, objects| AgentTruth {
+        cav: cav(name),
+        world_from_lidar: Pose::from_xyz_yaw([x, 0.0, 0.0], 0.0),
+        objects,
+    };
+    let (first, second) = (object(1, "car", 10.0), object(2, "van", 30.0));
+    Truth {
+        tick,
+        agents: vec![
+            agent("e", 0.0, vec![first.clone(), object(9, "pedestrian", 5.0)]),
+            agent("n", 20.0, vec![first, second]),
+        ],
+    }
+}
+
+fn result(tick: u64, at_x: &[f64]) -> Detections {
+    let found = |&x: &f64| Detection {
+        box3d: Box3d { center_m: [x, 0.0, -1.0], size_m: [4.0, 2.0, 1.5], heading_rad: 0.0 },
+        score: 0.9,
+        source: None,
+    };
+    Detections {
+        ego: cav("e"),
+        agent_frame: tick,
+        method: "max".into(),
+        pose: PoseEstimate::new(Pose::from_xyz_yaw([1.0, 0.0, 0.0], 0.0), 1.0),
+        detections: at_x.iter().map(found).collect(),
+        fused: vec![FusedNeighbour {
+            cav: cav("n"),
+            age_nanos: 0,
+            confidence: 1.0,
+            payload_bytes: 1000,
+            wire_bytes: 1300,
+        }],
+        skipped: vec![],
+        heard: vec![HeardNeighbour {
+            cav: cav("n"),
+            trust: Some(0.5 + 0.25 * tick as f64),
+            doubt: None,
+            clock_offset_s: Some(0.125),
+        }],
+        stages: vec![],
+    }
+}
+
+fn board() -> Board {
+    Board::new(cav("e"), RULE, 64 * 96 * 128)
+}
+
+#[test]
+fn a_frame_is_judged_against_everyones_truth() {
+    let mut board = board();
+    board.truth(&stamp("replay", 0, 1_000), truth(0));
+    board.result(&stamp("e", 0, 1_080), result(0, &[10.0, 30.0, -20.0]));
+    board.close();
+    let record = &board.records()[0];
+    assert_eq!((record.truth, record.detected, record.found), (2, 3, 2), "the pedestrian does not count");
+    assert_eq!((record.latency_ms, record.payload_bytes, record.wire_bytes), (Some(80.0), 1000, 1300));
+    assert_eq!(record.ego_error_m, Some(1.0));
+    let (global, _) = board.average_precision();
+    assert_eq!(global.at_50, Some(1.0), "the false box has the same score and comes last");
+    assert_eq!(board.communication().payload_bytes_mean, Some(1000.0));
+    assert_eq!(board.showpiece().unwrap().truth.len(), 2);
+}
+
+#[test]
+fn order_of_arrival_changes_nothing() {
+    let score = |backwards: bool| {
+        let mut board = board();
+        let mut ticks: Vec<u64> = (0..10).collect();
+        if backwards {
+            ticks.reverse();
+        }
+        for tick in ticks {
+            let detected: &[f64] = if tick % 2 == 0 { &[10.0] } else { &[-7.0, 30.0] };
+            if backwards {
+                board.result(&stamp("e", tick, 50), result(tick, detected));
+                board.truth(&stamp("replay", tick, 0), truth(tick));
+            } else {
+                board.truth(&stamp("replay", tick, 0), truth(tick));
+                board.result(&stamp("e", tick, 50), result(tick, detected));
+            }
+        }
+        board.close();
+        (board.average_precision(), board.records().to_vec())
+    };
+    assert_eq!(score(false), score(true));
+}
+
+#[test]
+fn a_tick_without_result_is_missed_and_a_second_result_ignored() {
+    let mut board = board();
+    for tick in 0..3 {
+        board.truth(&stamp("replay", tick, 0), truth(tick));
+    }
+    board.result(&stamp("e", 1, 50), result(1, &[10.0]));
+    board.result(&stamp("e", 1, 90), result(1, &[]));
+    board.close();
+    assert_eq!((board.missed(), board.records().len()), (2, 1));
+    assert_eq!((board.records()[0].latency_ms, board.records()[0].detected), (Some(50.0), 1));
+}
+
+#[test]
+fn poses_of_all_vehicles_are_judged() {
+    let mut board = board();
+    board.pose(&stamp("n", 0, 0), PoseEstimate::new(Pose::from_xyz_yaw([20.0, 4.0, 0.0], 0.0), 0.5));
+    let reason = protocol::NoPoseReason::TooFewPoints;
+    board.pose(&stamp("e", 0, 0), PoseEstimate::NoPose { reason, inlier_count: 2 });
+    board.pose(&stamp("stranger", 0, 0), PoseEstimate::new(Pose::IDENTITY, 0.5));
+    board.truth(&stamp("replay", 0, 0), truth(0));
+    board.close();
+    let errors = board.pose_errors();
+    assert_eq!((errors.mean_m, errors.no_pose, errors.success_3m), (Some(4.0), 1, Some(0.0)));
+}
+
+#[test]
+fn a_long_run_keeps_few_ticks_open() {
+    let mut board = board();
+    for tick in 0..1_000 {
+        board.truth(&stamp("replay", tick, 0), truth(tick));
+        board.result(&stamp("e", tick, 50), result(tick, &[10.0]));
+    }
+    assert!(board.open.len() <= MOST_OPEN && board.records().len() >= 1_000 - MOST_OPEN);
+    board.result(&stamp("e", 3, 50), result(3, &[]));
+    board.close();
+    assert_eq!(board.records().len(), 1_000, "a late second result of a judged tick adds none");
+}
+
+#[test]
+fn neighbours_are_followed_over_the_run() {
+    let mut board = Board::new(cav("e"), RULE, 1);
+    let doubted = Detections {
+        fused: vec![],
+        skipped: vec![SkippedNeighbour { cav: cav("n"), reason: Some(DropReason::Distrusted) }],
+        heard: vec![HeardNeighbour {
+            cav: cav("n"),
+            trust: Some(0.25),
+            doubt: Some(Doubt::Invented),
+            clock_offset_s: None,
+        }],
+        ..result(1, &[])
+    };
+    for (tick, result) in [(0, result(0, &[])), (1, doubted)] {
+        board.truth(&stamp("replay", tick, 100 * tick), truth(tick));
+        board.result(&stamp("e", tick, 100 * tick + 50), result);
+    }
+    board.close();
+    let record = &board.neighbours()[&cav("n")];
+    assert_eq!((record.fused, record.left_out[&DropReason::Distrusted], record.doubts[&Doubt::Invented]), (1, 1, 1));
+    assert_eq!((record.trust, record.least_trust), (Some(0.25), Some(0.25)));
+    assert_eq!((record.doubt, record.clock_offset_s), (Some(Doubt::Invented), Some(0.125)));
+}

@@ -1,0 +1,218 @@
+//! `clock: stepped`: a scenario in virtual time, all of it in this process, or every agent in one of its own.
+//!
+//! The run folder is that of a live run. Nothing in it but `scenario.yaml` and `log/` depends on machine, load, time of day
+//! or on how many processes there are.
+
+use std::collections::BTreeSet;
+use std::fs::File;
+use std::io::{BufWriter, Write};
+use std::ops::ControlFlow;
+use std::path::PathBuf;
+
+use dataset::{self, Scenario as Recorded};
+use ego_fuser::misbehaviour::TrustConfig;
+use ego_fuser::pairing::PairingConfig;
+use ego_fuser_offline::evaluation::stepped::{ComputeTimes, Crew, SteppedConfig, VehicleConfig};
+use ego_fuser_offline::evaluation::{EvaluateConfig, EvaluateError, EvaluatedFrame, Evaluator};
+use indicatif::{ProgressBar, ProgressStyle};
+use link::LinkConfig;
+use localization::pose_source::motion_gate::SanityConfig;
+use localization::pose_source::{self, EndToEndPoseConfig, NoisyPoseConfig, PgcConfig, PoseSourceConfig};
+use protocol::{CavId, DetectionsReport, RunId};
+
+use crate::experiment::evaluation::judge;
+use crate::experiment::fingerprint::Provenance;
+use crate::experiment::ledger_report::LedgerReport;
+use crate::experiment::metrics::Metrics;
+use crate::experiment::score::Board;
+use crate::operate::agent_pool::CrewProcesses;
+use crate::operate::fleet::{Fleet, FleetError};
+use crate::operate::run_fleet::{RunResult, UpError, UpOptions};
+use crate::operate::run_folder::{RunFolder, RunFolderError, name_of_now};
+use crate::scenario::{NoiseMode, PoseSource, Scenario, Stepped};
+
+/// Runs a scenario in virtual time to its end.
+///
+/// # Errors
+/// [`UpError`] when the scenario makes no fleet, or a frame cannot be read or computed.
+pub fn up(scenario: &Scenario, options: &UpOptions) -> Result<RunResult, UpError> {
+    let mut fleet = Fleet::plan(scenario)?;
+    tch::set_num_threads(i32::try_from(fleet.scenario.models.threads).unwrap_or(1));
+    let recorded = recorded(&fleet)?;
+    let mut evaluator = Evaluator::new(evaluate_config(&fleet))?;
+    let compute = match fleet.scenario.stepped.as_ref().and_then(|stepped| stepped.compute) {
+        Some(compute) => compute,
+        None => evaluator.measure(&recorded)?,
+    };
+    // Written into the run's scenario, from where another run can take it.
+    let processes = fleet.scenario.stepped.is_some_and(|stepped| stepped.processes);
+    fleet.scenario.stepped = Some(Stepped { compute: Some(compute), processes });
+    let run = fleet.scenario.run.clone().unwrap_or_else(|| name_of_now(options.prefix));
+    let mut evaluator = evaluator.over_link(stepped_config(&fleet, compute)?);
+    let folder = RunFolder::create(&options.runs, &run)?;
+    let result = go(&fleet, &recorded, &mut evaluator, (&run, &folder), options);
+    if result.as_ref().is_err_and(UpError::is_refusal) {
+        folder.remove();
+    }
+    result
+}
+
+/// Runs a fleet, as the run of that name in that folder.
+fn go(
+    fleet: &Fleet,
+    recorded: &Recorded,
+    evaluator: &mut Evaluator,
+    (run, folder): (&RunId, &RunFolder),
+    options: &UpOptions,
+) -> Result<RunResult, UpError> {
+    let processes = fleet.scenario.stepped.is_some_and(|stepped| stepped.processes);
+    let crew = processes.then(|| CrewProcesses::start(fleet, run, folder, &options.programs)).transpose()?;
+    let processes = crew.map(|(processes, remote)| {
+        evaluator.set_processes(Some(remote));
+        processes
+    });
+    let board = play(fleet, recorded, evaluator, folder)?;
+    evaluator.set_processes(None);
+    let killed = processes.map(CrewProcesses::end).unwrap_or_default();
+    let result = write(fleet, evaluator, &board, folder.clone(), options)?;
+    Ok(RunResult { killed, ..result })
+}
+
+/// The recorded scenario that the fleet plays.
+fn recorded(fleet: &Fleet) -> Result<Recorded, FleetError> {
+    let scene = &fleet.scenario.scene;
+    let scenarios = dataset::open(&scene.dir)?.scenarios;
+    let found = scenarios.into_iter().find(|known| Some(&known.name) == scene.scenario.as_ref());
+    found.ok_or_else(|| FleetError::Empty(scene.dir.clone()))
+}
+
+fn evaluate_config(fleet: &Fleet) -> EvaluateConfig {
+    let scenario = &fleet.scenario;
+    EvaluateConfig {
+        weights: scenario.models.weights.clone(),
+        method: Some(scenario.method),
+        pose_source: pose_source(scenario, &scenario.agents.pose),
+        codec: scenario.agents.codec,
+        rate: scenario.agents.rate,
+        protocol: Some(fleet.protocol.clone()),
+        delay_nanos: 0,
+        attack: None,
+        trust: scenario.ego.trust.then(TrustConfig::default),
+    }
+}
+
+fn stepped_config(fleet: &Fleet, compute: ComputeTimes) -> Result<SteppedConfig, FleetError> {
+    let Scenario { scene, ego, link, .. } = &fleet.scenario;
+    let (config, link_folder, seed) = match link {
+        Some(link) => {
+            let (config, folder) = LinkConfig::open(&link.air.to_string_lossy())?;
+            (config, folder, link.seed)
+        }
+        None => (LinkConfig::default(), PathBuf::from("."), 0),
+    };
+    let others = fleet.agents.iter().filter(|cav| **cav != fleet.ego);
+    let vehicles = fleet.agents.iter().map(|cav| (cav.clone(), vehicle(&fleet.scenario, cav)));
+    let last = fleet.ticks.map_or(usize::MAX, |ticks| scene.seek + ticks);
+    Ok(SteppedConfig {
+        link: config,
+        link_folder,
+        seed,
+        deadline_nanos: ego.deadline_ms.saturating_mul(1_000_000),
+        pairing: PairingConfig { max_age_nanos: ego.max_age_ms.saturating_mul(1_000_000), ..PairingConfig::default() },
+        compute,
+        crew: Crew::Named(std::iter::once(&fleet.ego).chain(others).cloned().collect()),
+        vehicles: vehicles.collect(),
+        ticks: scene.seek..last,
+        lidar_variant: scene.variant.clone(),
+    })
+}
+
+fn vehicle(scenario: &Scenario, cav: &CavId) -> VehicleConfig {
+    let settings = scenario.settings_of(cav);
+    let pose_source = pose_source(scenario, &settings.pose);
+    VehicleConfig { pose_source, codec: settings.codec, rate: settings.rate, lie: settings.lie }
+}
+
+/// The source that an agent's process would set up for these settings.
+fn pose_source(scenario: &Scenario, pose: &PoseSource) -> PoseSourceConfig {
+    let (models, sanity) = (&scenario.models, SanityConfig::default());
+    match pose {
+        PoseSource::Recorded => PoseSourceConfig::Recorded,
+        PoseSource::Noisy(noise) => PoseSourceConfig::Noisy(NoisyPoseConfig {
+            mode: match noise.mode {
+                NoiseMode::Fixed => pose_source::NoiseMode::Fixed,
+                NoiseMode::Independent => pose_source::NoiseMode::Independent,
+                NoiseMode::Autoregressive => pose_source::NoiseMode::Autoregressive,
+            },
+            position_std_m: noise.std_m,
+            heading_std_deg: noise.std_deg,
+            seed: noise.seed,
+            ..NoisyPoseConfig::default()
+        }),
+        // That the networks are named was checked with the scenario.
+        PoseSource::Pgc => {
+            let named = models.localizer.as_ref().map(|models| (models.encoder.clone(), models.head.clone()));
+            let (encoder, head) = named.unwrap_or_default();
+            PoseSourceConfig::Pgc(PgcConfig { encoder, head, sanity })
+        }
+        PoseSource::EndToEnd => {
+            let weights = models.end_to_end.clone().unwrap_or_default();
+            PoseSourceConfig::EndToEnd(EndToEndPoseConfig { weights, sanity })
+        }
+    }
+}
+
+/// Runs over the ticks; detections go to their file as they come.
+fn play(fleet: &Fleet, recorded: &Recorded, evaluator: &mut Evaluator, folder: &RunFolder) -> Result<Board, UpError> {
+    let mut board = Board::new(fleet.ego.clone(), fleet.ground_truth_rule(), fleet.map_values());
+    let path = folder.file("detections.jsonl");
+    let unwritable = |source| RunFolderError::Write { path: path.clone(), source };
+    let mut file = BufWriter::new(File::create(&path).map_err(unwritable)?);
+    let style = ProgressStyle::with_template("{bar:30} {pos}/{len} ticks  {eta} left");
+    let bar =
+        ProgressBar::new(fleet.ticks.unwrap_or(0) as u64).with_style(style.unwrap_or(ProgressStyle::default_bar()));
+    let mut written = Ok(());
+    let _ = evaluator.run(recorded, &mut |frame: EvaluatedFrame| {
+        bar.inc(1);
+        let report = DetectionsReport::new(&frame.stamp, Some(frame.tick as u64), frame.result.clone());
+        written = writeln!(file, "{}", report.to_json());
+        judge(&mut board, frame, true);
+        if written.is_ok() { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
+    })?;
+    bar.finish_and_clear();
+    written.and_then(|()| file.flush()).map_err(unwritable)?;
+    Ok(board)
+}
+
+fn write(
+    fleet: &Fleet,
+    evaluator: &Evaluator,
+    board: &Board,
+    folder: RunFolder,
+    options: &UpOptions,
+) -> Result<RunResult, UpError> {
+    let ledger = evaluator.ledger();
+    let balance = ledger.balance();
+    let names = [fleet.scenario.method.name(), fleet.pose_source()];
+    let metrics = Metrics::of(board, "stepped", names, board.seconds(), ledger, Some(evaluator.sent_bytes()));
+    folder.write_json("metrics.json", &metrics)?;
+    folder.write_frames(board.records(), &std::collections::BTreeMap::new())?;
+    folder.write_json("ledger.json", &LedgerReport::new(&[], ledger, &balance, (&BTreeSet::new(), 0)))?;
+    let models = &fleet.scenario.models;
+    let localizer = models.localizer.as_ref().filter(|_| fleet.scenario.uses_localizer());
+    let end_to_end = models.end_to_end.as_deref().filter(|_| fleet.scenario.uses_end_to_end());
+    let programs = Fleet::programs(&options.programs);
+    let provenance = Provenance::collect(&programs, &models.weights, localizer, end_to_end, &fleet.scene_dir);
+    let provenance = provenance.inspect_err(|error| tracing::warn!("no hashes in scenario.yaml: {error}")).ok();
+    let resolved = Scenario { provenance, ..fleet.scenario.clone() };
+    folder.write("scenario.yaml", &resolved.to_yaml())?;
+    let picture = crate::view::demo::draw(fleet, board, &folder.file("frame.png"));
+    let (killed, unwritten, failures) = (Vec::new(), Vec::new(), Vec::new());
+    Ok(RunResult { folder, metrics, balance, missed: 0, interrupted: false, killed, unwritten, failures, picture })
+}
+
+impl From<EvaluateError> for UpError {
+    fn from(error: EvaluateError) -> Self {
+        Self::Evaluate(Box::new(error))
+    }
+}

@@ -1,0 +1,215 @@
+//! What makes no experiment: values out of bounds, fields that contradict each other, grids that nobody can wait for.
+
+use std::fmt::Debug;
+
+use dataset::Scenario;
+use fusion::Exchange;
+use fusion::Method;
+use link::{CapacityConfig, DelayLaw, LinkConfig, LossLaw};
+
+use super::spec::{CodecSpec, Experiment, Grid, NoiseSpec};
+use localization::pose_source::PoseSourceConfig;
+
+/// More runs than this are a mistake.
+pub(super) const MOST_RUNS: usize = 10_000;
+
+/// Checks everything that can be said without looking at the data.
+pub(super) fn check(experiment: &Experiment) -> Result<(), String> {
+    let Experiment { name, grid, ego, compute, maps_limit_gb, scenarios, ticks, .. } = experiment;
+    let is_name = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
+    if name.is_empty() || !name.chars().all(is_name) {
+        return Err(format!("name {name:?} is to name files: letters, digits, - and _"));
+    }
+    for (field, value) in [("scenarios", scenarios), ("ticks", ticks)] {
+        if *value == Some(0) {
+            return Err(format!("{field} is 0: there would be nothing to judge"));
+        }
+    }
+    number("ego.deadline_ms", ego.deadline_ms as f64, 0.0, 60_000.0)?;
+    number("ego.max_age_ms", ego.max_age_ms as f64, 0.0, 600_000.0)?;
+    number("compute.pose_ms", compute.pose_ms, 0.0, 60_000.0)?;
+    number("compute.map_ms", compute.map_ms, 0.0, 60_000.0)?;
+    number("compute.fuse_ms", compute.fuse_ms, 0.0, 60_000.0)?;
+    number("maps_limit_gb", *maps_limit_gb, 0.0, 10_000.0)?;
+    axes(grid)?;
+    let (link, _) = LinkConfig::open(&experiment.link).map_err(|error| format!("link: {error}"))?;
+    contradictions(experiment, &link)?;
+    let runs = super::grid::count(grid);
+    if runs > MOST_RUNS {
+        let hours = runs as f64 / 3600.0;
+        return Err(format!(
+            "the grid has {} = {runs} runs, {hours:.1} hours even at a second each; more than {MOST_RUNS} are refused",
+            product(grid)
+        ));
+    }
+    Ok(())
+}
+
+/// Checks what depends on the data.
+pub(super) fn check_scenes(experiment: &Experiment, scenarios: &[Scenario]) -> Result<(), String> {
+    for scenario in scenarios {
+        let found = scenario.agents.len();
+        let asked = experiment.grid.agents.iter().flatten().find(|asked| **asked > found);
+        if let Some(asked) = asked {
+            return Err(format!("grid.agents is {asked}, but scenario {} has {found} vehicles", scenario.name));
+        }
+    }
+    Ok(())
+}
+
+/// Every axis alone.
+fn axes(grid: &Grid) -> Result<(), String> {
+    let Grid { method, codec, latency_ms, jitter_ms, bandwidth_mbps, loss, pose_noise, agents, seed } = grid;
+    values("grid.method", Some(method), |_| Ok(()))?;
+    values("grid.codec", codec.as_ref(), |CodecSpec { keep, zstd, fit, .. }| {
+        if let Some(keep) = keep
+            && !(*keep > 0.0 && *keep <= 1.0)
+        {
+            return Err(format!("grid.codec: keep is {keep}, must be above 0 and at most 1"));
+        }
+        number("grid.codec: fit", fit.unwrap_or(1.0), 0.01, 1.0)?;
+        number("grid.codec: zstd", f64::from(zstd.unwrap_or(1)), 1.0, 22.0)
+    })?;
+    values("grid.latency_ms", latency_ms.as_ref(), |ms| number("grid.latency_ms", *ms, 0.0, 600_000.0))?;
+    values("grid.jitter_ms", jitter_ms.as_ref(), |ms| number("grid.jitter_ms", *ms, 0.0, 600_000.0))?;
+    values("grid.bandwidth_mbps", bandwidth_mbps.as_ref(), |mbps| match *mbps {
+        f64::INFINITY => Ok(()),
+        mbps => number("grid.bandwidth_mbps", mbps, 1e-6, 1e6),
+    })?;
+    values("grid.loss", loss.as_ref(), |share| number("grid.loss", *share, 0.0, 1.0))?;
+    values("grid.pose_noise", pose_noise.as_ref(), |NoiseSpec { m, deg }| {
+        number("grid.pose_noise: m", *m, 0.0, 1000.0)?;
+        number("grid.pose_noise: deg", *deg, 0.0, 360.0)
+    })?;
+    values("grid.agents", agents.as_ref(), |count| number("grid.agents", *count as f64, 1.0, 64.0))?;
+    values("grid.seed", seed.as_ref(), |_| Ok(()))
+}
+
+/// Fields that say two things, or ask for what cannot be.
+fn contradictions(experiment: &Experiment, link: &LinkConfig) -> Result<(), String> {
+    let Experiment { grid, ego, poses, link: name, .. } = experiment;
+    let says = |axis: &str, field: &str| Err(format!("{axis} and the {field} of link {name} contradict each other"));
+    if grid.latency_ms.is_some() && link.delay != DelayLaw::None {
+        return says("grid.latency_ms", "delay");
+    }
+    if grid.bandwidth_mbps.is_some() && link.capacity != CapacityConfig::Unlimited {
+        return says("grid.bandwidth_mbps", "capacity");
+    }
+    if grid.loss.is_some() && link.loss != LossLaw::None {
+        return says("grid.loss", "loss");
+    }
+    if grid.jitter_ms.is_some() && grid.latency_ms.is_none() {
+        return Err("grid.jitter_ms is the deviation of grid.latency_ms, which is left out".into());
+    }
+    if grid.bandwidth_mbps.is_none() && grid.codec.iter().flatten().any(|codec| codec.fit.is_some()) {
+        return Err("grid.codec.fit is a share of grid.bandwidth_mbps, which is left out".into());
+    }
+    if let Some(ms) = grid.latency_ms.iter().flatten().find(|ms| **ms > ego.max_age_ms as f64 + ego.deadline_ms as f64)
+    {
+        return Err(format!(
+            "grid.latency_ms is {ms}, but ego.max_age_ms is {}: nothing would ever be young enough to be fused",
+            ego.max_age_ms
+        ));
+    }
+    if grid.pose_noise.is_some() && *poses != PoseSourceConfig::Recorded {
+        return Err(format!("grid.pose_noise is added to recorded poses, but poses is {}", poses.name()));
+    }
+    if grid.codec.is_some() && grid.method.iter().all(|method| method.exchange() != Exchange::Features) {
+        let names: Vec<&str> = grid.method.iter().map(|method| method.name()).collect();
+        return Err(format!("grid.codec is how maps are written, but grid.method ({}) sends none", names.join(", ")));
+    }
+    if grid.method.iter().all(|method| *method == Method::None) && grid.agents.is_some() {
+        return Err("grid.agents varies who talks, but grid.method is none: nobody does".into());
+    }
+    let jitters = grid.jitter_ms.iter().flatten().any(|ms| *ms > 0.0);
+    let loses = grid.loss.iter().flatten().any(|share| *share > 0.0 && *share < 1.0);
+    let errs = grid.pose_noise.iter().flatten().any(|noise| noise.m > 0.0 || noise.deg > 0.0);
+    let is_random = jitters || loses || errs || is_random(link);
+    if !is_random && grid.seed.as_ref().is_some_and(|seeds| seeds.len() > 1) {
+        return Err("grid.seed has several values, but nothing in the experiment is random".into());
+    }
+    Ok(())
+}
+
+fn is_random(link: &LinkConfig) -> bool {
+    let delay = !matches!(link.delay, DelayLaw::None | DelayLaw::ConstantMs(_) | DelayLaw::Trace);
+    delay || link.loss != LossLaw::None || link.reorder.is_some() || link.duplicate > 0.0
+}
+
+/// Checks each value of an axis, and that there are some and none twice.
+fn values<T: PartialEq + Debug>(
+    field: &str,
+    values: Option<&Vec<T>>,
+    check: impl Fn(&T) -> Result<(), String>,
+) -> Result<(), String> {
+    let Some(values) = values else { return Ok(()) };
+    if values.is_empty() {
+        return Err(format!("{field} is empty: the grid has no run"));
+    }
+    for (place, value) in values.iter().enumerate() {
+        check(value)?;
+        if values[..place].contains(value) {
+            return Err(format!("{field} names {value:?} twice"));
+        }
+    }
+    Ok(())
+}
+
+fn number(field: &str, value: f64, low: f64, high: f64) -> Result<(), String> {
+    let fits = (low..=high).contains(&value);
+    if fits { Ok(()) } else { Err(format!("{field} is {value}, must be {low} to {high}")) }
+}
+
+/// The axes with more than one value, multiplied: `3 method x 6 latency_ms`.
+pub(super) fn product(grid: &Grid) -> String {
+    let sizes = super::grid::sizes(grid).into_iter().filter(|(_, size)| *size > 1);
+    let factors: Vec<String> = sizes.map(|(axis, size)| format!("{size} {axis}")).collect();
+    if factors.is_empty() { "1".into() } else { factors.join(" x ") }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn problem(text: &str) -> String {
+        let text = format!("name: e\ndataset: d\nweights: w\n{text}");
+        let experiment: Experiment = serde_saphyr::from_str(&text).unwrap();
+        check(&experiment).err().unwrap_or_default()
+    }
+
+    #[test]
+    fn every_contradiction_is_named_by_its_fields() {
+        assert_eq!(problem("grid: {method: [max]}"), "");
+        for (text, words) in [
+            ("grid: {method: []}", "grid.method is empty"),
+            ("grid: {method: [max], loss: [0, 1.5]}", "grid.loss is 1.5"),
+            ("grid: {method: [max], loss: [0.1, 0.1]}", "grid.loss names 0.1 twice"),
+            ("grid: {method: [max], bandwidth_mbps: [0]}", "grid.bandwidth_mbps is 0"),
+            ("grid: {method: [max], codec: [{dtype: f16, keep: 0}]}", "keep is 0"),
+            ("grid: {method: [max], codec: [{dtype: f32, fit: 2}]}", "grid.codec: fit is 2"),
+            ("grid: {method: [max], jitter_ms: [5]}", "grid.latency_ms, which is left out"),
+            ("grid: {method: [max], codec: [{dtype: f32, fit: 0.2}]}", "grid.bandwidth_mbps, which is left out"),
+            ("link: dsrc\ngrid: {method: [max], bandwidth_mbps: [6]}", "capacity of link dsrc"),
+            ("link: nowhere\ngrid: {method: [max]}", "nowhere"),
+            ("ego: {max_age_ms: 300}\ngrid: {method: [max], latency_ms: [500]}", "ego.max_age_ms is 300"),
+            ("grid: {method: [late], codec: [{dtype: i8}]}", "grid.method (late) sends none"),
+            ("grid: {method: [max], seed: [1, 2]}", "nothing in the experiment is random"),
+            ("poses: {cached: {file: p.csv}}\ngrid: {method: [max], pose_noise: [{m: 1, deg: 1}]}", "poses is cached"),
+            ("ticks: 0\ngrid: {method: [max]}", "ticks is 0"),
+        ] {
+            let problem = problem(text);
+            assert!(problem.contains(words), "{text}: {problem}");
+        }
+    }
+
+    #[test]
+    fn a_grid_that_nobody_can_wait_for_is_refused_with_its_size() {
+        let many = (0..101).map(|k| k.to_string()).collect::<Vec<_>>().join(", ");
+        let text = format!("grid: {{method: [max], latency_ms: [{many}], seed: [{many}], jitter_ms: [1]}}");
+        let problem = problem(&text);
+        assert!(
+            problem.contains("101 latency_ms x 101 seed = 10201 runs, 2.8 hours even at a second each"),
+            "{problem}"
+        );
+    }
+}

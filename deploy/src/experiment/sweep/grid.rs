@@ -1,0 +1,245 @@
+//! The runs of a grid, in order.
+
+use std::path::PathBuf;
+
+use agent::rate::RateConfig;
+use ego_fuser::pairing::PairingConfig;
+use ego_fuser_offline::evaluation::stepped::{ComputeTimes, Crew, SteppedConfig};
+use fusion::Method;
+use link::{CapacityConfig, DelayLaw, LinkConfig, LinkError, LossLaw};
+use localization::pose_source::{self, NoisyPoseConfig, PoseSourceConfig};
+use protocol::{BevGrid, CodecConfig, Dtype};
+use serde::{Deserialize, Serialize};
+
+use super::spec::{CodecSpec, EgoRule, Experiment, Grid, NoiseSpec};
+use crate::scenario::NoiseMode;
+
+/// One point of a grid.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct Point {
+    /// Method.
+    pub method: Method,
+    /// How maps are written.
+    pub codec: CodecSpec,
+    /// Mean delay, milliseconds; absent: as the link says. The same for those below.
+    pub latency_ms: Option<f64>,
+    /// Its standard deviation, milliseconds.
+    pub jitter_ms: Option<f64>,
+    /// Rate, Mbit/s; absent where unlimited too, as JSON knows no infinity.
+    pub bandwidth_mbps: Option<f64>,
+    /// Share of the messages that get lost.
+    pub loss: Option<f64>,
+    /// Error of the poses.
+    pub pose_noise: Option<NoiseSpec>,
+    /// Vehicles that take part; absent: all.
+    pub agents: Option<usize>,
+    /// Seed.
+    pub seed: u64,
+}
+
+/// Values of each axis.
+pub(super) fn sizes(grid: &Grid) -> Vec<(&'static str, usize)> {
+    let size = |length: Option<usize>| length.unwrap_or(1);
+    vec![
+        ("method", grid.method.len()),
+        ("codec", size(grid.codec.as_ref().map(Vec::len))),
+        ("latency_ms", size(grid.latency_ms.as_ref().map(Vec::len))),
+        ("jitter_ms", size(grid.jitter_ms.as_ref().map(Vec::len))),
+        ("bandwidth_mbps", size(grid.bandwidth_mbps.as_ref().map(Vec::len))),
+        ("loss", size(grid.loss.as_ref().map(Vec::len))),
+        ("pose_noise", size(grid.pose_noise.as_ref().map(Vec::len))),
+        ("agents", size(grid.agents.as_ref().map(Vec::len))),
+        ("seed", size(grid.seed.as_ref().map(Vec::len))),
+    ]
+}
+
+/// Points of the grid.
+pub(super) fn count(grid: &Grid) -> usize {
+    sizes(grid).into_iter().fold(1, |product, (_, size)| product.saturating_mul(size))
+}
+
+/// Every point, the last field turning fastest.
+#[must_use]
+pub fn points(grid: &Grid) -> Vec<Point> {
+    let mut points: Vec<Point> = Vec::new();
+    let codecs = grid.codec.clone().unwrap_or_else(|| vec![CodecSpec::default()]);
+    for &method in &grid.method {
+        for &codec in &codecs {
+            points.push(Point {
+                method,
+                codec,
+                latency_ms: None,
+                jitter_ms: None,
+                bandwidth_mbps: None,
+                loss: None,
+                pose_noise: None,
+                agents: None,
+                seed: 0,
+            });
+        }
+    }
+    points = spread(points, grid.latency_ms.as_deref(), |point, value| point.latency_ms = Some(value));
+    points = spread(points, grid.jitter_ms.as_deref(), |point, value| point.jitter_ms = Some(value));
+    points = spread(points, grid.bandwidth_mbps.as_deref(), |point, value| {
+        point.bandwidth_mbps = Some(value).filter(|mbps| mbps.is_finite());
+    });
+    points = spread(points, grid.loss.as_deref(), |point, value| point.loss = Some(value));
+    points = spread(points, grid.pose_noise.as_deref(), |point, value| point.pose_noise = Some(value));
+    points = spread(points, grid.agents.as_deref(), |point, value| point.agents = Some(value));
+    spread(points, grid.seed.as_deref(), |point, value| point.seed = value)
+}
+
+fn spread<T: Copy>(points: Vec<Point>, values: Option<&[T]>, set: impl Fn(&mut Point, T)) -> Vec<Point> {
+    let Some(values) = values else { return points };
+    let with = |point: Point| {
+        let set = &set;
+        values.iter().map(move |&value| {
+            let mut point = point.clone();
+            set(&mut point, value);
+            point
+        })
+    };
+    points.into_iter().flat_map(with).collect()
+}
+
+impl Point {
+    /// The link of this point: the experiment's with what the grid says.
+    ///
+    /// # Errors
+    /// [`LinkError`] when the experiment's is not readable.
+    pub fn link(&self, experiment: &Experiment) -> Result<(LinkConfig, PathBuf), LinkError> {
+        let (mut link, folder) = LinkConfig::open(&experiment.link)?;
+        if let Some(mean_ms) = self.latency_ms {
+            link.delay = match self.jitter_ms.unwrap_or(0.0) {
+                0.0 => DelayLaw::ConstantMs(mean_ms),
+                std_ms => DelayLaw::Normal { mean_ms, std_ms },
+            };
+        }
+        if let Some(rate_mbps) = self.bandwidth_mbps {
+            link.capacity = CapacityConfig::TokenBucket { rate_mbps, burst_bytes: 0 };
+        }
+        if let Some(share) = self.loss {
+            link.loss = LossLaw::Bernoulli(share);
+        }
+        link.validate()?;
+        Ok((link, folder))
+    }
+
+    /// Where poses come from.
+    #[must_use]
+    pub fn poses(&self, experiment: &Experiment) -> PoseSourceConfig {
+        let Some(NoiseSpec { m, deg }) = self.pose_noise else { return experiment.poses.clone() };
+        let mode = match experiment.noise_mode {
+            NoiseMode::Fixed => pose_source::NoiseMode::Fixed,
+            NoiseMode::Independent => pose_source::NoiseMode::Independent,
+            NoiseMode::Autoregressive => pose_source::NoiseMode::Autoregressive,
+        };
+        let noise = NoisyPoseConfig { mode, position_std_m: m, heading_std_deg: deg, ..NoisyPoseConfig::default() };
+        PoseSourceConfig::Noisy(NoisyPoseConfig { seed: self.seed, ..noise })
+    }
+
+    /// How maps of `channels` on `grid` are written.
+    #[must_use]
+    pub fn codec(&self, grid: BevGrid, channels: u64) -> CodecConfig {
+        let CodecSpec { dtype, keep, zstd, fit: _ } = self.codec;
+        let cells = grid.cells() as u64;
+        let budget = |keep: f64| {
+            let kept = (keep * cells as f64).ceil() as u64;
+            let scales = if dtype == Dtype::I8 { 4 * channels } else { 0 };
+            scales + cells.div_ceil(8) + kept * channels * dtype.size()
+        };
+        // All cells need no budget, and a mask would only cost bytes.
+        let budget_bytes = keep.filter(|keep| *keep < 1.0).map(budget);
+        CodecConfig { dtype, gate: None, budget_bytes, zstd_level: zstd }
+    }
+
+    /// What maps are fitted to: nothing where they are not, or where the link takes anything.
+    #[must_use]
+    pub fn rate(&self) -> RateConfig {
+        let share = self.codec.fit.zip(self.bandwidth_mbps);
+        RateConfig {
+            bytes_per_second: share.map(|(share, mbps)| (share * mbps * 1e6 / 8.0) as u64),
+            ..RateConfig::default()
+        }
+    }
+}
+
+/// Virtual time for a point.
+pub(super) fn stepped(
+    (link, link_folder): (LinkConfig, PathBuf),
+    point: &Point,
+    ego: EgoRule,
+    compute: ComputeTimes,
+) -> SteppedConfig {
+    let nanos = |ms: u64| ms.saturating_mul(1_000_000);
+    SteppedConfig {
+        link,
+        link_folder,
+        seed: point.seed,
+        deadline_nanos: nanos(ego.deadline_ms),
+        pairing: PairingConfig {
+            max_age_nanos: nanos(ego.max_age_ms),
+            // At 10 Hz as many messages wait as may still be used.
+            depth: (ego.max_age_ms / 100 + 4) as usize,
+            ..PairingConfig::default()
+        },
+        compute,
+        crew: Crew::First(point.agents.unwrap_or(usize::MAX)),
+        vehicles: std::collections::BTreeMap::new(),
+        ticks: 0..usize::MAX,
+        lidar_variant: None,
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn experiment(grid: &str) -> Experiment {
+        serde_saphyr::from_str(&format!("name: e\ndataset: d\nweights: w\ngrid: {grid}\n")).unwrap()
+    }
+
+    #[test]
+    fn a_grid_is_every_value_with_every_other() {
+        let grid = experiment("{method: [max, late], latency_ms: [0, 100], seed: [1, 2, 3]}").grid;
+        let points = points(&grid);
+        assert_eq!((points.len(), count(&grid)), (12, 12));
+        assert_eq!((points[0].method, points[0].latency_ms, points[0].seed), (Method::Max, Some(0.0), 1));
+        assert_eq!((points[1].latency_ms, points[1].seed), (Some(0.0), 2));
+        assert_eq!((points[11].method, points[11].latency_ms, points[11].seed), (Method::Late, Some(100.0), 3));
+    }
+
+    #[test]
+    fn a_point_shapes_the_link() {
+        let text = "{method: [max], latency_ms: [50], jitter_ms: [0, 10], bandwidth_mbps: [.inf, 6], loss: [0.1]}";
+        let experiment = experiment(text);
+        let points = points(&experiment.grid);
+        let (first, _) = points[0].link(&experiment).unwrap();
+        assert_eq!((first.delay, first.capacity), (DelayLaw::ConstantMs(50.0), CapacityConfig::Unlimited));
+        let (last, _) = points[3].link(&experiment).unwrap();
+        assert_eq!(last.delay, DelayLaw::Normal { mean_ms: 50.0, std_ms: 10.0 });
+        assert_eq!(last.capacity, CapacityConfig::TokenBucket { rate_mbps: 6.0, burst_bytes: 0 });
+        assert_eq!(last.loss, LossLaw::Bernoulli(0.1));
+    }
+
+    #[test]
+    fn a_share_of_the_link_is_a_rate_of_bytes() {
+        let text = "{method: [max], codec: [{dtype: f32}, {dtype: f32, fit: 0.5}], bandwidth_mbps: [6, .inf]}";
+        let points = points(&experiment(text).grid);
+        let rates: Vec<_> = points.iter().map(|point| (point.codec.name(), point.rate().bytes_per_second)).collect();
+        let name = |text: &str| text.to_owned();
+        let fitted = name("f32 fitted to 0.5");
+        let expected = [(name("f32"), None), (name("f32"), None), (fitted.clone(), Some(375_000)), (fitted, None)];
+        assert_eq!(rates, expected);
+    }
+
+    #[test]
+    fn a_share_of_cells_is_a_budget_of_bytes() {
+        let grid = BevGrid { x_min_m: 0.0, y_min_m: 0.0, cell_m: 1.0, width: 10, height: 8 };
+        let experiment = experiment("{method: [max], codec: [{dtype: f16}, {dtype: i8, keep: 0.25}]}");
+        let points = points(&experiment.grid);
+        assert_eq!(points[0].codec(grid, 4).budget_bytes, None);
+        // Four scales, ten bytes of mask, twenty cells of four bytes.
+        assert_eq!(points[1].codec(grid, 4).budget_bytes, Some(16 + 10 + 80));
+    }
+}

@@ -1,0 +1,77 @@
+//! `report.html`: figures, table and what they were made of, in one file that needs no other.
+
+use std::fmt::Write as _;
+
+use figures::chart_svg::{self, escaped};
+
+use super::cell::Cell;
+use super::charts::Figure;
+use super::spec::Experiment;
+use super::table::{NOTES, rows};
+
+const STYLE: &str = "body{font:16px/1.5 system-ui,sans-serif;margin:2rem auto;max-width:72rem;padding:0 1rem;\
+    color:#282c34}h1{font-size:1.5rem}h2{font-size:1.15rem;margin-top:2rem}svg{width:100%;height:auto}\
+    .wide{overflow-x:auto}table{border-collapse:collapse;font-size:.8rem;white-space:nowrap}\
+    th,td{padding:.2rem .6rem;text-align:right;border-bottom:1px solid #e2e5ea}th{position:sticky;top:0;background:#fff}\
+    pre{background:#f5f6f8;padding:1rem;overflow-x:auto;font-size:.85rem}dt{font-weight:600}dd{margin:0 0 .4rem 1rem}";
+
+/// The page of an experiment, whose file says `spec`.
+// Writing to a string cannot fail.
+pub(super) fn page(experiment: &Experiment, spec: &str, cells: &[Cell], figures: &[Figure]) -> String {
+    let title = if experiment.title.is_empty() { &experiment.name } else { &experiment.title };
+    let mut page = format!(
+        "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">\n\
+         <meta name=\"viewport\" content=\"width=device-width,initial-scale=1\">\n\
+         <title>{0}</title><style>{STYLE}</style></head><body>\n<h1>{0}</h1>\n",
+        escaped(title)
+    );
+    let frames = cells.first().map_or(0, |cell| cell.metrics.frames);
+    let _ = writeln!(
+        page,
+        "<p>{} runs of {frames} frames in virtual time; means over seeds in the figures. The table is \
+         <code>{}.csv</code>.</p>",
+        cells.len(),
+        escaped(&experiment.name)
+    );
+    for figure in figures {
+        let _ = writeln!(page, "<figure>{}</figure>", chart_svg::text(&figure.charts));
+    }
+    let (columns, lines) = rows(experiment, cells);
+    let cells_of = |tag: &str, fields: &mut dyn Iterator<Item = String>| {
+        fields.map(|field| format!("<{tag}>{}</{tag}>", escaped(&field))).collect::<String>()
+    };
+    page += "<h2>Runs</h2>\n<div class=\"wide\"><table><thead><tr>";
+    page += &cells_of("th", &mut columns.iter().map(|column| column.trim().to_owned()));
+    page += "</tr></thead><tbody>\n";
+    for line in lines {
+        let _ = writeln!(page, "<tr>{}</tr>", cells_of("td", &mut line.into_iter()));
+    }
+    page += "</tbody></table></div>\n<h2>Columns</h2>\n<dl>\n";
+    for (column, note) in NOTES {
+        let _ = writeln!(page, "<dt>{column}</dt><dd>{}</dd>", escaped(note));
+    }
+    page += "</dl>\n<h2>What it was made of</h2>\n<ul>\n";
+    for line in provenance(cells) {
+        let _ = writeln!(page, "<li>{}</li>", escaped(&line));
+    }
+    let _ = writeln!(page, "</ul>\n<h2>Experiment</h2>\n<pre>{}</pre>\n</body></html>", escaped(spec));
+    page
+}
+
+/// Program, data and weights, each once.
+fn provenance(cells: &[Cell]) -> Vec<String> {
+    let mut lines: Vec<String> = cells
+        .iter()
+        .flat_map(|cell| {
+            let key = &cell.key;
+            [
+                format!("program SHA-256 {}", key.program_sha256),
+                format!("data SHA-256 {}", key.data_sha256),
+                format!("weights of {} SHA-256 {}", key.point.method, key.weights_sha256),
+            ]
+        })
+        .collect();
+    lines.sort();
+    lines.dedup();
+    lines
+}

@@ -1,0 +1,342 @@
+//! Sweeps: a grid of runs in virtual time, one CSV, charts, a report.
+//!
+//! Runs are kept one by one under all that decides them, so that an interrupted sweep goes on where it was. The same
+//! experiment gives the same CSV, byte for byte, in one process or in many.
+
+mod cell;
+mod charts;
+mod check;
+mod grid;
+mod html;
+mod spec;
+mod table;
+mod workers;
+
+use std::fs;
+use std::io::{self, BufRead, Write};
+use std::path::{Path, PathBuf};
+use std::time::Instant;
+
+use dataset::{self, LeftOut, ReadError, Scenario};
+use ego_fuser_offline::evaluation::EvaluateError;
+use fusion::Exchange;
+use indicatif::{ProgressBar, ProgressStyle};
+use link::LinkError;
+use simulator::generate::{self, Subset, SynthError, SynthOptions};
+use support::output;
+use training::feature_store::FeatureStore;
+
+pub use cell::{Cell, CellKey, MessageCounts};
+pub use grid::{Point, points};
+pub use spec::{CodecSpec, EgoRule, Experiment, Generate, Grid, NoiseSpec};
+pub use table::csv;
+
+use crate::experiment::evaluation::{EvaluationError, evaluate};
+use crate::experiment::weights_choice::{WeightsChoiceError, weights_of};
+
+/// Ticks that are timed before a sweep begins, for its estimate.
+const PROBED_TICKS: usize = 4;
+
+/// What came of a sweep.
+#[derive(Debug, Default)]
+pub struct Swept {
+    /// The table, as CSV.
+    pub table: String,
+    /// What each run left out of the data set.
+    pub left_out: Vec<LeftOut>,
+}
+
+/// Why a sweep came to nothing.
+#[derive(Debug, thiserror::Error)]
+pub enum SweepError {
+    /// The system refused.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// A file does not say what it should.
+    #[error("{}: {problem}", path.display())]
+    Spec {
+        /// The file.
+        path: PathBuf,
+        /// The field, and what is wrong with it.
+        problem: String,
+    },
+    /// The data set cannot be read.
+    #[error("dataset: {0}")]
+    Dataset(#[from] ReadError),
+    /// The data set cannot be generated.
+    #[error("generate: {0}")]
+    Generate(#[from] SynthError),
+    /// A method has no weights.
+    #[error("weights: {0}")]
+    Weights(#[from] WeightsChoiceError),
+    /// The link cannot be used.
+    #[error("link: {0}")]
+    Link(#[from] LinkError),
+    /// A run cannot be computed.
+    #[error(transparent)]
+    Evaluation(#[from] Box<EvaluationError>),
+    /// A process that computes runs has failed.
+    #[error("a worker has failed: {0}")]
+    Worker(String),
+    /// A chart cannot be drawn.
+    #[error("charts: {0}")]
+    Chart(String),
+}
+
+impl SweepError {
+    /// Whether the input is at fault, and not the run.
+    #[must_use]
+    pub fn is_bad_input(&self) -> bool {
+        !matches!(self, Self::Worker(_) | Self::Chart(_))
+    }
+}
+
+/// How a sweep is to be run.
+#[derive(Debug, Clone)]
+pub struct SweepOptions {
+    /// Where everything goes.
+    pub out: PathBuf,
+    /// Processes that compute.
+    pub jobs: usize,
+    /// Only say what there is to do.
+    pub dry_run: bool,
+}
+
+/// Reads, prepares and runs an experiment.
+#[derive(Debug)]
+pub struct Sweep {
+    file: PathBuf,
+    experiment: Experiment,
+    points: Vec<Point>,
+    /// All scenarios of the data set, of which maps are kept.
+    all: Vec<Scenario>,
+    /// Those that are judged.
+    scenarios: Vec<Scenario>,
+    keys: Vec<CellKey>,
+    out: PathBuf,
+}
+
+impl Sweep {
+    /// Reads an experiment, generates its data where it asks for that, and checks the one against the other.
+    ///
+    /// # Errors
+    /// [`SweepError`] names the file and the field.
+    pub fn open(file: &Path, out: &Path) -> Result<Self, SweepError> {
+        let experiment = Experiment::read(file)?;
+        generate(&experiment)?;
+        let part = experiment.part();
+        let all = part.open(&experiment.dataset, &experiment.protocol).map_err(Box::new)?.scenarios;
+        let scenarios: Vec<Scenario> = part.chosen(&all).cloned().collect();
+        let spec = |problem| SweepError::Spec { path: file.to_owned(), problem };
+        if scenarios.iter().all(|scenario| scenario.ticks.is_empty()) {
+            return Err(spec(format!("dataset {}: there is no frame in it", experiment.dataset.display())));
+        }
+        check::check_scenes(&experiment, &scenarios).map_err(spec)?;
+        let points = points(&experiment.grid);
+        let mut hashes = cell::Hashes::new(dataset::content_sha256(&scenarios));
+        let keys = points.iter().map(|point| hashes.key(&experiment, point)).collect::<Result<_, _>>()?;
+        let (file, out) = (file.to_owned(), out.to_owned());
+        Ok(Self { file, experiment, points, all, scenarios, keys, out })
+    }
+
+    /// What is there already, by place in the grid.
+    fn known(&self) -> Result<Vec<Option<Cell>>, SweepError> {
+        self.keys.iter().map(|key| Cell::read(key, &self.cells())).collect()
+    }
+
+    fn cells(&self) -> PathBuf {
+        self.out.join("cells")
+    }
+
+    fn maps(&self) -> PathBuf {
+        self.out.join("maps")
+    }
+
+    fn frames(&self) -> usize {
+        self.scenarios.iter().map(|scenario| scenario.ticks.len()).sum()
+    }
+
+    /// Runs what is missing and writes table, charts and report.
+    ///
+    /// # Errors
+    /// [`SweepError`] at the first run that cannot be computed; those before it are kept.
+    pub fn run(&self, options: &SweepOptions) -> Result<Swept, SweepError> {
+        fs::create_dir_all(self.cells()).map_err(|source| SweepError::Io { path: self.cells(), source })?;
+        let known = self.known()?;
+        let missing: Vec<usize> = (0..known.len()).filter(|&index| known[index].is_none()).collect();
+        self.announce(&known, &missing, options)?;
+        if options.dry_run {
+            return Ok(Swept::default());
+        }
+        self.encode(&missing)?;
+        self.compute(&missing, options.jobs)?;
+        let cells: Option<Vec<Cell>> = self.known()?.into_iter().collect();
+        let cells = cells.ok_or_else(|| SweepError::Worker("a run that was done is not there".into()))?;
+        Ok(Swept {
+            table: self.write(&cells)?,
+            left_out: cells.into_iter().map(|cell| cell.metrics.left_out).collect(),
+        })
+    }
+
+    /// Says how many runs there are and how long they will take.
+    fn announce(&self, known: &[Option<Cell>], missing: &[usize], options: &SweepOptions) -> Result<(), SweepError> {
+        let (runs, frames) = (known.len(), self.frames());
+        output::note(format_args!(
+            "{}: {} = {runs} runs of {frames} frames, {} done before",
+            self.experiment.name,
+            check::product(&self.experiment.grid),
+            runs - missing.len()
+        ));
+        let Some(&first) = missing.first() else { return Ok(()) };
+        let done: Vec<&Cell> = known.iter().flatten().collect();
+        let seconds: f64 = done.iter().map(|cell| cell.wall_seconds).sum();
+        let judged: f64 = done.iter().map(|cell| cell.metrics.frames as f64).sum();
+        let per_frame = if judged > 0.0 { seconds / judged } else { self.probe(&self.points[first])? };
+        let jobs = options.jobs.clamp(1, missing.len());
+        let minutes = per_frame * (missing.len() * frames) as f64 / jobs as f64 / 60.0;
+        output::note(format_args!("about {minutes:.1} minutes for {} runs with {jobs} jobs", missing.len()));
+        Ok(())
+    }
+
+    /// Seconds a frame takes, from the first few, without kept maps: longer rather than shorter.
+    fn probe(&self, point: &Point) -> Result<f64, SweepError> {
+        let mut options = cell::options(&self.experiment, point, &self.maps())?;
+        options.maps = None;
+        options.part.scenarios = Some(1);
+        options.part.ticks = Some(self.experiment.ticks.unwrap_or(PROBED_TICKS).min(PROBED_TICKS));
+        let began = Instant::now();
+        let metrics = evaluate(&options, point.method, &mut || {}).map_err(Box::new)?;
+        Ok(began.elapsed().as_secs_f64() / metrics.frames.max(1) as f64)
+    }
+
+    /// Computes the maps of all sweeps, once for each encoder that is needed.
+    fn encode(&self, missing: &[usize]) -> Result<(), SweepError> {
+        let methods = missing.iter().map(|&index| self.points[index].method);
+        let mut files = Vec::new();
+        for method in methods.filter(|method| method.exchange() != Exchange::Points) {
+            let file = weights_of(&self.experiment.weights, method)?;
+            if !files.contains(&file) {
+                files.push(file);
+            }
+        }
+        for file in files {
+            let refused = |error: EvaluateError| SweepError::Evaluation(Box::new(error.into()));
+            let weights = perception::weights::Weights::load(&file).map_err(|error| refused(error.into()))?;
+            let bar = progress("{bar:30} {pos}/{len} sweeps encoded  {eta} left", 0);
+            let kept = cell::kept_maps(&self.experiment, &self.maps());
+            let store = FeatureStore::open(&kept, &weights, &self.all, &mut |stored, all| {
+                bar.set_length(all as u64);
+                bar.set_position(stored as u64);
+            });
+            store.map_err(|error| refused(Box::new(error).into()))?;
+            bar.finish_and_clear();
+        }
+        Ok(())
+    }
+
+    fn compute(&self, missing: &[usize], jobs: usize) -> Result<(), SweepError> {
+        let bar = progress("{bar:30} {pos}/{len} frames  {msg}  {eta} left", missing.len() * self.frames());
+        let done = std::sync::atomic::AtomicUsize::new(0);
+        let on_done = || {
+            let done = 1 + done.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
+            bar.set_message(format!("{done}/{} runs", missing.len()));
+            if bar.is_hidden() {
+                output::note(format_args!("{done}/{} runs done", missing.len()));
+            }
+        };
+        let computed = if jobs > 1 && missing.len() > 1 {
+            workers::run(&self.file, &self.out, missing, jobs, &|| bar.inc(1), &on_done)
+        } else {
+            missing.iter().try_for_each(|&index| {
+                self.compute_one(index, &mut || bar.inc(1))?;
+                on_done();
+                Ok(())
+            })
+        };
+        bar.finish_and_clear();
+        computed
+    }
+
+    fn compute_one(&self, index: usize, on_frame: &mut dyn FnMut()) -> Result<(), SweepError> {
+        let (point, key) = (&self.points[index], self.keys[index].clone());
+        cell::compute(&self.experiment, point, key, &self.maps(), on_frame)?.write(&self.cells())
+    }
+
+    /// Does as another process asks.
+    ///
+    /// # Errors
+    /// [`SweepError::Io`] when the other end is gone.
+    pub fn work(&self) -> Result<(), SweepError> {
+        let gone = |source| SweepError::Io { path: "the sweep that asked".into(), source };
+        let say = |word: &str| {
+            let mut output = io::stdout().lock();
+            writeln!(output, "{word}").and_then(|()| output.flush())
+        };
+        for line in io::stdin().lock().lines() {
+            let index: Option<usize> = line.map_err(gone)?.trim().parse().ok();
+            let Some(index) = index.filter(|index| *index < self.points.len()) else {
+                say(&format!("{} that is no point of the grid", workers::FAILED)).map_err(gone)?;
+                continue;
+            };
+            // Who asks may be gone; then the answer to the run fails too.
+            let computed = self.compute_one(index, &mut || say(workers::FRAME).unwrap_or_default());
+            let answer = match computed {
+                Ok(()) => workers::DONE.to_owned(),
+                Err(error) => format!("{} {error}", workers::FAILED),
+            };
+            say(&answer).map_err(gone)?;
+        }
+        Ok(())
+    }
+
+    /// Writes table, charts and report.
+    fn write(&self, cells: &[Cell]) -> Result<String, SweepError> {
+        let text = csv(&self.experiment, cells);
+        let write = |name: &str, text: &str| {
+            let path = self.out.join(name);
+            fs::write(&path, text).map_err(|source| SweepError::Io { path, source })
+        };
+        write(&format!("{}.csv", self.experiment.name), &text)?;
+        let figures = charts::figures(&self.experiment, cells);
+        for figure in &figures {
+            write(&format!("{}.svg", figure.name), &figures::chart_svg::text(&figure.charts))?;
+            figures::chart::save(&figure.charts, &self.out.join(format!("{}.png", figure.name)))
+                .map_err(|error| SweepError::Chart(error.to_string()))?;
+        }
+        let spec =
+            fs::read_to_string(&self.file).map_err(|source| SweepError::Io { path: self.file.clone(), source })?;
+        write("report.html", &html::page(&self.experiment, &spec, cells, &figures))?;
+        Ok(text)
+    }
+}
+
+/// Generates the data set where it is asked for and not there.
+fn generate(experiment: &Experiment) -> Result<(), SweepError> {
+    let Some(generate) = &experiment.generate else { return Ok(()) };
+    let options = SynthOptions {
+        frames: generate.frames,
+        scenes: generate.scenarios,
+        agents: generate.agents(),
+        threads: std::thread::available_parallelism().map_or(1, usize::from),
+        ..SynthOptions::new(Subset::V2vdet, generate.seed, experiment.dataset.clone())
+    };
+    if generate::are_kept(&options)? {
+        return Ok(());
+    }
+    output::note(format_args!("generating {} scenarios into {}", generate.scenarios, experiment.dataset.display()));
+    let bar = progress("{bar:30} {percent} %  {eta} left", 1000 * options.scenarios());
+    let generated = generate::generate_whole(&options, &|thousandths| bar.set_position(thousandths));
+    bar.finish_and_clear();
+    generated?;
+    Ok(())
+}
+
+fn progress(template: &str, length: usize) -> ProgressBar {
+    let style = ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar());
+    ProgressBar::new(length as u64).with_style(style)
+}

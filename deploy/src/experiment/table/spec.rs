@@ -1,0 +1,214 @@
+//! What tables are asked for.
+
+use std::path::{Path, PathBuf};
+
+use agent::attack::AttackConfig;
+use dataset::evaluation_protocol::ProtocolConfig;
+use fusion::Method;
+use localization::pose_source::PoseSourceConfig;
+use protocol::{CodecConfig, Dtype};
+use serde::Deserialize;
+use support::bounded_file;
+
+use super::TableError;
+use crate::experiment::weights_choice::weights_of;
+
+/// A file of tables: what is common to all, and each.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TableSpec {
+    /// Data set, split or scenario; the first vehicle of each scenario is the ego.
+    pub dataset: PathBuf,
+    /// Whose messages and annotations count, and which objects.
+    #[serde(default)]
+    pub protocol: ProtocolConfig,
+    /// Folder with a file `*-METHOD.safetensors` for each method, for rows that name no weights.
+    #[serde(default)]
+    pub weights: Option<PathBuf>,
+    /// How exactly feature values cross the air.
+    #[serde(default = "half")]
+    pub dtype: Dtype,
+    /// Frames to judge at most, over all scenarios.
+    #[serde(default)]
+    pub frames: Option<usize>,
+    /// Where maps of encoders are kept; absent: they are computed for every cell.
+    #[serde(default)]
+    pub maps: Option<PathBuf>,
+    /// Most gigabytes of maps per encoder.
+    #[serde(default = "gigabytes")]
+    pub maps_limit_gb: f64,
+    /// The tables.
+    pub tables: Vec<Table>,
+}
+
+/// One table: every row in every column.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Table {
+    /// Name of its files.
+    pub name: String,
+    /// Scenarios to judge at most, evenly spread over the data set; absent: all.
+    #[serde(default)]
+    pub scenarios: Option<usize>,
+    /// Its rows.
+    pub rows: Vec<Row>,
+    /// Its columns.
+    pub columns: Vec<Column>,
+}
+
+/// A method with its weights.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Row {
+    /// What stands before it; absent: the method.
+    #[serde(default)]
+    pub name: Option<String>,
+    /// The method.
+    pub method: Method,
+    /// Its weights, several for a mean over trainings; absent: those of the folder.
+    #[serde(default)]
+    pub weights: Vec<PathBuf>,
+    /// Poses of this row, whatever the columns say.
+    #[serde(default)]
+    pub poses: Option<PoseSourceConfig>,
+}
+
+/// What rows are judged under.
+#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Column {
+    /// What stands above it.
+    pub name: String,
+    /// Where poses come from.
+    #[serde(default)]
+    pub poses: PoseSourceConfig,
+    /// How long messages of neighbours are under way, milliseconds.
+    #[serde(default)]
+    pub delay_ms: u64,
+    /// Neighbours that lie; absent: none.
+    #[serde(default)]
+    pub attack: Option<AttackConfig>,
+    /// Whether the ego leaves out neighbours that it does not trust.
+    #[serde(default)]
+    pub trust: bool,
+}
+
+fn half() -> Dtype {
+    Dtype::F16
+}
+
+fn gigabytes() -> f64 {
+    8.0
+}
+
+/// Largest file that is read, bytes.
+const MAX_BYTES: u64 = 1 << 20;
+
+impl TableSpec {
+    /// Reads a file of tables.
+    ///
+    /// # Errors
+    /// [`TableError`] names the file and what is wrong with it.
+    pub fn read(path: &Path) -> Result<Self, TableError> {
+        let text = bounded_file::read_text(path, MAX_BYTES)
+            .map_err(|source| TableError::Io { path: path.to_owned(), source })?;
+        let spec: Self = serde_saphyr::from_str(&text)
+            .map_err(|error| TableError::Spec { path: path.to_owned(), problem: error.to_string() })?;
+        spec.check().map_err(|problem| TableError::Spec { path: path.to_owned(), problem })?;
+        Ok(spec)
+    }
+
+    fn check(&self) -> Result<(), String> {
+        for (index, table) in self.tables.iter().enumerate() {
+            let is_name = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
+            if table.name.is_empty() || !table.name.chars().all(is_name) {
+                return Err(format!("table name {:?} is to name files: letters, digits, - and _", table.name));
+            }
+            if self.tables[..index].iter().any(|other| other.name == table.name) {
+                return Err(format!("two tables are called {:?}", table.name));
+            }
+            if table.rows.is_empty() || table.columns.is_empty() {
+                return Err(format!("table {:?} has no rows or no columns", table.name));
+            }
+        }
+        Ok(())
+    }
+
+    /// The weights of a row, one file per training.
+    ///
+    /// # Errors
+    /// [`TableError`] where neither the row nor the folder has any.
+    pub fn weights_of(&self, row: &Row) -> Result<Vec<PathBuf>, TableError> {
+        match (&row.weights[..], &self.weights) {
+            ([], Some(folder)) => Ok(vec![weights_of(folder, row.method)?]),
+            ([], None) => Err(TableError::NoWeights(row.label())),
+            (files, _) => Ok(files.to_vec()),
+        }
+    }
+
+    /// How maps are written.
+    #[must_use]
+    pub fn codec(&self) -> CodecConfig {
+        CodecConfig { dtype: self.dtype, ..CodecConfig::default() }
+    }
+}
+
+impl Row {
+    /// What stands before it.
+    #[must_use]
+    pub fn label(&self) -> String {
+        self.name.clone().unwrap_or_else(|| self.method.name().to_owned())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const SPEC: &str = "\
+dataset: scenes/test
+weights: deploy/weights
+tables:
+- name: main
+  rows:
+  - method: none
+  - {name: PASTAT, method: pastat, weights: [a.safetensors, b.safetensors], poses: {cached: {file: poses.csv}}}
+  columns:
+  - name: true poses
+  - {name: 1 m, poses: {noisy: {mode: independent, position_std_m: 1}}, delay_ms: 100}
+";
+
+    fn read(text: &str) -> Result<TableSpec, TableError> {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("tables.yaml");
+        std::fs::write(&path, text).unwrap();
+        TableSpec::read(&path)
+    }
+
+    #[test]
+    fn rows_and_columns_are_read_with_their_defaults() {
+        let spec = read(SPEC).unwrap();
+        let table = &spec.tables[0];
+        assert_eq!((table.rows[0].label(), table.rows[1].label()), ("none".to_owned(), "PASTAT".to_owned()));
+        assert_eq!(table.rows[1].poses.as_ref().unwrap().name(), "cached");
+        assert_eq!((table.columns[0].poses.name(), table.columns[1].poses.name()), ("recorded", "noisy"));
+        assert_eq!((table.columns[0].delay_ms, table.columns[1].delay_ms, spec.dtype), (0, 100, Dtype::F16));
+        assert_eq!(spec.weights_of(&table.rows[1]).unwrap().len(), 2);
+    }
+
+    #[test]
+    fn what_is_wrong_is_named_with_the_file() {
+        for (text, part) in [
+            (SPEC.replace("method: none", "method: nine"), "tables.yaml"),
+            (SPEC.replace("name: main", "name: ../main"), "../main"),
+            (SPEC.replace("delay_ms", "delay_s"), "delay_s"),
+            (SPEC.replace("  columns:", "  columns: []\n  more:"), "tables.yaml"),
+        ] {
+            let message = read(&text).unwrap_err().to_string();
+            assert!(message.contains("tables.yaml") && message.contains(part), "{message}");
+        }
+        let spec = read(&SPEC.replace("weights: deploy/weights\n", "")).unwrap();
+        let message = spec.weights_of(&spec.tables[0].rows[0]).unwrap_err().to_string();
+        assert!(message.contains("none"), "{message}");
+    }
+}

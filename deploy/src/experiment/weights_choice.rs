@@ -1,0 +1,183 @@
+//! Which weights a method runs with.
+
+use std::path::{Path, PathBuf};
+
+use fusion::Method;
+use fusion::model::METHOD_KEY;
+use perception::weights::{Weights, WeightsError};
+
+/// What a training calls its weights.
+const TRAINED_FILE: &str = "weights.safetensors";
+
+/// Why a method has no weights.
+#[derive(Debug, thiserror::Error)]
+pub enum WeightsChoiceError {
+    /// The folder cannot be listed.
+    #[error("{}: {source}", folder.display())]
+    Io {
+        /// The folder.
+        folder: PathBuf,
+        /// What the system said.
+        source: std::io::Error,
+    },
+    /// The folder has none, or several.
+    #[error(
+        "{}: {found} files named *-{name}.safetensors or {name}/{TRAINED_FILE}, method {method} needs one, or {TRAINED_FILE}",
+        folder.display()
+    )]
+    NotOne {
+        /// The folder.
+        folder: PathBuf,
+        /// The method.
+        method: Method,
+        /// The method it would be trained for.
+        name: Method,
+        /// How many there are.
+        found: usize,
+    },
+    /// The folder is one of a training of another method.
+    #[error("{}: trained for {trained}, and method {method} needs weights trained for {name}", file.display())]
+    OtherMethod {
+        /// The weights.
+        file: PathBuf,
+        /// The method.
+        method: Method,
+        /// The method it would be trained for.
+        name: Method,
+        /// The method that the file names.
+        trained: String,
+    },
+    /// The weights of a training cannot be read.
+    #[error(transparent)]
+    Weights(#[from] WeightsError),
+}
+
+/// The weights of a method: `path` itself; of the folder `path` the one file `*-METHOD.safetensors` or
+/// `METHOD/weights.safetensors`, or where it has neither, `weights.safetensors` of a training of that method.
+///
+/// `late` exchanges what every vehicle finds alone, so it runs with the weights of `none`; so does `early` where the
+/// folder has none of its own.
+///
+/// # Errors
+/// [`WeightsChoiceError`] when the folder does not hold exactly one.
+pub fn weights_of(path: &Path, method: Method) -> Result<PathBuf, WeightsChoiceError> {
+    if !path.is_dir() {
+        return Ok(path.to_path_buf());
+    }
+    let candidates: &[Method] = match method {
+        Method::Late => &[Method::None],
+        Method::Early => &[Method::Early, Method::None],
+        _ => &[method],
+    };
+    let mut last = (method, 0);
+    for &name in candidates {
+        let mut files = files_of(path, name)?;
+        match (files.pop(), files.len()) {
+            (Some(file), 0) => return Ok(file),
+            (None, _) => last = (name, 0),
+            (Some(_), others) => {
+                last = (name, others + 1);
+                break;
+            }
+        }
+    }
+    let (name, found) = last;
+    let trained = path.join(TRAINED_FILE);
+    if found == 0 && trained.is_file() {
+        return trained_for(trained, method, candidates);
+    }
+    Err(WeightsChoiceError::NotOne { folder: path.to_path_buf(), method, name, found })
+}
+
+/// The weights of a training, if it was one of a method that `method` can run with.
+fn trained_for(file: PathBuf, method: Method, candidates: &[Method]) -> Result<PathBuf, WeightsChoiceError> {
+    let weights = Weights::load(&file)?;
+    match weights.metadata(METHOD_KEY) {
+        Some(trained) if candidates.iter().all(|name| name.name() != trained) => {
+            let trained = trained.to_owned();
+            Err(WeightsChoiceError::OtherMethod { file, method, name: candidates[0], trained })
+        }
+        _ => Ok(file),
+    }
+}
+
+fn files_of(folder: &Path, name: Method) -> Result<Vec<PathBuf>, WeightsChoiceError> {
+    let io = |source| WeightsChoiceError::Io { folder: folder.to_path_buf(), source };
+    let ending = format!("-{name}.safetensors");
+    let mut files = Vec::new();
+    for entry in std::fs::read_dir(folder).map_err(io)? {
+        let entry = entry.map_err(io)?;
+        if entry.file_name().to_string_lossy().ends_with(&ending) {
+            files.push(entry.path());
+        }
+    }
+    let trained = folder.join(name.name()).join(TRAINED_FILE);
+    files.extend(trained.is_file().then_some(trained));
+    Ok(files)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::collections::BTreeMap;
+
+    use perception::weights::{Precision, save};
+    use tch::Device;
+    use tch::nn::{Init, VarStore};
+
+    use super::*;
+
+    #[test]
+    fn a_folder_holds_one_file_per_method() {
+        let folder = tempfile::tempdir().unwrap();
+        for name in ["lean-none.safetensors", "lean-max.safetensors", "full-max.safetensors", "lean-none.md"] {
+            std::fs::write(folder.path().join(name), b"").unwrap();
+        }
+        let of = |method| weights_of(folder.path(), method);
+        for method in [Method::None, Method::Late, Method::Early] {
+            assert!(of(method).unwrap().ends_with("lean-none.safetensors"), "{method}");
+        }
+        std::fs::write(folder.path().join("lean-early.safetensors"), b"").unwrap();
+        assert!(of(Method::Early).unwrap().ends_with("lean-early.safetensors"));
+        assert!(of(Method::Max).unwrap_err().to_string().contains("2 files named *-max.safetensors"));
+        assert!(of(Method::Attention).unwrap_err().to_string().contains("0 files"));
+        assert_eq!(weights_of(Path::new("w.safetensors"), Method::Late).unwrap(), Path::new("w.safetensors"));
+    }
+
+    /// A training's folder with weights that say what they were trained for.
+    fn write_trained(folder: &Path, method: Method) {
+        std::fs::create_dir_all(folder).unwrap();
+        let variables = VarStore::new(Device::Cpu);
+        let _ = variables.root().var("weight", &[2], Init::Const(1.0));
+        let about = BTreeMap::from([(METHOD_KEY.to_owned(), method.name().to_owned())]);
+        save(&folder.join(TRAINED_FILE), &variables, &about, Precision::Single).unwrap();
+    }
+
+    #[test]
+    fn the_folder_of_a_training_serves_the_method_it_was_trained_for() {
+        let folder = tempfile::tempdir().unwrap();
+        write_trained(folder.path(), Method::None);
+        let of = |method| weights_of(folder.path(), method);
+        for method in [Method::None, Method::Late, Method::Early] {
+            assert!(of(method).unwrap().ends_with(TRAINED_FILE), "{method}");
+        }
+        let refused = of(Method::Attention).unwrap_err().to_string();
+        assert!(
+            refused.contains("trained for none, and method attention needs weights trained for attention"),
+            "{refused}"
+        );
+    }
+
+    #[test]
+    fn trainings_side_by_side_are_found_by_the_names_of_their_methods() {
+        let folder = tempfile::tempdir().unwrap();
+        for method in [Method::None, Method::Max] {
+            write_trained(&folder.path().join(method.name()), method);
+        }
+        let of = |method| weights_of(folder.path(), method);
+        assert_eq!(of(Method::Max).unwrap(), folder.path().join("max").join(TRAINED_FILE));
+        assert_eq!(of(Method::Late).unwrap(), folder.path().join("none").join(TRAINED_FILE));
+        assert!(of(Method::Attention).unwrap_err().to_string().contains("attention/weights.safetensors"));
+        std::fs::write(folder.path().join("lean-max.safetensors"), b"").unwrap();
+        assert!(of(Method::Max).unwrap_err().to_string().contains("2 files"), "two that could be meant");
+    }
+}

@@ -1,0 +1,93 @@
+//! The agents of a run in virtual time as processes of their own.
+
+use std::path::Path;
+use std::sync::mpsc::channel;
+use std::thread;
+use std::time::Duration;
+
+use bus::shutdown::Stop;
+use bus::{Bus, Identity};
+use ego_fuser_offline::evaluation::EvaluateError;
+use ego_fuser_offline::evaluation::stepped::RemoteCrew;
+use protocol::{CavId, ProcessId, RunId};
+
+use crate::operate::fleet::{Fleet, Meeting};
+use crate::operate::network::MeetingPlace;
+use crate::operate::run_fleet::UpError;
+use crate::operate::run_folder::RunFolder;
+use crate::operate::security::RunKeys;
+use crate::operate::supervise::{Happening, Supervisor};
+
+/// What the process that hands out the sweeps is called on the bus.
+const NAME: &str = "stepped";
+/// How long the session may take to close.
+const LEAVE_LIMIT: Duration = Duration::from_secs(2);
+
+/// The processes, and where they meet.
+pub(crate) struct CrewProcesses {
+    supervisor: Supervisor,
+    bus: Bus,
+    place: MeetingPlace,
+    grace: Duration,
+    _keys: Option<RunKeys>,
+}
+
+impl CrewProcesses {
+    /// Starts an agent for each vehicle and waits until all are there.
+    ///
+    /// # Errors
+    /// [`UpError`] when they cannot meet.
+    pub(crate) fn start(
+        fleet: &Fleet,
+        run: &RunId,
+        folder: &RunFolder,
+        programs: &Path,
+    ) -> Result<(Self, RemoteCrew), UpError> {
+        let keys = fleet.keys(folder)?;
+        let place = MeetingPlace::open(&fleet.scenario.network, run, keys.as_ref())?;
+        let endpoint = place.endpoint.as_str();
+        let mut specs = fleet.processes(&Meeting { run, endpoint, keys: keys.as_ref(), programs, folder });
+        specs.retain(|spec| spec.program.ends_with("agent"));
+        place.check_free(&fleet.scenario.network, run, &specs)?;
+        let identity = Identity {
+            run: run.clone(),
+            process: ProcessId::new(NAME).expect("lower-case letters"),
+            cav: CavId::new(NAME).expect("lower-case letters"),
+        };
+        let bus = Bus::over(place.session.clone(), identity)?;
+        let (events, happened) = channel();
+        // Who starts anew has forgotten what came before, and the result would depend on when it fell.
+        let supervisor = Supervisor::start(specs, &folder.log_dir(), 0, &events)?;
+        let stop = Stop::new();
+        thread::spawn({
+            let stop = stop.clone();
+            move || {
+                for event in happened {
+                    if let Happening::GaveUp { how, .. } = event.what {
+                        tracing::error!("{} {how}", event.name);
+                        stop.request();
+                    }
+                }
+            }
+        });
+        let stream = fleet.publish().stream();
+        let vehicles: Vec<_> = fleet.agents.iter().map(|cav| (cav.clone(), stream)).collect();
+        let timeouts = &fleet.scenario.timeouts;
+        let remote = RemoteCrew::meet(&bus, &vehicles, Duration::from_secs_f64(timeouts.ready_s), &stop)
+            .map_err(|error| EvaluateError::from(Box::new(error)))?;
+        let grace = Duration::from_secs_f64(timeouts.stop_s);
+        Ok((Self { supervisor, bus, place, grace, _keys: keys }, remote))
+    }
+
+    /// Ends all; the names of those that had to be killed.
+    pub(crate) fn end(self) -> Vec<String> {
+        let Self { supervisor, bus, place, grace, _keys } = self;
+        let killed = supervisor.stop(grace).killed;
+        for closed in [bus.leave(LEAVE_LIMIT), place.close()] {
+            if let Err(overdue) = closed {
+                tracing::warn!("{overdue}");
+            }
+        }
+        killed
+    }
+}

@@ -1,0 +1,113 @@
+//! What went wrong with single processes of a run that goes on without what they were to do: the run ends with exit code 3.
+
+use std::collections::BTreeMap;
+
+use sim_replay::recorder::RecordReport;
+
+use crate::operate::fleet::RECORDER;
+use crate::operate::supervise::{Happening, ProcessEvent};
+
+/// The failures of a run, by process.
+#[derive(Debug, Default)]
+pub(crate) struct Failures {
+    /// In words.
+    failed: BTreeMap<String, String>,
+    /// The last line of each process's report.
+    said: BTreeMap<String, String>,
+}
+
+impl Failures {
+    /// Takes note of what happened; what is wrong with the process from now on, in words.
+    pub(crate) fn note(&mut self, event: &ProcessEvent) -> Option<&str> {
+        let ProcessEvent { name, what } = event;
+        let words = match what {
+            Happening::Said { line } if name == RECORDER => {
+                serde_json::from_str::<RecordReport>(line).ok()?.loss_in_words()?
+            }
+            Happening::Said { line } => {
+                self.said.insert(name.clone(), line.clone());
+                return None;
+            }
+            // Its report tells why.
+            Happening::Done { data_lost: true } if self.failed.contains_key(name) => return None,
+            Happening::Done { data_lost: true } => match self.said.get(name) {
+                Some(line) => format!("data were lost: {line}"),
+                None => "data were lost; see its log".into(),
+            },
+            Happening::GaveUp { how, is_optional: true } => format!("{how}; the run went on without it"),
+            Happening::Failed { how } => format!("{how} when it was asked to end"),
+            Happening::GaveUp { is_optional: false, .. }
+            | Happening::Started { .. }
+            | Happening::Fell { .. }
+            | Happening::Done { data_lost: false } => return None,
+        };
+        self.failed.insert(name.clone(), words);
+        self.failed.get(name).map(String::as_str)
+    }
+
+    /// Each of them with the name of its process.
+    pub(crate) fn in_words(&self) -> Vec<String> {
+        self.failed.iter().map(|(name, words)| format!("{name}: {words}")).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn noted(events: &[(&str, Happening)]) -> Vec<String> {
+        let mut failures = Failures::default();
+        for (name, what) in events {
+            failures.note(&ProcessEvent { name: (*name).into(), what: what.clone() });
+        }
+        failures.in_words()
+    }
+
+    fn report(failure: Option<&str>, not_written: u64) -> Happening {
+        let report = RecordReport {
+            file: "runs/a/recording.mcap".into(),
+            messages: 40,
+            bytes: 1000,
+            seconds: 0.93,
+            overwritten: 0,
+            not_written,
+            failure: failure.map(str::to_owned),
+        };
+        Happening::Said { line: serde_json::to_string(&report).unwrap() }
+    }
+
+    #[test]
+    fn a_recording_that_is_cut_is_told_with_what_helps() {
+        let events = [
+            ("recorder", report(Some("disk full"), 0)),
+            ("recorder", report(Some("disk full"), 344)),
+            ("recorder", Happening::Done { data_lost: true }),
+        ];
+        let words = "recorder: recording cut at 0.9 s: disk full, 344 messages missing; \
+                     sim-replay recover runs/a/recording.mcap --out runs/a/recording.whole.mcap";
+        assert_eq!(noted(&events), [words]);
+        assert!(noted(&[("recorder", report(None, 0)), ("recorder", Happening::Done { data_lost: false })]).is_empty());
+    }
+
+    #[test]
+    fn every_process_counts() {
+        let said = |line: &str| Happening::Said { line: line.into() };
+        let events = [
+            ("replay", said("7 ticks were not answered")),
+            ("replay", Happening::Done { data_lost: true }),
+            ("link-1", Happening::Failed { how: "ended with code 1".into() }),
+            ("agent-1", Happening::Started { pid: 1 }),
+            ("agent-1", said("40 sweeps")),
+            ("agent-1", Happening::Done { data_lost: false }),
+            ("recorder", Happening::GaveUp { how: "was ended by signal 9".into(), is_optional: true }),
+        ];
+        assert_eq!(
+            noted(&events),
+            [
+                "link-1: ended with code 1 when it was asked to end",
+                "recorder: was ended by signal 9; the run went on without it",
+                "replay: data were lost: 7 ticks were not answered",
+            ]
+        );
+    }
+}

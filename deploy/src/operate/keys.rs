@@ -1,0 +1,288 @@
+//! A test authority, and certificates for the processes of a fleet.
+//!
+//! ```text
+//! KEYS/authority.key        signs further certificates; belongs on no vehicle
+//! KEYS/agent-4279/ca.pem    whom to trust
+//!                 cert.pem  who this is: the common name is that of the folder
+//!                 key.pem   the proof of it, readable for its owner alone
+//! KEYS/router/members       beside the router's own three: whom it lets in
+//! ```
+//!
+//! A host gets the folders of its own processes and nothing else.
+
+use std::fs::{self, OpenOptions};
+use std::io::{self, Write};
+use std::net::IpAddr;
+use std::os::unix::fs::{DirBuilderExt, OpenOptionsExt};
+use std::path::{Path, PathBuf};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+
+use bus::{AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE, MEMBERS_FILE, ROUTER};
+use protocol::Party;
+use rcgen::{
+    BasicConstraints, CertificateParams, DistinguishedName, DnType, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair,
+    KeyUsagePurpose, SanType, date_time_ymd,
+};
+
+/// The key of the authority.
+pub const AUTHORITY_KEY: &str = "authority.key";
+const AUTHORITY_NAME: &str = "v2vloc test authority";
+const DAY: Duration = Duration::from_secs(24 * 3600);
+/// Certificates hold from a little before they are made: clocks differ.
+const LEEWAY: Duration = Duration::from_secs(600);
+
+/// What to make.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct KeyPlan {
+    /// Where; an authority that is there already signs.
+    pub folder: PathBuf,
+    /// For whom, beside the router.
+    pub parties: Vec<Party>,
+    /// Names and addresses under which the router is reached.
+    pub hosts: Vec<String>,
+    /// How long the certificates hold.
+    pub lifetime: Duration,
+    /// Whether certificates that are there are replaced.
+    pub replace: bool,
+}
+
+impl KeyPlan {
+    /// Certificates for `parties` of a fleet on this machine, for `days` days.
+    #[must_use]
+    pub fn new(folder: &Path, parties: Vec<Party>, days: u32) -> Self {
+        let hosts = ["localhost", "127.0.0.1", "::1"].map(str::to_owned).into();
+        Self { folder: folder.to_path_buf(), parties, hosts, lifetime: DAY * days, replace: false }
+    }
+}
+
+/// Why there are no keys.
+#[derive(Debug, thiserror::Error)]
+pub enum KeyError {
+    /// The disk refuses.
+    #[error("{}: {cause}", path.display())]
+    Io {
+        /// Which file or folder.
+        path: PathBuf,
+        /// The system's words.
+        cause: io::Error,
+    },
+    /// Nothing is overwritten unasked.
+    #[error("{} is there already; --force makes it anew, and whoever holds the old one keeps it until it expires", .0.display())]
+    There(PathBuf),
+    /// A name of a host, or a key, that cannot be used.
+    #[error("{what}: {cause}")]
+    Unusable {
+        /// What.
+        what: String,
+        /// Why.
+        cause: rcgen::Error,
+    },
+}
+
+/// Makes what the plan asks for, and tells every file it wrote.
+///
+/// # Errors
+/// [`KeyError`]; files that were written before it stay.
+pub fn make(plan: &KeyPlan) -> Result<Vec<PathBuf>, KeyError> {
+    let mut desk = Desk { plan, written: Vec::new() };
+    let folders = plan.parties.iter().map(ToString::to_string).chain([ROUTER.to_owned()]);
+    let folders: Vec<(String, PathBuf)> = folders.map(|name| (name.clone(), plan.folder.join(name))).collect();
+    let router_is_there = plan.folder.join(ROUTER).join(CERTIFICATE_FILE).exists();
+    let is_wanted = |name: &str| name != ROUTER || !router_is_there || plan.replace;
+    if !plan.replace {
+        let taken = folders.iter().map(|(name, folder)| (name, folder.join(CERTIFICATE_FILE)));
+        if let Some((_, taken)) = taken.filter(|(name, _)| *name != ROUTER).find(|(_, file)| file.exists()) {
+            return Err(KeyError::There(taken));
+        }
+    }
+    let authority = desk.authority()?;
+    for (name, folder) in folders.iter().filter(|(name, _)| is_wanted(name)) {
+        desk.certify(&authority, name, folder)?;
+    }
+    desk.enlist()?;
+    Ok(desk.written)
+}
+
+/// The authority: its certificate as text, and what signs.
+struct Authority {
+    pem: String,
+    issuer: Issuer<'static, KeyPair>,
+}
+
+struct Desk<'a> {
+    plan: &'a KeyPlan,
+    written: Vec<PathBuf>,
+}
+
+impl Desk<'_> {
+    /// Takes the authority of the folder, or founds one.
+    fn authority(&mut self) -> Result<Authority, KeyError> {
+        let folder = &self.plan.folder;
+        make_folder(folder)?;
+        let (key_path, pem_path) = (folder.join(AUTHORITY_KEY), folder.join(AUTHORITY_FILE));
+        let unusable = |cause| KeyError::Unusable { what: key_path.display().to_string(), cause };
+        // One that is there goes on for as long as the certificates that it signs.
+        let params = authority_params(self.plan.lifetime.max(DAY * 3650))?;
+        if key_path.exists() {
+            let key = KeyPair::from_pem(&read(&key_path)?).map_err(unusable)?;
+            return Ok(Authority { pem: read(&pem_path)?, issuer: Issuer::new(params, key) });
+        }
+        let key = KeyPair::generate().map_err(unusable)?;
+        let pem = params.self_signed(&key).map_err(unusable)?.pem();
+        self.write(key_path.clone(), &key.serialize_pem(), 0o600)?;
+        self.write(pem_path, &pem, 0o644)?;
+        Ok(Authority { pem, issuer: Issuer::new(params, key) })
+    }
+
+    fn certify(&mut self, authority: &Authority, name: &str, folder: &Path) -> Result<(), KeyError> {
+        let unusable = |cause| KeyError::Unusable { what: format!("a certificate for {name}"), cause };
+        let mut params = params(name, self.plan.lifetime)?;
+        params.use_authority_key_identifier_extension = true;
+        params.key_usages = vec![KeyUsagePurpose::DigitalSignature];
+        // Any process can be the router of its run (--listen); only the one of that name is asked by its address.
+        params.extended_key_usages = vec![ExtendedKeyUsagePurpose::ClientAuth];
+        if name == ROUTER {
+            params.extended_key_usages.push(ExtendedKeyUsagePurpose::ServerAuth);
+            params.subject_alt_names =
+                self.plan.hosts.iter().map(|host| alternative(host)).collect::<Result<_, _>>()?;
+        }
+        let key = KeyPair::generate().map_err(unusable)?;
+        let certificate = params.signed_by(&key, &authority.issuer).map_err(unusable)?;
+        make_folder(folder)?;
+        self.write(folder.join(AUTHORITY_FILE), &authority.pem, 0o644)?;
+        self.write(folder.join(KEY_FILE), &key.serialize_pem(), 0o600)?;
+        // Last: where it is, the rest is.
+        self.write(folder.join(CERTIFICATE_FILE), &certificate.pem(), 0o644)
+    }
+
+    /// Tells the router of everybody in the folder, also of those who were there before.
+    fn enlist(&mut self) -> Result<(), KeyError> {
+        let folder = &self.plan.folder;
+        let io = |cause| KeyError::Io { path: folder.clone(), cause };
+        let mut members = Vec::new();
+        for entry in fs::read_dir(folder).map_err(io)? {
+            let entry = entry.map_err(io)?;
+            let name = entry.file_name().to_string_lossy().into_owned();
+            if entry.path().join(CERTIFICATE_FILE).exists() && name.parse::<Party>().is_ok() {
+                members.push(name + "\n");
+            }
+        }
+        members.sort();
+        self.write(folder.join(ROUTER).join(MEMBERS_FILE), &members.concat(), 0o644)
+    }
+
+    /// Never leaves half a file, nor a moment in which others can read a key.
+    fn write(&mut self, path: PathBuf, text: &str, mode: u32) -> Result<(), KeyError> {
+        let io = |cause| KeyError::Io { path: path.clone(), cause };
+        let begun = path.with_extension("new");
+        let _ = fs::remove_file(&begun);
+        let mut file = OpenOptions::new().write(true).create_new(true).mode(mode).open(&begun).map_err(io)?;
+        file.write_all(text.as_bytes()).and_then(|()| file.sync_all()).map_err(io)?;
+        fs::rename(&begun, &path).map_err(io)?;
+        self.written.push(path);
+        Ok(())
+    }
+}
+
+fn make_folder(path: &Path) -> Result<(), KeyError> {
+    let made = fs::DirBuilder::new().recursive(true).mode(0o700).create(path);
+    made.map_err(|cause| KeyError::Io { path: path.to_path_buf(), cause })
+}
+
+fn read(path: &Path) -> Result<String, KeyError> {
+    fs::read_to_string(path).map_err(|cause| KeyError::Io { path: path.to_path_buf(), cause })
+}
+
+fn authority_params(lifetime: Duration) -> Result<CertificateParams, KeyError> {
+    let mut params = params(AUTHORITY_NAME, lifetime)?;
+    params.is_ca = IsCa::Ca(BasicConstraints::Constrained(0));
+    params.key_usages = vec![KeyUsagePurpose::KeyCertSign, KeyUsagePurpose::CrlSign];
+    Ok(params)
+}
+
+fn params(name: &str, lifetime: Duration) -> Result<CertificateParams, KeyError> {
+    let unusable = |cause| KeyError::Unusable { what: name.to_owned(), cause };
+    let mut params = CertificateParams::new(Vec::new()).map_err(unusable)?;
+    params.distinguished_name = DistinguishedName::new();
+    params.distinguished_name.push(DnType::CommonName, name);
+    let now = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    let epoch = date_time_ymd(1970, 1, 1);
+    params.not_before = epoch + now.saturating_sub(LEEWAY);
+    params.not_after = epoch + now + lifetime;
+    Ok(params)
+}
+
+/// A name or an address in a router's certificate.
+fn alternative(host: &str) -> Result<SanType, KeyError> {
+    if let Ok(address) = host.parse::<IpAddr>() {
+        return Ok(SanType::IpAddress(address));
+    }
+    let unusable = |cause| KeyError::Unusable { what: format!("host {host:?}"), cause };
+    host.try_into().map(SanType::DnsName).map_err(unusable)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::fs::PermissionsExt;
+
+    use bus::Credentials;
+
+    use super::*;
+
+    fn parties(names: &[&str]) -> Vec<Party> {
+        names.iter().map(|name| name.parse().unwrap()).collect()
+    }
+
+    #[test]
+    fn everybody_gets_a_certificate_and_a_key_of_his_own() {
+        let folder = tempfile::tempdir().unwrap();
+        let plan = KeyPlan::new(&folder.path().join("keys"), parties(&["agent-1", "replay"]), 1);
+        let written = make(&plan).unwrap();
+        assert_eq!(written.len(), 2 + 3 * 3 + 1, "{written:?}");
+        for name in ["agent-1", "replay", "router"] {
+            let credentials = Credentials::read(&plan.folder.join(name)).unwrap();
+            assert_eq!(credentials.name(), name);
+            assert!(credentials.check_name("agent-2").is_err());
+            let mode = fs::metadata(plan.folder.join(name).join(KEY_FILE)).unwrap().permissions().mode();
+            assert_eq!(mode & 0o777, 0o600, "{name}");
+        }
+        assert_eq!(fs::metadata(plan.folder.join(AUTHORITY_KEY)).unwrap().permissions().mode() & 0o777, 0o600);
+        let members = Credentials::read(&plan.folder.join("router")).unwrap().members().unwrap();
+        assert_eq!(members, parties(&["agent-1", "replay"]));
+    }
+
+    #[test]
+    fn what_is_there_stays_unless_asked() {
+        let folder = tempfile::tempdir().unwrap();
+        let plan = KeyPlan::new(folder.path(), parties(&["agent-1"]), 1);
+        make(&plan).unwrap();
+        let read = |name: &str| fs::read(folder.path().join(name).join(CERTIFICATE_FILE)).unwrap();
+        let (agent, router) = (read("agent-1"), read("router"));
+        assert!(matches!(make(&plan), Err(KeyError::There(_))));
+        // A vehicle that comes later is signed by the same authority.
+        make(&KeyPlan { parties: parties(&["agent-2"]), ..plan.clone() }).unwrap();
+        assert_eq!((read("agent-1"), read("router")), (agent.clone(), router));
+        let members = fs::read_to_string(folder.path().join("router/members")).unwrap();
+        assert_eq!(members, "agent-1\nagent-2\n");
+        make(&KeyPlan { replace: true, ..plan }).unwrap();
+        assert_ne!(read("agent-1"), agent);
+    }
+
+    #[test]
+    fn an_expired_certificate_is_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let plan = KeyPlan { lifetime: Duration::ZERO, ..KeyPlan::new(folder.path(), parties(&["agent-1"]), 1) };
+        make(&plan).unwrap();
+        std::thread::sleep(Duration::from_millis(1100));
+        let error = Credentials::read(&folder.path().join("agent-1")).unwrap_err().to_string();
+        assert!(error.contains("agent-1 expired"), "{error}");
+    }
+
+    #[test]
+    fn a_host_that_is_none_is_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let hosts = vec!["router.local".into(), "näher".into()];
+        let plan = KeyPlan { hosts, ..KeyPlan::new(folder.path(), Vec::new(), 1) };
+        assert!(make(&plan).unwrap_err().to_string().contains("näher"));
+    }
+}

@@ -1,0 +1,137 @@
+//! Where the processes of a run meet: a router inside this process, or one that runs elsewhere.
+
+use std::net::{SocketAddr, TcpListener, UdpSocket};
+use std::time::Duration;
+
+use bus::shutdown::{self, Overdue};
+use bus::{BusError, BusOptions, Endpoint, open, present, process_id};
+use zenoh::{Session, Wait};
+
+use protocol::{Party, ProcessId, Role, RunId};
+
+use crate::experiment::score::scorer_cav;
+use crate::operate::run_fleet::UpError;
+use crate::operate::security::RunKeys;
+use crate::operate::supervise::ProcessSpec;
+use crate::scenario::Network;
+
+/// How long closing the session may take.
+const CLOSE_LIMIT: Duration = Duration::from_millis(500);
+
+/// An open session, and the endpoint that the other processes connect to.
+pub struct MeetingPlace {
+    /// The session of this process.
+    pub session: Session,
+    /// What to tell the others.
+    pub endpoint: Endpoint,
+    /// Whether the router is this process and refuses what is not allowed.
+    pub is_guarded: bool,
+}
+
+impl MeetingPlace {
+    /// Opens the router of this run, or connects to the one that the scenario names; with keys over QUIC.
+    ///
+    /// # Errors
+    /// [`BusError`] when the port is in use, nothing answers there, the endpoint is none or the keys are not right.
+    pub fn open(network: &Network, run: &RunId, keys: Option<&RunKeys>) -> Result<Self, BusError> {
+        let options = match &network.connect {
+            Some(router) => {
+                let options = BusOptions::client(Endpoint::new(router)?);
+                keys.map_or(Ok(options.clone()), |keys| {
+                    keys.for_client(options, Party::alone(Role::Scorer).name().as_str())
+                })
+            }
+            None => {
+                let mut options = BusOptions::router(with_port(&network.listen, keys.is_some())?);
+                options.stall_limit = Duration::from_secs_f64(network.stall_limit_s);
+                keys.map_or(Ok(options.clone()), |keys| keys.for_router(options, run))
+            }
+        }?;
+        let session = open(&options)?;
+        Ok(Self { session, endpoint: from_here(options.endpoint())?, is_guarded: options.guard.is_some() })
+    }
+
+    /// Checks that none of the processes to start, nor a scorer, is there already, on a router that others use too.
+    ///
+    /// # Errors
+    /// [`UpError::Live`] names those that are; [`UpError::Network`] when the router does not say.
+    pub fn check_free(&self, network: &Network, run: &RunId, specs: &[ProcessSpec]) -> Result<(), UpError> {
+        if network.connect.is_none() {
+            return Ok(());
+        }
+        let scorer = process_id(Role::Scorer, &scorer_cav());
+        let is_ours =
+            |process: &ProcessId| *process == scorer || specs.iter().any(|spec| spec.name == process.as_str());
+        let processes: Vec<ProcessId> = present(&self.session, run)?.into_iter().filter(is_ours).collect();
+        if processes.is_empty() {
+            return Ok(());
+        }
+        Err(UpError::Live { run: run.clone(), router: self.endpoint.to_string(), processes })
+    }
+
+    /// Closes the session.
+    ///
+    /// # Errors
+    /// [`Overdue`] when the network does not let go.
+    pub fn close(self) -> Result<(), Overdue> {
+        shutdown::within(CLOSE_LIMIT, "the router", move || {
+            if let Err(cause) = self.session.close().wait() {
+                tracing::debug!("closing the router: {cause}");
+            }
+        })
+    }
+}
+
+/// The endpoint as processes of this host reach it: who listens everywhere is met on the loopback, whose name certificates
+/// carry.
+fn from_here(endpoint: &Endpoint) -> Result<Endpoint, BusError> {
+    let text = endpoint.as_str().replacen("/0.0.0.0:", "/127.0.0.1:", 1);
+    Endpoint::new(&text.replacen("/[::]:", "/[::1]:", 1))
+}
+
+/// The endpoint with port 0 replaced by a port that is free right now.
+fn with_port(listen: &str, secured: bool) -> Result<Endpoint, BusError> {
+    let Some(place) = listen.strip_suffix(":0") else { return Endpoint::new(listen) };
+    let host = place.split_once('/').map_or(place, |(_, host)| host);
+    // Asking the system beats guessing; should another program take the port in between, the router says so.
+    let bound = if secured {
+        UdpSocket::bind(format!("{host}:0")).and_then(|socket| socket.local_addr())
+    } else {
+        TcpListener::bind(format!("{host}:0")).and_then(|listener| listener.local_addr())
+    };
+    Endpoint::new(&format!("{place}:{}", bound.as_ref().map_or(0, SocketAddr::port)))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn port_zero_becomes_a_free_one() {
+        for (listen, secured) in [("tcp/127.0.0.1:0", false), ("tcp/127.0.0.1:0", true), ("quic/127.0.0.1:0", true)] {
+            let endpoint = with_port(listen, secured).unwrap();
+            assert!(!endpoint.as_str().ends_with(":0"), "{}", endpoint.as_str());
+        }
+        assert_eq!(with_port("tcp/127.0.0.1:7447", false).unwrap().as_str(), "tcp/127.0.0.1:7447");
+    }
+
+    #[test]
+    fn who_listens_everywhere_is_met_on_the_loopback() {
+        for (listen, met) in [
+            ("quic/0.0.0.0:7447", "quic/127.0.0.1:7447"),
+            ("tcp/[::]:7447", "tcp/[::1]:7447"),
+            ("tcp/10.0.0.1:7447", "tcp/10.0.0.1:7447"),
+        ] {
+            assert_eq!(from_here(&Endpoint::new(listen).unwrap()).unwrap().as_str(), met);
+        }
+    }
+
+    #[test]
+    fn a_port_in_use_is_named() {
+        let taken = TcpListener::bind("127.0.0.1:0").unwrap();
+        let listen = format!("tcp/{}", taken.local_addr().unwrap());
+        let network = Network { listen: listen.clone(), ..Network::default() };
+        let error = MeetingPlace::open(&network, &"r1".parse().unwrap(), None).err().unwrap().to_string();
+        assert!(error.contains(&listen) && error.contains("in use"), "{error}");
+    }
+}

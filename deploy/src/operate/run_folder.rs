@@ -1,0 +1,255 @@
+//! `runs/<name>/`: everything that is kept of a run.
+
+use std::collections::BTreeMap;
+use std::fmt::Write as _;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, SystemTime, UNIX_EPOCH};
+
+use protocol::RunId;
+use serde::Serialize;
+
+use crate::experiment::score::{FrameRecord, StageStamps};
+
+/// Why a run folder cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum RunFolderError {
+    /// Another run of that name is kept there.
+    #[error("{} exists already: choose another --name, or remove it", .0.display())]
+    Taken(PathBuf),
+    /// A file or folder cannot be written.
+    #[error("cannot write {}: {source}", path.display())]
+    Write {
+        /// Which.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+}
+
+/// The recording of a run.
+pub const RECORDING: &str = "recording.mcap";
+/// Where the ego's agent notes when each sweep came.
+pub const SWEEP_LOG: &str = "sweeps.csv";
+/// Where the replay notes how far it is, for one that falls and is started again.
+pub const BOOKMARK: &str = "replay.json";
+
+/// The folder of one run.
+#[derive(Debug, Clone)]
+pub struct RunFolder {
+    path: PathBuf,
+}
+
+impl RunFolder {
+    /// Creates `<runs>/<name>` and `log` in it.
+    ///
+    /// # Errors
+    /// [`RunFolderError`] when it is there already or cannot be created.
+    pub fn create(runs: &Path, name: &RunId) -> Result<Self, RunFolderError> {
+        let runs = std::path::absolute(runs).unwrap_or_else(|_| runs.into());
+        let path = runs.join(name.as_str());
+        fs::create_dir_all(&runs).map_err(|source| RunFolderError::Write { path: runs.clone(), source })?;
+        // One call that fails if it is there, so that two runs never share a folder.
+        match fs::create_dir(&path) {
+            Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => return Err(RunFolderError::Taken(path)),
+            other => other.map_err(|source| RunFolderError::Write { path: path.clone(), source })?,
+        }
+        let log = path.join("log");
+        fs::create_dir(&log).map_err(|source| RunFolderError::Write { path: log, source })?;
+        Ok(Self { path })
+    }
+
+    /// Removes it with all that is in it: of a run that was refused before it began, so that its name is free again.
+    pub fn remove(self) {
+        if let Err(error) = fs::remove_dir_all(&self.path) {
+            tracing::warn!("cannot remove {}, the folder of a run that did not begin: {error}", self.path.display());
+        }
+    }
+
+    /// Where it is.
+    #[must_use]
+    pub fn path(&self) -> &Path {
+        &self.path
+    }
+
+    /// Where the processes' logs are.
+    #[must_use]
+    pub fn log_dir(&self) -> PathBuf {
+        self.path.join("log")
+    }
+
+    /// The path of a file in it.
+    #[must_use]
+    pub fn file(&self, name: &str) -> PathBuf {
+        self.path.join(name)
+    }
+
+    /// Writes a text file.
+    ///
+    /// # Errors
+    /// [`RunFolderError::Write`].
+    pub fn write(&self, name: &str, text: &str) -> Result<(), RunFolderError> {
+        let path = self.file(name);
+        fs::write(&path, text).map_err(|source| {
+            // Half a file is worse than none.
+            let _ = fs::remove_file(&path);
+            RunFolderError::Write { path, source }
+        })
+    }
+
+    /// Writes `value` as indented JSON.
+    ///
+    /// # Errors
+    /// [`RunFolderError::Write`].
+    pub fn write_json(&self, name: &str, value: &impl Serialize) -> Result<(), RunFolderError> {
+        let text = serde_json::to_string_pretty(value)
+            .map_err(|error| RunFolderError::Write { path: self.file(name), source: error.into() })?;
+        self.write(name, &(text + "\n"))
+    }
+
+    /// Writes `frames.csv`; `swept` says when the sweep of each capture time reached the ego's agent, Unix nanoseconds.
+    ///
+    /// # Errors
+    /// [`RunFolderError::Write`].
+    pub fn write_frames(&self, records: &[FrameRecord], swept: &BTreeMap<u64, u64>) -> Result<(), RunFolderError> {
+        self.write("frames.csv", &frames_csv(records, swept))
+    }
+}
+
+/// The table of a run's frames: a header line, then a line per frame.
+fn frames_csv(records: &[FrameRecord], swept: &BTreeMap<u64, u64>) -> String {
+    let mut text = String::from(
+        "tick,agent_frame,capture_nanos,latency_ms,detected,truth,found,fused,skipped,oldest_ms,stale,payload_bytes,wire_bytes,ego_error_m,\
+         ego_error_deg,swept_ms,posed_ms,published_ms,arrived_ms,decided_ms,fused_ms,detected_ms\n",
+    );
+    let optional = |number: &Option<f64>| number.map_or(String::new(), |number| format!("{number:.4}"));
+    for record in records {
+        // Destructured in full, so that a new column stops the build here.
+        let FrameRecord {
+            tick,
+            agent_frame,
+            capture_nanos,
+            latency_ms,
+            stamps,
+            detected,
+            truth,
+            found,
+            fused,
+            skipped,
+            oldest_ms,
+            stale,
+            payload_bytes,
+            wire_bytes,
+            ego_error_m,
+            ego_error_deg,
+        } = record;
+        let [latency_ms, oldest_ms, error_m, error_deg] =
+            [latency_ms, oldest_ms, ego_error_m, ego_error_deg].map(optional);
+        let swept_ms = swept.get(capture_nanos).and_then(|swept| stamps.since_began_ms(*swept));
+        let StageStamps { began_nanos: _, posed_ms, published_ms, arrived_ms, decided_ms, fused_ms, detected_ms } =
+            stamps;
+        let stamps =
+            [&swept_ms, posed_ms, published_ms, arrived_ms, decided_ms, fused_ms, detected_ms].map(optional).join(",");
+        // Writing to a string cannot fail.
+        let _ = writeln!(
+            text,
+            "{tick},{agent_frame},{capture_nanos},{latency_ms},{detected},{truth},{found},{fused},{skipped},\
+             {oldest_ms},{stale},{payload_bytes},{wire_bytes},{error_m},{error_deg},{stamps}"
+        );
+    }
+    text
+}
+
+/// A name for a run that has none: `prefix` and the time, UTC, for example `up-20260131-235959`.
+///
+/// # Panics
+/// Never with a `prefix` of an identifier's characters, at most 16.
+#[must_use]
+pub fn name_of_now(prefix: &str) -> RunId {
+    let since_epoch = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or(Duration::ZERO);
+    let name = format!("{prefix}-{}", time_stamp(since_epoch.as_secs()));
+    RunId::new(&name).expect("a prefix and digits make an identifier")
+}
+
+/// Seconds of the Unix clock as `YYYYMMDD-HHMMSS`, UTC.
+fn time_stamp(unix_secs: u64) -> String {
+    let (days, second_of_day) = (unix_secs / 86_400, unix_secs % 86_400);
+    // Days since 0000-03-01, cut into 400-year cycles: with years that begin in March the leap day comes last, and the
+    // lengths of the months are a linear function (Howard Hinnant, "chrono-compatible low-level date algorithms").
+    let days = days + 719_468;
+    let (cycle, day_of_cycle) = (days / 146_097, days % 146_097);
+    let year_of_cycle = (day_of_cycle - day_of_cycle / 1_460 + day_of_cycle / 36_524 - day_of_cycle / 146_096) / 365;
+    let day_of_year = day_of_cycle - (365 * year_of_cycle + year_of_cycle / 4 - year_of_cycle / 100);
+    let march_month = (5 * day_of_year + 2) / 153;
+    let day = day_of_year - (153 * march_month + 2) / 5 + 1;
+    let month = if march_month < 10 { march_month + 3 } else { march_month - 9 };
+    let year = 400 * cycle + year_of_cycle + u64::from(month <= 2);
+    let (hour, minute, second) = (second_of_day / 3_600, second_of_day / 60 % 60, second_of_day % 60);
+    format!("{year:04}{month:02}{day:02}-{hour:02}{minute:02}{second:02}")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn two_runs_never_share_a_folder() {
+        let runs = tempfile::tempdir().unwrap();
+        let name = RunId::new("r1").unwrap();
+        let folder = RunFolder::create(&runs.path().join("deeper"), &name).unwrap();
+        assert!(folder.log_dir().is_dir() && folder.path().is_absolute());
+        let error = RunFolder::create(&runs.path().join("deeper"), &name).unwrap_err().to_string();
+        assert!(error.contains("r1 exists already"), "{error}");
+        folder.remove();
+        RunFolder::create(&runs.path().join("deeper"), &name).unwrap();
+    }
+
+    #[test]
+    fn every_line_of_the_table_has_every_column() {
+        let record = FrameRecord {
+            tick: 3,
+            agent_frame: 2,
+            capture_nanos: 300_000_000,
+            latency_ms: Some(81.25),
+            stamps: StageStamps {
+                began_nanos: Some(1_000_000_000),
+                posed_ms: Some(40.5),
+                detected_ms: Some(81.25),
+                ..StageStamps::default()
+            },
+            detected: 20,
+            truth: 22,
+            found: 18,
+            fused: 1,
+            skipped: 0,
+            oldest_ms: Some(100.0),
+            stale: 1,
+            payload_bytes: 1000,
+            wire_bytes: 1300,
+            ego_error_m: Some(0.25),
+            ego_error_deg: None,
+        };
+        let text = frames_csv(&[record], &BTreeMap::from([(300_000_000, 1_002_500_000)]));
+        let lines: Vec<&str> = text.lines().collect();
+        assert_eq!(
+            lines[1],
+            "3,2,300000000,81.2500,20,22,18,1,0,100.0000,1,1000,1300,0.2500,,2.5000,40.5000,,,,,81.2500"
+        );
+        assert_eq!(lines[0].matches(',').count(), lines[1].matches(',').count());
+    }
+
+    #[test]
+    fn time_stamps_are_dates() {
+        // Taken from `date -u -d @... +%Y%m%d-%H%M%S`.
+        for (secs, text) in [
+            (0, "19700101-000000"),
+            (951_782_400, "20000229-000000"),
+            (1_735_689_599, "20241231-235959"),
+            (1_772_323_200, "20260301-000000"),
+            (4_107_542_400, "21000301-000000"),
+        ] {
+            assert_eq!(time_stamp(secs), text);
+        }
+        assert!(name_of_now("up").as_str().starts_with("up-2"));
+    }
+}

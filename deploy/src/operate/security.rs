@@ -1,0 +1,134 @@
+//! The keys of one run: those of a folder, or some made for it alone.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::thread::{self, JoinHandle};
+use std::time::{Duration, Instant};
+
+use bus::shutdown::Stop;
+use bus::{BusError, BusOptions, Credentials, Guard, ROUTER, Refusal, Refusals};
+use protocol::{Party, RunId, Runs};
+
+use crate::operate::keys::{self, KeyError, KeyPlan};
+use crate::operate::network::MeetingPlace;
+use crate::scenario::Security;
+
+/// Days for which the keys of one run hold.
+const DAYS_OF_A_RUN: u32 = 30;
+
+/// Where every process of a run finds its keys.
+#[derive(Debug)]
+pub struct RunKeys {
+    folder: PathBuf,
+    /// Made for this run, and gone with it.
+    is_own: bool,
+}
+
+impl RunKeys {
+    /// Takes the folder that the scenario names, or makes keys for `parties` in `run_folder`.
+    ///
+    /// # Errors
+    /// [`KeyError`] when they cannot be made.
+    pub fn of(security: &Security, parties: Vec<Party>, run_folder: &Path) -> Result<Self, KeyError> {
+        if let Some(folder) = &security.keys {
+            return Ok(Self { folder: folder.clone(), is_own: false });
+        }
+        let own = Self { folder: run_folder.join("keys"), is_own: true };
+        keys::make(&KeyPlan::new(&own.folder, parties, DAYS_OF_A_RUN))?;
+        Ok(own)
+    }
+
+    /// The folder of one process.
+    #[must_use]
+    pub fn of_process(&self, name: &str) -> PathBuf {
+        self.folder.join(name)
+    }
+
+    /// A router with these keys that lets everyone in who has some, into `run`.
+    ///
+    /// # Errors
+    /// [`BusError::Keys`] names what is wrong with them.
+    pub fn for_router(&self, options: BusOptions, run: &RunId) -> Result<BusOptions, BusError> {
+        let credentials = self.read(ROUTER)?;
+        let guard = Guard { members: credentials.members()?, runs: Runs::One(run.clone()) };
+        Ok(options.with_credentials(credentials).guarded_by(guard))
+    }
+
+    /// A client with the keys of the process of that name.
+    ///
+    /// # Errors
+    /// [`BusError::Keys`] names what is wrong with them.
+    pub fn for_client(&self, options: BusOptions, name: &str) -> Result<BusOptions, BusError> {
+        Ok(options.with_credentials(self.read(name)?))
+    }
+
+    fn read(&self, name: &str) -> Result<Credentials, BusError> {
+        let credentials = Credentials::read(&self.of_process(name))?;
+        credentials.check_name(name)?;
+        Ok(credentials)
+    }
+}
+
+impl Drop for RunKeys {
+    fn drop(&mut self) {
+        if self.is_own
+            && let Err(error) = fs::remove_dir_all(&self.folder)
+        {
+            tracing::warn!("{} holds keys that nobody needs any more: {error}", self.folder.display());
+        }
+    }
+}
+
+/// How often the router of a run is asked what it has refused.
+const LOOK_ROUND: Duration = Duration::from_secs(1);
+
+/// Follows what the router of a run refuses.
+pub(crate) struct RefusalWatch {
+    stop: Stop,
+    thread: Option<JoinHandle<Refusals>>,
+}
+
+impl RefusalWatch {
+    /// Follows the router of this process; one that runs elsewhere keeps its own log.
+    ///
+    /// # Errors
+    /// [`BusError::Thread`] when the system gives no thread.
+    pub(crate) fn over(place: &MeetingPlace) -> Result<Self, BusError> {
+        let stop = Stop::new();
+        if !place.is_guarded {
+            return Ok(Self { stop, thread: None });
+        }
+        let (session, ending) = (place.session.clone(), stop.clone());
+        let mut refusals = Refusals::of(&place.endpoint);
+        let look = move || {
+            loop {
+                let ended = ending.wait_until(Instant::now() + LOOK_ROUND);
+                refusals.update(&session);
+                if ended {
+                    return refusals;
+                }
+            }
+        };
+        let thread = thread::Builder::new().name("refusals".into()).spawn(look);
+        let thread = thread.map_err(|cause| BusError::Thread { what: "refusals".into(), cause })?;
+        Ok(Self { stop, thread: Some(thread) })
+    }
+
+    /// All it has refused; said in the log too.
+    pub(crate) fn finish(mut self) -> BTreeMap<Refusal, u64> {
+        self.stop.request();
+        let counts =
+            self.thread.take().and_then(|thread| thread.join().ok()).map_or_else(BTreeMap::new, |all| all.counts());
+        for (Refusal { peer, reason, message }, count) in &counts {
+            tracing::warn!(%peer, %reason, what = %message, count, "refused by the router");
+        }
+        counts
+    }
+}
+
+impl Drop for RefusalWatch {
+    fn drop(&mut self) {
+        self.stop.request();
+    }
+}

@@ -1,0 +1,343 @@
+//! `status.json` in the folder of a run: how it goes, written while it goes and for the last time when it has ended.
+
+use std::fmt::Write as _;
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+use protocol::HeardNeighbour;
+use serde::{Deserialize, Serialize};
+use support::atomic_file;
+
+use crate::experiment::score::Progress;
+use crate::operate::health::{ProcessStatus, State, Usage};
+
+/// Name of the file.
+pub const FILE: &str = "status.json";
+/// How often it is written.
+const PERIOD: Duration = Duration::from_millis(500);
+/// A run whose status is older than this is not watched by anyone any more.
+const STALE: Duration = Duration::from_secs(3);
+
+/// How a run goes.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct RunStatus {
+    /// Its name.
+    pub run: String,
+    /// Whether it goes on.
+    pub phase: Phase,
+    /// Process id of the `v2vloc up` that watches over it.
+    pub pid: u32,
+    /// Where its processes meet.
+    pub endpoint: String,
+    /// When this was written, milliseconds on the Unix clock.
+    pub written_unix_ms: u64,
+    /// Since it began, seconds.
+    pub seconds: f64,
+    /// Results of the ego so far.
+    pub frames: u64,
+    /// Since the last of them, seconds.
+    pub last_result_s: Option<f64>,
+    /// From a tick to its result, milliseconds, of the last one.
+    pub latency_ms: Option<f64>,
+    /// Neighbours in the last result.
+    pub fused: usize,
+    /// What the ego makes of those it heard for it.
+    #[serde(default)]
+    pub neighbours: Vec<HeardNeighbour>,
+    /// Messages dropped so far, by all processes.
+    pub dropped: u64,
+    /// Its processes.
+    pub processes: Vec<ProcessStatus>,
+}
+
+/// Where a run stands.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Phase {
+    /// It goes on.
+    Running,
+    /// Its processes are being ended.
+    Ending,
+    /// It is over.
+    Over,
+    /// Whoever watched over it is gone without a word.
+    Lost,
+}
+
+/// Why there is no status.
+#[derive(Debug, thiserror::Error)]
+pub enum StatusError {
+    /// The file cannot be read.
+    #[error("{}: {source}; is it the folder of a run that `v2vloc up` has started?", path.display())]
+    Read {
+        /// Which.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// It is not one.
+    #[error("{}: {problem}", path.display())]
+    Syntax {
+        /// Which.
+        path: PathBuf,
+        /// What is wrong.
+        problem: String,
+    },
+    /// There is no run at all.
+    #[error("there is no run in {}", .0.display())]
+    NoRun(PathBuf),
+}
+
+impl RunStatus {
+    /// Reads the status in the folder of a run, and sees whether someone still watches over it.
+    ///
+    /// # Errors
+    /// [`StatusError`] names the file.
+    pub fn read(folder: &Path) -> Result<Self, StatusError> {
+        let path = folder.join(FILE);
+        let text = fs::read_to_string(&path).map_err(|source| StatusError::Read { path: path.clone(), source })?;
+        let status: Self = serde_json::from_str(&text)
+            .map_err(|error| StatusError::Syntax { path: path.clone(), problem: error.to_string() })?;
+        let is_lost = status.phase != Phase::Over && (Usage::of(status.pid).is_none() || status.age() > STALE);
+        Ok(if is_lost { Self { phase: Phase::Lost, ..status } } else { status })
+    }
+
+    /// The folder of the run in `runs` that told about itself last.
+    ///
+    /// # Errors
+    /// [`StatusError::NoRun`] when none does.
+    pub fn newest(runs: &Path) -> Result<PathBuf, StatusError> {
+        let folders = fs::read_dir(runs).into_iter().flatten().flatten().map(|entry| entry.path());
+        let written = |folder: &PathBuf| fs::metadata(folder.join(FILE)).and_then(|file| file.modified()).ok();
+        let newest = folders.filter(|folder| written(folder).is_some()).max_by_key(written);
+        newest.ok_or_else(|| StatusError::NoRun(runs.to_owned()))
+    }
+
+    /// What is wrong, in words: with whom while it goes on, who failed or stays down when it is over.
+    #[must_use]
+    pub fn troubles(&self) -> Vec<String> {
+        let is_well = |process: &&ProcessStatus| match self.phase {
+            Phase::Running => matches!(process.state, State::Ready | State::Ended),
+            Phase::Ending | Phase::Over => process.state != State::Down,
+            Phase::Lost => true,
+        };
+        let sick = self.processes.iter().filter(|process| !is_well(process) || process.failure.is_some());
+        let in_words = |process: &ProcessStatus| {
+            let why = process.failure.as_ref().or(process.last_fall.as_ref());
+            let state = name_of(&process.state);
+            format!("{} is {state}{}", process.name, why.map_or(String::new(), |why| format!(" ({why})")))
+        };
+        let lost = (self.phase == Phase::Lost).then(|| "whoever watched over it is gone".to_owned());
+        lost.into_iter().chain(sick.map(in_words)).collect()
+    }
+
+    /// Whether nothing is wrong.
+    #[must_use]
+    pub fn is_well(&self) -> bool {
+        self.troubles().is_empty()
+    }
+
+    /// Since it was written.
+    fn age(&self) -> Duration {
+        Duration::from_millis(unix_ms().saturating_sub(self.written_unix_ms))
+    }
+
+    /// For people.
+    #[must_use]
+    pub fn table(&self) -> String {
+        let optional =
+            |value: Option<f64>, digits: usize| value.map_or("-".into(), |value| format!("{value:.digits$}"));
+        let mut text = format!(
+            "{} {} for {:.0} s at {}: {} frames, latency {} ms, {} fused, {} dropped\n",
+            self.run,
+            name_of(&self.phase),
+            self.seconds,
+            self.endpoint,
+            self.frames,
+            optional(self.latency_ms, 0),
+            self.fused,
+            self.dropped
+        );
+        let _ = writeln!(
+            text,
+            "{:20} {:9} {:>8} {:>8} {:>9} {:>9} {:>8} {:>5}  last fall or failure",
+            "process", "state", "pid", "up s", "restarts", "silent s", "MiB", "fds"
+        );
+        for process in &self.processes {
+            let pid = process.pid.map_or("-".into(), |pid| pid.to_string());
+            let _ = writeln!(
+                text,
+                "{:20} {:9} {pid:>8} {:>8.0} {:>9} {:>9} {:>8} {:>5}  {}",
+                process.name,
+                name_of(&process.state),
+                process.up_s,
+                process.restarts,
+                optional(process.silent_s, 1),
+                optional(process.resident_mib, 0),
+                process.descriptors.map_or("-".into(), |count| count.to_string()),
+                process.failure.as_deref().or(process.last_fall.as_deref()).unwrap_or("")
+            );
+        }
+        for neighbour in &self.neighbours {
+            let _ = writeln!(
+                text,
+                "neighbour {:10} clock {:>6} ms  trust {:>4}  {}",
+                neighbour.cav.as_str(),
+                optional(neighbour.clock_offset_s.map(|seconds| seconds * 1e3), 1),
+                optional(neighbour.trust, 2),
+                neighbour.doubt.map_or(String::new(), |doubt| format!("left out: {doubt}")),
+            );
+        }
+        text
+    }
+}
+
+/// A name as in the file.
+fn name_of(value: &impl Serialize) -> String {
+    serde_json::to_value(value).ok().and_then(|value| value.as_str().map(str::to_owned)).unwrap_or_default()
+}
+
+/// Writes the status of a run from time to time.
+#[derive(Debug)]
+pub struct StatusWriter {
+    path: PathBuf,
+    run: String,
+    endpoint: String,
+    began: Instant,
+    written: Option<Instant>,
+    /// A disk that is full is complained of once.
+    complained: bool,
+}
+
+impl StatusWriter {
+    /// For the run in `folder`, which meets at `endpoint`.
+    #[must_use]
+    pub fn new(folder: &Path, run: &str, endpoint: &str) -> Self {
+        Self {
+            path: folder.join(FILE),
+            run: run.to_owned(),
+            endpoint: endpoint.to_owned(),
+            began: Instant::now(),
+            written: None,
+            complained: false,
+        }
+    }
+
+    /// Writes the status if it is time to, or `phase` is another than before and has to be told.
+    pub fn write(&mut self, phase: Phase, progress: &Progress, processes: impl FnOnce(Instant) -> Vec<ProcessStatus>) {
+        let now = Instant::now();
+        if phase == Phase::Running && self.written.is_some_and(|written| now.duration_since(written) < PERIOD) {
+            return;
+        }
+        self.written = Some(now);
+        let status = RunStatus {
+            run: self.run.clone(),
+            phase,
+            pid: std::process::id(),
+            endpoint: self.endpoint.clone(),
+            written_unix_ms: unix_ms(),
+            seconds: now.duration_since(self.began).as_secs_f64(),
+            frames: progress.frames,
+            last_result_s: progress.span.map(|(_, last)| now.saturating_duration_since(last).as_secs_f64()),
+            latency_ms: progress.latency_ms,
+            fused: progress.fused,
+            neighbours: progress.heard.clone(),
+            dropped: progress.dropped,
+            processes: processes(now),
+        };
+        match atomic_file::write(&self.path, serde_json::to_string_pretty(&status).unwrap_or_default()) {
+            Ok(()) => self.complained = false,
+            Err(error) if !self.complained => {
+                self.complained = true;
+                tracing::warn!("{}: {error}; `v2vloc status` will not know", self.path.display());
+            }
+            Err(_) => {}
+        }
+    }
+}
+
+fn unix_ms() -> u64 {
+    let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
+    u64::try_from(since.as_millis()).unwrap_or(u64::MAX)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn process(state: State) -> ProcessStatus {
+        ProcessStatus {
+            name: "agent-4288".into(),
+            state,
+            pid: Some(77),
+            up_s: 12.3,
+            restarts: 2,
+            last_fall: Some("was ended by signal 9".into()),
+            failure: (state == State::Failing).then(|| "recording cut".into()),
+            silent_s: Some(0.2),
+            resident_mib: Some(150.0),
+            threads: Some(20),
+            descriptors: Some(31),
+        }
+    }
+
+    #[test]
+    fn what_is_written_reads_back_and_a_dead_watcher_is_noticed() {
+        let folder = tempfile::tempdir().unwrap();
+        let run = folder.path().join("test");
+        fs::create_dir(&run).unwrap();
+        assert!(matches!(RunStatus::newest(folder.path()), Err(StatusError::NoRun(_))));
+        assert!(RunStatus::read(&run).unwrap_err().to_string().contains("status.json"));
+        let mut writer = StatusWriter::new(&run, "test", "tcp/127.0.0.1:7447");
+        let liar = HeardNeighbour {
+            cav: protocol::CavId::new("4279").unwrap(),
+            trust: Some(0.03),
+            doubt: Some(protocol::Doubt::Invented),
+            clock_offset_s: Some(0.0125),
+        };
+        let progress = Progress { frames: 7, heard: vec![liar], ..Progress::default() };
+        writer.write(Phase::Running, &progress, |_| vec![process(State::Ready)]);
+        // Not time yet.
+        writer.write(Phase::Running, &Progress::default(), |_| Vec::new());
+        let status = RunStatus::read(&RunStatus::newest(folder.path()).unwrap()).unwrap();
+        assert_eq!((status.phase, status.frames, status.processes.len()), (Phase::Running, 7, 1));
+        assert!(status.is_well());
+        let table = status.table();
+        assert!(table.starts_with("test running for 0 s at tcp/127.0.0.1:7447: 7 frames"), "{table}");
+        assert!(table.contains("clock   12.5 ms  trust 0.03  left out: invented"), "{table}");
+        assert!(table.contains("agent-4288") && table.contains("was ended by signal 9"), "{table}");
+
+        let dead = RunStatus { pid: u32::MAX, ..status.clone() };
+        fs::write(run.join(FILE), serde_json::to_string(&dead).unwrap()).unwrap();
+        let found = RunStatus::read(&run).unwrap();
+        assert!(found.phase == Phase::Lost && !found.is_well());
+        fs::write(run.join(FILE), "{").unwrap();
+        assert!(matches!(RunStatus::read(&run), Err(StatusError::Syntax { .. })));
+    }
+
+    #[test]
+    fn who_is_not_ready_makes_a_run_unwell() {
+        let folder = tempfile::tempdir().unwrap();
+        for (state, is_well) in [
+            (State::Ready, true),
+            (State::Ended, true),
+            (State::Starting, false),
+            (State::Failing, false),
+            (State::Silent, false),
+            (State::Fallen, false),
+            (State::Down, false),
+        ] {
+            let mut writer = StatusWriter::new(folder.path(), "test", "tcp/127.0.0.1:7447");
+            writer.write(Phase::Running, &Progress::default(), |_| vec![process(state)]);
+            assert_eq!(RunStatus::read(folder.path()).unwrap().is_well(), is_well, "{state:?}");
+        }
+    }
+
+    #[test]
+    fn a_disk_that_refuses_ends_nothing() {
+        let mut writer = StatusWriter::new(Path::new("/nowhere"), "test", "tcp/127.0.0.1:7447");
+        writer.write(Phase::Running, &Progress::default(), |_| Vec::new());
+        assert!(writer.complained);
+    }
+}

@@ -1,0 +1,131 @@
+//! Warping and fusing maps of `lean`, per method and number of vehicles.
+//!
+//! `cargo bench -p ego-fuser --bench fusion -- fuse/pastat/4`: three neighbours and the ego, three time steps.
+
+use std::hint::black_box;
+
+use bus::malloc_settings;
+use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
+use fusion::Exchange;
+use fusion::Method;
+use fusion::pastat::Part;
+use fusion::{EarlierMaps, FusionConfig, FusionStage, SentMaps, ViewFacts};
+use perception::model_config::DetectorConfig;
+use protocol::{BevGrid, Pose};
+use tch::nn::VarStore;
+use tch::{Device, Kind, Tensor, no_grad};
+
+/// Edge of what a vehicle covers of a map together with what lies close to it, cells of 0.8 m.
+const VEHICLE_CELLS: i64 = 8;
+
+fn fuse(criterion: &mut Criterion) {
+    // As in the programs.
+    malloc_settings::ensure(&malloc_settings::KEPT_MEMORY).expect("this program can be started again");
+    tch::set_num_threads(1);
+    let config = DetectorConfig::lean();
+    let grid = config.feature_grid();
+    let shape = [config.feature_channels(), i64::from(grid.height), i64::from(grid.width)];
+    let world = World::random(shape, &grid);
+    let mut group = criterion.benchmark_group("lean");
+    for agents in [1usize, 2, 4] {
+        for Case { name, stage, is_lost } in cases(&config) {
+            // The newest of all first, as the ego gives them.
+            let entries = (0..stage.frames()).flat_map(|step| (0..agents).map(move |agent| (step, agent)));
+            let facts: Vec<_> = entries.map(|(step, agent)| entry(step, agent)).collect();
+            let size = [facts.len() as i64, shape[0], shape[1], shape[2]];
+            let seen = facts.iter().enumerate().map(|(index, ViewFacts { ego_from_cav, .. })| {
+                let own = (is_lost && index > 0).then(|| World::random(shape, &grid));
+                own.as_ref().unwrap_or(&world).seen_from(ego_from_cav)
+            });
+            let seen: Vec<Tensor> = seen.collect();
+            let features = Tensor::cat(&seen, 0);
+            // As the ego keeps them.
+            let of = |first: i64, count: i64| SentMaps { maps: features.narrow(0, first, count), sent: None };
+            let newest = of(0, agents as i64);
+            let kept: Vec<EarlierMaps> = no_grad(|| {
+                let kept = |map| stage.kept(&of(map, 1), &of(map, 1).maps).expect("maps are maps");
+                (agents as i64..size[0]).map(kept).collect()
+            });
+            let align = || {
+                let kept: Vec<&EarlierMaps> = kept.iter().collect();
+                let earlier = (!kept.is_empty()).then(|| EarlierMaps::together(&kept).expect("maps of one size"));
+                stage.align_kept(&newest, earlier, &facts).expect("maps lie on the lattice")
+            };
+            group.bench_function(BenchmarkId::new(format!("warp/{name}"), agents), |bencher| {
+                bencher.iter(|| black_box(no_grad(align)));
+            });
+            // No gradient, as in the ego: what has one lies elsewhere in memory, and takes longer.
+            let maps = no_grad(align);
+            group.bench_function(BenchmarkId::new(format!("fuse/{name}"), agents), |bencher| {
+                bencher.iter(|| {
+                    let fused = no_grad(|| stage.fuse(&maps, &facts, false)).expect("views fit together");
+                    assert_eq!(fused.size(), shape);
+                    black_box(fused)
+                });
+            });
+        }
+    }
+    group.finish();
+}
+
+/// What is around the ego. Vehicles' maps show the same world, so that they fit where poses put them.
+struct World {
+    /// `[1, C, H, W]`, on the ego's lattice.
+    map: Tensor,
+    /// Half the lattice, metres along x and y; its middle is the ego.
+    half_m: [f64; 2],
+}
+
+impl World {
+    fn random(shape: [i64; 3], grid: &BevGrid) -> Self {
+        let [channels, height, width] = shape;
+        // Alike over about a vehicle's length and width, so that what is worth a recall lies together as around vehicles.
+        let places = [1, channels, height / VEHICLE_CELLS, width / VEHICLE_CELLS];
+        let map = Tensor::rand(places, (Kind::Float, Device::Cpu)).upsample_nearest2d([height, width], None, None);
+        Self { map, half_m: [width, height].map(|cells| cells as f64 * grid.cell_m / 2.0) }
+    }
+
+    fn seen_from(&self, ego_from_cav: &Pose) -> Tensor {
+        let ([x, y, _], (sin, cos)) = (ego_from_cav.translation_m, ego_from_cav.yaw_rad().sin_cos());
+        let [half_x, half_y] = self.half_m;
+        let affine = [cos, -sin * half_y / half_x, x / half_x, sin * half_x / half_y, cos, y / half_y];
+        let affine = Tensor::from_slice(&affine.map(|number| number as f32)).view([1, 2, 3]);
+        let places = Tensor::affine_grid_generator(&affine, self.map.size(), false);
+        // Bilinear; zeros beyond.
+        self.map.grid_sampler(&places, 0, 0, false)
+    }
+}
+
+struct Case {
+    name: String,
+    stage: FusionStage,
+    /// Every map but the ego's newest shows a world of its own: the most that FSA may have to do.
+    is_lost: bool,
+}
+
+/// All that fuse maps, and the turning of channels that comes with each.
+fn cases(config: &DetectorConfig) -> Vec<Case> {
+    let case = |name: &str, method: Method, fusion: &FusionConfig, is_lost: bool| {
+        let variables = VarStore::new(Device::Cpu);
+        let stage = FusionStage::new(&variables.root(), fusion, method, config).expect("lean is a valid configuration");
+        Case { name: name.to_owned(), stage, is_lost }
+    };
+    let usual = |method: Method| FusionConfig::for_detector(method, config);
+    let methods = Method::ALL.into_iter().filter(|method| method.exchange() == Exchange::Features);
+    let mut cases: Vec<_> = methods.map(|method| case(&method.to_string(), method, &usual(method), false)).collect();
+    let pastat = usual(Method::Pastat);
+    let no_recall = pastat.clone().ablated(&[Part::Recall], None).expect("it is a PASTAT");
+    cases.push(case("pastat-no-recall", Method::Pastat, &no_recall, false));
+    cases.push(case("pastat-lost", Method::Pastat, &pastat, true));
+    cases
+}
+
+/// What is known of a vehicle's map from some time steps ago.
+fn entry(step: usize, agent: usize) -> ViewFacts {
+    let [step_m, agent_m] = [step, agent].map(|count| 7.0 * count as f64);
+    let pose = Pose::from_xyz_yaw([agent_m - 0.1 * step_m, 2.0 * agent as f64, 0.0], 0.2 * agent as f64);
+    ViewFacts { age_secs: 0.1 * step as f64, ..ViewFacts::fresh(agent, pose) }
+}
+
+criterion_group!(benches, fuse);
+criterion_main!(benches);

@@ -1,0 +1,54 @@
+//! AttFuse (OPV2V): scaled dot-product self-attention over the agents at every cell, without projections.
+
+use perception::layers::agent_attention::attend_ego;
+use tch::{TchError, Tensor};
+
+use super::{AlignedViews, Fusion};
+
+/// Per-cell attention of the ego over all agents.
+///
+/// Of the attention matrix only the ego's row is kept in the end, so only that row is computed.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct AttentionFusion;
+
+impl Fusion for AttentionFusion {
+    fn fuse(&self, views: &AlignedViews<'_>, _train: bool) -> Result<Tensor, TchError> {
+        if views.features.size4()?.0 == 1 {
+            return views.features.f_get(0);
+        }
+        let is_seen = views.mask.f_squeeze_dim(1)?.f_ne(0.0)?;
+        attend_ego(views.features, Some(&is_seen))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use protocol::{BevGrid, Pose};
+    use tch::{Device, Kind};
+
+    use super::*;
+    use crate::ViewFacts;
+
+    #[test]
+    fn where_a_neighbour_has_seen_nothing_the_ego_attends_to_the_others() {
+        let grid = BevGrid { x_min_m: 0.0, y_min_m: 0.0, cell_m: 1.0, width: 7, height: 5 };
+        let features = Tensor::randn([3, 4, 5, 7], (Kind::Float, Device::Cpu));
+        let mask = Tensor::ones([3, 1, 5, 7], (Kind::Float, Device::Cpu));
+        let _ = mask.narrow(0, 2, 1).narrow(2, 1, 2).fill_(0.0);
+        let facts = [0, 1, 2].map(|agent| ViewFacts::fresh(agent, Pose::IDENTITY));
+        let own_frame = &features;
+        let views = AlignedViews {
+            features: &features,
+            mask: &mask,
+            own_frame,
+            sent: None,
+            grid: &grid,
+            facts: &facts,
+            earlier: None,
+        };
+        let scores = (features.narrow(0, 0, 1) * &features).sum_dim_intlist([1_i64].as_slice(), true, None) / 2.0;
+        let shares = scores.masked_fill(&mask.eq(0.0), f64::NEG_INFINITY).softmax(0, None);
+        let expected = (shares * &features).sum_dim_intlist([0_i64].as_slice(), false, None);
+        assert_eq!(AttentionFusion.fuse(&views, false).unwrap(), expected, "to the bit");
+    }
+}

@@ -1,0 +1,61 @@
+//! Where on a map vehicles may be, as the detector's head says.
+
+use tch::nn::{self, Init};
+use tch::{TchError, Tensor};
+
+/// Before they are read or trained.
+const RANDOM: Init = Init::Randn { mean: 0.0, stdev: 0.01 };
+
+/// The detector's head of classes.
+#[derive(Debug)]
+pub(crate) struct Classes {
+    weight: Tensor,
+    bias: Tensor,
+}
+
+impl Classes {
+    /// The head for maps of `channels` and cells of `anchors` whose parameters lie under `path`, which a detector that is
+    /// trained with the fusion has made; without one they are made here.
+    pub(crate) fn under(path: &nn::Path<'_>, [channels, anchors]: [i64; 2]) -> Self {
+        let path = path / "cls_head";
+        let of = |name: &str, size: &[i64]| path.get(name).unwrap_or_else(|| path.var(name, size, RANDOM));
+        Self { weight: of("weight", &[anchors, channels, 1, 1]), bias: of("bias", &[anchors]) }
+    }
+
+    /// How likely a vehicle is around each cell of a map `[1, C, H, W]`: `[1, 1, H, W]`, the logit of its best anchor. No
+    /// gradient flows.
+    pub(crate) fn likely(&self, map: &Tensor) -> Result<Tensor, TchError> {
+        let [map, weight, bias] = [map, &self.weight, &self.bias].map(Tensor::f_detach);
+        let logits = map?.f_permute([0, 2, 3, 1])?.f_linear(&weight?.f_flatten(1, 3)?, Some(&bias?))?;
+        logits.f_amax([3_i64].as_slice(), false)?.f_unsqueeze(1)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use perception::layers::head::DetectionHead;
+    use tch::nn::VarStore;
+    use tch::{Device, Kind};
+
+    use super::*;
+    use crate::test_data::uniform;
+
+    #[test]
+    fn it_is_the_head_that_lies_there_and_says_what_that_says() {
+        let variables = VarStore::new(Device::Cpu);
+        let head = DetectionHead::new(&variables.root(), 5, 2);
+        let parameters = variables.variables().len();
+        let classes = Classes::under(&variables.root(), [5, 2]);
+        assert_eq!(variables.variables().len(), parameters);
+        let map = uniform(3, &[1, 5, 6, 8]);
+        let scores = head.forward(&map).unwrap().scores.amax([1], true);
+        let likely = classes.likely(&map).unwrap();
+        assert!(!likely.requires_grad() && likely.allclose(&scores, 1e-5, 1e-5, false));
+        assert_eq!(likely.kind(), Kind::Float);
+        let alone = VarStore::new(Device::Cpu);
+        let _ = Classes::under(&alone.root(), [5, 2]);
+        let mut names: Vec<String> = alone.variables().into_keys().collect();
+        names.sort();
+        assert_eq!(names, ["cls_head.bias", "cls_head.weight"]);
+    }
+}

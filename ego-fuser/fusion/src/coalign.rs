@@ -1,0 +1,38 @@
+//! CoAlign (Lu et al., ICRA 2023): poses corrected by the boxes that agents have in common, then per-cell fusion.
+//!
+//! The correction happens before maps are moved, see [`crate::pose_graph`]; what is left for the fusion is
+//! attention or the maximum. The published network has a residual backbone and fuses at each of its levels; that is
+//! [`ego_fuser_offline::multi_scale`], for imported weights. Live, an agent sends one map, and it is fused once.
+
+use serde::{Deserialize, Serialize};
+
+use super::where2comm::{Aggregation, Missing, Where2comm, Where2commConfig};
+use crate::pose_graph::PoseGraphConfig;
+
+/// Settings of CoAlign.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct CoAlignConfig {
+    /// How a cell's features become one.
+    pub aggregation: Aggregation,
+    /// What cells mean that have not come.
+    pub missing: Missing,
+    /// Correction of the poses; absent: poses are taken as they come.
+    pub pose_graph: Option<PoseGraphConfig>,
+}
+
+impl Default for CoAlignConfig {
+    /// Attention after the correction.
+    fn default() -> Self {
+        let pose_graph = Some(PoseGraphConfig::default());
+        Self { aggregation: Aggregation::Attention, missing: Missing::Absent, pose_graph }
+    }
+}
+
+impl CoAlignConfig {
+    /// The fusion, which has no parameters.
+    #[must_use]
+    pub fn fusion(&self) -> Where2comm {
+        Where2comm::new(&Where2commConfig { aggregation: self.aggregation, missing: self.missing })
+    }
+}

@@ -1,0 +1,143 @@
+//! DiscoNet (Li et al., NeurIPS 2021): at every cell, a small network weighs each agent's features against the ego's.
+//!
+//! The fusion of the published network. What it was taught by, a teacher that saw all points at once, is a way of
+//! training and not part of the network; weights trained here have had no teacher.
+
+use perception::layers::convolution::Norm;
+use perception::model_config::ConfigError;
+use serde::{Deserialize, Serialize};
+use tch::nn;
+use tch::{TchError, Tensor};
+
+use super::config::within;
+use super::conv_gru::Conv;
+use super::{AlignedViews, Fusion};
+
+/// Batch norm of the reference: PyTorch's defaults.
+const NORM: (f64, f64) = (1e-5, 0.1);
+
+/// Sizes of [`DiscoNet`].
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct DiscoNetConfig {
+    /// Channels of the maps.
+    pub channels: i64,
+    /// Channels of the layers before the weight.
+    pub hidden: [i64; 3],
+}
+
+impl DiscoNetConfig {
+    /// The published sizes.
+    #[must_use]
+    pub fn full(channels: i64) -> Self {
+        Self { channels, hidden: [128, 32, 8] }
+    }
+
+    /// The same: the weights are the cheapest part of any network.
+    #[must_use]
+    pub fn lean(channels: i64) -> Self {
+        Self::full(channels)
+    }
+
+    /// Checks that a network can be built.
+    ///
+    /// # Errors
+    /// [`ConfigError`] names the field.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        within("fusion channels", self.channels, 1..=4096)?;
+        self.hidden.iter().try_for_each(|&hidden| within("fusion hidden channels", hidden, 1..=4096))
+    }
+}
+
+/// A weight per agent and cell.
+#[derive(Debug)]
+pub struct DiscoNet {
+    channels: i64,
+    layers: [(Conv, Norm); 3],
+    weight: Conv,
+}
+
+impl DiscoNet {
+    /// Parameters `pixel_weight_layer.{conv1_<n>,bn1_<n>}.*` below `path`.
+    ///
+    /// # Errors
+    /// [`ConfigError`] names the field that no network can be built from.
+    pub fn new(path: &nn::Path<'_>, config: &DiscoNetConfig) -> Result<Self, ConfigError> {
+        config.validate()?;
+        let path = path / "pixel_weight_layer";
+        let [first, second, third] = config.hidden;
+        let layer = |index: usize, io: [i64; 2]| {
+            let norm = Norm::with_eps(&(&path / format!("bn1_{index}")), io[1], NORM.0, NORM.1);
+            (Conv::new(&(&path / format!("conv1_{index}")), io, 1), norm)
+        };
+        Ok(Self {
+            channels: config.channels,
+            layers: [layer(1, [2 * config.channels, first]), layer(2, [first, second]), layer(3, [second, third])],
+            weight: Conv::new(&(&path / "conv1_4"), [third, 1], 1),
+        })
+    }
+
+    /// Weights `[N, 1, H, W]` of aligned maps `[N, C, H, W]`, before the softmax.
+    fn scores(&self, maps: &Tensor, train: bool) -> Result<Tensor, TchError> {
+        let [(first, norm), rest @ ..] = &self.layers;
+        // A pair is (agent, ego); the ego's half is the same for all.
+        let of_ego = first.part(&maps.f_narrow(0, 0, 1)?, self.channels, true)?;
+        let mut x = norm.forward(&(first.part(maps, 0, false)? + of_ego), train).f_relu()?;
+        for (conv, norm) in rest {
+            x = norm.forward(&conv.apply(&x)?, train).f_relu()?;
+        }
+        self.weight.apply(&x)?.f_relu()
+    }
+}
+
+impl Fusion for DiscoNet {
+    fn fuse(&self, views: &AlignedViews<'_>, train: bool) -> Result<Tensor, TchError> {
+        let maps = views.features;
+        if maps.size4()?.0 == 1 {
+            return maps.f_get(0);
+        }
+        let scores = self.scores(maps, train)?;
+        let weights = scores.f_masked_fill(&views.mask.f_eq(0.0)?, f64::NEG_INFINITY)?.f_softmax(0, None)?;
+        (weights * maps).f_sum_dim_intlist([0i64].as_slice(), false, None)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use protocol::{BevGrid, Pose};
+    use tch::nn::VarStore;
+    use tch::{Device, Kind};
+
+    use super::*;
+    use crate::ViewFacts;
+
+    #[test]
+    fn every_parameter_learns() {
+        tch::set_num_threads(1);
+        tch::manual_seed(4);
+        let variables = VarStore::new(Device::Cpu);
+        let network = DiscoNet::new(&variables.root(), &DiscoNetConfig::lean(8)).unwrap();
+        let features = Tensor::rand([3, 8, 6, 10], (Kind::Float, Device::Cpu));
+        let mask = Tensor::ones([3, 1, 6, 10], (Kind::Float, Device::Cpu));
+        let grid = BevGrid { x_min_m: 0.0, y_min_m: 0.0, cell_m: 1.0, width: 10, height: 6 };
+        let facts: Vec<_> = (0..3).map(|agent| ViewFacts::fresh(agent, Pose::IDENTITY)).collect();
+        let views = AlignedViews {
+            features: &features,
+            mask: &mask,
+            own_frame: &features,
+            sent: None,
+            grid: &grid,
+            facts: &facts,
+            earlier: None,
+        };
+        network.fuse(&views, true).unwrap().square().sum(Kind::Float).backward();
+        for (name, variable) in variables.variables() {
+            if variable.requires_grad() {
+                // A bias before a batch norm has no say.
+                let must_move = !(name.contains("conv1_") && name.ends_with("bias")) || name.contains("conv1_4");
+                let norm = variable.grad().abs().sum(Kind::Float).double_value(&[]);
+                assert!(norm.is_finite() && (norm > 0.0 || !must_move), "{name}: {norm}");
+            }
+        }
+    }
+}

@@ -1,0 +1,215 @@
+//! Where a neighbour's map really lies: what both have seen has to lie on one another.
+
+use tch::nn::{self, Init};
+use tch::{Kind, TchError, Tensor};
+
+use crate::layers::Linear;
+use crate::warp::{BILINEAR, NEAREST, PADDING_ZEROS};
+
+/// Channels that cells are compared by.
+const KEYS: i64 = 32;
+/// Weight below which a neighbour has nothing in common with the ego.
+const TOO_LITTLE: f64 = 1e-6;
+
+/// Finds a small rigid motion from a few cells that both vehicles find worth sending.
+///
+/// Each of them is looked for around its place in the ego's map. Where it is found, as the mean over the search window
+/// weighed by similarity, gives one correspondence; the motion is the weighted least-squares fit of all (the planar case
+/// has a closed form). A cell that looks the same everywhere is found where it was, so it pulls towards no correction.
+/// Everything is differentiable, and the detection loss trains it.
+#[derive(Debug)]
+pub(super) struct Consensus {
+    key: Linear,
+    /// `[]` logarithm of how much a similarity counts.
+    sharpness: Tensor,
+    /// `[]` how much of a motion is believed, before the sigmoid.
+    trust: Tensor,
+    cells: i64,
+    reach: i64,
+}
+
+/// A planar motion of a map about its middle, in cells: `ego = rotation * map + shift`.
+#[derive(Debug)]
+pub(super) struct Motion {
+    /// `[]` radians.
+    angle: Tensor,
+    /// `[2]` columns, rows.
+    shift: Tensor,
+}
+
+impl Consensus {
+    /// Variables `key`, `sharpness` and `trust` below `path`; compares `cells` cells within `reach` cells to each side.
+    pub(super) fn new(path: &nn::Path<'_>, channels: i64, cells: i64, reach: i64) -> Self {
+        Self {
+            key: Linear::new(&(path / "key"), channels, KEYS, true),
+            sharpness: path.var("sharpness", &[], Init::Const(20f64.ln())),
+            trust: path.var("trust", &[], Init::Const(0.0)),
+            cells,
+            reach,
+        }
+    }
+
+    /// The motion that brings a neighbour's map `[H, W, C]` onto the ego's; nothing where they share nothing.
+    ///
+    /// `weight` `[H, W]` says how much a cell matters to both, 0 where the neighbour has none.
+    pub(super) fn motion(&self, ego: &Tensor, other: &Tensor, weight: &Tensor) -> Result<Option<Motion>, TchError> {
+        let (height, width, channels) = ego.size3()?;
+        let count = self.cells.min(height * width);
+        let (_, best) = weight.f_detach()?.f_view([-1])?.f_topk(count, 0, true, false)?;
+        let weight = weight.f_view([-1])?.f_index_select(0, &best)?;
+        if weight.f_sum(Kind::Float)?.f_double_value(&[])? < TOO_LITTLE {
+            return Ok(None);
+        }
+        let offsets = self.offsets(ego)?;
+        let rows = best.f_divide_scalar_mode(width, "floor")?;
+        let columns = best.f_remainder(width)?;
+        // Beyond the edge the nearest cell stands in: a few cells of a window hardly matter.
+        let around = |at: &Tensor, axis: i64, length: i64| {
+            let offset = offsets.f_select(1, axis)?.f_unsqueeze(0)?;
+            at.f_unsqueeze(1)?.f_add(&offset)?.f_clamp(0, length - 1)
+        };
+        let places = around(&rows, 1, height)? * width + around(&columns, 0, width)?;
+        let keys = |cells: &Tensor| {
+            let key = self.key.forward(cells)?;
+            let norm = key.f_square()?.f_sum_dim_intlist([-1i64].as_slice(), true, None::<Kind>)? + 1e-6;
+            key.f_div(&norm.f_sqrt()?)
+        };
+        let candidates = ego.f_reshape([-1, channels])?.f_index_select(0, &places.f_view([-1])?)?;
+        let candidates = keys(&candidates)?.f_view([count, -1, KEYS])?;
+        let asked = keys(&other.f_reshape([-1, channels])?.f_index_select(0, &best)?)?;
+        let similarity = candidates.f_bmm(&asked.f_unsqueeze(2)?)?.f_squeeze_dim(2)?;
+        let share = similarity.f_mul(&self.sharpness.f_exp()?)?.f_softmax(1, None::<Kind>)?;
+        let moved = share.f_matmul(&offsets.f_to_kind(ego.kind())?)?;
+        let middle =
+            Tensor::from_slice(&[(width - 1) as f32 / 2.0, (height - 1) as f32 / 2.0]).f_to_device(ego.device())?;
+        let from = Tensor::f_stack(&[columns, rows], 1)?.f_to_kind(ego.kind())? - middle;
+        let certain = share.f_amax([1i64].as_slice(), false)?;
+        Ok(Some(self.fit(&from, &moved, &(weight * certain))?))
+    }
+
+    /// `[(2 * reach + 1)^2, 2]` columns and rows around a cell.
+    fn offsets(&self, like: &Tensor) -> Result<Tensor, TchError> {
+        let side = -self.reach..=self.reach;
+        let offsets: Vec<i64> =
+            side.clone().flat_map(|row| side.clone().flat_map(move |column| [column, row])).collect();
+        Tensor::f_from_slice(&offsets)?.f_view([-1, 2])?.f_to_device(like.device())
+    }
+
+    /// The motion of points `from` `[K, 2]` that have moved by `moved`, as far as it is believed.
+    fn fit(&self, from: &Tensor, moved: &Tensor, weight: &Tensor) -> Result<Motion, TchError> {
+        let weight = weight.f_div(&(weight.f_sum(Kind::Float)? + TOO_LITTLE))?.f_unsqueeze(1)?;
+        let mean = |x: &Tensor| (x * &weight).f_sum_dim_intlist([0i64].as_slice(), false, None::<Kind>);
+        let (centre, step) = (mean(from)?, mean(moved)?);
+        let (one, other) = (from - &centre, from + moved - &centre - &step);
+        let [x, y] = [one.f_select(1, 0)?, one.f_select(1, 1)?];
+        let [to_x, to_y] = [other.f_select(1, 0)?, other.f_select(1, 1)?];
+        let flat = weight.f_squeeze_dim(1)?;
+        let sine = ((&x * &to_y - &y * &to_x) * &flat).f_sum(Kind::Float)?;
+        // The more so the less the points spread: a turn needs a lever.
+        let cosine = ((&x * &to_x + &y * &to_y) * &flat).f_sum(Kind::Float)? + 1.0;
+        let trust = self.trust.f_sigmoid()?;
+        let angle = sine.f_atan2(&cosine)? * &trust;
+        let turned = rotated(&angle, &centre)?;
+        let shift = &centre + step * trust - turned;
+        Ok(Motion { angle, shift })
+    }
+}
+
+impl Motion {
+    /// A map `[H, W, C]` moved by it, zeros outside, and the mask `[H, W]` moved along.
+    pub(super) fn apply(&self, map: &Tensor, mask: &Tensor) -> Result<(Tensor, Tensor), TchError> {
+        let (height, width, channels) = map.size3()?;
+        // From the ego's cells back to the map's: the transposed rotation of what is left without the shift.
+        let back = -&self.angle;
+        let from = -rotated(&back, &self.shift)?;
+        let (sine, cosine) = (back.f_sin()?, back.f_cos()?);
+        let (height_m, width_m) = (height as f64, width as f64);
+        let entries = [
+            cosine.shallow_clone(),
+            -&sine * (height_m / width_m),
+            from.f_get(0)? * (2.0 / width_m),
+            sine * (width_m / height_m),
+            cosine,
+            from.f_get(1)? * (2.0 / height_m),
+        ];
+        let theta = Tensor::f_stack(&entries, 0)?.f_view([1, 2, 3])?;
+        let lattice = Tensor::f_affine_grid_generator(&theta, [1, channels, height, width], false)?;
+        let maps =
+            map.f_permute([2, 0, 1])?.f_unsqueeze(0)?.f_grid_sampler(&lattice, BILINEAR, PADDING_ZEROS, false)?;
+        let mask = mask.f_view([1, 1, height, width])?;
+        let mask = mask.f_grid_sampler(&lattice.f_detach()?, NEAREST, PADDING_ZEROS, false)?.f_view([height, width])?;
+        let moved = maps.f_squeeze_dim(0)?.f_permute([1, 2, 0])? * mask.f_unsqueeze(2)?;
+        Ok((moved.f_contiguous()?, mask))
+    }
+}
+
+/// A point `[2]` turned by an angle.
+fn rotated(angle: &Tensor, point: &Tensor) -> Result<Tensor, TchError> {
+    let (sine, cosine) = (angle.f_sin()?, angle.f_cos()?);
+    let (x, y) = (point.f_get(0)?, point.f_get(1)?);
+    Tensor::f_stack(&[&cosine * &x - &sine * &y, sine * x + cosine * y], 0)
+}
+
+#[cfg(test)]
+mod tests {
+    use tch::Device;
+    use tch::nn::VarStore;
+
+    use super::*;
+
+    fn trusting() -> (VarStore, Consensus) {
+        tch::manual_seed(3);
+        let variables = VarStore::new(Device::Cpu);
+        let consensus = Consensus::new(&variables.root(), 16, 64, 3);
+        let _ = tch::no_grad(|| consensus.trust.shallow_clone().fill_(20.0));
+        let _ = tch::no_grad(|| consensus.sharpness.shallow_clone().fill_(4.0));
+        (variables, consensus)
+    }
+
+    #[test]
+    fn a_map_that_lies_two_cells_off_is_brought_back() {
+        let (_variables, consensus) = trusting();
+        let ego = Tensor::randn([24, 32, 16], (Kind::Float, Device::Cpu));
+        // What the ego has at a column, the neighbour's map has two columns on and one row up.
+        let other = ego.roll([2i64, -1].as_slice(), [1i64, 0].as_slice());
+        let weight = Tensor::zeros([24, 32], (Kind::Float, Device::Cpu));
+        let _ = weight.narrow(0, 6, 12).narrow(1, 6, 20).fill_(1.0);
+        let motion = consensus.motion(&ego, &other, &weight).unwrap().unwrap();
+        assert!((motion.shift.double_value(&[0]) + 2.0).abs() < 0.1, "{:?}", motion.shift);
+        assert!((motion.shift.double_value(&[1]) - 1.0).abs() < 0.1, "{:?}", motion.shift);
+        assert!(motion.angle.double_value(&[]).abs() < 0.01);
+        let inner = |map: &Tensor| map.narrow(0, 6, 12).narrow(1, 6, 20);
+        let (moved, mask) = motion.apply(&other, &weight.ones_like()).unwrap();
+        let error = |map: &Tensor| (inner(map) - inner(&ego)).abs().mean(Kind::Float).double_value(&[]);
+        assert!(error(&moved) < 0.2 * error(&other), "{} of {}", error(&moved), error(&other));
+        assert_eq!(mask.double_value(&[10, 31]), 0.0, "nothing comes from beyond the edge");
+    }
+
+    #[test]
+    fn a_known_motion_is_fitted_and_applied_the_same_way() {
+        let (_variables, consensus) = trusting();
+        let (angle, shift) = (0.05f64, [1.5f64, -0.7]);
+        let from = Tensor::rand([50, 2], (Kind::Float, Device::Cpu)) * 40.0 - 20.0;
+        let (sine, cosine) = angle.sin_cos();
+        let turn = Tensor::from_slice(&[cosine as f32, sine as f32, -sine as f32, cosine as f32]).view([2, 2]);
+        let to = from.matmul(&turn) + Tensor::from_slice(&shift.map(|value| value as f32));
+        let motion = consensus.fit(&from, &(to - &from), &Tensor::ones([50], (Kind::Float, Device::Cpu))).unwrap();
+        assert!((motion.angle.double_value(&[]) - angle).abs() < 2e-3, "{:?}", motion.angle);
+        // A map with one bright cell: it lands where the motion takes it.
+        let map = Tensor::zeros([41, 41, 1], (Kind::Float, Device::Cpu));
+        let _ = map.get(20 + 4).get(20 + 10).fill_(1.0);
+        let (moved, _) = motion.apply(&map, &Tensor::ones([41, 41], (Kind::Float, Device::Cpu))).unwrap();
+        let expected = [cosine * 10.0 - sine * 4.0 + shift[0], sine * 10.0 + cosine * 4.0 + shift[1]];
+        let found = moved.argmax(None::<i64>, false).int64_value(&[]);
+        let found = [(found % 41 - 20) as f64, (found / 41 - 20) as f64];
+        assert!((found[0] - expected[0]).abs() < 0.8 && (found[1] - expected[1]).abs() < 0.8, "{found:?} {expected:?}");
+    }
+
+    #[test]
+    fn vehicles_that_share_nothing_are_left_where_they_are() {
+        let (_variables, consensus) = trusting();
+        let map = Tensor::randn([8, 8, 16], (Kind::Float, Device::Cpu));
+        let nothing = Tensor::zeros([8, 8], (Kind::Float, Device::Cpu));
+        assert!(consensus.motion(&map, &map, &nothing).unwrap().is_none());
+    }
+}

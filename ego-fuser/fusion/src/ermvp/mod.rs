@@ -1,0 +1,179 @@
+//! ERMVP: few cells cross the air, agreement about them corrects poses, attention with local and global queries fuses.
+//!
+//! Zhang et al., CVPR 2024. What is its own is kept: cells are sampled by a learnt score, agreement between sampled cells
+//! moves a neighbour's map before it is fused, and each layer attends within windows with queries of the window and then
+//! with queries that stand for the whole map. What is simpler than in the paper, and what that costs:
+//!
+//! - Similar cells among the sampled ones are not merged into clusters. Merging saves bytes and loses detail (the
+//!   published code computes it and fuses without it), so a message is larger here than the paper's, and the fused map not
+//!   worse.
+//! - Cells are sampled by the ego from maps that arrived whole. What is fused is what would have been sent, the traffic is
+//!   that of whole maps, and a sender could leave out as many cells as `kept` says.
+//! - The correction is a soft search around each sampled cell and a closed-form fit. It reaches `search` cells and no
+//!   further, where matching over the whole map may find its way back from larger errors, or be led astray.
+//! - Queries from the whole map attend with the usual scale inside the softmax; the published code scales behind it, which
+//!   makes its queries almost uniform. Missing neighbours are masked there too, so that they change nothing.
+//! - The mean at the end is taken over those that reach a cell, and there is no second loss on the ego's map alone.
+
+mod consensus;
+mod global_attention;
+mod sampling;
+
+use perception::model_config::ConfigError;
+use serde::{Deserialize, Serialize};
+use tch::nn;
+use tch::{TchError, Tensor};
+
+use self::consensus::Consensus;
+use self::global_attention::{GlobalHalf, REDUCTION};
+use self::sampling::Sampler;
+use super::cobevt::{CobevtConfig, nearest_first};
+use super::config::within;
+use super::padding::Padding;
+use super::partition::Partition;
+use super::swap_fusion::{HalfBlock, MeanHead, Slots};
+use super::{AlignedViews, Fusion};
+
+/// Sizes of ERMVP.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ErmvpConfig {
+    /// The layers; each has attention within windows twice, with local and with global queries.
+    pub layers: CobevtConfig,
+    /// Share of a neighbour's cells that are kept.
+    pub kept: f64,
+    /// Cells that are compared to find out how a neighbour's map lies.
+    pub compared: i64,
+    /// How far to each side such a cell is looked for, cells.
+    pub search: i64,
+}
+
+impl ErmvpConfig {
+    /// The published sizes, for maps of `channels` (256 there).
+    #[must_use]
+    pub fn full(channels: i64) -> Self {
+        Self { layers: CobevtConfig::full(channels), kept: 0.2, compared: 128, search: 2 }
+    }
+
+    /// For live traffic on two cores; cells are half as large, so they are looked for twice as far.
+    #[must_use]
+    pub fn lean(channels: i64) -> Self {
+        Self { layers: CobevtConfig::lean(channels), search: 3, ..Self::full(channels) }
+    }
+
+    /// Checks that a network can be built.
+    ///
+    /// # Errors
+    /// [`ConfigError`] names the field, its value and what it must be.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        self.layers.validate()?;
+        within("fusion.compared", self.compared, 1..=4096)?;
+        within("fusion.search", self.search, 1..=16)?;
+        if self.layers.count_missing {
+            let must = "false: only agents that are there are fused";
+            return Err(ConfigError::Value { field: "fusion.layers.count_missing", value: "true".into(), must });
+        }
+        if !(self.kept > 0.0 && self.kept <= 1.0) {
+            let value = self.kept.to_string();
+            return Err(ConfigError::Value { field: "fusion.kept", value, must: "a share above 0 and up to 1" });
+        }
+        Ok(())
+    }
+}
+
+/// Attention with queries of the window, then with queries of the whole map.
+#[derive(Debug)]
+struct Layer {
+    local: HalfBlock,
+    global: GlobalHalf,
+}
+
+/// The method behind the common interface.
+#[derive(Debug)]
+pub struct Ermvp {
+    sampler: Sampler,
+    consensus: Consensus,
+    layers: Vec<Layer>,
+    head: MeanHead,
+    window: i64,
+}
+
+impl Ermvp {
+    /// Variables below `path`.
+    ///
+    /// # Errors
+    /// [`ConfigError`] when no network can be built from `config`.
+    pub fn new(path: &nn::Path<'_>, config: &ErmvpConfig) -> Result<Self, ConfigError> {
+        config.validate()?;
+        let sizes = &config.layers;
+        let layer = |index: usize| {
+            let path = path / "layers" / index;
+            let (attention, feed) = (&path / "window_attention", &path / "window_ffd");
+            let local = HalfBlock::new(Partition::Window, &attention, &feed, sizes);
+            Layer { local, global: GlobalHalf::new(&path, sizes) }
+        };
+        Ok(Self {
+            sampler: Sampler::new(&(path / "sampler"), sizes.channels, config.kept),
+            consensus: Consensus::new(&(path / "consensus"), sizes.channels, config.compared, config.search),
+            layers: (0..sizes.depth).map(layer).collect(),
+            head: MeanHead::new(&(path / "mlp_head"), sizes.channels),
+            window: sizes.window,
+        })
+    }
+
+    /// What is fused: maps `[N, H, W, C]` of the cells that are kept, corrected, and where they are, `[N, H, W]`.
+    fn received(&self, maps: &Tensor, reach: &Tensor) -> Result<(Tensor, Tensor), TchError> {
+        let agents = maps.size()[0];
+        let scores = self.sampler.scores(maps)?;
+        let kept = self.sampler.kept(&scores, reach)?;
+        let ego = maps.f_get(0)?;
+        let mut received = vec![ego.shallow_clone()];
+        let mut there = vec![kept.f_get(0)?];
+        let ego_score = scores.f_get(0)?;
+        for agent in 1..agents {
+            let kept = kept.f_get(agent)?;
+            let score = scores.f_get(agent)? * &kept;
+            let sent = maps.f_get(agent)? * score.f_unsqueeze(2)?;
+            let (sent, kept) = match self.consensus.motion(&ego, &sent, &(&ego_score * &score))? {
+                Some(motion) => motion.apply(&sent, &kept)?,
+                None => (sent, kept),
+            };
+            received.push(sent);
+            there.push(kept);
+        }
+        Ok((Tensor::f_stack(&received, 0)?, Tensor::f_stack(&there, 0)?))
+    }
+}
+
+impl Fusion for Ermvp {
+    fn fuse(&self, views: &AlignedViews<'_>, train: bool) -> Result<Tensor, TchError> {
+        let order = nearest_first(views);
+        let features = views.features.f_index_select(0, &order)?;
+        let mask = views.mask.f_index_select(0, &order)?;
+        let padding = Padding::to_multiples(&features, self.window * REDUCTION)?;
+        let maps = padding.maps(&features, 0)?.f_permute([0, 2, 3, 1])?.f_contiguous()?;
+        let (maps, reach) = self.received(&maps, &padding.mask(&mask, 0)?.f_squeeze_dim(1)?)?;
+        let slots = Slots { asked: reach.size()[0], reach: Some(&reach), count_missing: false };
+        let mut x = maps;
+        for layer in &self.layers {
+            let groups = layer.local.whole(&x, slots, self.window, train)?;
+            x = Partition::Window.map(&groups, padding.size(), self.window)?;
+            x = layer.global.forward(&x, slots, train)?;
+        }
+        padding.crop(&self.head.forward(&x, slots)?)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_cannot_be_built_is_named() {
+        assert!(ErmvpConfig::full(256).validate().is_ok());
+        assert!(ErmvpConfig::lean(64).validate().is_ok());
+        let message = |config: ErmvpConfig| config.validate().unwrap_err().to_string();
+        assert!(message(ErmvpConfig { kept: 0.0, ..ErmvpConfig::lean(64) }).contains("fusion.kept is 0"));
+        assert!(message(ErmvpConfig { search: 99, ..ErmvpConfig::lean(64) }).contains("fusion.search"));
+    }
+}

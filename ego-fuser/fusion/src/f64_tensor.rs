@@ -1,0 +1,88 @@
+//! Tensors as plain numbers, for loops that visit memory in an order that the tensor library does not.
+
+use tch::{Device, Kind, TchError, Tensor, nn};
+
+/// Cells that are transposed together; what they show fits into a core's nearest cache.
+pub(crate) const BLOCK: usize = 16;
+
+/// What a tensor of floats holds, row by row.
+pub(crate) fn numbers(tensor: &Tensor) -> Result<Vec<f32>, TchError> {
+    Vec::try_from(tensor.f_reshape(-1)?)
+}
+
+/// Whether loops over numbers may stand for the tensor library's operations.
+pub(crate) fn are_numbers(tensor: &Tensor) -> bool {
+    tensor.device() == Device::Cpu && tensor.kind() == Kind::Float && tensor.numel() > 0 && !tensor.requires_grad()
+}
+
+/// What a map `[C, H, W]` of floats holds, cell by cell: `[H * W, C]`.
+pub(crate) fn cells(map: &Tensor) -> Result<Vec<f32>, TchError> {
+    let (channels, height, width) = map.size3()?;
+    let cell_after_cell = map.f_permute([1, 2, 0])?;
+    if cell_after_cell.is_contiguous() {
+        return numbers(&cell_after_cell);
+    }
+    let [channels, count] = [channels, height * width].map(|size| size as usize);
+    let planes = numbers(map)?;
+    let mut values = vec![0.0; planes.len()];
+    for (block, values) in values.chunks_mut(BLOCK * channels).enumerate() {
+        for (channel, plane) in planes.chunks(count).enumerate() {
+            let cells = plane[block * BLOCK..].iter().zip(values[channel..].iter_mut().step_by(channels));
+            cells.for_each(|(cell, value)| *value = *cell);
+        }
+    }
+    Ok(values)
+}
+
+/// `[1, C, H, W]` of a map `[C, H, W]`, its channels side by side in memory, as convolutions over few channels at a time are
+/// fastest; in the order it has where gradients flow.
+pub(crate) fn by_cell(map: &Tensor) -> Result<Tensor, TchError> {
+    if !are_numbers(map) {
+        return map.f_unsqueeze(0);
+    }
+    let (channels, height, width) = map.size3()?;
+    Tensor::f_from_slice(&cells(map)?)?.f_view([1, height, width, channels])?.f_permute([0, 3, 1, 2])
+}
+
+/// A convolution of single cells of maps `[N, C, H, W]`, in the order of memory that these have: where the channels of a cell lie
+/// side by side it is one product of matrices.
+pub(crate) fn pointwise(convolution: &nn::Conv2D, maps: &Tensor) -> Result<Tensor, TchError> {
+    let cells = maps.f_permute([0, 2, 3, 1])?;
+    let (weight, bias) = (&convolution.ws, convolution.bs.as_ref());
+    if !cells.is_contiguous() || maps.is_contiguous() {
+        return maps.f_conv2d(weight, bias, [1, 1], [0, 0], [1, 1], 1);
+    }
+    cells.f_linear(&weight.f_flatten(1, 3)?, bias)?.f_permute([0, 3, 1, 2])
+}
+
+/// `[1, C, H, W]` of a map `[C, H, W]` in the order that it has in memory, such that convolutions see that order.
+pub fn as_batch(map: &Tensor) -> Result<Tensor, TchError> {
+    map.f_permute([1, 2, 0])?.f_unsqueeze(0)?.f_permute([0, 3, 1, 2])
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::test_data::uniform;
+
+    #[test]
+    fn a_convolution_of_cells_is_the_same_in_either_order() {
+        let variables = nn::VarStore::new(Device::Cpu);
+        let convolution = nn::conv2d(variables.root(), 5, 3, 1, nn::ConvConfig::default());
+        let map = uniform(3, &[5, 6, 7]);
+        let [planes, cells] = [map.unsqueeze(0), by_cell(&map).unwrap()];
+        let [planes, cells] = [planes, cells].map(|maps| pointwise(&convolution, &maps).unwrap());
+        assert!(planes.allclose(&cells, 1e-6, 1e-6, false));
+        assert!(cells.allclose(&by_cell(&map).unwrap().apply(&convolution), 1e-5, 1e-5, false));
+    }
+
+    #[test]
+    fn a_map_by_cell_is_the_same_map_in_another_order() {
+        let map = uniform(3, &[5, 6, 7]);
+        let by_cell = by_cell(&map).unwrap();
+        assert_eq!(by_cell, map.unsqueeze(0));
+        assert_eq!(by_cell.stride()[1..], [1, 7 * 5, 5]);
+        assert_eq!(as_batch(&by_cell.squeeze_dim(0)).unwrap().stride(), [6 * 7 * 5, 1, 7 * 5, 5]);
+        assert_eq!(as_batch(&map).unwrap(), map.unsqueeze(0));
+    }
+}

@@ -1,0 +1,162 @@
+//! Maps that are kept to the cell, and read at few.
+
+use std::collections::BTreeMap;
+use std::sync::Arc;
+
+use protocol::{BevGrid, Pose};
+use tch::{Kind, TchError, Tensor};
+
+use crate::f64_tensor::{are_numbers, numbers};
+use crate::warp::{BILINEAR, Cells, NEAREST, PADDING_ZEROS, places_of};
+
+/// A map on the lattice of its sender, in axes of the ego.
+#[derive(Debug)]
+pub(crate) enum WholeMap {
+    /// Numbers, where no gradient flows: a map is kept for several frames, and turned into numbers once.
+    Numbers {
+        /// What it shows.
+        cells: Arc<Cells>,
+        /// `[H * W]`, 1 where a cell was sent.
+        sent: Arc<[f32]>,
+    },
+    /// Tensors, where one does.
+    Tensors {
+        /// `[1, C, H, W]`.
+        map: Tensor,
+        /// `[1, 1, H, W]`, 1 where a cell was sent.
+        sent: Tensor,
+    },
+}
+
+/// What maps show at some cells of the ego.
+#[derive(Debug)]
+pub(crate) struct Seen {
+    /// `[R, C]`: zeros where they show nothing.
+    pub(crate) features: Tensor,
+    /// `[R, 1]`, 1 where they show something.
+    pub(crate) mask: Tensor,
+}
+
+impl WholeMap {
+    /// Of a map `[1, C, H, W]`, none of whose numbers is below zero, and which of its cells were sent, `[1, 1, H, W]`; absent:
+    /// all.
+    pub(crate) fn of(map: &Tensor, sent: Option<&Tensor>) -> Result<Self, TchError> {
+        let sent = match sent {
+            Some(sent) => sent.f_to_kind(Kind::Float)?,
+            None => map.f_narrow(1, 0, 1)?.f_ones_like()?,
+        };
+        Ok(match are_numbers(map) {
+            true => Self::Numbers { cells: Arc::new(Cells::of(&map.f_squeeze_dim(0)?)?), sent: numbers(&sent)?.into() },
+            false => Self::Tensors { map: map.shallow_clone(), sent },
+        })
+    }
+
+    /// The same map; nothing is copied.
+    pub(crate) fn shallow_clone(&self) -> Self {
+        match self {
+            Self::Numbers { cells, sent } => Self::Numbers { cells: Arc::clone(cells), sent: Arc::clone(sent) },
+            Self::Tensors { map, sent } => Self::Tensors { map: map.shallow_clone(), sent: sent.shallow_clone() },
+        }
+    }
+
+    /// What `maps` on `grid`, each with its time step and its sender's pose, show at some `cells` of the ego's lattice, by row and
+    /// column: by time step the most that any of them shows.
+    pub(crate) fn seen(
+        maps: &[(usize, Pose, &Self)],
+        cells: &[[usize; 2]],
+        grid: &BevGrid,
+    ) -> Result<BTreeMap<usize, Seen>, TchError> {
+        maps.iter().try_fold(BTreeMap::new(), |mut by_step, (step, pose, map)| {
+            let seen = map.at(&places_of(cells, pose, grid))?;
+            let most = match by_step.get(step) {
+                Some(before) => seen.or(before)?,
+                None => seen,
+            };
+            by_step.insert(*step, most);
+            Ok(by_step)
+        })
+    }
+
+    /// What it shows at places in `grid_sampler`'s coordinates, two for each: `[R, C]`, and whether it does, `[R, 1]`.
+    fn at(&self, places: &[f32]) -> Result<Seen, TchError> {
+        let count = places.len() / 2;
+        match self {
+            Self::Numbers { cells, sent } => {
+                let channels = cells.channels();
+                let (mut features, mut mask) = (vec![0.0; count * channels], vec![0.0; count]);
+                cells.look(sent, places, |place, shown| {
+                    features[place * channels..][..channels].copy_from_slice(shown);
+                    mask[place] = 1.0;
+                });
+                let of = |values: &[f32]| Tensor::f_from_slice(values)?.f_view([count as i64, -1]);
+                Ok(Seen { features: of(&features)?, mask: of(&mask)? })
+            }
+            Self::Tensors { map, sent } => {
+                let lattice = Tensor::f_from_slice(places)?.f_view([1, 1, -1, 2])?.f_to_device(map.device())?;
+                let read = |map: &Tensor, how| {
+                    let read = map.f_grid_sampler(&lattice, how, PADDING_ZEROS, false)?;
+                    read.f_squeeze_dim(2)?.f_squeeze_dim(0)?.f_transpose(0, 1)
+                };
+                let mask = read(sent, NEAREST)?.f_ceil()?;
+                Ok(Seen { features: read(map, BILINEAR)? * &mask, mask })
+            }
+        }
+    }
+}
+
+impl Seen {
+    /// The most of both.
+    fn or(&self, other: &Self) -> Result<Self, TchError> {
+        Ok(Self { features: self.features.f_maximum(&other.features)?, mask: self.mask.f_maximum(&other.mask)? })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::test_data::uniform;
+    use crate::warp::warp_to_ego;
+
+    const GRID: BevGrid = BevGrid { x_min_m: -8.0, y_min_m: -4.0, cell_m: 0.5, width: 32, height: 16 };
+
+    fn poses() -> [Pose; 3] {
+        [0.0, 1.0, 3.0].map(|x_m| Pose::from_xyz_yaw([x_m, 0.5, 0.0], 0.3 * x_m))
+    }
+
+    fn maps() -> (Tensor, Tensor) {
+        (uniform(3, &[3, 4, 16, 32]), uniform(5, &[3, 1, 16, 32]).gt(0.2).to_kind(Kind::Float))
+    }
+
+    fn seen(with_gradient: [bool; 3], entries: &[(usize, usize)], cells: &[[usize; 2]]) -> BTreeMap<usize, Seen> {
+        let (maps, sent) = maps();
+        let whole = (0..3).map(|entry| {
+            let map = maps.narrow(0, entry, 1).copy().set_requires_grad(with_gradient[entry as usize]);
+            WholeMap::of(&map, Some(&sent.narrow(0, entry, 1))).unwrap()
+        });
+        let whole: Vec<WholeMap> = whole.collect();
+        let told = entries.iter().map(|&(step, entry)| (step, poses()[entry], &whole[entry]));
+        WholeMap::seen(&told.collect::<Vec<_>>(), cells, &GRID).unwrap()
+    }
+
+    #[test]
+    fn numbers_and_tensors_show_what_a_warp_of_the_whole_map_does() {
+        let some: Vec<i64> = (0..16 * 32).filter(|cell| cell % 3 == 0).collect();
+        let index = Tensor::from_slice(&some);
+        let cells: Vec<[usize; 2]> = some.iter().map(|&cell| [cell as usize / 32, cell as usize % 32]).collect();
+        let (maps, sent) = maps();
+        let warped = warp_to_ego(&maps, Some(&sent), &poses(), &GRID).unwrap();
+        let picked = |maps: &Tensor| maps.flatten(2, 3).index_select(2, &index).transpose(1, 2);
+        let (features, mask) = (picked(&warped.features), picked(&warped.mask));
+        let expected = |tensor: &Tensor| [tensor.get(0).maximum(&tensor.get(2)), tensor.get(1)];
+        for with_gradient in [[false; 3], [true; 3], [false, true, true]] {
+            let seen = seen(with_gradient, &[(0, 0), (1, 1), (0, 2)], &cells);
+            assert!(seen.keys().eq(&[0, 1]));
+            for ((seen, features), mask) in seen.values().zip(expected(&features)).zip(expected(&mask)) {
+                // A place between two cells may be nearest to either.
+                let apart = |a: &Tensor, b: &Tensor| (a - b).abs().gt(1e-5).sum(Kind::Int64).int64_value(&[]);
+                assert!(apart(&seen.features, &features) <= 8 && apart(&seen.mask, &mask) <= 2);
+                assert!(seen.mask.sum(Kind::Float).double_value(&[]) > 50.0);
+            }
+        }
+    }
+}

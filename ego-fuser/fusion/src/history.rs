@@ -1,0 +1,157 @@
+//! The last maps of every vehicle, kept by the ego: nothing is sent twice.
+//!
+//! Each lies here with the pose that its sender had when it was made, so that it can be put where it belongs from
+//! wherever the ego is now.
+
+use std::collections::{BTreeMap, VecDeque};
+
+use protocol::{CavId, Pose};
+
+use crate::EarlierMaps;
+
+/// Maps older than this tell of another situation, nanoseconds.
+pub const MAX_AGE_NANOS: u64 = 1_000_000_000;
+/// Vehicles that are remembered at most.
+const MAX_VEHICLES: usize = 64;
+
+/// A map as it came.
+#[derive(Debug)]
+pub struct KeptMap {
+    /// When it was made, nanoseconds.
+    pub capture_nanos: u64,
+    /// Where its sender believed to be then.
+    pub world_from_cav: Pose,
+    /// How sure it was.
+    pub confidence: f64,
+    /// One map, as the fusion keeps it.
+    pub shown: EarlierMaps,
+}
+
+/// Maps by vehicle, oldest first.
+#[derive(Debug)]
+pub struct History {
+    frames: usize,
+    kept: BTreeMap<CavId, VecDeque<KeptMap>>,
+    latest_nanos: u64,
+}
+
+impl History {
+    /// Keeps what a fusion of `frames` time steps asks for; with one there is nothing to keep.
+    pub fn new(frames: usize) -> Self {
+        Self { frames, kept: BTreeMap::new(), latest_nanos: 0 }
+    }
+
+    /// Forgets everything: another scene begins.
+    pub fn clear(&mut self) {
+        self.kept.clear();
+        self.latest_nanos = 0;
+    }
+
+    /// The ego's clock stands at `now_nanos`: what is too old goes, and all of it where the clock was turned back.
+    pub fn advance(&mut self, now_nanos: u64) {
+        if now_nanos < self.latest_nanos {
+            self.clear();
+        }
+        self.latest_nanos = now_nanos;
+        for maps in self.kept.values_mut() {
+            maps.retain(|kept| kept.capture_nanos.saturating_add(MAX_AGE_NANOS) >= now_nanos);
+        }
+        self.kept.retain(|_, maps| !maps.is_empty());
+    }
+
+    /// The maps of a vehicle from before the one that is fused now, newest first: at most a time step each.
+    pub fn before(&self, cav: &CavId, capture_nanos: u64) -> impl Iterator<Item = &KeptMap> {
+        let earlier = move |kept: &&KeptMap| kept.capture_nanos < capture_nanos;
+        self.kept.get(cav).into_iter().flatten().rev().filter(earlier).take(self.frames.saturating_sub(1))
+    }
+
+    /// Keeps a map for later. One that is kept already, as it served more than one frame, is not kept twice.
+    pub fn keep(&mut self, cav: &CavId, kept: KeptMap) {
+        let is_new = !self.kept.contains_key(cav);
+        if self.frames < 2 || (is_new && self.kept.len() >= MAX_VEHICLES) {
+            return;
+        }
+        let maps = self.kept.entry(cav.clone()).or_default();
+        if maps.back().is_some_and(|last| last.capture_nanos >= kept.capture_nanos) {
+            return;
+        }
+        maps.push_back(kept);
+        if maps.len() > self.frames {
+            maps.pop_front();
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    const FRAME: u64 = 100_000_000;
+
+    fn cav(name: &str) -> CavId {
+        CavId::new(name).unwrap()
+    }
+
+    fn map(frame: u64) -> KeptMap {
+        KeptMap {
+            capture_nanos: frame * FRAME,
+            world_from_cav: Pose::IDENTITY,
+            confidence: 1.0,
+            shown: EarlierMaps::of_nothing(),
+        }
+    }
+
+    fn frames_before(history: &History, name: &str, frame: u64) -> Vec<u64> {
+        history.before(&cav(name), frame * FRAME).map(|kept| kept.capture_nanos / FRAME).collect()
+    }
+
+    #[test]
+    fn the_last_maps_of_each_come_back_newest_first() {
+        let mut history = History::new(3);
+        for frame in 0..6 {
+            history.advance(frame * FRAME);
+            history.keep(&cav("a"), map(frame));
+        }
+        assert_eq!(frames_before(&history, "a", 5), [4, 3]);
+        assert_eq!(frames_before(&history, "a", 6), [5, 4]);
+        assert!(frames_before(&history, "b", 6).is_empty());
+        history.keep(&cav("a"), map(5));
+        history.keep(&cav("a"), map(2));
+        assert_eq!(frames_before(&history, "a", 6), [5, 4], "what served before is not kept twice");
+    }
+
+    #[test]
+    fn what_is_old_goes_and_a_clock_that_is_turned_back_clears_all() {
+        let mut history = History::new(3);
+        history.keep(&cav("a"), map(0));
+        history.keep(&cav("b"), map(8));
+        history.advance(11 * FRAME);
+        assert!(frames_before(&history, "a", 11).is_empty());
+        assert_eq!(frames_before(&history, "b", 11), [8]);
+        history.advance(2 * FRAME);
+        assert!(history.kept.is_empty());
+    }
+
+    #[test]
+    fn one_frame_needs_no_memory() {
+        let mut history = History::new(1);
+        history.keep(&cav("a"), map(0));
+        assert!(history.kept.is_empty());
+    }
+
+    proptest! {
+        #[test]
+        fn it_never_grows_beyond_its_bounds(events in prop::collection::vec((0u64..200, 0u32..100), 0..300)) {
+            let mut history = History::new(3);
+            for (frame, vehicle) in events {
+                history.advance(frame * FRAME);
+                history.keep(&cav(&vehicle.to_string()), map(frame));
+                prop_assert!(history.kept.len() <= MAX_VEHICLES);
+                prop_assert!(history.kept.values().all(|maps| maps.len() <= 3));
+                prop_assert!(history.before(&cav(&vehicle.to_string()), (frame + 1) * FRAME).count() <= 2);
+            }
+        }
+    }
+}

@@ -1,0 +1,296 @@
+//! The whole network of a method, encoder to head, for training and for the ego's half of inference.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+
+use nalgebra::Isometry3;
+use perception::boxes::anchors::Anchors;
+use perception::boxes::decode::{DecodeError, decode};
+use perception::boxes::postprocess::{AgentBoxes, PostprocessConfig, postprocess};
+use perception::layers::head::HeadOutput;
+use perception::model_config::{ConfigError, DetectorConfig, YAxis};
+use perception::pillars::batch::PillarBatch;
+use perception::pillars::point_pillars::PointPillars;
+use perception::train::ComputePrecision;
+use perception::weights::{CONFIG_KEY, Weights, WeightsError};
+use protocol::{Box3d, Detection};
+use tch::nn::VarStore;
+use tch::{Device, Kind, TchError, Tensor};
+
+use crate::method::{Method, UnknownMethod};
+use crate::targets::{LatticeError, TargetAssigner, TargetRule};
+use crate::warp::WarpError;
+use crate::where2comm::most_confident;
+use crate::{FUSION_KEY, FUSION_PREFIX, FusionConfig, FusionStage, ViewFacts, channel_mixing, stored_config};
+
+/// Metadata key of the method that weights were trained with.
+pub const METHOD_KEY: &str = "method";
+
+/// Why a model cannot be built, loaded or run.
+#[derive(Debug, thiserror::Error)]
+pub enum ModelError {
+    /// No network can be built from the configuration.
+    #[error(transparent)]
+    Config(#[from] ConfigError),
+    /// The weights do not fit.
+    #[error(transparent)]
+    Weights(#[from] WeightsError),
+    /// The weights name a method that is not known.
+    #[error(transparent)]
+    Method(#[from] UnknownMethod),
+    /// Maps do not fit the lattice.
+    #[error(transparent)]
+    Warp(#[from] WarpError),
+    /// The tensor library refused.
+    #[error("model: {0}")]
+    Torch(#[from] TchError),
+    /// The head's output does not fit the anchors.
+    #[error(transparent)]
+    Decode(#[from] DecodeError),
+    /// Facts and views do not add up.
+    #[error("{views} views encoded, but the samples name {told}")]
+    ViewCount {
+        /// Feature maps.
+        views: i64,
+        /// Facts over all samples.
+        told: usize,
+    },
+}
+
+/// What a model makes of a batch.
+#[derive(Debug)]
+pub struct CooperativeOutput {
+    /// Scores and boxes of every anchor.
+    pub head: HeadOutput,
+    /// For each sample how the fusion has moved its views but the first, see [`crate::Fusion::fuse_and_correct`].
+    pub corrections: Vec<Option<Tensor>>,
+}
+
+/// Encoder, fusion and head of one method under one set of variables.
+#[derive(Debug)]
+pub struct CooperativeModel {
+    /// Which method it was built for.
+    pub method: Method,
+    /// Every variable, by the names of the weights file.
+    pub variables: VarStore,
+    network: PointPillars,
+    anchors: Anchors,
+    fusion: FusionStage,
+}
+
+impl CooperativeModel {
+    /// Builds a model with random parameters (`tch::manual_seed` makes them repeatable).
+    ///
+    /// # Errors
+    /// [`ModelError::Config`] when no network can be built from `config`.
+    pub fn new(config: &DetectorConfig, method: Method, device: Device) -> Result<Self, ModelError> {
+        Self::with_fusion(config, method, &FusionConfig::for_detector(method, config), device)
+    }
+
+    /// The same with a fusion of another size.
+    ///
+    /// # Errors
+    /// As [`Self::new`].
+    pub fn with_fusion(
+        config: &DetectorConfig,
+        method: Method,
+        fusion: &FusionConfig,
+        device: Device,
+    ) -> Result<Self, ModelError> {
+        if config.y_axis == YAxis::Right {
+            // Samples and targets are of this world.
+            let (field, value) = ("y_axis", "right".to_owned());
+            return Err(ConfigError::Value { field, value, must: "left to train" }.into());
+        }
+        let variables = VarStore::new(device);
+        let network = PointPillars::new(&variables.root(), config)?;
+        let fusion = FusionStage::new(&variables.root(), fusion, method, config)?;
+        let anchors = Anchors::for_detector(config);
+        Ok(Self { method, network, variables, anchors, fusion })
+    }
+
+    /// Builds the model of a weights file; `method` overrides the one that the file names.
+    ///
+    /// # Errors
+    /// [`ModelError`] when the file is missing, names no known method or does not fit its own configuration.
+    pub fn load(path: &Path, method: Option<Method>, device: Device) -> Result<Self, ModelError> {
+        Self::from_weights(&Weights::load(path)?, method, None, device)
+    }
+
+    /// The same from a file already read, with another fusion than it names.
+    ///
+    /// # Errors
+    /// As [`Self::load`].
+    pub fn from_weights(
+        weights: &Weights,
+        method: Option<Method>,
+        fusion: Option<&FusionConfig>,
+        device: Device,
+    ) -> Result<Self, ModelError> {
+        let method = match (method, weights.metadata(METHOD_KEY)) {
+            (Some(method), _) => method,
+            (None, Some(name)) => name.parse()?,
+            (None, None) => Method::None,
+        };
+        let config = weights.config()?;
+        let fusion = match fusion {
+            Some(fusion) => fusion.clone(),
+            None => stored_config(weights, method, &config)?,
+        };
+        let model = Self::with_fusion(&config, method, &fusion, device)?;
+        // A network that was trained alone becomes a cooperative one whose fusion has everything to learn.
+        let is_fusion = |name: &str| name == channel_mixing::WEIGHT || name.starts_with(FUSION_PREFIX);
+        weights.copy_some_into(&model.variables, |name| !is_fusion(name) || weights.contains(name))?;
+        Ok(model)
+    }
+
+    /// What the header of its weights says of it: configuration, method and fusion.
+    #[must_use]
+    pub fn about(&self) -> BTreeMap<String, String> {
+        let config = serde_json::to_string(&self.network.config).expect("a configuration is JSON");
+        let fusion = serde_json::to_string(self.fusion.config()).expect("a configuration is JSON");
+        let method = self.method.name().to_owned();
+        [(CONFIG_KEY, config), (METHOD_KEY, method), (FUSION_KEY, fusion)]
+            .map(|(key, value)| (key.to_owned(), value))
+            .into()
+    }
+
+    /// The numbers it was built from.
+    #[must_use]
+    pub fn config(&self) -> &DetectorConfig {
+        &self.network.config
+    }
+
+    /// The encoder and head.
+    #[must_use]
+    pub fn network(&self) -> &PointPillars {
+        &self.network
+    }
+
+    /// In which numbers the convolutions compute from now on.
+    pub fn set_precision(&mut self, precision: ComputePrecision) {
+        self.network.compute = precision.kind();
+    }
+
+    /// Where the variables are.
+    #[must_use]
+    pub fn device(&self) -> Device {
+        self.variables.device()
+    }
+
+    /// How it makes one map of many.
+    #[must_use]
+    pub fn fusion(&self) -> &FusionStage {
+        &self.fusion
+    }
+
+    /// The forward pass of a training step: all views are encoded together, then fused sample by sample.
+    ///
+    /// `facts` tell of each sample's views, ego first; views lie in `pillars` in the same order.
+    ///
+    /// # Errors
+    /// [`ModelError`] when facts and views do not add up.
+    pub fn forward(
+        &self,
+        pillars: &PillarBatch,
+        facts: &[Vec<ViewFacts>],
+        train: bool,
+    ) -> Result<CooperativeOutput, ModelError> {
+        let features = self.network.features(pillars, train);
+        self.fuse_and_detect(&self.network.through_compressor(&features, train), facts, train)
+    }
+
+    /// The rest of the forward pass, from the maps of all views `[sum(views), C, H, W]` on, each in its own frame.
+    ///
+    /// # Errors
+    /// [`ModelError`] when facts and views do not add up.
+    pub fn fuse_and_detect(
+        &self,
+        features: &Tensor,
+        facts: &[Vec<ViewFacts>],
+        train: bool,
+    ) -> Result<CooperativeOutput, ModelError> {
+        let told: usize = facts.iter().map(Vec::len).sum();
+        let views = features.size4()?.0;
+        if views != told as i64 {
+            return Err(ModelError::ViewCount { views, told });
+        }
+        if self.fusion.config() == &FusionConfig::Own && told == facts.len() {
+            let corrections = facts.iter().map(|_| None).collect();
+            return Ok(CooperativeOutput { head: self.network.heads(features)?, corrections });
+        }
+        let (mut fused, mut corrections) = (Vec::with_capacity(facts.len()), Vec::with_capacity(facts.len()));
+        let mut first = 0;
+        for facts in facts {
+            let views = features.f_narrow(0, first, facts.len() as i64)?;
+            first += facts.len() as i64;
+            let sent = if train { self.sent_in_training(&views)? } else { None };
+            let aligned = self.fusion.align(&views, sent.as_ref(), facts)?;
+            let (map, moved_by) = self.fusion.fuse_and_correct(&aligned, facts, train)?;
+            fused.push(map);
+            corrections.push(moved_by);
+        }
+        Ok(CooperativeOutput { head: self.network.heads(&Tensor::f_stack(&fused, 0)?)?, corrections })
+    }
+
+    /// What agents would have sent of their maps `[N, C, H, W]`, for a method in which they choose: in training a random
+    /// share of the cells that they are surest of, so that every threshold is learnt for. The ego has all of its own.
+    fn sent_in_training(&self, features: &Tensor) -> Result<Option<Tensor>, TchError> {
+        let agents = features.size4()?.0;
+        if !matches!(self.fusion.config(), FusionConfig::Where2comm(_)) || agents < 2 {
+            return Ok(None);
+        }
+        tch::no_grad(|| {
+            let confidence = self.network.heads(features)?.confidence().f_unsqueeze(1)?;
+            let share = Tensor::f_rand([1], (Kind::Float, Device::Cpu))?.double_value(&[0]);
+            let sent = most_confident(&confidence, share)?;
+            let _ = sent.f_get(0)?.f_fill_(1.0)?;
+            Ok(Some(sent))
+        })
+    }
+
+    /// Boxes of every sample of a head's output, cleaned up by `limits`.
+    ///
+    /// # Errors
+    /// [`ModelError::Decode`] when the output does not fit the anchors.
+    pub fn detections(
+        &self,
+        output: &HeadOutput,
+        limits: &PostprocessConfig,
+    ) -> Result<Vec<Vec<Detection>>, ModelError> {
+        let samples = output.scores.size4()?.0;
+        (0..samples)
+            .map(|sample| {
+                let scores = flat(&output.scores, sample)?;
+                let decoded = decode(&scores, &flat(&output.offsets, sample)?, &self.anchors, limits.score_threshold)?;
+                let boxes = AgentBoxes { boxes: &decoded, output_from_agent: Isometry3::identity() };
+                Ok(postprocess(&[boxes], limits).iter().map(|candidate| candidate.detection(None)).collect())
+            })
+            .collect()
+    }
+
+    /// The limits of the clean-up that go with this network: boxes lie wholly over its area.
+    #[must_use]
+    pub fn limits(&self) -> PostprocessConfig {
+        PostprocessConfig::for_detector(self.config())
+    }
+
+    /// What finds the targets of a frame among the anchors of the head.
+    ///
+    /// # Errors
+    /// [`LatticeError`] when the configuration has no anchors.
+    pub fn assigner(&self) -> Result<TargetAssigner, LatticeError> {
+        let anchors = &self.anchors;
+        let boxes = (0..anchors.len()).map(|index| {
+            let [x, y, z, h, w, l, yaw] = anchors.get(index);
+            Box3d { center_m: [x, y, z], size_m: [l, w, h], heading_rad: yaw }
+        });
+        let shape = [anchors.y_m.len(), anchors.x_m.len(), anchors.yaws_rad.len()];
+        TargetAssigner::new(boxes.collect(), shape, TargetRule::default())
+    }
+}
+
+/// The values of one sample of a map, row-major.
+pub fn flat(map: &Tensor, sample: i64) -> Result<Vec<f32>, TchError> {
+    Vec::try_from(map.f_get(sample)?.f_to_device(Device::Cpu)?.f_to_kind(Kind::Float)?.f_reshape([-1])?)
+}

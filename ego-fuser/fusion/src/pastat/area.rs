@@ -1,0 +1,190 @@
+//! The area that maps show, and maps moved on it.
+
+use protocol::{BevGrid, Pose};
+use tch::{Kind, TchError, Tensor};
+
+use super::correlation::PARTS;
+use crate::warp::{BILINEAR, NEAREST, PADDING_ZEROS};
+
+/// The area of a padded map, metres.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Area {
+    middle_m: [f64; 2],
+    half_m: [f64; 2],
+    /// Rows and columns.
+    size: [i64; 2],
+    cell_m: f64,
+    /// Cells of the ego's lattice along each edge of a cell.
+    cells: i64,
+    /// Cells are compared with those of the ego up to so many cells away.
+    radius: i64,
+}
+
+impl Area {
+    /// The area of `height` x `width` cells that begin where `grid` begins; maps are compared up to `radius` cells away.
+    pub(super) fn new(grid: &BevGrid, [height, width]: [i64; 2], radius: i64) -> Self {
+        let half_m = [width as f64 * grid.cell_m / 2.0, height as f64 * grid.cell_m / 2.0];
+        Self {
+            middle_m: [grid.x_min_m + half_m[0], grid.y_min_m + half_m[1]],
+            half_m,
+            size: [height, width],
+            cell_m: grid.cell_m,
+            cells: 1,
+            radius,
+        }
+    }
+
+    /// The same with cells of `cells` by `cells`, compared up to about as many metres away.
+    pub(super) fn with_cells_of(self, cells: i64) -> Self {
+        let (cell_m, radius) = (self.cell_m * cells as f64, (self.radius + cells - 1) / cells);
+        let size = self.size.map(|count| count / cells);
+        Self { size, cell_m, cells: self.cells * cells, radius, ..self }
+    }
+
+    /// Edge of a cell, metres.
+    pub(super) fn cell_m(&self) -> f64 {
+        self.cell_m
+    }
+
+    /// Cells of the ego's lattice along each edge of a cell.
+    pub(super) fn cells(&self) -> i64 {
+        self.cells
+    }
+
+    /// Where vehicles are, metres from the middle of the area, `[N, 2]`.
+    pub(super) fn places_of(&self, ego_from_cav: &[Pose]) -> Result<Tensor, TchError> {
+        let place = |pose: &Pose| [0, 1].map(|axis| (pose.translation_m[axis] - self.middle_m[axis]) as f32);
+        let places: Vec<f32> = ego_from_cav.iter().flat_map(place).collect();
+        Tensor::f_from_slice(&places)?.f_view([-1, 2])
+    }
+
+    /// Cells are compared with those of the ego up to so many cells away.
+    pub(super) fn radius(&self) -> i64 {
+        self.radius
+    }
+
+    /// `[PARTS^2, 2]`: the middles of the parts that maps are compared by, metres from the middle of the area.
+    pub(super) fn middles_of_parts(&self) -> Result<Tensor, TchError> {
+        let along = |part: i64, half_m: f64| (((2 * part + 1) as f64 / PARTS as f64 - 1.0) * half_m) as f32;
+        let [half_x, half_y] = self.half_m;
+        let middles: Vec<f32> = (0..PARTS)
+            .flat_map(|row| (0..PARTS).flat_map(move |column| [along(column, half_x), along(row, half_y)]))
+            .collect();
+        Tensor::f_from_slice(&middles)?.f_view([-1, 2])
+    }
+}
+
+/// Where the cells of the ego's lattice lie on maps that are moved by `deltas` `[N, 3]`, for `grid_sampler`: `[N, H, W, 2]`.
+///
+/// A map is turned about the place of the vehicle that made it and then shifted, both in the ego's frame, so that an
+/// error of its pose's heading is one number and not three.
+pub(super) fn lattice(deltas: &Tensor, ego_from_cav: &[Pose], area: &Area, size: [i64; 2]) -> Result<Tensor, TchError> {
+    let senders = said(ego_from_cav)?.f_to_device(deltas.device())?.f_narrow(1, 0, 2)?;
+    // p_map = v + R^T (p_ego - v - d), with v the vehicle's place and d the shift.
+    let moved = senders.f_constant_pad_nd([0, 1])? + deltas;
+    places(&moved, &senders, [area, area], size)
+}
+
+/// Where the cells of the ego's lattice, that of `area`, lie on maps that are still where they were made, on `own`, given that
+/// their senders are `deltas` `[N, 3]` from where they say: `[N, H, W, 2]`.
+pub(super) fn own_lattice(deltas: &Tensor, ego_from_cav: &[Pose], [area, own]: [&Area; 2]) -> Result<Tensor, TchError> {
+    let moved = said(ego_from_cav)?.f_to_device(deltas.device())? + deltas;
+    // p_cav = R^T (p_ego - v - d).
+    places(&moved, &moved.f_narrow(1, 0, 2)?.f_zeros_like()?, [area, own], area.size)
+}
+
+/// `[N, 3]`: x and y, metres, and yaw, radians.
+fn said(ego_from_cav: &[Pose]) -> Result<Tensor, TchError> {
+    let of_pose = |pose: &Pose| [pose.translation_m[0] as f32, pose.translation_m[1] as f32, pose.yaw_rad() as f32];
+    let values: Vec<f32> = ego_from_cav.iter().flat_map(of_pose).collect();
+    Tensor::f_from_slice(&values)?.f_view([-1, 3])
+}
+
+/// Where the cells of a lattice over `area` lie on lattices over `on`, given where on `area` lies, and how it is turned there,
+/// `[N, 3]`, what lies at `origin` `[N, 2]` on those: `[N, H, W, 2]`.
+fn places(pose: &Tensor, origin: &Tensor, [area, on]: [&Area; 2], size: [i64; 2]) -> Result<Tensor, TchError> {
+    let yaw = pose.f_select(1, 2)?;
+    let (cos, sin) = (yaw.f_cos()?, yaw.f_sin()?);
+    let from = |axis: usize| Ok::<_, TchError>(area.middle_m[axis] - pose.f_select(1, axis as i64)?);
+    let at = |axis: usize| Ok::<_, TchError>(origin.f_select(1, axis as i64)? - on.middle_m[axis]);
+    let ([half_x, half_y], [on_x, on_y]) = (area.half_m, on.half_m);
+    let (from_x, from_y) = (from(0)?, from(1)?);
+    let x0 = (&cos * &from_x + &sin * &from_y + at(0)?) / on_x;
+    let y0 = (&cos * &from_y - &sin * &from_x + at(1)?) / on_y;
+    let (xx, xy) = (&cos * (half_x / on_x), &sin * (half_y / on_x));
+    let (yx, yy) = (&sin * (-half_x / on_y), &cos * (half_y / on_y));
+    let affine = Tensor::f_stack(&[xx, xy, x0, yx, yy, y0], 1)?.f_view([-1, 2, 3])?;
+    Tensor::f_affine_grid_generator(&affine, [pose.size2()?.0, 1, size[0], size[1]], false)
+}
+
+/// Where a vehicle was by a `delta`, see [`lattice`].
+pub(super) fn moved(ego_from_cav: &Pose, delta: &[f64]) -> Pose {
+    let [x, y, z] = ego_from_cav.translation_m;
+    Pose::from_xyz_yaw([x + delta[0], y + delta[1], z], ego_from_cav.yaw_rad() + delta[2])
+}
+
+/// Maps `[N, C, H, W]` and what is valid of them `[N, 1, H, W]`, read at `lattice`. Nothing is valid beyond their edges; maps
+/// are not zero where nothing is valid.
+pub(super) fn resample(maps: &Tensor, valid: &Tensor, lattice: &Tensor) -> Result<(Tensor, Tensor), TchError> {
+    let valid = valid.f_grid_sampler(&lattice.f_detach()?, NEAREST, PADDING_ZEROS, false)?.f_to_kind(Kind::Float)?;
+    Ok((maps.f_grid_sampler(lattice, BILINEAR, PADDING_ZEROS, false)?, valid))
+}
+
+#[cfg(test)]
+mod tests {
+    use tch::Device;
+
+    use super::*;
+    use crate::test_data::uniform;
+    use crate::warp::warp_to_ego;
+
+    const FLOAT: (Kind, Device) = (Kind::Float, Device::Cpu);
+    const GRID: BevGrid = BevGrid { x_min_m: -8.0, y_min_m: -4.0, cell_m: 0.5, width: 32, height: 16 };
+
+    fn area() -> Area {
+        Area::new(&GRID, [16, 32], 4)
+    }
+
+    fn map_moved(maps: &Tensor, delta: [f32; 3], ego_from_cav: Pose) -> Tensor {
+        let deltas = Tensor::from_slice(&delta).view([1, 3]);
+        let lattice = lattice(&deltas, &[ego_from_cav], &area(), [16, 32]).unwrap();
+        resample(maps, &Tensor::ones([1, 1, 16, 32], FLOAT), &lattice).unwrap().0
+    }
+
+    #[test]
+    fn a_delta_moves_a_map_as_a_pose_would() {
+        let maps = Tensor::randn([1, 2, 16, 32], FLOAT);
+        // A vehicle at the ego's own place: turning about it and then shifting is a pose.
+        let by_pose = warp_to_ego(&maps, None, &[Pose::from_xyz_yaw([1.0, -0.5, 0.0], 0.1)], &GRID).unwrap();
+        let by_delta = map_moved(&maps, [1.0, -0.5, 0.1], Pose::IDENTITY);
+        let inside = |map: &Tensor| map.narrow(2, 4, 8).narrow(3, 8, 16);
+        assert!(inside(&by_delta).allclose(&inside(&by_pose.features), 1e-3, 1e-3, false));
+    }
+
+    #[test]
+    fn a_map_read_where_it_was_made_is_one_warped_by_the_right_pose() {
+        let maps = uniform(3, &[1, 2, 16, 32]);
+        let (pose, delta) = (Pose::from_xyz_yaw([2.3, -1.2, 0.0], 0.7), [0.8, -0.3, 0.1]);
+        let by_pose = warp_to_ego(&maps, None, &[moved(&pose, &delta)], &GRID).unwrap();
+        let deltas = Tensor::from_slice(&delta).to_kind(Kind::Float).view([1, 3]);
+        // Rows and columns that were padded on show what the ego's do, and more.
+        let padded = Area::new(&GRID, [20, 40], 4);
+        let places = own_lattice(&deltas, &[pose], [&padded, &area()]).unwrap();
+        let (read, valid) = resample(&maps, &Tensor::ones([1, 1, 16, 32], FLOAT), &places).unwrap();
+        let inside = |map: &Tensor| map.narrow(2, 0, 16).narrow(3, 0, 32);
+        assert!((inside(&(read * &valid)) - by_pose.features).abs().mean(Kind::Float).double_value(&[]) < 1e-3);
+        assert_eq!(inside(&valid), by_pose.mask);
+        assert!(valid.sum(Kind::Float).double_value(&[]) > by_pose.mask.sum(Kind::Float).double_value(&[]));
+    }
+
+    #[test]
+    fn a_turn_is_about_the_vehicle_that_made_the_map() {
+        let map = Tensor::zeros([1, 1, 16, 32], FLOAT);
+        // The cell of the vehicle itself, at (3.25, 1.25), stays where it is; one beside it does not.
+        let _ = map.get(0).get(0).get(10).get(22).fill_(1.0);
+        let vehicle = Pose::from_xyz_yaw([3.25, 1.25, 0.0], 0.7);
+        assert!((map_moved(&map, [0.0, 0.0, 0.5], vehicle).double_value(&[0, 0, 10, 22]) - 1.0).abs() < 1e-3);
+        let _ = map.get(0).get(0).get(10).get(28).fill_(1.0);
+        assert!(map_moved(&map, [0.0, 0.0, 0.5], vehicle).double_value(&[0, 0, 10, 28]) < 0.1);
+    }
+}

@@ -1,0 +1,275 @@
+//! Attention among the tokens of one cell, over agents and time, and among the tokens of one map, within windows.
+
+use tch::nn::{self, Init, Module};
+use tch::{Kind, TchError, Tensor};
+
+use super::gather::Others;
+use crate::f64_tensor::numbers;
+
+/// What a masked score is set to: low enough for no weight, and finite, so that rows with nothing valid stay numbers.
+const MASKED: f64 = -1e9;
+
+/// Multi-head self-attention over agents and time at each cell (the MSA of Eq. 8).
+#[derive(Debug)]
+pub(super) struct AgentAttention {
+    query: nn::Linear,
+    key: nn::Linear,
+    value: nn::Linear,
+    out: nn::Linear,
+    /// `[D, heads]`, 1 where a channel is of a head: sums over a head's channels are products with it, and so are copies of
+    /// a head's weight to its channels; both cost less than sums and products of many small rows.
+    members: Tensor,
+    heads: i64,
+}
+
+impl AgentAttention {
+    pub(super) fn new(path: &nn::Path<'_>, dim: i64, heads: i64) -> Self {
+        let bare = nn::LinearConfig { bias: false, ..Default::default() };
+        Self {
+            query: nn::linear(path / "query", dim, dim, bare),
+            key: nn::linear(path / "key", dim, dim, bare),
+            value: nn::linear(path / "value", dim, dim, bare),
+            out: nn::linear(path / "out", dim, dim, nn::LinearConfig::default()),
+            members: Tensor::eye(heads, (Kind::Float, path.device())).repeat_interleave_self_int(dim / heads, 0, None),
+            heads,
+        }
+    }
+
+    /// What the first `rows` entries learn of all, at each cell.
+    ///
+    /// # Shapes
+    /// - `tokens`: `[N, h, w, D]`
+    /// - `valid`: `[N, h, w]`, 1 for tokens that count
+    /// - returns: `[rows, h, w, D]`
+    pub(super) fn forward(&self, tokens: &Tensor, valid: &Tensor, rows: i64) -> Result<Tensor, TchError> {
+        let (entries, height, width, dim) = tokens.size4()?;
+        let (cells, each) = (height * width, dim / self.heads);
+        let query = self.query.forward(&tokens.f_narrow(0, 0, rows)?) / (each as f64).sqrt();
+        let (key, value) = (self.key.forward(tokens), self.value.forward(tokens));
+        let hidden = valid.f_eq(0.0)?.f_view([entries, cells, 1])?;
+        let mixed = if rows == 1 {
+            let by_cell = |tensor: &Tensor| tensor.f_view([-1, cells, dim]);
+            self.one_row(&by_cell(&query)?, &by_cell(&key)?, &by_cell(&value)?, &hidden)?
+        } else {
+            let by_head = |tensor: &Tensor| tensor.f_view([-1, cells, self.heads, each]);
+            all_rows(&by_head(&query)?, &by_head(&key)?, &by_head(&value)?, &hidden)?
+        };
+        Ok(self.out.forward(&mixed.f_reshape([rows, height, width, dim])?))
+    }
+
+    /// What the ego learns of all, from tokens that are not normalised yet: the same as `forward` of one row.
+    ///
+    /// A head's score of a token is the product of its query, led back through the weights of keys and norm, with the
+    /// token; what the norm adds to all tokens alike changes no weight. So neither keys nor values are made of tokens.
+    ///
+    /// # Shapes
+    /// - `ego`, returns: `[1, h, w, D]`
+    pub(super) fn gather(&self, norm: &nn::LayerNorm, ego: &Tensor, others: &Others) -> Result<Tensor, TchError> {
+        let (_, height, width, dim) = ego.size4()?;
+        let (cells, each) = (height * width, dim / self.heads);
+        let by_channel = |tokens: &Tensor| tokens.f_view([cells, dim])?.f_transpose(0, 1);
+        let by_head = |linear: &nn::Linear| linear.ws.f_view([self.heads, each, dim]);
+        let query = self.query.forward(&norm.forward(ego)) / (each as f64).sqrt();
+        let query = by_channel(&query)?.f_reshape([self.heads, each, cells])?;
+        let (one, none) = (Tensor::from(1f32), Tensor::from(0f32));
+        let (gain, shift) = (norm.ws.as_ref().unwrap_or(&one), norm.bs.as_ref().unwrap_or(&none));
+        let asked = (by_head(&self.key)? * gain).f_transpose(1, 2)?.f_matmul(&query)?;
+        let gathered = others.gather(&numbers(&asked)?, &numbers(&by_channel(ego)?)?);
+        let gathered = Tensor::f_from_slice(&gathered)?.f_view([self.heads, dim, cells])?;
+        let values = by_head(&self.value)?;
+        let mixed =
+            (&values * gain).f_matmul(&gathered)? + values.f_matmul(&shift.f_expand([dim], false)?.f_unsqueeze(1)?)?;
+        Ok(self.out.forward(&mixed.f_view([dim, cells])?.f_transpose(0, 1)?.f_reshape([1, height, width, dim])?))
+    }
+
+    /// Only the ego asks: sums over few entries, cheaper than products of small matrices.
+    fn one_row(&self, query: &Tensor, key: &Tensor, value: &Tensor, hidden: &Tensor) -> Result<Tensor, TchError> {
+        let scores = (query * key).f_matmul(&self.members)?;
+        let weights = scores.f_masked_fill(hidden, MASKED)?.f_softmax(0, None)?;
+        (weights.f_matmul(&self.members.f_transpose(0, 1)?)? * value).f_sum_dim_intlist([0_i64].as_slice(), true, None)
+    }
+}
+
+fn all_rows(query: &Tensor, key: &Tensor, value: &Tensor, hidden: &Tensor) -> Result<Tensor, TchError> {
+    // [N, cells, heads, d] to [cells, heads, N, d]
+    let by_cell = |tensor: &Tensor| tensor.f_permute([1, 2, 0, 3])?.f_contiguous();
+    let scores = by_cell(query)?.f_matmul(&by_cell(key)?.f_transpose(2, 3)?)?;
+    let hidden = hidden.f_permute([1, 2, 0])?.f_unsqueeze(2)?;
+    let weights = scores.f_masked_fill(&hidden, MASKED)?.f_softmax(3, None)?;
+    weights.f_matmul(&by_cell(value)?)?.f_permute([2, 0, 1, 3])
+}
+
+/// Attention among the tokens of a window, with windows of several sizes, each with its share of the heads.
+#[derive(Debug)]
+pub(super) struct WindowAttention {
+    query_key_value: nn::Linear,
+    out: nn::Linear,
+    sizes: Vec<WindowSize>,
+    /// Heads of each size.
+    heads: i64,
+}
+
+#[derive(Debug)]
+struct WindowSize {
+    edge: i64,
+    /// `[(2 edge - 1)^2, heads]`: a learnt preference for each relative place.
+    bias: Tensor,
+    /// `[edge^4]`: the relative place of each pair.
+    places: Vec<i64>,
+}
+
+impl WindowAttention {
+    pub(super) fn new(path: &nn::Path<'_>, dim: i64, heads: i64, edges: &[i64]) -> Self {
+        let bare = nn::LinearConfig { bias: false, ..Default::default() };
+        let heads = heads / edges.len() as i64;
+        let size = |(index, &edge): (usize, &i64)| WindowSize {
+            edge,
+            bias: path.var(&format!("bias{index}"), &[(2 * edge - 1).pow(2), heads], Init::Const(0.0)),
+            places: relative_places(edge),
+        };
+        Self {
+            query_key_value: nn::linear(path / "query_key_value", dim, 3 * dim, bare),
+            out: nn::linear(path / "out", dim, dim, nn::LinearConfig::default()),
+            sizes: edges.iter().enumerate().map(size).collect(),
+            heads,
+        }
+    }
+
+    /// What each token learns of its windows.
+    ///
+    /// # Shapes
+    /// - `tokens`: `[N, h, w, D]`, `h` and `w` multiples of every window
+    /// - `valid`: `[N, h, w]`, 1 for tokens that count
+    /// - returns: `[N, h, w, D]`
+    pub(super) fn forward(&self, tokens: &Tensor, valid: &Tensor) -> Result<Tensor, TchError> {
+        let (.., dim) = tokens.size4()?;
+        let share = dim / self.sizes.len() as i64;
+        let projected = self.query_key_value.forward(tokens);
+        let mut parts = Vec::with_capacity(self.sizes.len());
+        for (index, size) in self.sizes.iter().enumerate() {
+            let of_size = |which: i64| projected.f_narrow(3, which * dim + index as i64 * share, share);
+            parts.push(self.within(size, [of_size(0)?, of_size(1)?, of_size(2)?], valid)?);
+        }
+        Ok(self.out.forward(&Tensor::f_cat(&parts, 3)?))
+    }
+
+    fn within(&self, size: &WindowSize, parts: [Tensor; 3], valid: &Tensor) -> Result<Tensor, TchError> {
+        let (entries, height, width, share) = parts[0].size4()?;
+        let (edge, each) = (size.edge, share / self.heads);
+        let (down, across) = (height / edge, width / edge);
+        let windows = |tensor: &Tensor| {
+            tensor
+                .f_reshape([entries, down, edge, across, edge, self.heads, each])?
+                .f_permute([0, 1, 3, 5, 2, 4, 6])?
+                .f_reshape([entries * down * across, self.heads, edge * edge, each])
+        };
+        let [query, key, value] = [windows(&parts[0])?, windows(&parts[1])?, windows(&parts[2])?];
+        let scores = (query / (each as f64).sqrt()).f_matmul(&key.f_transpose(2, 3)?)? + self.preference(size)?;
+        let hidden = valid.f_eq(0.0)?.f_view([entries, down, edge, across, edge])?.f_permute([0, 1, 3, 2, 4])?;
+        let hidden = hidden.f_reshape([entries * down * across, 1, 1, edge * edge])?;
+        let weights = scores.f_masked_fill(&hidden, MASKED)?.f_softmax(3, None)?;
+        weights
+            .f_matmul(&value)?
+            .f_view([entries, down, across, self.heads, edge, edge, each].as_slice())?
+            .f_permute([0, 1, 4, 2, 5, 3, 6])?
+            .f_reshape([entries, height, width, share])
+    }
+
+    /// `[heads, edge^2, edge^2]`.
+    fn preference(&self, size: &WindowSize) -> Result<Tensor, TchError> {
+        let tokens = size.edge * size.edge;
+        let places = Tensor::f_from_slice(&size.places)?.f_to_device(size.bias.device())?;
+        size.bias.f_index_select(0, &places)?.f_view([tokens, tokens, self.heads])?.f_permute([2, 0, 1])
+    }
+}
+
+/// For each pair of tokens of a window, which row of the table of preferences is theirs.
+fn relative_places(edge: i64) -> Vec<i64> {
+    let tokens = || (0..edge).flat_map(move |row| (0..edge).map(move |column| (row, column)));
+    let place = |(a_row, a_column): (i64, i64), (b_row, b_column): (i64, i64)| {
+        (a_row - b_row + edge - 1) * (2 * edge - 1) + a_column - b_column + edge - 1
+    };
+    tokens().flat_map(|a| tokens().map(move |b| place(a, b))).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use tch::Device;
+    use tch::nn::VarStore;
+
+    use super::*;
+    use crate::test_data::{redraw, uniform};
+
+    const FLOAT: (Kind, Device) = (Kind::Float, Device::Cpu);
+
+    #[test]
+    fn one_row_is_the_first_of_all_rows() {
+        let variables = VarStore::new(Device::Cpu);
+        let attention = AgentAttention::new(&variables.root(), 8, 2);
+        let tokens = Tensor::randn([4, 3, 5, 8], FLOAT);
+        let valid = Tensor::rand([4, 3, 5], FLOAT).gt(0.4).to_kind(Kind::Float);
+        let _ = valid.get(0).fill_(1.0);
+        let all = attention.forward(&tokens, &valid, 4).unwrap();
+        let one = attention.forward(&tokens, &valid, 1).unwrap();
+        assert!(one.allclose(&all.narrow(0, 0, 1), 1e-4, 1e-5, false));
+    }
+
+    #[test]
+    fn what_the_ego_gathers_is_what_one_row_learns() {
+        let variables = VarStore::new(Device::Cpu);
+        let attention = AgentAttention::new(&variables.root(), 12, 2);
+        let norm = nn::layer_norm(variables.root() / "norm", vec![12], nn::LayerNormConfig::default());
+        redraw(&variables, &["weight", "bias"], 0.8);
+        // More cells than a strip, and a rest.
+        let tokens = uniform(1, &[4, 9, 10, 12]) * 3.0;
+        let valid = uniform(2, &[4, 9, 10]).gt(0.4).to_kind(Kind::Float);
+        // There nothing counts.
+        let _ = valid.select(1, 0).select(1, 0).fill_(0.0);
+        let forward = attention.forward(&norm.forward(&tokens), &valid, 1).unwrap();
+        let others = Others::of(&tokens.permute([0, 3, 1, 2]), &valid).unwrap();
+        let gathered = attention.gather(&norm, &tokens.narrow(0, 0, 1), &others).unwrap();
+        assert!(gathered.allclose(&forward, 1e-4, 1e-5, false), "{}", (gathered - forward).abs().max());
+    }
+
+    #[test]
+    fn hidden_tokens_are_not_looked_at() {
+        let variables = VarStore::new(Device::Cpu);
+        let agents = AgentAttention::new(&(variables.root() / "a"), 8, 2);
+        let windows = WindowAttention::new(&(variables.root() / "w"), 8, 2, &[2, 4]);
+        let tokens = Tensor::randn([2, 4, 8, 8], FLOAT);
+        let valid = Tensor::ones([2, 4, 8], FLOAT);
+        let _ = valid.get(1).fill_(0.0);
+        let changed = tokens.copy();
+        let _ = changed.get(1).fill_(7.0);
+        let same = |found: Tensor, again: Tensor| found.allclose(&again, 1e-5, 1e-6, false);
+        assert!(same(agents.forward(&tokens, &valid, 1).unwrap(), agents.forward(&changed, &valid, 1).unwrap()));
+        let _ = valid.get(0).get(1).get(3).fill_(0.0);
+        let _ = changed.get(0).get(1).get(3).fill_(9.0);
+        let [first, second] = [&tokens, &changed].map(|tokens| windows.forward(tokens, &valid).unwrap());
+        let difference = (first - second).abs().sum_dim_intlist([3_i64].as_slice(), false, Kind::Float);
+        let _ = difference.get(0).get(1).get(3).fill_(0.0);
+        assert!(difference.get(0).max().double_value(&[]) < 1e-5, "only the hidden token itself may change");
+        assert!(difference.isfinite().all().int64_value(&[]) == 1, "a window with nothing valid is a number too");
+    }
+
+    #[test]
+    fn tokens_of_other_windows_do_not_matter() {
+        let variables = VarStore::new(Device::Cpu);
+        let windows = WindowAttention::new(&variables.root(), 8, 2, &[2, 4]);
+        let tokens = Tensor::randn([1, 4, 8, 8], FLOAT);
+        let changed = tokens.copy();
+        let _ = changed.narrow(2, 4, 4).fill_(3.0);
+        let valid = Tensor::ones([1, 4, 8], FLOAT);
+        let left = |tokens: &Tensor| windows.forward(tokens, &valid).unwrap().narrow(2, 0, 4);
+        assert!(left(&tokens).allclose(&left(&changed), 1e-5, 1e-6, false));
+    }
+
+    #[test]
+    fn pairs_in_the_same_relation_share_a_place() {
+        let places = relative_places(3);
+        let at = |a: usize, b: usize| places[a * 9 + b];
+        assert_eq!(at(0, 1), at(4, 5));
+        assert_ne!(at(0, 1), at(1, 0));
+        assert!(places.iter().all(|place| (0..25).contains(place)));
+    }
+}

@@ -1,0 +1,340 @@
+//! The numbers that define a PASTAT, and its switches.
+
+use perception::model_config::ConfigError;
+use serde::{Deserialize, Serialize};
+
+use super::correlation::PARTS;
+
+/// Which tokens ask in the attention over agents and time.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Rows {
+    /// Those of the ego's newest map alone: in the end only they are kept. Maps of others stay as they came.
+    Ego,
+    /// All in every block but the last: maps of others learn of each other too.
+    All,
+}
+
+/// How the wavelengths of the temporal encoding grow with the channel.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Wavelengths {
+    /// `2k / D` for the sine (Eq. 11) and `(2k + 1) / D` for the cosine (Eq. 12), as the paper prints them.
+    Printed,
+    /// `2k / D` for both, as is usual.
+    Usual,
+}
+
+/// A part that can be left out, for the ablation.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub enum Part {
+    /// Confidence Embedding.
+    Ce,
+    /// Feature Spatial Alignment.
+    Fsa,
+    /// Temporal Encoding.
+    Te,
+    /// The recall of earlier maps to the cell.
+    Recall,
+}
+
+/// Feature Spatial Alignment.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct FsaConfig {
+    /// Channels that maps are compared in.
+    pub matching: i64,
+    /// Cells are compared with those of the ego up to so many cells away, along x and along y.
+    pub radius: i64,
+    /// Neurons of the fully connected layer.
+    pub hidden: i64,
+    /// Largest shift of one look along x or y, metres.
+    pub max_shift_m: f64,
+    /// Largest turn of one look, radians.
+    pub max_turn_rad: f64,
+    /// The search for maps that are further away than all that; absent: such maps stay where they are.
+    #[serde(default)]
+    pub search: Option<SearchConfig>,
+}
+
+/// The search for a map that lies far from where its pose puts it.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SearchConfig {
+    /// So many cells along each edge are taken together.
+    pub cells: i64,
+    /// Maps are looked for up to so many of these larger cells away, along x and along y.
+    pub radius: i64,
+    /// In training a map is moved when its correlation with the ego's is higher elsewhere by more than this. Once trained,
+    /// what is higher there by anything is compared closely at both places.
+    pub margin: f64,
+}
+
+impl Default for FsaConfig {
+    fn default() -> Self {
+        Self {
+            matching: 4,
+            radius: 4,
+            hidden: 64,
+            max_shift_m: 3.0,
+            max_turn_rad: 5.0_f64.to_radians(),
+            search: Some(SearchConfig { cells: 4, radius: 9, margin: 0.1 }),
+        }
+    }
+}
+
+/// The recall of earlier maps, cell by cell.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct RecallConfig {
+    /// Channels from which it is told how much of an earlier map is taken.
+    pub hidden: i64,
+    /// In such a share of all tokens' patches, those where vehicles are most likely.
+    pub share: f64,
+}
+
+impl Default for RecallConfig {
+    fn default() -> Self {
+        Self { hidden: 24, share: 0.125 }
+    }
+}
+
+/// A PASTAT from its tokens to its output. `ce`, `fsa`, `te`, `recall` and `frames` are the switches of the ablation.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct PastatConfig {
+    /// Channels of the maps.
+    pub channels: i64,
+    /// Cells along each edge of a token.
+    pub patch: i64,
+    /// Channels of a token, the D of the paper.
+    pub dim: i64,
+    /// Heads of every attention.
+    pub heads: i64,
+    /// Blocks of attention and MLP, the L of the paper.
+    pub depth: usize,
+    /// Channels inside the MLP, in multiples of `dim`.
+    pub mlp_ratio: i64,
+    /// Edges of the attention windows, tokens; each has its equal share of the heads.
+    pub windows: Vec<i64>,
+    /// Which tokens ask.
+    pub rows: Rows,
+    /// Channels inside the two convolutions that sharpen the fused map; absent: there are none.
+    #[serde(default)]
+    pub refine: Option<i64>,
+    /// How earlier maps are blended into the newest; absent: they are heard through their tokens alone.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub recall: Option<RecallConfig>,
+    /// Time steps wanted of every agent, the T of the paper.
+    pub frames: usize,
+    /// Along each edge so many cells of a map from before its agent's newest are taken together before it is moved: what
+    /// is a few steps old need not be known to the cell.
+    pub earlier_cells: i64,
+    /// Time from one step to the next that the temporal encoding counts in, seconds.
+    pub frame_secs: f64,
+    /// Whether poses' confidences are embedded (Eq. 7).
+    pub ce: bool,
+    /// Feature Spatial Alignment; absent: maps stay where poses put them.
+    pub fsa: Option<FsaConfig>,
+    /// Temporal encoding (Eq. 10-12); absent: the age of a map is not known.
+    pub te: Option<Wavelengths>,
+}
+
+impl PastatConfig {
+    /// Sized for one core and live traffic.
+    #[must_use]
+    pub fn lean(channels: i64) -> Self {
+        Self {
+            channels,
+            patch: 2,
+            dim: 32,
+            heads: 4,
+            depth: 1,
+            mlp_ratio: 2,
+            windows: vec![4, 8],
+            rows: Rows::Ego,
+            refine: Some(96),
+            recall: Some(RecallConfig::default()),
+            frames: 3,
+            earlier_cells: 2,
+            frame_secs: 0.1,
+            ce: true,
+            fsa: Some(FsaConfig::default()),
+            te: Some(Wavelengths::Printed),
+        }
+    }
+
+    /// Sized like the transformer that the paper builds on.
+    #[must_use]
+    pub fn full(channels: i64) -> Self {
+        Self {
+            patch: 1,
+            dim: channels,
+            heads: 8,
+            depth: 3,
+            windows: vec![4, 8],
+            rows: Rows::All,
+            refine: Some(channels),
+            recall: None,
+            earlier_cells: 1,
+            fsa: Some(FsaConfig { matching: 16, ..FsaConfig::default() }),
+            ..Self::lean(channels)
+        }
+    }
+
+    /// The same without some parts.
+    #[must_use]
+    pub fn without(mut self, parts: &[Part]) -> Self {
+        for part in parts {
+            match part {
+                Part::Ce => self.ce = false,
+                Part::Fsa => self.fsa = None,
+                Part::Te => self.te = None,
+                Part::Recall => self.recall = None,
+            }
+        }
+        self
+    }
+
+    /// Maps are padded to multiples of this many cells, so that tokens fill every window and cells every part that FSA
+    /// compares.
+    #[must_use]
+    pub fn padding_cells(&self) -> i64 {
+        let larger =
+            |fsa: &FsaConfig| fsa.search.map_or(self.earlier_cells, |search| lcm(search.cells, self.earlier_cells));
+        let parts = self.fsa.as_ref().map_or(1, |fsa| PARTS * larger(fsa));
+        lcm(self.patch * self.windows.iter().copied().fold(1, lcm), parts)
+    }
+
+    /// Checks that a module can be built.
+    ///
+    /// # Errors
+    /// [`ConfigError`] names the field, its value and what it must be.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        let error = |field, value: String, must| Err(ConfigError::Value { field, value, must });
+        for (field, value, most) in [
+            ("pastat channels", self.channels, 4096),
+            ("pastat patch", self.patch, 16),
+            ("pastat dim", self.dim, 1024),
+            ("pastat heads", self.heads, 64),
+            ("pastat mlp_ratio", self.mlp_ratio, 16),
+            ("pastat depth", i64::try_from(self.depth).unwrap_or(i64::MAX), 32),
+            ("pastat refine", self.refine.unwrap_or(1), 4096),
+            ("pastat recall hidden", self.recall.map_or(1, |recall| recall.hidden), 4096),
+            ("pastat frames", i64::try_from(self.frames).unwrap_or(i64::MAX), 16),
+        ] {
+            if !(1..=most).contains(&value) {
+                return error(field, value.to_string(), "above zero and of a sensible size");
+            }
+        }
+        if self.earlier_cells < 1 || self.patch % self.earlier_cells != 0 {
+            return error("pastat earlier_cells", self.earlier_cells.to_string(), "a divisor of the patch");
+        }
+        if self.dim % (2 * self.heads) != 0 {
+            return error("pastat dim", self.dim.to_string(), "a multiple of twice the heads");
+        }
+        let sizes = i64::try_from(self.windows.len()).unwrap_or(i64::MAX);
+        let are_sizes = self.windows.iter().all(|size| (1..=32).contains(size));
+        if sizes == 0 || self.heads % sizes != 0 || !are_sizes {
+            return error("pastat windows", format!("{:?}", self.windows), "1 to 32 tokens each, sharing the heads");
+        }
+        if !(1e-3..=10.0).contains(&self.frame_secs) {
+            return error("pastat frame_secs", self.frame_secs.to_string(), "0.001 to 10 s");
+        }
+        if let Some(cells) = self.fsa.as_ref().and_then(|fsa| fsa.search).map(|search| search.cells)
+            && cells % self.earlier_cells != 0
+        {
+            return error("pastat fsa search cells", cells.to_string(), "a multiple of earlier_cells");
+        }
+        if let Some(RecallConfig { share, .. }) = self.recall
+            && !(share > 0.0 && share <= 1.0)
+        {
+            return error("pastat recall share", share.to_string(), "above 0, up to 1");
+        }
+        if self.recall.is_some() && self.frames < 2 {
+            return error("pastat frames", self.frames.to_string(), "2 or more, as earlier maps are recalled");
+        }
+        self.fsa.as_ref().map_or(Ok(()), FsaConfig::validate)
+    }
+}
+
+impl FsaConfig {
+    fn validate(&self) -> Result<(), ConfigError> {
+        let error = |field, value: String, must| Err(ConfigError::Value { field, value, must });
+        if !(1..=256).contains(&self.matching) || !(1..=4096).contains(&self.hidden) {
+            return error(
+                "pastat fsa channels",
+                format!("{}, {}", self.matching, self.hidden),
+                "1 to 256 and 1 to 4096",
+            );
+        }
+        if !(0..=8).contains(&self.radius) {
+            return error("pastat fsa radius", self.radius.to_string(), "0 to 8 cells");
+        }
+        if !(0.0..=50.0).contains(&self.max_shift_m) || !(0.0..=1.6).contains(&self.max_turn_rad) {
+            let value = format!("{} m, {} rad", self.max_shift_m, self.max_turn_rad);
+            return error("pastat fsa bounds", value, "up to 50 m and 1.6 rad");
+        }
+        if let Some(SearchConfig { cells, radius, margin }) = self.search
+            && !((1..=16).contains(&cells) && (1..=32).contains(&radius) && (0.0..=2.0).contains(&margin))
+        {
+            let value = format!("{cells}, {radius}, {margin}");
+            return error("pastat fsa search", value, "1 to 16 cells, 1 to 32 of them away, a margin of 0 to 2");
+        }
+        Ok(())
+    }
+}
+
+fn lcm(a: i64, b: i64) -> i64 {
+    let (mut rest, mut divisor) = (a, b);
+    while rest != 0 {
+        (rest, divisor) = (divisor % rest, rest);
+    }
+    a / divisor.max(1) * b
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn presets_are_valid_and_come_back_from_json() {
+        for config in [PastatConfig::lean(64), PastatConfig::full(256)] {
+            config.validate().unwrap();
+            let text = serde_json::to_string(&config).unwrap();
+            assert_eq!(serde_json::from_str::<PastatConfig>(&text).unwrap(), config);
+        }
+        assert_eq!(PastatConfig::lean(64).padding_cells(), 16);
+        assert_eq!(PastatConfig { windows: vec![4, 6], ..PastatConfig::lean(64) }.padding_cells(), 48);
+    }
+
+    #[test]
+    fn what_cannot_be_built_is_named() {
+        let recall = |recall| PastatConfig { recall: Some(recall), ..PastatConfig::lean(64) };
+        for (config, part) in [
+            (PastatConfig { dim: 36, ..PastatConfig::lean(64) }, "dim is 36"),
+            (PastatConfig { windows: vec![4, 8, 16], ..PastatConfig::lean(64) }, "windows is [4, 8, 16]"),
+            (PastatConfig { earlier_cells: 3, ..PastatConfig::lean(64) }, "earlier_cells is 3"),
+            (
+                PastatConfig {
+                    fsa: Some(FsaConfig {
+                        search: Some(SearchConfig { cells: 3, radius: 9, margin: 0.1 }),
+                        ..FsaConfig::default()
+                    }),
+                    ..PastatConfig::lean(64)
+                },
+                "search cells is 3",
+            ),
+            (PastatConfig { frames: 1, ..PastatConfig::lean(64) }, "frames is 1"),
+            (recall(RecallConfig { hidden: 0, ..RecallConfig::default() }), "recall hidden is 0"),
+            (recall(RecallConfig { share: f64::NAN, ..RecallConfig::default() }), "recall share is NaN"),
+            (PastatConfig { frames: 0, ..PastatConfig::lean(64) }, "frames is 0"),
+            (PastatConfig { frame_secs: f64::NAN, ..PastatConfig::lean(64) }, "frame_secs is NaN"),
+        ] {
+            let message = config.validate().unwrap_err().to_string();
+            assert!(message.contains(part), "{message}");
+        }
+        let text = serde_json::to_string(&PastatConfig::lean(64)).unwrap().replace("\"ce\"", "\"cf\"");
+        assert!(serde_json::from_str::<PastatConfig>(&text).unwrap_err().to_string().contains("cf"));
+    }
+}

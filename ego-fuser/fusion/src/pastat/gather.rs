@@ -1,0 +1,141 @@
+//! What the ego gathers at each cell from the tokens of all entries: attention in one walk over the tokens, where tensor
+//! operations pass over all of them a dozen times. Numbers only: on the CPU, without gradients.
+
+use tch::{TchError, Tensor};
+
+use crate::f64_tensor::numbers;
+
+/// Cells that are worked on together: their numbers fit into a core's nearest cache.
+const STRIP: usize = 64;
+/// As in `LayerNormConfig`.
+const EPSILON: f32 = 1e-5;
+
+/// The tokens of all entries but the ego's newest, and which of all count.
+pub(super) struct Others {
+    /// `[N - 1, D, cells]`.
+    tokens: Vec<f32>,
+    /// `[N, cells]`, 0 for tokens that do not count; the ego's newest first.
+    valid: Vec<f32>,
+    dim: usize,
+    cells: usize,
+}
+
+impl Others {
+    /// Of the tokens of all `[N, D, h, w]`, of which `valid` `[N, h, w]` count.
+    pub(super) fn of(tokens: &Tensor, valid: &Tensor) -> Result<Self, TchError> {
+        let (entries, dim, height, width) = tokens.size4()?;
+        let others = tokens.f_narrow(0, 1, entries - 1)?;
+        let [dim, cells] = [dim, height * width].map(|size| size as usize);
+        Ok(Self { tokens: numbers(&others)?, valid: numbers(valid)?, dim, cells })
+    }
+
+    /// For each head and cell the mean of all entries' normalised tokens, weighted by how well they answer what the head
+    /// asks there, `[heads, D, cells]`. A cell where nothing counts takes all alike.
+    ///
+    /// # Shapes
+    /// - `asked`: `[heads, D, cells]`: a token's product with it is its score
+    /// - `ego`: `[D, cells]`, the tokens of the ego's newest
+    pub(super) fn gather(&self, asked: &[f32], ego: &[f32]) -> Vec<f32> {
+        let size = self.dim * self.cells;
+        let entries: Vec<&[f32]> = std::iter::once(ego).chain(self.tokens.chunks_exact(size)).collect();
+        let mut gathered = vec![0.0; asked.len()];
+        for first in (0..self.cells).step_by(STRIP) {
+            let strip = Strip { first, count: STRIP.min(self.cells - first), of: self };
+            let normal: Vec<Normal> = entries.iter().map(|entry| strip.normal(entry)).collect();
+            for (asked, gathered) in asked.chunks_exact(size).zip(gathered.chunks_exact_mut(size)) {
+                let mut weights: Vec<Row> =
+                    entries.iter().zip(&normal).map(|(entry, normal)| strip.score(asked, entry, normal)).collect();
+                strip.softmax(&mut weights);
+                strip.mean(&entries, &normal, &weights, gathered);
+            }
+        }
+        gathered
+    }
+}
+
+/// A number for each cell of a strip.
+type Row = [f32; STRIP];
+
+/// What a layer norm takes away from the tokens of a strip, and what it multiplies with then.
+struct Normal {
+    mean: Row,
+    scale: Row,
+}
+
+/// Some cells one after another.
+struct Strip<'a> {
+    first: usize,
+    count: usize,
+    of: &'a Others,
+}
+
+impl Strip<'_> {
+    /// The strip's cells of each channel.
+    fn rows<'b>(&self, map: &'b [f32]) -> impl Iterator<Item = &'b [f32]> + use<'b> {
+        let cells = self.first..self.first + self.count;
+        map.chunks_exact(self.of.cells).map(move |row| &row[cells.clone()])
+    }
+
+    fn normal(&self, entry: &[f32]) -> Normal {
+        let channels = self.of.dim as f32;
+        let (mut mean, mut scale) = ([0.0; STRIP], [0.0; STRIP]);
+        self.rows(entry).for_each(|row| mean.iter_mut().zip(row).for_each(|(sum, value)| *sum += value));
+        mean.iter_mut().for_each(|sum| *sum /= channels);
+        self.rows(entry).for_each(|row| {
+            for ((sum, value), mean) in scale.iter_mut().zip(row).zip(&mean) {
+                *sum += (value - mean) * (value - mean);
+            }
+        });
+        scale.iter_mut().for_each(|sum| *sum = (*sum / channels + EPSILON).sqrt().recip());
+        Normal { mean, scale }
+    }
+
+    fn score(&self, asked: &[f32], entry: &[f32], Normal { mean, scale }: &Normal) -> Row {
+        let mut score = [0.0; STRIP];
+        for (asked, row) in self.rows(asked).zip(self.rows(entry)) {
+            for (((score, asked), value), mean) in score.iter_mut().zip(asked).zip(row).zip(mean) {
+                *score += asked * (value - mean);
+            }
+        }
+        score.iter_mut().zip(scale).for_each(|(score, scale)| *score *= scale);
+        score
+    }
+
+    /// Scores of the entries to their weights.
+    fn softmax(&self, scores: &mut [Row]) {
+        let valid = |entry: usize, cell: usize| self.of.valid[entry * self.of.cells + self.first + cell] != 0.0;
+        for cell in 0..self.count {
+            let is_any = (0..scores.len()).any(|entry| valid(entry, cell));
+            for (entry, scores) in scores.iter_mut().enumerate() {
+                scores[cell] = match (is_any, valid(entry, cell)) {
+                    (false, _) => 0.0,
+                    (true, true) => scores[cell],
+                    (true, false) => f32::NEG_INFINITY,
+                };
+            }
+        }
+        let mut most = [f32::NEG_INFINITY; STRIP];
+        scores.iter().for_each(|scores| most.iter_mut().zip(scores).for_each(|(most, score)| *most = most.max(*score)));
+        let mut total = [0.0; STRIP];
+        for scores in scores.iter_mut() {
+            for ((score, most), total) in scores.iter_mut().zip(&most).zip(&mut total) {
+                *score = (*score - most).exp();
+                *total += *score;
+            }
+        }
+        scores.iter_mut().for_each(|scores| scores.iter_mut().zip(&total).for_each(|(score, total)| *score /= total));
+    }
+
+    fn mean(&self, entries: &[&[f32]], normal: &[Normal], weights: &[Row], gathered: &mut [f32]) {
+        let cells = self.first..self.first + self.count;
+        for ((entry, Normal { mean, scale }), weight) in entries.iter().zip(normal).zip(weights) {
+            let mut share = *weight;
+            share.iter_mut().zip(scale).for_each(|(share, scale)| *share *= scale);
+            for (sums, row) in gathered.chunks_exact_mut(self.of.cells).zip(self.rows(entry)) {
+                for (((sum, value), mean), share) in sums[cells.clone()].iter_mut().zip(row).zip(mean).zip(&share) {
+                    *sum += share * (value - mean);
+                }
+            }
+        }
+    }
+}

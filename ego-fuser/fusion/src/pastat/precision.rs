@@ -1,0 +1,33 @@
+//! In which numbers convolutions compute where nothing is learnt.
+
+use tch::{Device, Kind, TchError, Tensor, nn};
+
+use crate::f64_tensor::are_numbers;
+
+/// A convolution in the precision of `maps` and without a change of size; its parameters stay as they are.
+pub(super) fn convolve(convolution: &nn::Conv2D, maps: &Tensor) -> Result<Tensor, TchError> {
+    let weight = convolution.ws.f_to_kind(maps.kind())?;
+    let bias = convolution.bs.as_ref().map(|bias| bias.f_to_kind(maps.kind())).transpose()?;
+    let around = convolution.ws.size4()?.3 / 2;
+    maps.f_conv2d(&weight, bias.as_ref(), [1, 1], [around, around], [1, 1], 1)
+}
+
+/// The precision in which what is made of `maps` is fastest without being wrong; their own where a gradient flows.
+pub(super) fn fastest_of(maps: &Tensor) -> Kind {
+    if are_numbers(maps) { fastest(maps.device()) } else { maps.kind() }
+}
+
+/// The precision in which convolutions are fastest without being wrong.
+pub(super) fn fastest(device: Device) -> Kind {
+    if device == Device::Cpu && multiplies_bfloat16() { Kind::BFloat16 } else { Kind::Float }
+}
+
+#[cfg(target_arch = "x86_64")]
+fn multiplies_bfloat16() -> bool {
+    std::arch::is_x86_feature_detected!("avx512bf16")
+}
+
+#[cfg(not(target_arch = "x86_64"))]
+fn multiplies_bfloat16() -> bool {
+    false
+}

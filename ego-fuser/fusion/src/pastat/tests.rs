@@ -1,0 +1,222 @@
+use protocol::{BevGrid, Pose};
+use tch::nn::VarStore;
+use tch::{Device, Kind};
+
+use super::super::classes::Classes;
+use super::super::{EarlierViews, ViewFacts, WholeMap, WholeViews};
+use super::*;
+use crate::test_data::{redraw, uniform};
+
+const FLOAT: (Kind, Device) = (Kind::Float, Device::Cpu);
+const GRID: BevGrid = BevGrid { x_min_m: -10.0, y_min_m: -6.0, cell_m: 1.0, width: 20, height: 12 };
+
+/// Made-up entries: who made them, and when.
+struct Scene {
+    features: Tensor,
+    mask: Tensor,
+    facts: Vec<ViewFacts>,
+}
+
+impl Scene {
+    fn new(agent: &[usize], age_secs: &[f64]) -> Self {
+        tch::set_num_threads(1);
+        let entries = agent.len() as i64;
+        let fact = |(&agent, &age_secs): (&usize, &f64)| ViewFacts {
+            agent,
+            // All stand where the ego does: where a map was made it is what it is on the ego's lattice.
+            ego_from_cav: Pose::IDENTITY,
+            confidence: 0.8,
+            age_secs,
+        };
+        Self {
+            features: uniform(9, &[entries, 4, 12, 20]),
+            mask: Tensor::ones([entries, 1, 12, 20], FLOAT),
+            facts: agent.iter().zip(age_secs).map(fact).collect(),
+        }
+    }
+
+    fn fused(&self, pastat: &Pastat) -> Tensor {
+        self.seen_by(pastat, |views| pastat.fuse(&views, true).unwrap())
+    }
+
+    /// What `see` makes of it: the newest of each agent, and the rest with larger cells.
+    fn seen_by<T>(&self, pastat: &Pastat, see: impl FnOnce(AlignedViews<'_>) -> T) -> T {
+        let is_newest =
+            |entry: &usize| self.facts[..*entry].iter().all(|facts| facts.agent != self.facts[*entry].agent);
+        let (newest, earlier): (Vec<usize>, Vec<usize>) = (0..self.facts.len()).partition(is_newest);
+        let (newest, earlier) = (self.only(&newest), self.only(&earlier));
+        let cells = pastat.config.earlier_cells;
+        let of = |tensor: &Tensor, entry: usize| tensor.narrow(0, entry as i64, 1);
+        let whole = |entry| WholeMap::of(&of(&earlier.features, entry), Some(&of(&earlier.mask, entry))).unwrap();
+        let whole: Vec<_> = (0..earlier.facts.len()).map(whole).collect();
+        let head = VarStore::new(Device::Cpu);
+        let classes = Classes::under(&head.root(), [4, 2]);
+        redraw(&head, &["cls_head"], 1.0);
+        let whole = WholeViews { maps: &whole, classes: &classes };
+        let maps = Maps { features: earlier.features, mask: earlier.mask }.with_cells_of(cells).unwrap();
+        let (features, mask) = (&maps.features, &maps.mask);
+        let before = EarlierViews { features, mask, facts: &earlier.facts, whole: Some(whole) };
+        see(AlignedViews {
+            features: &newest.features,
+            mask: &newest.mask,
+            own_frame: &newest.features,
+            sent: Some(&newest.mask),
+            grid: &GRID,
+            facts: &newest.facts,
+            earlier: (!earlier.facts.is_empty()).then_some(before),
+        })
+    }
+
+    /// The same with these entries alone, in this order.
+    fn only(&self, entries: &[usize]) -> Self {
+        let index: Vec<i64> = entries.iter().map(|&entry| entry as i64).collect();
+        let index = Tensor::from_slice(&index);
+        Self {
+            features: self.features.index_select(0, &index),
+            mask: self.mask.index_select(0, &index),
+            facts: entries.iter().map(|&entry| self.facts[entry]).collect(),
+        }
+    }
+}
+
+/// Without the search, in which maps without a meaning fit anywhere.
+fn small() -> PastatConfig {
+    let fsa = FsaConfig { search: None, ..FsaConfig::default() };
+    PastatConfig { dim: 16, windows: vec![2, 4], fsa: Some(fsa), ..PastatConfig::lean(4) }
+}
+
+/// A module in which no weight is neutral any more, as after a training.
+fn trained(config: &PastatConfig) -> (VarStore, Pastat) {
+    let variables = VarStore::new(Device::Cpu);
+    let pastat = Pastat::new(&variables.root(), config).unwrap();
+    redraw(&variables, &["weight"], 0.3);
+    redraw(&variables, &["delta", "fit", "out", "cells", "conv1"], 0.35);
+    (variables, pastat)
+}
+
+fn distance(a: &Tensor, b: &Tensor) -> f64 {
+    (a - b).abs().max().double_value(&[])
+}
+
+#[test]
+fn untrained_it_is_the_maximum_of_the_newest_maps() {
+    for config in [small(), PastatConfig { rows: Rows::All, patch: 1, earlier_cells: 1, ..small() }] {
+        let variables = VarStore::new(Device::Cpu);
+        let pastat = Pastat::new(&variables.root(), &config).unwrap();
+        let scene = Scene::new(&[0, 1, 2, 0, 1], &[0.0, 0.1, 0.0, 0.1, 0.2]);
+        let newest = scene.features.narrow(0, 0, 3).amax([0_i64].as_slice(), false);
+        assert!(distance(&scene.fused(&pastat), &newest) < 1e-4);
+        let alone = Scene::new(&[0], &[0.0]);
+        assert!(distance(&alone.fused(&pastat), &alone.features.get(0)) < 1e-6);
+    }
+}
+
+#[test]
+fn masked_entries_change_nothing_also_after_training() {
+    for rows in [Rows::Ego, Rows::All] {
+        let (_store, pastat) = trained(&PastatConfig { rows, fsa: None, ..small() });
+        let scene = Scene::new(&[0, 1, 2, 1], &[0.0, 0.1, 0.0, 0.2]);
+        for entry in [1, 3] {
+            let _ = scene.mask.get(entry).fill_(0.0);
+        }
+        let fused = scene.fused(&pastat);
+        for entry in [1, 3] {
+            let _ = scene.features.get(entry).fill_(5.0);
+        }
+        assert!(distance(&scene.fused(&pastat), &fused) < 1e-4);
+        assert!(distance(&scene.only(&[0, 2]).fused(&pastat), &fused) < 1e-4);
+        // One that reaches some cells only counts there alone.
+        let _ = scene.mask.get(1).narrow(2, 0, 4).fill_(1.0);
+        let near = scene.fused(&pastat);
+        let _ = scene.features.get(1).narrow(2, 8, 12).fill_(-5.0);
+        assert!(distance(&scene.fused(&pastat), &near) < 1e-4);
+    }
+}
+
+#[test]
+fn the_order_of_neighbours_does_not_matter() {
+    let (_store, pastat) = trained(&small());
+    let scene = Scene::new(&[0, 1, 2, 0], &[0.0, 0.1, 0.0, 0.1]);
+    assert!(distance(&scene.only(&[0, 3, 2, 1]).fused(&pastat), &scene.fused(&pastat)) < 1e-4);
+}
+
+#[test]
+fn each_switch_decides_whether_its_input_matters() {
+    let base = || Scene::new(&[0, 1], &[0.0, 0.1]);
+    for (ce, te) in [(false, false), (true, false), (false, true)] {
+        let te = te.then_some(Wavelengths::Printed);
+        let is_timed = te.is_some();
+        let (_store, pastat) = trained(&PastatConfig { ce, te, fsa: None, ..small() });
+        let mut scene = base();
+        let fused = scene.fused(&pastat);
+        scene.facts[1].confidence = 0.1;
+        assert_eq!(distance(&scene.fused(&pastat), &fused) > 1e-5, ce, "confidence");
+        scene.facts[1].confidence = 0.8;
+        scene.facts[1].age_secs = 0.4;
+        assert_eq!(distance(&scene.fused(&pastat), &fused) > 1e-5, is_timed, "age");
+    }
+    let count = |fsa| trained(&PastatConfig { fsa, ..small() }).0.variables().len();
+    assert!(count(None) < count(Some(FsaConfig::default())));
+}
+
+#[test]
+fn every_parameter_gets_a_gradient() {
+    for rows in [Rows::Ego, Rows::All] {
+        let (store, pastat) = trained(&PastatConfig { rows, ..small() });
+        let scene = Scene::new(&[0, 1, 2, 1], &[0.0, 0.1, 0.0, 0.2]);
+        (scene.fused(&pastat) * (uniform(8, &[4, 12, 20]) - 0.5)).sum(Kind::Float).backward();
+        for (name, variable) in store.variables() {
+            let gradient = variable.grad();
+            assert!(gradient.defined(), "{name} has no gradient");
+            let is_finite = gradient.isfinite().all().int64_value(&[]) == 1;
+            assert!(is_finite && gradient.abs().max().double_value(&[]) > 0.0, "{name}");
+        }
+    }
+}
+
+#[test]
+fn fsa_learns_a_shift_from_the_maps_alone() {
+    tch::manual_seed(7);
+    let variables = VarStore::new(Device::Cpu);
+    let config = PastatConfig { patch: 1, earlier_cells: 1, ..small() };
+    let pastat = Pastat::new(&variables.root(), &config).unwrap();
+    let mut optimizer = perception::train::AdamW::new(&variables, perception::train::AdamWConfig::default());
+    // The neighbour shows what the ego shows, a cell beside it; what is wanted is one sharp map.
+    let mut error = |step: u64, train: bool| {
+        let mut scene = Scene::new(&[0, 1], &[0.0, 0.0]);
+        let cells = uniform(step, &[1, 4, 12, 20]).gt(0.9).to_kind(Kind::Float) * 3.0;
+        let shift = if step.is_multiple_of(2) { 1 } else { -1 };
+        scene.features = Tensor::cat(&[&cells, &cells.roll([shift], [3])], 0);
+        let entries = scene.seen_by(&pastat, |views| pastat.align(&Shown::of(&views).unwrap(), &GRID, true).unwrap());
+        let inside = |map: Tensor| map.narrow(1, 2, 8).narrow(2, 4, 12);
+        let difference = inside(entries.others.maps().features.get(0)) - inside(cells.get(0));
+        let loss = difference.square().mean(Kind::Float);
+        if train {
+            optimizer.zero_grad();
+            loss.backward();
+            optimizer.step(3e-3).unwrap();
+        }
+        loss.double_value(&[])
+    };
+    let before: f64 = (300..310).map(|step| error(step, false)).sum();
+    (0..300).for_each(|step| {
+        error(step, true);
+    });
+    let after: f64 = (300..310).map(|step| error(step, false)).sum();
+    assert!(after < 0.5 * before, "{before} before, {after} after");
+}
+
+#[test]
+fn a_recall_takes_of_earlier_maps_where_they_show_something() {
+    let (_store, pastat) = trained(&PastatConfig { fsa: None, ..small() });
+    let scene = Scene::new(&[0, 1, 0, 1, 0], &[0.0, 0.0, 0.1, 0.1, 0.2]);
+    let fused = scene.fused(&pastat);
+    let _ = scene.mask.get(4).fill_(0.0);
+    let without = scene.fused(&pastat);
+    assert!(distance(&fused, &without) > 1e-3);
+    // What is masked is nowhere read.
+    let _ = scene.features.get(4).fill_(9.0);
+    assert!(distance(&scene.fused(&pastat), &without) < 1e-4);
+    assert!(distance(&scene.only(&[0, 1, 2, 3]).fused(&pastat), &without) < 1e-4);
+    assert!(scene.only(&[0, 1]).fused(&pastat).isfinite().all().int64_value(&[]) == 1, "nothing to recall");
+}

@@ -1,0 +1,159 @@
+//! Which boxes of an agent are which objects: the motion near its pose that most of them agree on.
+
+use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
+
+use super::PoseGraphConfig;
+use crate::planar_fit;
+
+/// Two boxes nearer than this fix no heading, metres.
+const MIN_EDGE_M: f64 = 2.0;
+/// By how much the score of the best motion must exceed that of any other; every box counts up to one.
+const MIN_LEAD: f64 = 0.5;
+
+/// A motion that boxes agree on.
+pub(super) struct Consensus {
+    /// Takes points of the agent's frame to the ego's.
+    pub(super) motion: Isometry3<f64>,
+    /// Object and box.
+    pub(super) matches: Vec<(usize, usize)>,
+    /// One for every box that fits exactly, less for those that fit less, less for a motion far from the prior.
+    pub(super) score: f64,
+}
+
+/// Matches boxes with objects; both lie at height zero.
+pub(super) fn consensus(
+    objects: &[Vector3<f64>],
+    boxes: &[Vector3<f64>],
+    prior: &Isometry3<f64>,
+    config: &PoseGraphConfig,
+) -> Option<Consensus> {
+    let search = Search { objects, boxes, prior, config, candidates: candidates(objects, boxes, prior, config) };
+    let motions = search.motions();
+    let best = motions.iter().max_by(|one, other| one.score.total_cmp(&other.score))?;
+    let rival = motions.iter().filter(|other| search.differ(&best.motion, &other.motion)).map(|other| other.score);
+    if rival.fold(f64::NEG_INFINITY, f64::max) + MIN_LEAD > best.score {
+        return None;
+    }
+    let refined = search.refined(best.motion);
+    let matches = search.matches(&refined);
+    (matches.len() >= config.min_shared.max(2)).then(|| Consensus {
+        score: search.score(&refined, &matches),
+        matches,
+        motion: refined,
+    })
+}
+
+/// Pairs of object and box that may be one by the pose as it came.
+fn candidates(
+    objects: &[Vector3<f64>],
+    boxes: &[Vector3<f64>],
+    prior: &Isometry3<f64>,
+    config: &PoseGraphConfig,
+) -> Vec<(usize, usize)> {
+    let mut candidates = Vec::new();
+    for (index, center) in boxes.iter().enumerate() {
+        let place = moved(prior, center);
+        let near = objects.iter().enumerate().filter(|(_, object)| (*object - place).norm() < config.search_m);
+        candidates.extend(near.map(|(object, _)| (object, index)));
+    }
+    candidates
+}
+
+struct Search<'a> {
+    objects: &'a [Vector3<f64>],
+    boxes: &'a [Vector3<f64>],
+    prior: &'a Isometry3<f64>,
+    config: &'a PoseGraphConfig,
+    candidates: Vec<(usize, usize)>,
+}
+
+struct Scored {
+    motion: Isometry3<f64>,
+    score: f64,
+}
+
+impl Search<'_> {
+    /// What each two candidates would move the agent by, where that is within bounds and enough others agree.
+    fn motions(&self) -> Vec<Scored> {
+        let mut motions = Vec::new();
+        for (index, &first) in self.candidates.iter().enumerate() {
+            for &second in &self.candidates[index + 1..] {
+                let Some(motion) = self.motion(first, second) else { continue };
+                let matches = self.matches(&motion);
+                if matches.len() >= self.config.min_shared.max(2) {
+                    motions.push(Scored { score: self.score(&motion, &matches), motion });
+                }
+            }
+        }
+        motions
+    }
+
+    fn motion(&self, first: (usize, usize), second: (usize, usize)) -> Option<Isometry3<f64>> {
+        if first.0 == second.0 || first.1 == second.1 {
+            return None;
+        }
+        let edge = self.objects[second.0] - self.objects[first.0];
+        let seen = self.prior.rotation * (self.boxes[second.1] - self.boxes[first.1]);
+        let fits = (edge.norm() - seen.norm()).abs() < self.config.fit_tolerance_m;
+        if !fits || edge.norm().min(seen.norm()) < MIN_EDGE_M {
+            return None;
+        }
+        let turn = seen.xy().perp(&edge.xy()).atan2(seen.dot(&edge));
+        if turn.abs() > self.config.max_turn_deg.to_radians() {
+            return None;
+        }
+        let rotation = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), turn) * self.prior.rotation;
+        let middle = (self.objects[first.0] + self.objects[second.0]) / 2.0;
+        let from = rotation * (self.boxes[first.1] + self.boxes[second.1]) / 2.0;
+        Some(Isometry3::from_parts(Translation3::from(middle - from), rotation))
+    }
+
+    /// Candidates that a motion brings together, each box and each object once, the nearest first.
+    fn matches(&self, motion: &Isometry3<f64>) -> Vec<(usize, usize)> {
+        let mut near: Vec<(f64, usize, usize)> = (self.candidates.iter())
+            .map(|&(object, index)| (self.apart(motion, object, index), object, index))
+            .filter(|(apart, ..)| *apart < self.config.fit_tolerance_m)
+            .collect();
+        near.sort_by(|one, other| one.0.total_cmp(&other.0));
+        let mut matches: Vec<(usize, usize)> = Vec::with_capacity(near.len());
+        for (_, object, index) in near {
+            if matches.iter().all(|&(other, taken)| other != object && taken != index) {
+                matches.push((object, index));
+            }
+        }
+        matches
+    }
+
+    fn apart(&self, motion: &Isometry3<f64>, object: usize, index: usize) -> f64 {
+        (self.objects[object] - moved(motion, &self.boxes[index])).norm()
+    }
+
+    fn score(&self, motion: &Isometry3<f64>, matches: &[(usize, usize)]) -> f64 {
+        let fit = |&(object, index): &(usize, usize)| {
+            1.0 - (self.apart(motion, object, index) / self.config.fit_tolerance_m).powi(2)
+        };
+        let off = self.off(motion, self.prior) / self.config.search_m;
+        matches.iter().map(fit).sum::<f64>() - off * off
+    }
+
+    /// How far apart two motions leave the boxes, on average.
+    fn off(&self, one: &Isometry3<f64>, other: &Isometry3<f64>) -> f64 {
+        let sum: f64 = self.boxes.iter().map(|center| (moved(one, center) - moved(other, center)).norm()).sum();
+        sum / self.boxes.len().max(1) as f64
+    }
+
+    fn differ(&self, one: &Isometry3<f64>, other: &Isometry3<f64>) -> bool {
+        self.off(one, other) > 2.0 * self.config.fit_tolerance_m
+    }
+
+    /// The best fit to what a motion brings together.
+    fn refined(&self, motion: Isometry3<f64>) -> Isometry3<f64> {
+        let matches = self.matches(&motion);
+        let pairs = matches.iter().map(|&(object, index)| (self.boxes[index], self.objects[object]));
+        planar_fit::fit(&pairs).unwrap_or(motion)
+    }
+}
+
+fn moved(motion: &Isometry3<f64>, point: &Vector3<f64>) -> Vector3<f64> {
+    motion.rotation * point + motion.translation.vector
+}

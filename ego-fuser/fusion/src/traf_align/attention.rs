@@ -1,0 +1,68 @@
+//! Attention of every token to the points along its trajectory.
+
+use tch::nn::{self, Init};
+use tch::{TchError, Tensor};
+
+use super::TrafAlignConfig;
+use crate::layers::{LayerNorm, Linear};
+use crate::warp::{BILINEAR, PADDING_ZEROS};
+
+/// Multi-head attention to points between tokens, then an MLP, each with a residual and a norm after it.
+#[derive(Debug)]
+pub(super) struct TrajectoryAttention {
+    /// Query, key and value in one.
+    project: Linear,
+    out: Linear,
+    norm: LayerNorm,
+    mlp: [Linear; 2],
+    mlp_norm: LayerNorm,
+    heads: i64,
+}
+
+impl TrajectoryAttention {
+    pub(super) fn new(path: &nn::Path<'_>, config: &TrafAlignConfig) -> Self {
+        let dim = config.dim;
+        Self {
+            project: linear(&(path / "project"), [dim, 3 * dim]),
+            out: linear(&(path / "out"), [dim, dim]),
+            norm: LayerNorm::new(&(path / "norm"), dim),
+            mlp: [linear(&(path / "mlp" / 0), [dim, 2 * dim]), linear(&(path / "mlp" / 1), [2 * dim, dim])],
+            mlp_norm: LayerNorm::new(&(path / "mlp_norm"), dim),
+            heads: config.heads,
+        }
+    }
+
+    /// Tokens `[A, D, h, w]` and points `[A, K h, w, 2]` to tokens.
+    pub(super) fn forward(&self, tokens: &Tensor, points: &Tensor) -> Result<Tensor, TchError> {
+        let (agents, dim, height, width) = tokens.size4()?;
+        let last = tokens.f_permute([0, 2, 3, 1])?.f_contiguous()?;
+        let projected = self.project.forward(&last)?.f_permute([0, 3, 1, 2])?.f_contiguous()?;
+        let query = projected.f_narrow(1, 0, dim)?;
+        let read = projected.f_narrow(1, dim, 2 * dim)?.f_grid_sampler(points, BILINEAR, PADDING_ZEROS, false)?;
+        let per_head = dim / self.heads;
+        let count = points.size()[1] / height;
+        let split = |first: i64| {
+            let part = read.f_narrow(1, first, dim)?;
+            part.f_reshape([agents, self.heads, per_head, count, height, width])
+        };
+        let (keys, values) = (split(0)?, split(dim)?);
+        let query = query.f_reshape([agents, self.heads, per_head, 1, height, width])?;
+        let scores = (query * keys).f_sum_dim_intlist([2i64].as_slice(), true, None)? / (per_head as f64).sqrt();
+        let weights = scores.f_softmax(3, None)?;
+        let heard = (weights * values).f_sum_dim_intlist([3i64].as_slice(), false, None)?;
+        let heard = heard.f_reshape([agents, dim, height, width])?.f_permute([0, 2, 3, 1])?.f_contiguous()?;
+        let tokens = self.norm.forward(&(last + self.out.forward(&heard)?))?;
+        let [first, second] = &self.mlp;
+        let tokens = self.mlp_norm.forward(&(&tokens + second.forward(&first.forward(&tokens)?.f_relu()?)?))?;
+        tokens.f_permute([0, 3, 1, 2])
+    }
+}
+
+/// A linear layer whose bias is random at the start, like its weight.
+fn linear(path: &nn::Path<'_>, [input, output]: [i64; 2]) -> Linear {
+    let bound = 1.0 / (input as f64).sqrt();
+    Linear {
+        weight: path.var("weight", &[output, input], nn::init::DEFAULT_KAIMING_UNIFORM),
+        bias: Some(path.var("bias", &[output], Init::Uniform { lo: -bound, up: bound })),
+    }
+}

@@ -1,0 +1,215 @@
+//! TraF-Align (Song et al., CVPR 2025): attention along the ways that objects take from past maps to now.
+//!
+//! The maps of an agent, each told its age, become one sum over time. A small U-Net predicts a trajectory field of it, and
+//! from that a convolution says for every cell where to look: offsets of some points around it. Each cell then attends to
+//! what lies at its points, and so gathers what was left behind along an object's way. Agents are fused by the maximum.
+//!
+//! What differs from the published code, and what it costs:
+//!
+//! - Its field and its offsets have losses of their own, made from tracked objects, and points are rounded to cells. Here
+//!   the detection loss alone trains them, through points that are read between cells. They need longer to find a
+//!   motion, and nothing keeps them from looking elsewhere where that detects as well.
+//! - Its agents are concatenated and fused by a convolution over a fixed number of places; here by the maximum, its other
+//!   option, which knows no order and no number of agents.
+//! - Its output replaces the features. Here it is added to each agent's newest map and begins at zero, so that training
+//!   begins as [`MaxFusion`](super::MaxFusion) and an encoder that was trained before is of use at once.
+//! - Learnt position encodings over the lattice are left out: objects move alike everywhere.
+//! - `lean` works on tokens of 2 x 2 cells.
+
+mod attention;
+mod field;
+
+use perception::layers::convolution::ConvLayer;
+use perception::model_config::ConfigError;
+use serde::{Deserialize, Serialize};
+use tch::nn::{self, Init};
+use tch::{Kind, TchError, Tensor};
+
+use self::attention::TrajectoryAttention;
+use self::field::Trajectories;
+use super::config::within;
+use super::padding::Padding;
+use super::{AlignedViews, Fusion, present};
+
+/// Sizes of [`TrafAlign`].
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TrafAlignConfig {
+    /// Channels of the maps.
+    pub channels: i64,
+    /// Cells along each edge of a token.
+    pub patch: i64,
+    /// Channels of a token.
+    pub dim: i64,
+    /// Heads of the attention.
+    pub heads: i64,
+    /// Points that a token looks at: a square of so many along each edge, moved by offsets.
+    pub kernel: i64,
+    /// Layers of attention, all along the same points.
+    pub layers: usize,
+    /// Channels of the trajectory field.
+    pub field: i64,
+    /// Time steps wanted of every agent.
+    pub frames: usize,
+    /// Time from one step to the next, seconds.
+    pub frame_secs: f64,
+}
+
+impl TrafAlignConfig {
+    /// Sized for one core and live traffic.
+    #[must_use]
+    pub fn lean(channels: i64) -> Self {
+        let (patch, dim, heads, kernel, layers, field) = (2, 32, 2, 3, 1, 3);
+        Self { channels, patch, dim, heads, kernel, layers, field, frames: 3, frame_secs: 0.1 }
+    }
+
+    /// About the published sizes.
+    #[must_use]
+    pub fn full(channels: i64) -> Self {
+        Self { patch: 1, dim: channels, heads: 4, layers: 2, frames: 4, ..Self::lean(channels) }
+    }
+
+    /// Checks that a network can be built.
+    ///
+    /// # Errors
+    /// [`ConfigError`] names the field.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        within("fusion channels", self.channels, 1..=4096)?;
+        within("fusion patch", self.patch, 1..=8)?;
+        within("fusion dim", self.dim, 2..=4096)?;
+        within("fusion heads", if self.dim % self.heads.max(1) == 0 { self.heads } else { 0 }, 1..=64)?;
+        within("fusion kernel", self.kernel, 1..=9)?;
+        within("fusion layers", self.layers as i64, 1..=16)?;
+        within("fusion field", self.field, 1..=64)?;
+        within("fusion frames", self.frames as i64, 1..=16)?;
+        within("fusion frame_secs in ms", (self.frame_secs * 1e3) as i64, 1..=60_000)
+    }
+}
+
+/// Trajectory-aware fusion.
+#[derive(Debug)]
+pub struct TrafAlign {
+    config: TrafAlignConfig,
+    tokeniser: ConvLayer,
+    /// `[2 K, D]`: sine and cosine of an age to a token's channels.
+    age: Tensor,
+    trajectories: Trajectories,
+    layers: Vec<TrajectoryAttention>,
+    /// `[D, C, patch, patch]`.
+    decoder: Tensor,
+}
+
+/// Wavelengths of the encoding of ages, in steps: two to the power of 1 to so many.
+const WAVES: i64 = 4;
+
+impl TrafAlign {
+    /// Its variables lie below `path`.
+    ///
+    /// # Errors
+    /// [`ConfigError`] names the field that no network can be built from.
+    pub fn new(path: &nn::Path<'_>, config: &TrafAlignConfig) -> Result<Self, ConfigError> {
+        config.validate()?;
+        let TrafAlignConfig { channels, patch, dim, .. } = *config;
+        let layer = |index: usize| TrajectoryAttention::new(&(path / "layers" / index), config);
+        Ok(Self {
+            tokeniser: ConvLayer::patches(&(path / "tokens"), &(path / "tokens_norm"), [channels, dim], patch),
+            age: path.var("age", &[2 * WAVES, dim], Init::Randn { mean: 0.0, stdev: 0.02 }),
+            trajectories: Trajectories::new(&(path / "trajectories"), config),
+            layers: (0..config.layers).map(layer).collect(),
+            decoder: path.var("decoder", &[dim, channels, patch, patch], Init::Const(0.0)),
+            config: config.clone(),
+        })
+    }
+
+    /// `[K, D]` for the ages of `K` maps.
+    fn ages(&self, age_secs: &[f64]) -> Result<Tensor, TchError> {
+        let waves = age_secs.iter().flat_map(|age| {
+            let steps = age / self.config.frame_secs;
+            (1..=WAVES as i32).flat_map(move |wave| {
+                let (sin, cos) = (std::f64::consts::TAU * steps / f64::from(1 << wave)).sin_cos();
+                [sin as f32, cos as f32]
+            })
+        });
+        let waves = Tensor::f_from_slice(&waves.collect::<Vec<f32>>())?.f_view([-1, 2 * WAVES])?;
+        waves.f_to_device(self.age.device())?.f_matmul(&self.age)
+    }
+
+    /// One map of tokens per agent: the sum over its frames, `[A, D, h, w]`.
+    fn over_time(&self, maps: &Tensor, mask: &Tensor, agents: &Agents, train: bool) -> Result<Tensor, TchError> {
+        let patch = [self.config.patch; 2];
+        let seen = mask.f_max_pool2d(patch, patch, [0, 0], [1, 1], false)?;
+        let told = self.ages(&agents.age_secs)?.f_unsqueeze(-1)?.f_unsqueeze(-1)?;
+        let tokens = (self.tokeniser.forward(maps, train) + told) * seen;
+        let mut size = tokens.size();
+        size[0] = agents.newest.len() as i64;
+        let owner = Tensor::f_from_slice(&agents.owner)?.f_to_device(tokens.device())?;
+        Tensor::f_zeros(size, (tokens.kind(), tokens.device()))?.f_index_add(0, &owner, &tokens)
+    }
+
+    fn fuse_present(&self, maps: &Tensor, mask: &Tensor, agents: &Agents, train: bool) -> Result<Tensor, TchError> {
+        let (_, _, height, width) = maps.size4()?;
+        // The U-Net halves the tokens once.
+        let padded = |maps: &Tensor| Padding::to_multiples_of(2 * self.config.patch, maps);
+        let (maps, mask) = (padded(maps)?, padded(mask)?);
+        let mut tokens = self.over_time(&maps, &mask, agents, train)?;
+        let points = self.trajectories.points(&tokens, train)?;
+        for layer in &self.layers {
+            tokens = layer.forward(&tokens, &points)?;
+        }
+        let patch = [self.config.patch; 2];
+        let gathered = tokens.f_conv_transpose2d(&self.decoder, None::<Tensor>, patch, [0, 0], [0, 0], 1, [1, 1])?;
+        let newest = Tensor::f_from_slice(&agents.newest)?.f_to_device(maps.device())?;
+        let out_of_reach = mask.f_index_select(0, &newest)?.f_eq(0.0)?;
+        let fused = (maps.f_index_select(0, &newest)? + gathered).f_masked_fill(&out_of_reach, f64::NEG_INFINITY)?;
+        fused.f_amax([0i64].as_slice(), false)?.f_narrow(1, 0, height)?.f_narrow(2, 0, width)
+    }
+}
+
+/// Which map is of whom.
+struct Agents {
+    /// For each map the place of its agent, the ego being 0.
+    owner: Vec<i64>,
+    age_secs: Vec<f64>,
+    /// For each agent its newest map.
+    newest: Vec<i64>,
+}
+
+impl Agents {
+    fn new(views: &AlignedViews<'_>, entries: &[i64]) -> Self {
+        let facts: Vec<_> = entries.iter().map(|&entry| views.facts[entry as usize]).collect();
+        let mut names: Vec<usize> = Vec::new();
+        let owner: Vec<i64> = (facts.iter())
+            .map(|facts| {
+                let known = names.iter().position(|name| *name == facts.agent);
+                known.unwrap_or_else(|| {
+                    names.push(facts.agent);
+                    names.len() - 1
+                }) as i64
+            })
+            .collect();
+        let age_secs: Vec<f64> = facts.iter().map(|facts| facts.age_secs).collect();
+        let newest = (0..names.len() as i64).map(|agent| {
+            let of_agent = (0..owner.len()).filter(|&entry| owner[entry] == agent);
+            of_agent.min_by(|&one, &other| age_secs[one].total_cmp(&age_secs[other])).unwrap_or(0) as i64
+        });
+        Self { newest: newest.collect(), owner, age_secs }
+    }
+}
+
+impl Fusion for TrafAlign {
+    fn fuse(&self, views: &AlignedViews<'_>, train: bool) -> Result<Tensor, TchError> {
+        let entries = present(views.mask)?;
+        let agents = Agents::new(views, &entries);
+        let index = Tensor::f_from_slice(&entries)?.f_to_device(views.features.device())?;
+        let pick = |tensor: &Tensor| tensor.f_index_select(0, &index)?.f_to_kind(Kind::Float);
+        let fused = self.fuse_present(&pick(views.features)?, &pick(views.mask)?, &agents, train)?;
+        fused.f_to_kind(views.features.kind())
+    }
+
+    fn frames(&self) -> usize {
+        self.config.frames
+    }
+}
+
+#[cfg(test)]
+mod tests;

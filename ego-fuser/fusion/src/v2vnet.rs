@@ -1,0 +1,257 @@
+//! V2VNet (Wang et al., ECCV 2020): vehicles as the nodes of a graph that send each other messages for some rounds.
+//!
+//! In each round every node gets everyone's map in its own frame, makes a message of each pair with a convolution, takes
+//! their mean or maximum, and updates its map with a convolutional GRU. As in OpenCOOD and CoAlign the GRU begins every
+//! round with an empty state: its reset gate and all weights that look at the state have no effect, and are neither
+//! multiplied here nor trained.
+
+use perception::model_config::ConfigError;
+use protocol::Pose;
+use serde::{Deserialize, Serialize};
+use tch::nn;
+use tch::{Kind, TchError, Tensor};
+
+use super::config::within;
+use super::conv_gru::{Conv, ConvGru};
+use super::{AlignedViews, Fusion, ViewFacts, present};
+use crate::warp::{BILINEAR, NEAREST, PADDING_ZEROS, cav_from_ego_normalized};
+
+/// How a node takes its messages together.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Aggregation {
+    /// Their mean.
+    Mean,
+    /// Their maximum; out of a map's reach a message is zero.
+    Max,
+}
+
+/// Sizes of [`V2vNet`].
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct V2vNetConfig {
+    /// Channels of the maps.
+    pub channels: i64,
+    /// Rounds of messages.
+    pub rounds: usize,
+    /// How messages are taken together.
+    pub aggregation: Aggregation,
+    /// Layers of the GRU; 0: a message is added to the map as it is.
+    pub gru_layers: usize,
+    /// Edge of the GRU's kernels, cells.
+    pub kernel: i64,
+}
+
+impl V2vNetConfig {
+    /// OpenCOOD's: two rounds, the mean, one layer.
+    #[must_use]
+    pub fn full(channels: i64) -> Self {
+        Self { channels, rounds: 2, aggregation: Aggregation::Mean, gru_layers: 1, kernel: 3 }
+    }
+
+    /// One round: with N vehicles the round before the last costs N times as much as the last, for what neighbours have
+    /// heard of each other.
+    #[must_use]
+    pub fn lean(channels: i64) -> Self {
+        Self { rounds: 1, ..Self::full(channels) }
+    }
+
+    /// Checks that a network can be built.
+    ///
+    /// # Errors
+    /// [`ConfigError`] names the field.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        within("fusion channels", self.channels, 1..=4096)?;
+        within("fusion rounds", self.rounds as i64, 1..=16)?;
+        within("fusion gru_layers", self.gru_layers as i64, 0..=8)?;
+        within("odd fusion kernel", if self.kernel % 2 == 1 { self.kernel } else { 0 }, 1..=15)
+    }
+}
+
+/// Message passing between vehicles.
+#[derive(Debug)]
+pub struct V2vNet {
+    config: V2vNetConfig,
+    message: Conv,
+    gru: ConvGru,
+    /// The last layer, per cell.
+    mlp: Conv,
+}
+
+/// How every node's map lies in the frame of one of them.
+#[derive(Debug)]
+pub struct Incoming {
+    /// `[N, 2, 3]` from coordinates -1..1 of the receiver to those of each sender.
+    pub theta: Tensor,
+    /// Whether -1 and 1 are the centres of the outer cells, rather than their edges.
+    pub corners_aligned: bool,
+    /// `[N, 1, H, W]`: where each sender's messages count.
+    pub mask: Tensor,
+}
+
+impl V2vNet {
+    /// Parameters `msg_cnn.*`, `conv_gru.cell_list.<layer>.{conv_gates,conv_can}.*` and `mlp.*` below `path`.
+    ///
+    /// # Errors
+    /// [`ConfigError`] names the field that no network can be built from.
+    pub fn new(path: &nn::Path<'_>, config: &V2vNetConfig) -> Result<Self, ConfigError> {
+        config.validate()?;
+        let channels = config.channels;
+        Ok(Self {
+            message: Conv::new(&(path / "msg_cnn"), [2 * channels, channels], 3),
+            gru: ConvGru::new(&(path / "conv_gru"), [2 * channels, channels], config.kernel, config.gru_layers),
+            mlp: Conv::linear(&(path / "mlp"), [channels, channels]),
+            config: config.clone(),
+        })
+    }
+
+    /// All rounds, and the map `[C, H, W]` of node 0 after them.
+    ///
+    /// # Shapes
+    /// - `maps`: `[N, C, H, W]`, each in the frame of its node
+    /// - `incoming`: for node 0 and, with more than one round, for all others
+    ///
+    /// # Errors
+    /// [`TchError`] when shapes do not fit.
+    pub fn propagate(&self, maps: &Tensor, incoming: &[Incoming]) -> Result<Tensor, TchError> {
+        let mut nodes = maps.shallow_clone();
+        for round in 1..=self.config.rounds {
+            // Of the last round only the ego's update is of use.
+            let receivers = if round == self.config.rounds { 1 } else { incoming.len() };
+            nodes = self.round(&nodes, &incoming[..receivers])?;
+        }
+        self.mlp.apply(&nodes.f_narrow(0, 0, 1)?)?.f_squeeze_dim(0)
+    }
+
+    fn round(&self, nodes: &Tensor, incoming: &[Incoming]) -> Result<Tensor, TchError> {
+        let channels = self.config.channels;
+        let receivers = nodes.f_narrow(0, 0, incoming.len() as i64)?;
+        // The convolution over a pair is the sum of one over the sender and one over the receiver, which is the same for
+        // all its senders.
+        let of_receivers = self.message.part(&receivers, channels, true)?;
+        let mut heard = Vec::with_capacity(incoming.len());
+        for (index, incoming) in incoming.iter().enumerate() {
+            let arrived = incoming.warp(nodes)?;
+            let of_receiver = of_receivers.f_narrow(0, index as i64, 1)?;
+            let messages = (self.message.part(&arrived, 0, false)? + of_receiver) * &incoming.mask;
+            heard.push(match self.config.aggregation {
+                Aggregation::Mean => messages.f_mean_dim([0i64].as_slice(), true, messages.kind())?,
+                Aggregation::Max => messages.f_amax([0i64].as_slice(), true)?,
+            });
+        }
+        let heard = Tensor::f_cat(&heard, 0)?;
+        if self.config.gru_layers == 0 {
+            return Ok(receivers + heard);
+        }
+        self.gru.first_state(&Tensor::f_cat(&[receivers, heard], 1)?)
+    }
+}
+
+impl Incoming {
+    fn warp(&self, maps: &Tensor) -> Result<Tensor, TchError> {
+        let theta = self.theta.f_to_kind(maps.kind())?;
+        let lattice = Tensor::f_affine_grid_generator(&theta, maps.size(), self.corners_aligned)?;
+        maps.f_grid_sampler(&lattice, BILINEAR, PADDING_ZEROS, self.corners_aligned)
+    }
+
+    /// What comes to `receiver` from all, by their poses; `reach` is known for the ego and computed for others.
+    fn between(
+        receiver: usize,
+        facts: &[ViewFacts],
+        views: &AlignedViews<'_>,
+        reach: Option<&Tensor>,
+    ) -> Result<Self, TchError> {
+        let receiver_from_ego = facts[receiver].ego_from_cav.isometry().inverse();
+        let relative = |facts: &ViewFacts| -> Pose { (receiver_from_ego * facts.ego_from_cav.isometry()).into() };
+        let entries = facts.iter().flat_map(|facts| cav_from_ego_normalized(&relative(facts), views.grid));
+        let theta = Tensor::f_from_slice(&entries.collect::<Vec<f32>>())?.f_view([-1, 2, 3])?;
+        let theta = theta.f_to_device(views.features.device())?;
+        let mask = match reach {
+            Some(reach) => reach.shallow_clone(),
+            None => {
+                let size = [facts.len() as i64, 1, i64::from(views.grid.height), i64::from(views.grid.width)];
+                let everywhere = Tensor::f_ones(size, (Kind::Float, theta.device()))?;
+                let lattice = Tensor::f_affine_grid_generator(&theta, size, false)?;
+                everywhere.f_grid_sampler(&lattice, NEAREST, PADDING_ZEROS, false)?
+            }
+        };
+        Ok(Self { theta, corners_aligned: false, mask })
+    }
+}
+
+impl Fusion for V2vNet {
+    /// Agents whose map does not reach the ego at all are no nodes of the graph. Between two neighbours all of a map
+    /// counts, cells that were not sent as zeros.
+    fn fuse(&self, views: &AlignedViews<'_>, _train: bool) -> Result<Tensor, TchError> {
+        let nodes = present(views.mask)?;
+        let facts: Vec<ViewFacts> = nodes.iter().map(|&node| views.facts[node as usize]).collect();
+        let index = Tensor::f_from_slice(&nodes)?.f_to_device(views.features.device())?;
+        let (maps, mask) = (views.own_frame.f_index_select(0, &index)?, views.mask.f_index_select(0, &index)?);
+        let receivers = if self.config.rounds > 1 { facts.len() } else { 1 };
+        let incoming =
+            (0..receivers).map(|receiver| Incoming::between(receiver, &facts, views, (receiver == 0).then_some(&mask)));
+        self.propagate(&maps, &incoming.collect::<Result<Vec<_>, _>>()?)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use protocol::BevGrid;
+    use tch::nn::VarStore;
+    use tch::{Device, no_grad};
+
+    use super::*;
+    use crate::test_data::redraw;
+
+    const FLOAT: (Kind, Device) = (Kind::Float, Device::Cpu);
+
+    fn network(config: &V2vNetConfig) -> (VarStore, V2vNet) {
+        tch::set_num_threads(1);
+        let variables = VarStore::new(Device::Cpu);
+        let network = V2vNet::new(&variables.root(), config).unwrap();
+        redraw(&variables, &["weight", "bias"], 0.3);
+        (variables, network)
+    }
+
+    #[test]
+    fn a_neighbour_of_a_neighbour_is_heard_after_two_rounds_only() {
+        let grid = BevGrid { x_min_m: -12.0, y_min_m: -2.0, cell_m: 1.0, width: 24, height: 4 };
+        let facts: Vec<_> = (0..3).map(|agent| ViewFacts::fresh(agent, Pose::IDENTITY)).collect();
+        // Of the third the ego has one cell in a corner, and what it has to say lies elsewhere.
+        let mask = Tensor::ones([3, 1, 4, 24], FLOAT);
+        let _ = mask.get(2).narrow(2, 1, 23).fill_(0.0);
+        let fused = |config: &V2vNetConfig, third: f64| {
+            let (_variables, network) = network(config);
+            let own_frame = Tensor::full([3, 4, 4, 24], 0.5, FLOAT);
+            let _ = own_frame.get(2).narrow(2, 12, 12).fill_(third);
+            let features = own_frame.shallow_clone();
+            let views = AlignedViews {
+                features: &features,
+                mask: &mask,
+                own_frame: &own_frame,
+                sent: None,
+                grid: &grid,
+                facts: &facts,
+                earlier: None,
+            };
+            no_grad(|| network.fuse(&views, false)).unwrap()
+        };
+        for (rounds, is_heard) in [(1, false), (2, true)] {
+            let config = V2vNetConfig { rounds, ..V2vNetConfig::full(4) };
+            let difference = (fused(&config, 0.0) - fused(&config, 3.0)).abs().max().double_value(&[]);
+            assert_eq!(difference > 1e-5, is_heard, "{rounds} rounds: {difference}");
+        }
+    }
+
+    #[test]
+    fn what_cannot_be_built_is_refused() {
+        let variables = VarStore::new(Device::Cpu);
+        for config in [
+            V2vNetConfig { rounds: 0, ..V2vNetConfig::full(4) },
+            V2vNetConfig { kernel: 2, ..V2vNetConfig::full(4) },
+            V2vNetConfig::full(0),
+        ] {
+            assert!(V2vNet::new(&variables.root(), &config).is_err(), "{config:?}");
+        }
+    }
+}

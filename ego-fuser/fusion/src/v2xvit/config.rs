@@ -1,0 +1,153 @@
+//! What a V2X-ViT encoder is built from.
+
+use perception::model_config::ConfigError;
+use serde::{Deserialize, Serialize};
+
+use crate::block_order::BlockOrder;
+
+/// Attention within windows of one size.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct WindowConfig {
+    /// Cells along an edge.
+    pub edge: i64,
+    /// Heads.
+    pub heads: i64,
+    /// Channels of a head.
+    pub head_channels: i64,
+}
+
+/// How the outputs of window attention of several sizes become one.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Merge {
+    /// Their mean.
+    Naive,
+    /// Weighed channel by channel by what the whole map looks like.
+    SplitAttention,
+}
+
+/// Sizes of a V2X-ViT encoder.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct V2xVitConfig {
+    /// Channels of the maps.
+    pub channels: i64,
+    /// Layers, each of `blocks` pairs of agent and window attention and a feed-forward network.
+    pub depth: usize,
+    /// Pairs of agent and window attention in a layer.
+    pub blocks: usize,
+    /// Heads of the agent attention.
+    pub agent_heads: i64,
+    /// Channels of a head of the agent attention.
+    pub agent_head_channels: i64,
+    /// Window attention, one entry a size; the edges divide one another.
+    pub windows: Vec<WindowConfig>,
+    /// How the sizes are merged.
+    pub merge: Merge,
+    /// Channels inside the feed-forward network.
+    pub hidden: i64,
+    /// Whether the delay of an agent is added to its features.
+    pub temporal_encoding: bool,
+    /// Share of values left out in training.
+    pub dropout: f64,
+}
+
+impl V2xVitConfig {
+    /// The published sizes, for maps of `channels` (256 there).
+    #[must_use]
+    pub fn full(channels: i64) -> Self {
+        let window = |edge, heads| WindowConfig { edge, heads, head_channels: (channels / heads).max(1) };
+        Self {
+            channels,
+            depth: 3,
+            blocks: 1,
+            agent_heads: 8,
+            agent_head_channels: (channels / 8).max(1),
+            windows: vec![window(4, 16), window(8, 8), window(16, 4)],
+            merge: Merge::SplitAttention,
+            hidden: channels,
+            temporal_encoding: true,
+            dropout: 0.3,
+        }
+    }
+
+    /// For live traffic on two cores: two layers, heads as wide as the published ones, nothing left out
+    /// (drawing what to leave out costs as much as a layer norm and a projection).
+    #[must_use]
+    pub fn lean(channels: i64) -> Self {
+        let window = |edge, heads| WindowConfig { edge, heads, head_channels: (channels / heads).max(1) };
+        Self {
+            depth: 2,
+            agent_heads: 2,
+            agent_head_channels: (channels / 2).max(1),
+            windows: vec![window(4, 4), window(8, 2), window(16, 1)],
+            dropout: 0.0,
+            ..Self::full(channels)
+        }
+    }
+
+    /// The order of tokens that all its windows need.
+    ///
+    /// # Errors
+    /// [`ConfigError`] when the edges do not divide one another.
+    pub fn order(&self) -> Result<BlockOrder, ConfigError> {
+        let edges: Vec<i64> = self.windows.iter().map(|window| window.edge).collect();
+        BlockOrder::new(&edges).ok_or_else(|| ConfigError::Value {
+            field: "fusion.windows.edge",
+            value: format!("{edges:?}"),
+            must: "edges of which each divides the next larger one",
+        })
+    }
+
+    /// Checks that an encoder can be built.
+    ///
+    /// # Errors
+    /// [`ConfigError`] names the field, its value and what it must be.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        let mut sizes = vec![
+            ("fusion.channels", self.channels),
+            ("fusion.agent_heads", self.agent_heads),
+            ("fusion.agent_head_channels", self.agent_head_channels),
+            ("fusion.hidden", self.hidden),
+            ("fusion.depth", self.depth as i64),
+            ("fusion.blocks", self.blocks as i64),
+        ];
+        for window in &self.windows {
+            sizes.push(("fusion.windows.heads", window.heads));
+            sizes.push(("fusion.windows.head_channels", window.head_channels));
+        }
+        if let Some((field, size)) = sizes.into_iter().find(|(_, size)| !(1..=4096).contains(size)) {
+            return Err(ConfigError::Value { field, value: size.to_string(), must: "1 to 4096" });
+        }
+        if self.order()?.largest() > 64 {
+            let value = self.order()?.largest().to_string();
+            return Err(ConfigError::Value { field: "fusion.windows.edge", value, must: "at most 64" });
+        }
+        if !(0.0..1.0).contains(&self.dropout) {
+            let value = self.dropout.to_string();
+            return Err(ConfigError::Value { field: "fusion.dropout", value, must: "a share below 1" });
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_cannot_be_built_is_named() {
+        assert!(V2xVitConfig::full(256).validate().is_ok());
+        assert!(V2xVitConfig::lean(64).validate().is_ok());
+        let message = |change: fn(&mut V2xVitConfig)| {
+            let mut config = V2xVitConfig::lean(64);
+            change(&mut config);
+            config.validate().unwrap_err().to_string()
+        };
+        assert!(message(|config| config.windows[0].edge = 3).contains("[3, 8, 16]"));
+        assert!(message(|config| config.windows.clear()).contains("windows.edge"));
+        assert!(message(|config| config.depth = 0).contains("fusion.depth is 0"));
+        assert!(message(|config| config.dropout = 1.0).contains("fusion.dropout"));
+    }
+}

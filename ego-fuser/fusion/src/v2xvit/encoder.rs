@@ -1,0 +1,174 @@
+//! The encoder: layers of agent attention, window attention and a feed-forward network, normalised first.
+
+use tch::nn;
+use tch::{TchError, Tensor};
+
+use super::agent_attention::AgentAttention;
+use super::config::V2xVitConfig;
+use super::temporal_encoding::TemporalEncoding;
+use super::window_attention::WindowAttention;
+use crate::block_order::BlockOrder;
+use crate::layers::{FeedForward, LayerNorm};
+
+/// One pair of attentions, each added to what it started from.
+#[derive(Debug)]
+pub struct Block {
+    agent_norm: LayerNorm,
+    agents: AgentAttention,
+    window_norm: LayerNorm,
+    windows: WindowAttention,
+}
+
+impl Block {
+    fn new(path: &nn::Path<'_>, config: &V2xVitConfig, order: &BlockOrder) -> Self {
+        let channels = config.channels;
+        let (agents, windows) = (path / 0, path / 1);
+        Self {
+            agent_norm: LayerNorm::new(&(&agents / "norm"), channels),
+            agents: AgentAttention::new(
+                &(&agents / "fn"),
+                channels,
+                config.agent_heads,
+                config.agent_head_channels,
+                config.dropout,
+            ),
+            window_norm: LayerNorm::new(&(&windows / "norm"), channels),
+            windows: WindowAttention::new(
+                &(&windows / "fn"),
+                channels,
+                &config.windows,
+                config.merge,
+                order,
+                config.dropout,
+            ),
+        }
+    }
+
+    /// Across the agents at every cell: `[N, T, C]` to what the first `queries` of them know then.
+    ///
+    /// # Errors
+    /// [`TchError`] when shapes do not fit.
+    pub fn across_agents(
+        &self,
+        x: &Tensor,
+        unseen: Option<&Tensor>,
+        types: &[usize],
+        queries: usize,
+        train: bool,
+    ) -> Result<Tensor, TchError> {
+        let seen = self.agents.forward(&self.agent_norm.forward(x)?, unseen, types, queries, train)?;
+        (x.f_narrow(0, 0, queries as i64)? + seen).f_contiguous()
+    }
+
+    /// Across the cells of one agent, `[T, C]` to the same.
+    ///
+    /// # Errors
+    /// [`TchError`] when shapes do not fit.
+    pub fn across_cells(&self, x: &Tensor, train: bool) -> Result<Tensor, TchError> {
+        Ok(x + self.windows.forward(&self.window_norm.forward(x)?, train)?)
+    }
+}
+
+/// Blocks, then a feed-forward network.
+#[derive(Debug)]
+pub struct Layer {
+    blocks: Vec<Block>,
+    norm: LayerNorm,
+    feed_forward: FeedForward,
+}
+
+impl Layer {
+    /// Its pairs of attentions.
+    #[must_use]
+    pub fn blocks(&self) -> &[Block] {
+        &self.blocks
+    }
+
+    /// The feed-forward network on the tokens of one agent, `[T, C]` to the same.
+    ///
+    /// # Errors
+    /// [`TchError`] when shapes do not fit.
+    pub fn feed_forward(&self, x: &Tensor, train: bool) -> Result<Tensor, TchError> {
+        Ok(x + self.feed_forward.forward(&self.norm.forward(x)?, train)?)
+    }
+}
+
+/// The whole encoder, on tokens in the order of [`BlockOrder`].
+#[derive(Debug)]
+pub struct Encoder {
+    layers: Vec<Layer>,
+    temporal: Option<TemporalEncoding>,
+}
+
+impl Encoder {
+    /// Variables `layers` and `rte` below `path`. `config` is valid and its order is `order`.
+    #[must_use]
+    pub fn new(path: &nn::Path<'_>, config: &V2xVitConfig, order: &BlockOrder) -> Self {
+        let layer = |index: usize| {
+            let path = path / "layers" / index;
+            let block = |block: usize| Block::new(&(&path / 0 / "layers" / block), config, order);
+            Layer {
+                blocks: (0..config.blocks).map(block).collect(),
+                norm: LayerNorm::new(&(&path / 1 / "norm"), config.channels),
+                feed_forward: FeedForward::new(&(&path / 1 / "fn"), config.channels, config.hidden, config.dropout),
+            }
+        };
+        let temporal = config.temporal_encoding.then(|| TemporalEncoding::new(&(path / "rte"), config.channels));
+        Self { layers: (0..config.depth).map(layer).collect(), temporal }
+    }
+
+    /// The layers, first to last.
+    #[must_use]
+    pub fn layers(&self) -> &[Layer] {
+        &self.layers
+    }
+
+    /// What delays are encoded by; nothing where they are not.
+    #[must_use]
+    pub fn temporal(&self) -> Option<&TemporalEncoding> {
+        self.temporal.as_ref()
+    }
+
+    /// What the ego, the first agent, knows in the end.
+    ///
+    /// The result is the ego's alone, so the last agent attention asks for the ego alone, and what follows it is computed
+    /// for no one else.
+    ///
+    /// # Shapes
+    /// - `x`: `[N, T, C]` maps on the ego's lattice, delays encoded
+    /// - `unseen`, `types`: as [`AgentAttention::forward`] has them
+    /// - returns: `[T, C]`
+    ///
+    /// # Errors
+    /// [`TchError`] when shapes do not fit.
+    pub fn forward(
+        &self,
+        x: &Tensor,
+        unseen: Option<&Tensor>,
+        types: &[usize],
+        train: bool,
+    ) -> Result<Tensor, TchError> {
+        let mut x = x.shallow_clone();
+        let attentions: usize = self.layers.iter().map(|layer| layer.blocks.len()).sum();
+        let mut done = 0;
+        for layer in &self.layers {
+            for (index, block) in layer.blocks.iter().enumerate() {
+                done += 1;
+                let queries = if done == attentions { 1 } else { types.len() };
+                x = block.across_agents(&x, unseen, types, queries, train)?;
+                let is_last = index + 1 == layer.blocks.len();
+                x = each_agent(&x, |x| {
+                    let x = block.across_cells(x, train)?;
+                    if is_last { layer.feed_forward(&x, train) } else { Ok(x) }
+                })?;
+            }
+        }
+        x.f_get(0)
+    }
+}
+
+/// Applies `step` to each of `[N, T, C]`.
+fn each_agent(x: &Tensor, step: impl Fn(&Tensor) -> Result<Tensor, TchError>) -> Result<Tensor, TchError> {
+    let agents = (0..x.size3()?.0).map(|agent| step(&x.f_get(agent)?)).collect::<Result<Vec<_>, _>>()?;
+    if let [only] = &agents[..] { only.f_unsqueeze(0) } else { Tensor::f_stack(&agents, 0) }
+}

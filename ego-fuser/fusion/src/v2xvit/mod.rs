@@ -1,0 +1,73 @@
+//! V2X-ViT: attention across agents at every cell and within windows of several sizes, in turn.
+//!
+//! Xu et al., ECCV 2022. What comes from the reference is the mathematics and the names of the parameters, so that its
+//! weights fit. Its spatial-temporal correction is the warp that all methods share here: maps come aligned for the time
+//! of the ego's newest map. The delay is encoded by the true age rather than by the number of a step.
+
+mod agent_attention;
+mod config;
+mod encoder;
+mod temporal_encoding;
+mod window_attention;
+
+use perception::model_config::ConfigError;
+use tch::nn;
+use tch::{TchError, Tensor};
+
+pub use agent_attention::{AGENT_TYPES, AgentAttention};
+pub use config::{Merge, V2xVitConfig, WindowConfig};
+pub use encoder::{Block, Encoder, Layer};
+pub use temporal_encoding::{ROW_SECS, TemporalEncoding};
+pub use window_attention::{WindowAttention, WindowBranch};
+
+use super::block_order::BlockOrder;
+use super::layers::unseen;
+use super::padding::Padding;
+use super::{AlignedViews, Fusion};
+
+/// All agents are vehicles; the second type of the reference is infrastructure.
+const VEHICLE: usize = 0;
+
+/// The method behind the common interface.
+#[derive(Debug)]
+pub struct V2xVit {
+    encoder: Encoder,
+    order: BlockOrder,
+}
+
+impl V2xVit {
+    /// Variables below `path`, in `encoder`.
+    ///
+    /// # Errors
+    /// [`ConfigError`] when no encoder can be built from `config`.
+    pub fn new(path: &nn::Path<'_>, config: &V2xVitConfig) -> Result<Self, ConfigError> {
+        config.validate()?;
+        let order = config.order()?;
+        Ok(Self { encoder: Encoder::new(&(path / "encoder"), config, &order), order })
+    }
+
+    /// The features with the code of each map's age where the map reaches.
+    fn with_age(&self, views: &AlignedViews<'_>) -> Result<Tensor, TchError> {
+        let Some(temporal) = self.encoder.temporal() else { return Ok(views.features.shallow_clone()) };
+        let rows: Vec<f64> = views.facts.iter().map(|facts| facts.age_secs / ROW_SECS).collect();
+        let code = temporal.encode(&rows)?.f_unsqueeze(-1)?.f_unsqueeze(-1)?;
+        // The reference adds it before the warp, which leaves zeros where a map does not reach.
+        views.features.f_addcmul(&code, views.mask)
+    }
+}
+
+impl Fusion for V2xVit {
+    fn fuse(&self, views: &AlignedViews<'_>, train: bool) -> Result<Tensor, TchError> {
+        let padding = Padding::to_multiples(views.features, self.order.largest())?;
+        let tokens = self.order.tokens(&padding.maps(&self.with_age(views)?, 0)?)?;
+        let sees_all = views.mask.f_min()?.f_double_value(&[])? > 0.0;
+        let unseen = if sees_all && padding.is_empty() {
+            None
+        } else {
+            Some(self.order.tokens(&unseen(&padding.mask(views.mask, 0)?)?)?.f_squeeze_dim(2)?)
+        };
+        let fused = self.encoder.forward(&tokens, unseen.as_ref(), &vec![VEHICLE; views.facts.len()], train)?;
+        let [height, width] = padding.size();
+        padding.crop(&self.order.maps(&fused.f_unsqueeze(0)?, height, width)?.f_get(0)?)
+    }
+}

@@ -1,0 +1,178 @@
+//! MSwin: attention within windows of several sizes, for every agent alone.
+
+use tch::nn::{self, Init};
+use tch::{Kind, TchError, Tensor};
+
+use super::config::{Merge, WindowConfig};
+use crate::block_order::BlockOrder;
+use crate::layers::{LayerNorm, Linear, attend, dropout};
+
+/// Tokens that are computed at once outside of training: what lies between two steps then stays in the cache.
+const CHUNK: i64 = 1024;
+
+/// Attention within windows of one size, scores moved by the relative position.
+#[derive(Debug)]
+pub struct WindowBranch {
+    tokens: i64,
+    heads: i64,
+    to_qkv: Linear,
+    /// `[2 * edge - 1, 2 * edge - 1]`, one for all heads.
+    pos_embedding: Tensor,
+    /// `[tokens^2]` where in the flat `pos_embedding` the offset of each pair of tokens lies.
+    offsets: Tensor,
+    out: Linear,
+}
+
+impl WindowBranch {
+    fn new(path: &nn::Path<'_>, channels: i64, config: &WindowConfig, order: &BlockOrder) -> Self {
+        let (edge, inner) = (config.edge, config.heads * config.head_channels);
+        let places = order.places(edge);
+        let span = 2 * edge - 1;
+        let offset =
+            |[row, column]: [i64; 2], to: [i64; 2]| (to[0] - row + edge - 1) * span + to[1] - column + edge - 1;
+        let offsets: Vec<i64> =
+            places.iter().flat_map(|&from| places.iter().map(move |&to| offset(from, to))).collect();
+        Self {
+            tokens: edge * edge,
+            heads: config.heads,
+            to_qkv: Linear::new(&(path / "to_qkv"), channels, 3 * inner, false),
+            pos_embedding: path.var("pos_embedding", &[span, span], Init::Randn { mean: 0.0, stdev: 0.02 }),
+            offsets: Tensor::from_slice(&offsets).to_device(path.device()),
+            out: Linear::residual(&(path / "to_out" / 0), inner, channels, true),
+        }
+    }
+
+    /// `[tokens, tokens]` added to the scores.
+    fn bias(&self) -> Result<Tensor, TchError> {
+        self.pos_embedding.f_view([-1])?.f_index_select(0, &self.offsets)?.f_view([self.tokens, self.tokens])
+    }
+
+    /// Tokens of whole windows `[t, C]` to `[t, inner]`, before the last projection.
+    fn attend(&self, x: &Tensor, bias: &Tensor) -> Result<Tensor, TchError> {
+        let qkv = self.to_qkv.forward(x)?;
+        let head_channels = qkv.size()[1] / (3 * self.heads);
+        let qkv = qkv.f_view([-1, self.tokens, 3, self.heads, head_channels])?;
+        let parts = qkv.f_unbind(2)?;
+        attend(&parts[0], &parts[1], &parts[2], Some(bias))?.f_view([-1, self.heads * head_channels])
+    }
+
+    /// What this branch gives alone: the tokens of one agent, `[T, C]` to the same.
+    ///
+    /// # Errors
+    /// [`TchError`] when they are no whole windows.
+    pub fn forward(&self, x: &Tensor) -> Result<Tensor, TchError> {
+        self.out.forward(&self.attend(x, &self.bias()?)?)
+    }
+}
+
+/// The gate of a split-attention merge: how much of each branch goes into each channel.
+#[derive(Debug)]
+struct Gate {
+    fc1: Linear,
+    bn1: LayerNorm,
+    fc2: Linear,
+}
+
+impl Gate {
+    /// From the branches' summed mean over the map `[C]` to shares `[branches, C]`.
+    fn shares(&self, mean: &Tensor) -> Result<Tensor, TchError> {
+        let hidden = self.bn1.forward(&self.fc1.forward(mean)?)?.f_relu()?;
+        self.fc2.forward(&hidden)?.f_view([-1, mean.size()[0]])?.f_softmax(0, None::<Kind>)
+    }
+}
+
+/// Window attention of several sizes side by side, merged.
+#[derive(Debug)]
+pub struct WindowAttention {
+    branches: Vec<WindowBranch>,
+    gate: Option<Gate>,
+    largest: i64,
+    dropout: f64,
+}
+
+impl WindowAttention {
+    /// Variables `pwmsa` and, for a merge by attention, `split_attn` below `path`.
+    #[must_use]
+    pub fn new(
+        path: &nn::Path<'_>,
+        channels: i64,
+        windows: &[WindowConfig],
+        merge: Merge,
+        order: &BlockOrder,
+        dropout: f64,
+    ) -> Self {
+        let branch = |(index, config)| WindowBranch::new(&(path / "pwmsa" / index), channels, config, order);
+        let gate = path / "split_attn";
+        let gate = (merge == Merge::SplitAttention).then(|| Gate {
+            fc1: Linear::new(&(&gate / "fc1"), channels, channels, false),
+            bn1: LayerNorm::new(&(&gate / "bn1"), channels),
+            fc2: Linear::new(&(&gate / "fc2"), channels, windows.len() as i64 * channels, false),
+        });
+        let largest = order.largest() * order.largest();
+        Self { branches: windows.iter().enumerate().map(branch).collect(), gate, largest, dropout }
+    }
+
+    /// The branches, in the order of the configuration.
+    #[must_use]
+    pub fn branches(&self) -> &[WindowBranch] {
+        &self.branches
+    }
+
+    /// The tokens of one agent, `[T, C]` in block order, to the same.
+    ///
+    /// # Errors
+    /// [`TchError`] when they are no whole windows.
+    pub fn forward(&self, x: &Tensor, train: bool) -> Result<Tensor, TchError> {
+        let tokens = x.size2()?.0;
+        let chunk = if train { tokens } else { (CHUNK / self.largest).max(1) * self.largest };
+        let biases = self.branches.iter().map(WindowBranch::bias).collect::<Result<Vec<_>, _>>()?;
+        let attend = |x: &Tensor| -> Result<Vec<Tensor>, TchError> {
+            self.branches.iter().zip(&biases).map(|(branch, bias)| branch.attend(x, bias)).collect()
+        };
+        let chunks = x.f_split(chunk.max(1), 0)?;
+        let seen: Vec<Vec<Tensor>> = chunks.iter().map(attend).collect::<Result<_, _>>()?;
+        let (weights, bias) = self.merged(&seen, tokens)?;
+        let outputs: Vec<Tensor> = seen.iter().map(|seen| project(seen, &weights, &bias)).collect::<Result<_, _>>()?;
+        let output = if let [only] = &outputs[..] { only.shallow_clone() } else { Tensor::f_cat(&outputs, 0)? };
+        dropout(output, self.dropout, train)
+    }
+
+    /// The last projections with the merge multiplied into them: `[inner, C]` for each branch, and one bias `[C]`.
+    ///
+    /// Both merges weigh the branches' outputs channel by channel. Those outputs are linear in what the branches have seen,
+    /// so the weights go into the projection, and so does the mean over the map that the gate asks for.
+    fn merged(&self, seen: &[Vec<Tensor>], tokens: i64) -> Result<(Vec<Tensor>, Tensor), TchError> {
+        let bias = |branch: &WindowBranch| branch.out.bias.as_ref().expect("the projection has a bias").shallow_clone();
+        let biases = Tensor::f_stack(&self.branches.iter().map(bias).collect::<Vec<_>>(), 0)?;
+        let shares = match &self.gate {
+            None => biases.f_ones_like()? / self.branches.len() as f64,
+            Some(gate) => {
+                let mut parts = vec![biases.f_sum_dim_intlist([0i64].as_slice(), false, None::<Kind>)?];
+                for (index, branch) in self.branches.iter().enumerate() {
+                    let sums =
+                        seen.iter().map(|seen| seen[index].f_sum_dim_intlist([0i64].as_slice(), false, None::<Kind>));
+                    let sums = Tensor::f_stack(&sums.collect::<Result<Vec<_>, _>>()?, 0)?;
+                    let sum = sums.f_sum_dim_intlist([0i64].as_slice(), false, None::<Kind>)? / tokens as f64;
+                    parts.push(branch.out.weight.f_mv(&sum)?);
+                }
+                let mean = Tensor::f_stack(&parts, 0)?.f_sum_dim_intlist([0i64].as_slice(), false, None::<Kind>)?;
+                gate.shares(&mean)?
+            }
+        };
+        let weight = |(index, branch): (usize, &WindowBranch)| {
+            branch.out.weight.f_transpose(0, 1)?.f_mul(&shares.f_get(index as i64)?)
+        };
+        let weights = self.branches.iter().enumerate().map(weight).collect::<Result<Vec<_>, _>>()?;
+        Ok((weights, (&biases * &shares).f_sum_dim_intlist([0i64].as_slice(), false, None::<Kind>)?))
+    }
+}
+
+/// The sum over the branches of `seen W`, and `bias`.
+fn project(seen: &[Tensor], weights: &[Tensor], bias: &Tensor) -> Result<Tensor, TchError> {
+    let mut sum = bias.f_addmm(&seen[0], &weights[0])?;
+    for (seen, weight) in seen.iter().zip(weights).skip(1) {
+        // Nothing before this needs the sum again, so it can grow in place.
+        sum = sum.f_addmm_(seen, weight)?;
+    }
+    Ok(sum)
+}

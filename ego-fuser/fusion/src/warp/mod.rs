@@ -1,0 +1,325 @@
+//! BEV features of a neighbour on the lattice of the ego.
+//!
+//! Only x, y and yaw of a pose enter: maps have no height. The public reference codes each have a convention of their
+//! own. [`opencood`] has those of OpenCOOD, for the tests that compare with it and for nothing else; [`coalign`] has that of
+//! CoAlign, for networks that fuse at every level. All other weights run on the warp of this module, whoever trained them.
+
+pub mod coalign;
+pub mod opencood;
+mod sampling;
+
+use protocol::{BevGrid, Pose};
+use tch::{Kind, TchError, Tensor};
+
+pub(crate) use self::sampling::{Cells, Order};
+use crate::f64_tensor::{self, are_numbers, as_batch};
+
+/// `grid_sampler` reads zeros outside of the map.
+pub(crate) const PADDING_ZEROS: i64 = 0;
+/// `grid_sampler` weighs the four nearest cells.
+pub(crate) const BILINEAR: i64 = 0;
+/// `grid_sampler` takes the nearest cell.
+pub(crate) const NEAREST: i64 = 1;
+
+/// Why maps cannot be moved onto the ego lattice.
+#[derive(Debug, thiserror::Error)]
+pub enum WarpError {
+    /// The maps were not made for this lattice.
+    #[error("features of shape {found:?} do not lie on a lattice of {height} rows and {width} columns")]
+    Shape {
+        /// Shape of the tensor.
+        found: Vec<i64>,
+        /// Rows of the lattice.
+        height: u32,
+        /// Columns of the lattice.
+        width: u32,
+    },
+    /// Not one pose per map.
+    #[error("{maps} maps but {poses} poses")]
+    PoseCount {
+        /// Number of maps.
+        maps: i64,
+        /// Number of poses.
+        poses: usize,
+    },
+    /// The tensor library refused.
+    #[error("warp: {0}")]
+    Torch(#[from] TchError),
+}
+
+/// Maps on the ego lattice.
+#[derive(Debug)]
+pub struct Warped {
+    /// `[N, C, H, W]`, zero wherever the mask is.
+    pub features: Tensor,
+    /// `[N, 1, H, W]` of the same kind: 1 where the ego's cell centre lies on a cell that the CAV
+    /// sent, else 0.
+    pub mask: Tensor,
+}
+
+/// Resamples BEV features of CAVs onto the ego lattice, bilinearly between cell centres.
+///
+/// Both maps lie on `grid`, each in the LiDAR frame of its vehicle. Where no transform moves anything (the ego itself),
+/// the features come back as they are, bit for bit.
+///
+/// # Shapes
+/// - `features`: `[N, C, H, W]`; row grows with y, column with x
+/// - `sent`: `[N, 1, H, W]`, 1 for cells that a CAV sent and 0 for those it left out; absent: all were sent
+/// - `ego_from_cav`: N poses
+///
+/// # Frames and units
+/// `ego_from_cav` takes points of the CAV's LiDAR frame to the ego's: metres, x forward, y left. x, y and yaw enter.
+///
+/// # Errors
+/// [`WarpError`] when the features do not lie on `grid` or their number is not that of the poses.
+pub fn warp_to_ego(
+    features: &Tensor,
+    sent: Option<&Tensor>,
+    ego_from_cav: &[Pose],
+    grid: &BevGrid,
+) -> Result<Warped, WarpError> {
+    warp_in_order(features, sent, ego_from_cav, grid, Order::Planes)
+}
+
+/// The same with the numbers of what is moved in some order, where no gradient flows.
+pub(crate) fn warp_in_order(
+    features: &Tensor,
+    sent: Option<&Tensor>,
+    ego_from_cav: &[Pose],
+    grid: &BevGrid,
+    order: Order,
+) -> Result<Warped, WarpError> {
+    let size = features.size();
+    let &[maps, _, height, width] = size.as_slice() else { return Err(shape_error(size, grid)) };
+    if (height, width) != (i64::from(grid.height), i64::from(grid.width)) {
+        return Err(shape_error(size, grid));
+    }
+    if maps != ego_from_cav.len() as i64 {
+        return Err(WarpError::PoseCount { maps, poses: ego_from_cav.len() });
+    }
+    let sent = match sent {
+        Some(sent) => sent.f_view([maps, 1, height, width])?,
+        None => Tensor::f_ones([1, 1, height, width], (Kind::Float, features.device()))?
+            .f_expand([maps, 1, height, width], false)?,
+    };
+    let affine: Vec<_> = ego_from_cav.iter().map(|pose| cav_from_ego_normalized(pose, grid)).collect();
+    if affine.iter().all(|&affine| affine == UNMOVED) {
+        return Ok(Warped { features: features.shallow_clone(), mask: sent.f_to_kind(features.kind())? });
+    }
+    let mut moved = Vec::with_capacity(ego_from_cav.len());
+    let mut masks = Vec::with_capacity(ego_from_cav.len());
+    for (index, affine) in affine.iter().enumerate() {
+        let map = features.f_narrow(0, index as i64, 1)?;
+        let sent = sent.f_narrow(0, index as i64, 1)?;
+        if *affine == UNMOVED {
+            moved.push(match order {
+                Order::Planes => map,
+                Order::Cells => f64_tensor::by_cell(&map.f_squeeze_dim(0)?)?,
+            });
+            masks.push(sent.f_to_kind(features.kind())?);
+            continue;
+        }
+        let lattice = lattice(*affine, grid)?.f_to_device(features.device())?;
+        let (map, mask) = read(&map, &sent, &lattice, order)?;
+        moved.push(map);
+        masks.push(mask);
+    }
+    let features = match order {
+        Order::Cells => one_after_another(&moved)?,
+        Order::Planes => Tensor::f_cat(&moved, 0)?,
+    };
+    Ok(Warped { features, mask: Tensor::f_cat(&masks, 0)? })
+}
+
+/// Where an affine map of normalised coordinates puts the cells of a lattice, `[1, h, w, 2]` for `grid_sampler`.
+fn lattice(affine: [f32; 6], grid: &BevGrid) -> Result<Tensor, TchError> {
+    let [rows, columns] = [grid.height, grid.width].map(|count| count as usize);
+    let row = |row| (0..columns).flat_map(move |column| place_of([row, column], affine, grid));
+    let places: Vec<f32> = (0..rows).flat_map(row).collect();
+    Tensor::f_from_slice(&places)?.f_view([1, i64::from(grid.height), i64::from(grid.width), 2])
+}
+
+/// The same of one cell, by row and column.
+fn place_of([row, column]: [usize; 2], [xx, xy, x0, yx, yy, y0]: [f32; 6], grid: &BevGrid) -> [f32; 2] {
+    let middle = |cell: usize, count: u32| (2 * cell + 1) as f32 / count as f32 - 1.0;
+    let (x, y) = (middle(column, grid.width), middle(row, grid.height));
+    [xx * x + xy * y + x0, yx * x + yy * y + y0]
+}
+
+/// Where some cells of the ego's lattice, by row and column, lie on a map of the same `grid`, in `grid_sampler`'s coordinates,
+/// two for each.
+pub(crate) fn places_of(cells: &[[usize; 2]], ego_from_cav: &Pose, grid: &BevGrid) -> Vec<f32> {
+    let affine = cav_from_ego_normalized(ego_from_cav, grid);
+    cells.iter().flat_map(|&cell| place_of(cell, affine, grid)).collect()
+}
+
+/// Maps `[1, C, H, W]` as `[N, C, H, W]`, in the order that they have in memory.
+fn one_after_another(maps: &[Tensor]) -> Result<Tensor, TchError> {
+    if !maps.iter().all(are_numbers) {
+        return Tensor::f_cat(maps, 0);
+    }
+    // Copied as a whole.
+    let cells: Vec<Tensor> = maps.iter().map(|map| map.f_permute([0, 2, 3, 1])).collect::<Result<_, _>>()?;
+    Tensor::f_cat(&cells, 0)?.f_permute([0, 3, 1, 2])
+}
+
+/// A map `[1, C, H, W]` and which of its cells were sent `[1, 1, H, W]`, read at `lattice` `[1, h, w, 2]`.
+fn read(map: &Tensor, sent: &Tensor, lattice: &Tensor, order: Order) -> Result<(Tensor, Tensor), TchError> {
+    if !are_numbers(map) {
+        return read_by_tensors(map, sent, lattice);
+    }
+    let first = |tensor: &Tensor| tensor.f_squeeze_dim(0);
+    let (map, mask) = Cells::of(&first(map)?)?.read(&first(&first(sent)?)?, &first(lattice)?, order)?;
+    Ok((as_batch(&map)?, mask.f_unsqueeze(0)?))
+}
+
+/// [`read`] on any device, in any precision, with gradients.
+fn read_by_tensors(map: &Tensor, sent: &Tensor, lattice: &Tensor) -> Result<(Tensor, Tensor), TchError> {
+    let mask = sent.f_grid_sampler(lattice, NEAREST, PADDING_ZEROS, false)?.f_to_kind(map.kind())?;
+    let lattice = lattice.f_to_kind(map.kind())?;
+    Ok((map.f_grid_sampler(&lattice, BILINEAR, PADDING_ZEROS, false)? * &mask, mask))
+}
+
+fn shape_error(found: Vec<i64>, grid: &BevGrid) -> WarpError {
+    WarpError::Shape { found, height: grid.height, width: grid.width }
+}
+
+/// The affine map that moves nothing.
+const UNMOVED: [f32; 6] = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0];
+
+/// Rows of the affine map from normalised ego coordinates (-1..1 over the whole extent of the lattice, edges of the outer
+/// cells included) to normalised CAV coordinates: `[xx, xy, x0, yx, yy, y0]`.
+pub fn cav_from_ego_normalized(ego_from_cav: &Pose, grid: &BevGrid) -> [f32; 6] {
+    let (sin, cos) = ego_from_cav.yaw_rad().sin_cos();
+    let [ego_x, ego_y, _] = ego_from_cav.translation_m;
+    let half_x = grid.cell_m * f64::from(grid.width) / 2.0;
+    let half_y = grid.cell_m * f64::from(grid.height) / 2.0;
+    let (middle_x, middle_y) = (grid.x_min_m + half_x, grid.y_min_m + half_y);
+    // p_cav = R^T (p_ego - t), with p_ego = middle + half * normalised, then back to normalised.
+    let (from_x, from_y) = (middle_x - ego_x, middle_y - ego_y);
+    let x0 = (cos * from_x + sin * from_y - middle_x) / half_x;
+    let y0 = (-sin * from_x + cos * from_y - middle_y) / half_y;
+    [cos, sin * half_y / half_x, x0, -sin * half_x / half_y, cos, y0].map(|value| value as f32)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::f64::consts::{FRAC_PI_2, PI};
+
+    use proptest::prelude::*;
+    use tch::Device;
+
+    use super::*;
+    use crate::test_data::uniform;
+
+    const GRID: BevGrid = BevGrid { x_min_m: -8.0, y_min_m: -4.0, cell_m: 0.5, width: 32, height: 16 };
+
+    fn one_hot(row: i64, column: i64) -> Tensor {
+        let map = Tensor::zeros([1, 1, 16, 32], (Kind::Float, Device::Cpu));
+        let _ = map.get(0).get(0).get(row).get(column).fill_(1.0);
+        map
+    }
+
+    fn at(map: &Tensor, row: i64, column: i64) -> f64 {
+        map.double_value(&[0, 0, row, column])
+    }
+
+    #[test]
+    fn the_ego_passes_through_bit_for_bit() {
+        let features = Tensor::randn([2, 3, 16, 32], (Kind::Float, Device::Cpu));
+        let shifted = Pose::from_xyz_yaw([1.0, 0.0, 0.0], 0.1);
+        let height_only = Pose::from_xyz_yaw([0.0, 0.0, 0.4], 0.0);
+        let warped = warp_to_ego(&features, None, &[height_only, shifted], &GRID).unwrap();
+        assert_eq!(warped.features.get(0), features.get(0));
+        assert_ne!(warped.features.get(1), features.get(1));
+        assert_eq!(warped.mask.get(0).min().double_value(&[]), 1.0);
+    }
+
+    #[test]
+    fn a_shift_of_whole_cells_moves_cells() {
+        // The CAV stands 2 m ahead of the ego: what it has at its own x, the ego has four columns on.
+        let pose = Pose::from_xyz_yaw([2.0, -1.0, 0.3], 0.0);
+        let warped = warp_to_ego(&one_hot(6, 10), None, &[pose], &GRID).unwrap();
+        assert!((at(&warped.features, 4, 14) - 1.0).abs() < 1e-4);
+        assert!((warped.features.sum(Kind::Float).double_value(&[]) - 1.0).abs() < 1e-3);
+        // Its map does not reach the ego's first four columns, nor the last two rows.
+        assert_eq!(at(&warped.mask, 5, 3), 0.0);
+        assert_eq!(at(&warped.mask, 5, 4), 1.0);
+        assert_eq!(at(&warped.mask, 13, 10), 1.0);
+        assert_eq!(at(&warped.mask, 14, 10), 0.0);
+    }
+
+    #[test]
+    fn a_quarter_turn_takes_forward_to_left() {
+        // Cell centre (x, y) = (2.25, 0.75) of a CAV turned left by 90 degrees lies at (-0.75, 2.25) of the ego.
+        let turned = Pose::from_xyz_yaw([0.0, 0.0, 0.0], FRAC_PI_2);
+        let warped = warp_to_ego(&one_hot(9, 20), None, &[turned], &GRID).unwrap();
+        assert!((at(&warped.features, 12, 14) - 1.0).abs() < 1e-4);
+    }
+
+    #[test]
+    fn the_order_of_numbers_in_memory_changes_none_of_them() {
+        let maps = uniform(5, &[2, 3, 16, 32]);
+        let poses = [Pose::IDENTITY, Pose::from_xyz_yaw([1.3, -0.4, 0.0], 0.2)];
+        let [planes, cells] =
+            [Order::Planes, Order::Cells].map(|order| warp_in_order(&maps, None, &poses, &GRID, order).unwrap());
+        assert_eq!(planes.features, cells.features);
+        assert_eq!(planes.mask, cells.mask);
+    }
+
+    proptest! {
+        #[test]
+        fn numbers_and_tensors_read_the_same(
+            x_m in -12.0..12.0f64, y_m in -6.0..6.0f64, yaw in -4.0..4.0f64, seed in 0..1000u64, channels in 1..6i64,
+        ) {
+            let map = uniform(seed, &[1, channels, 16, 32]);
+            let sent = uniform(seed + 1, &[1, 1, 16, 32]).gt(0.3).to_kind(Kind::Float);
+            let affine = cav_from_ego_normalized(&Pose::from_xyz_yaw([x_m, y_m, 0.0], yaw), &GRID);
+            let lattice = lattice(affine, &GRID).unwrap();
+            let theta = Tensor::from_slice(&affine).view([1, 2, 3]);
+            let apart = &lattice - Tensor::affine_grid_generator(&theta, [1, 1, 16, 32], false);
+            prop_assert!(apart.abs().max().double_value(&[]) < 1e-4);
+            let (numbers, reached) = read(&map, &sent, &lattice, Order::Planes).unwrap();
+            let (tensors, mask) = read_by_tensors(&map, &sent, &lattice).unwrap();
+            prop_assert_eq!(numbers.size(), tensors.size());
+            // A place between two cells may be nearest to either.
+            let differ = (&reached - mask).abs();
+            prop_assert!(differ.sum(Kind::Float).double_value(&[]) <= 2.0);
+            let apart = (numbers - tensors).abs() * differ.eq(0.0);
+            prop_assert!(apart.max().double_value(&[]) < 1e-4);
+        }
+    }
+
+    #[test]
+    fn half_a_cell_shares_between_two() {
+        let warped = warp_to_ego(&one_hot(8, 16), None, &[Pose::from_xyz_yaw([0.25, 0.0, 0.0], 0.0)], &GRID).unwrap();
+        assert!((at(&warped.features, 8, 16) - 0.5).abs() < 1e-4);
+        assert!((at(&warped.features, 8, 17) - 0.5).abs() < 1e-4);
+    }
+
+    #[test]
+    fn two_half_turns_give_the_map_back() {
+        let features = Tensor::randn([1, 2, 16, 32], (Kind::Float, Device::Cpu));
+        let turn = [Pose::from_xyz_yaw([0.0, 0.0, 0.0], PI)];
+        let once = warp_to_ego(&features, None, &turn, &GRID).unwrap().features;
+        let twice = warp_to_ego(&once, None, &turn, &GRID).unwrap().features;
+        assert!((twice - features).abs().max().double_value(&[]) < 1e-3);
+    }
+
+    #[test]
+    fn a_neighbour_out_of_reach_leaves_nothing() {
+        let features = Tensor::ones([1, 2, 16, 32], (Kind::Float, Device::Cpu));
+        let warped = warp_to_ego(&features, None, &[Pose::from_xyz_yaw([500.0, 0.0, 0.0], 1.0)], &GRID).unwrap();
+        assert_eq!(warped.features.abs().max().double_value(&[]), 0.0);
+        assert_eq!(warped.mask.max().double_value(&[]), 0.0);
+    }
+
+    #[test]
+    fn maps_of_another_lattice_are_refused() {
+        let features = Tensor::zeros([1, 2, 16, 31], (Kind::Float, Device::Cpu));
+        let error = warp_to_ego(&features, None, &[Pose::IDENTITY], &GRID).unwrap_err().to_string();
+        assert!(error.contains("[1, 2, 16, 31]") && error.contains("16 rows and 32 columns"), "{error}");
+        let features = Tensor::zeros([2, 2, 16, 32], (Kind::Float, Device::Cpu));
+        assert!(matches!(warp_to_ego(&features, None, &[Pose::IDENTITY], &GRID), Err(WarpError::PoseCount { .. })));
+    }
+}

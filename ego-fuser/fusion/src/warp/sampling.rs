@@ -1,0 +1,205 @@
+//! Maps read between their cells, in numbers: what `grid_sampler` does with floats on the CPU where no gradient is wanted.
+//!
+//! The tensor library collects the four cells around a place anew for every channel. Here a map is transposed first, so that
+//! the channels of a cell lie together and are read in one go.
+
+use tch::{TchError, Tensor};
+
+use crate::f64_tensor::{self, BLOCK, numbers};
+
+/// A map with the channels of each cell together.
+#[derive(Debug)]
+pub(crate) struct Cells {
+    /// `[height * width, channels]`.
+    values: Vec<f32>,
+    channels: usize,
+    height: usize,
+    width: usize,
+}
+
+/// How the numbers of what is read lie in memory; they are the same.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Order {
+    /// A channel after another.
+    Planes,
+    /// A cell after another.
+    Cells,
+}
+
+/// A place on a map: the four cells around it with their weights, which are zero beyond the edges.
+#[derive(Clone, Copy)]
+struct Place {
+    cells: [usize; 4],
+    weights: [f32; 4],
+    /// The nearest cell, where that is on the map.
+    nearest: Option<usize>,
+}
+
+impl Cells {
+    /// Of a map `[C, H, W]` that is not empty.
+    pub(crate) fn of(map: &Tensor) -> Result<Self, TchError> {
+        let (channels, height, width) = map.size3()?;
+        let [channels, height, width] = [channels, height, width].map(|size| size as usize);
+        Ok(Self { values: f64_tensor::cells(map)?, channels, height, width })
+    }
+
+    /// The map `[C, h, w]` read bilinearly at `lattice` `[h, w, 2]` (`grid_sampler`'s coordinates), and what is valid there
+    /// `[1, h, w]` by the nearest cell of `valid` `[H, W]`. Zeros beyond the edges, and where nothing is valid.
+    pub(super) fn read(&self, valid: &Tensor, lattice: &Tensor, order: Order) -> Result<(Tensor, Tensor), TchError> {
+        let (rows, columns, _) = lattice.size3()?;
+        let (valid, lattice) = (numbers(valid)?, numbers(lattice)?);
+        let cells = (rows * columns) as usize;
+        let (mut read, mut reached) = (vec![0.0; self.channels * cells], vec![0.0; cells]);
+        if order == Order::Cells {
+            let places = lattice.chunks_exact(2).zip(&mut reached).zip(read.chunks_mut(self.channels));
+            places.for_each(|((at, reached), values)| *reached = self.read_at([at[0], at[1]], &valid, values));
+            let read = Tensor::f_from_slice(&read)?.f_view([rows, columns, -1])?.f_permute([2, 0, 1])?;
+            return Ok((read, Tensor::f_from_slice(&reached)?.f_view([1, rows, columns])?));
+        }
+        let mut block = vec![0.0; BLOCK * self.channels];
+        for (index, (lattice, reached)) in lattice.chunks(2 * BLOCK).zip(reached.chunks_mut(BLOCK)).enumerate() {
+            let places = lattice.chunks_exact(2).zip(reached.iter_mut()).zip(block.chunks_mut(self.channels));
+            places.for_each(|((at, reached), values)| *reached = self.read_at([at[0], at[1]], &valid, values));
+            for (channel, plane) in read.chunks_mut(cells).enumerate() {
+                let plane = plane[index * BLOCK..].iter_mut().take(reached.len());
+                plane.zip(block[channel..].iter().step_by(self.channels)).for_each(|(cell, value)| *cell = *value);
+            }
+        }
+        let read = Tensor::f_from_slice(&read)?.f_view([-1, rows, columns])?;
+        Ok((read, Tensor::f_from_slice(&reached)?.f_view([1, rows, columns])?))
+    }
+
+    /// Raises `strongest` `[h * w, C]` to what the map shows at `lattice` `[h, w, 2]`, times `shares` `[h, w]`, where
+    /// that is more, and where the nearest cell of `valid` `[H, W]` says that it shows something.
+    pub(crate) fn raise(&self, strongest: &mut [f32], [valid, lattice, shares]: [&Tensor; 3]) -> Result<(), TchError> {
+        let shares = numbers(shares)?;
+        self.look(&numbers(valid)?, &numbers(lattice)?, |cell, shown| {
+            let strongest = &mut strongest[cell * self.channels..][..self.channels];
+            strongest.iter_mut().zip(shown).for_each(|(most, shown)| *most = most.max(shares[cell] * shown));
+        });
+        Ok(())
+    }
+
+    /// Channels of each cell.
+    pub(crate) fn channels(&self) -> usize {
+        self.channels
+    }
+
+    /// Shows `see` what lies at each place of `lattice` (`grid_sampler`'s coordinates, two a place) where the nearest cell of
+    /// `valid` `[H, W]` says that the map shows something.
+    #[inline]
+    pub(crate) fn look(&self, valid: &[f32], lattice: &[f32], mut see: impl FnMut(usize, &[f32])) {
+        let mut shown = vec![0.0; self.channels];
+        for (cell, at) in lattice.chunks_exact(2).enumerate() {
+            if self.read_at([at[0], at[1]], valid, &mut shown) != 0.0 {
+                see(cell, &shown);
+            }
+        }
+    }
+
+    /// The channels at a place, and what is valid there.
+    #[inline]
+    fn read_at(&self, at: [f32; 2], valid: &[f32], values: &mut [f32]) -> f32 {
+        let place = self.place(at);
+        let valid = place.nearest.map_or(0.0, |nearest| valid[nearest]);
+        match valid == 0.0 {
+            true => values.fill(0.0),
+            false => self.read_cell(&place, valid, values),
+        }
+        valid
+    }
+
+    #[inline]
+    fn read_cell(&self, place: &Place, valid: f32, values: &mut [f32]) {
+        let [a, b, c, d] = place.cells.map(|cell| &self.values[cell * self.channels..][..self.channels]);
+        let [of_a, of_b, of_c, of_d] = place.weights.map(|weight| weight * valid);
+        for ((((value, a), b), c), d) in values.iter_mut().zip(a).zip(b).zip(c).zip(d) {
+            *value = of_a * a + of_b * b + of_c * c + of_d * d;
+        }
+    }
+
+    /// From -1..1 over the whole extent of the map, edges of the outer cells included.
+    #[inline]
+    fn place(&self, [x, y]: [f32; 2]) -> Place {
+        let ([columns, rows], [width, height]) =
+            ([along(x, self.width), along(y, self.height)], [self.width, self.height]);
+        let (columns, rows) = (Pair::around(columns, width), Pair::around(rows, height));
+        let cell = |row: usize, column: usize| row * self.width + column;
+        let ([top, bottom], [left, right]) = (rows.places, columns.places);
+        let ([up, down], [before, behind]) = (rows.weights, columns.weights);
+        Place {
+            cells: [cell(top, left), cell(top, right), cell(bottom, left), cell(bottom, right)],
+            weights: [up * before, up * behind, down * before, down * behind],
+            nearest: rows.nearest.zip(columns.nearest).map(|(row, column)| cell(row, column)),
+        }
+    }
+}
+
+/// Cells from the first one's middle, of -1..1 over all `size` of them.
+fn along(at: f32, size: usize) -> f32 {
+    ((at + 1.0) * size as f32 - 1.0) / 2.0
+}
+
+/// The two cells that a place along one axis lies between.
+struct Pair {
+    /// Those nearest to them on the map.
+    places: [usize; 2],
+    /// Zero for one that is not on it.
+    weights: [f32; 2],
+    /// The nearer, where that is on the map; of two as near the even one.
+    nearest: Option<usize>,
+}
+
+impl Pair {
+    #[inline]
+    fn around(at: f32, size: usize) -> Self {
+        // Without the processor's own rounding, which not every one has, a call for each would take most of the time.
+        // What is no number is a place beyond the edge, not the first cell.
+        let at = if at.is_nan() { f32::NEG_INFINITY } else { at };
+        let truncated = at as i32;
+        let first = truncated.saturating_sub(i32::from(truncated as f32 > at));
+        let (second, share) = (first.saturating_add(1), at - first as f32);
+        let last = size as i32 - 1;
+        let on_map = |cell: i32| 0 <= cell && cell <= last;
+        let weight = |cell: i32, weight: f32| if on_map(cell) { weight } else { 0.0 };
+        let nearest = if share > 0.5 || (share == 0.5 && first & 1 != 0) { second } else { first };
+        Self {
+            places: [first, second].map(|cell| cell.clamp(0, last) as usize),
+            weights: [weight(first, 1.0 - share), weight(second, share)],
+            nearest: on_map(nearest).then_some(nearest as usize),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use proptest::prelude::*;
+
+    use super::*;
+
+    proptest! {
+        #[test]
+        fn a_place_lies_between_the_cells_around_it(at in -9.0..20.0f32, size in 1..12usize) {
+            let Pair { places, weights, nearest } = Pair::around(at, size);
+            let on_map = |cell: f32| (0.0..size as f32).contains(&cell).then_some(cell as usize);
+            let around = [at.floor(), at.floor() + 1.0];
+            for ((place, weight), cell) in places.into_iter().zip(weights).zip(around) {
+                match on_map(cell) {
+                    Some(cell) => prop_assert!(place == cell && (weight - (1.0 - (at - cell as f32).abs())).abs() < 1e-5),
+                    None => prop_assert!(place < size && weight == 0.0),
+                }
+            }
+            prop_assert_eq!(nearest, on_map(at.round_ties_even()));
+        }
+    }
+
+    #[test]
+    fn half_way_the_even_cell_is_the_nearest_and_what_is_no_place_has_none() {
+        let nearest = |at: f32| Pair::around(at, 4).nearest;
+        assert_eq!([0.5, 1.5, 2.5, -0.5, 3.5].map(nearest), [Some(0), Some(2), Some(2), Some(0), None]);
+        for at in [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, 3e9, -3e9] {
+            assert_eq!(nearest(at), None);
+            assert_eq!(Pair::around(at, 4).weights.map(|weight| weight == 0.0), [true; 2]);
+        }
+    }
+}

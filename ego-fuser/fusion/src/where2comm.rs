@@ -1,0 +1,198 @@
+//! Where2comm (Hu et al., NeurIPS 2022): agents send the cells around which they see vehicles, and nothing else.
+//!
+//! What is sent is decided by each agent before its message, see [`protocol::ConfidenceGate`]; the fusion is per-cell
+//! attention or the maximum over what has come. In training, where nothing crosses the air, a random share of the most
+//! confident cells is kept instead of those above a threshold, as published: see [`FusionStage`].
+//!
+//! The published networks fuse at several levels of the backbone; that is [`ego_fuser_offline::multi_scale`], for imported weights.
+//!
+//! [`FusionStage`]: super::FusionStage
+
+use perception::model_config::ConfigError;
+use protocol::Smoothing;
+use serde::{Deserialize, Serialize};
+use tch::nn::{self, Init};
+use tch::{Kind, TchError, Tensor};
+
+use super::{AlignedViews, AttentionFusion, Fusion, MaxFusion};
+
+/// How a cell's features become one.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Aggregation {
+    /// Attention of the ego over all, without parameters.
+    Attention,
+    /// Element-wise maximum.
+    Max,
+}
+
+/// What a cell means that has not come, because it was not sent or lies beyond the sender's map.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Missing {
+    /// Nothing: the agent does not take part there.
+    #[default]
+    Absent,
+    /// Features of zero, as in the published code: attention to them dilutes what the others have. Imported weights were
+    /// trained like that.
+    Zero,
+}
+
+/// Settings of [`Where2comm`].
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Where2commConfig {
+    /// How a cell's features become one.
+    pub aggregation: Aggregation,
+    /// What cells mean that have not come.
+    #[serde(default)]
+    pub missing: Missing,
+}
+
+impl Default for Where2commConfig {
+    /// Attention over those who have sent.
+    fn default() -> Self {
+        Self { aggregation: Aggregation::Attention, missing: Missing::Absent }
+    }
+}
+
+/// Fuses what agents thought worth sending.
+#[derive(Debug)]
+pub struct Where2comm {
+    missing: Missing,
+    fusion: Box<dyn Fusion>,
+}
+
+impl Where2comm {
+    /// It has no parameters.
+    #[must_use]
+    pub fn new(config: &Where2commConfig) -> Self {
+        let fusion: Box<dyn Fusion> = match config.aggregation {
+            Aggregation::Attention => Box::new(AttentionFusion),
+            Aggregation::Max => Box::new(MaxFusion),
+        };
+        Self { missing: config.missing, fusion }
+    }
+}
+
+impl Fusion for Where2comm {
+    fn fuse(&self, views: &AlignedViews<'_>, train: bool) -> Result<Tensor, TchError> {
+        match self.missing {
+            Missing::Absent => self.fusion.fuse(views, train),
+            Missing::Zero => {
+                let everywhere = views.mask.f_ones_like()?;
+                // Maps are zero wherever their mask is.
+                self.fusion.fuse(&AlignedViews { mask: &everywhere, ..*views }, train)
+            }
+        }
+    }
+}
+
+/// Sizes of [`Communication`].
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct CommunicationConfig {
+    /// Smoothed confidence that a cell must exceed to be sent.
+    pub threshold: f64,
+    /// How confidence is spread to the surroundings first.
+    pub smoothing: Option<Smoothing>,
+}
+
+/// The published selection on tensors, its window being part of the weights.
+#[derive(Debug)]
+pub struct Communication {
+    threshold: f64,
+    /// `[1, 1, k, k]` and `[1]`.
+    window: Option<(Tensor, Tensor)>,
+}
+
+impl Communication {
+    /// The window is `gaussian_filter.*` below `path`; it is not trained.
+    ///
+    /// # Errors
+    /// [`ConfigError`] when it has no middle.
+    pub fn new(path: &nn::Path<'_>, config: &CommunicationConfig) -> Result<Self, ConfigError> {
+        let window = config.smoothing.map(|Smoothing { kernel, .. }| {
+            let kernel = i64::from(kernel);
+            super::config::within("odd kernel of the smoothing", if kernel % 2 == 1 { kernel } else { 0 }, 1..=63)?;
+            let path = path / "gaussian_filter";
+            let weight = path.var("weight", &[1, 1, kernel, kernel], Init::Const(0.0)).set_requires_grad(false);
+            Ok((weight, path.var("bias", &[1], Init::Const(0.0)).set_requires_grad(false)))
+        });
+        Ok(Self { threshold: config.threshold, window: window.transpose()? })
+    }
+
+    /// Which cells each agent would send: logits `[N, A, H, W]` to `[N, 1, H, W]` of 0 and 1.
+    ///
+    /// # Errors
+    /// [`TchError`] when the shape is another.
+    pub fn masks(&self, logits: &Tensor) -> Result<Tensor, TchError> {
+        let confidence = logits.f_sigmoid()?.f_amax([1i64].as_slice(), true)?;
+        let smoothed = match &self.window {
+            Some((weight, bias)) => {
+                let padding = weight.size()[2] / 2;
+                confidence.f_conv2d(weight, Some(bias), [1, 1], [padding; 2], [1, 1], 1)?
+            }
+            None => confidence,
+        };
+        smoothed.f_gt(self.threshold)?.f_to_kind(Kind::Float)
+    }
+}
+
+/// Random selection for training: of each map `[N, 1, H, W]` of confidences the `share` (0..1) that is most confident.
+///
+/// # Errors
+/// [`TchError`] when the shape is another.
+pub fn most_confident(confidence: &Tensor, share: f64) -> Result<Tensor, TchError> {
+    let (maps, _, height, width) = confidence.size4()?;
+    let cells = height * width;
+    let count = ((cells as f64 * share) as i64).clamp(0, cells);
+    let flat = confidence.f_reshape([maps, cells])?;
+    let (_, best) = flat.f_topk(count, -1, true, false)?;
+    let mask = Tensor::f_zeros([maps, cells], (Kind::Float, confidence.device()))?;
+    mask.f_scatter_value(-1, &best, 1.0)?.f_view([maps, 1, height, width])
+}
+
+#[cfg(test)]
+mod tests {
+    use protocol::{BevGrid, Pose};
+    use tch::Device;
+
+    use super::*;
+    use crate::ViewFacts;
+
+    const FLOAT: (Kind, Device) = (Kind::Float, Device::Cpu);
+
+    #[test]
+    fn missing_cells_dilute_attention_only_where_told() {
+        let mask = Tensor::ones([2, 1, 1, 2], FLOAT);
+        let _ = mask.get(1).narrow(2, 1, 1).fill_(0.0);
+        let features = Tensor::ones([2, 3, 1, 2], FLOAT) * &mask;
+        let grid = BevGrid { x_min_m: 0.0, y_min_m: 0.0, cell_m: 1.0, width: 2, height: 1 };
+        let facts = [0, 1].map(|agent| ViewFacts::fresh(agent, Pose::IDENTITY));
+        let views = AlignedViews {
+            features: &features,
+            mask: &mask,
+            own_frame: &features,
+            sent: None,
+            grid: &grid,
+            facts: &facts,
+            earlier: None,
+        };
+        for (missing, expected) in [(Missing::Absent, 1.0), (Missing::Zero, 1.0 / (1.0 + (-(3f64.sqrt())).exp()))] {
+            let config = Where2commConfig { missing, ..Where2commConfig::default() };
+            let fused = Where2comm::new(&config).fuse(&views, false).unwrap();
+            assert!((fused.double_value(&[0, 0, 0]) - 1.0).abs() < 1e-6);
+            assert!((fused.double_value(&[0, 0, 1]) - expected).abs() < 1e-6, "{missing:?}");
+        }
+    }
+
+    #[test]
+    fn the_most_confident_share_is_kept() {
+        let confidence = Tensor::from_slice(&[0.1f32, 0.9, 0.5, 0.2, 0.8, 0.3, 0.7, 0.6]).view([2, 1, 2, 2]);
+        let mask = most_confident(&confidence, 0.5).unwrap();
+        assert_eq!(Vec::<f32>::try_from(mask.view(-1)).unwrap(), [0.0, 1.0, 1.0, 0.0, 1.0, 0.0, 1.0, 0.0]);
+        assert_eq!(most_confident(&confidence, 0.0).unwrap().sum(Kind::Float).double_value(&[]), 0.0);
+        assert_eq!(most_confident(&confidence, 1.0).unwrap().sum(Kind::Float).double_value(&[]), 8.0);
+    }
+}

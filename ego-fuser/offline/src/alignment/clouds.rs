@@ -1,0 +1,57 @@
+//! The approach that exchanges sweeps: ICP of the neighbour's against the ego's.
+
+use localization::registration::icp::{self, IcpConfig, IcpSource, IcpTarget};
+use nalgebra::Isometry3;
+use protocol::message::{Message, Points};
+use protocol::{NoPoseReason, PointCloud, PoseEstimate};
+
+use super::{AlignError, Approach, NotAligned, Vehicle};
+
+/// Registers the neighbour's thinned sweep against the ego's own.
+#[derive(Debug, Clone)]
+pub struct CloudIcp {
+    config: IcpConfig,
+    starts_at_gnss: bool,
+}
+
+impl CloudIcp {
+    /// Begins as if both stood at one place, or (`starts_at_gnss`) where both receivers say they are.
+    #[must_use]
+    pub fn new(config: IcpConfig, starts_at_gnss: bool) -> Self {
+        Self { config, starts_at_gnss }
+    }
+
+    fn start(&self, own: &PoseEstimate, received: &PoseEstimate) -> Result<Isometry3<f64>, NotAligned> {
+        if !self.starts_at_gnss {
+            return Ok(Isometry3::identity());
+        }
+        let own = own.world_from_cav().ok_or(NotAligned::NoPose)?;
+        Ok(own.from_world(received.world_from_cav().ok_or(NotAligned::NoPose)?).isometry())
+    }
+}
+
+impl Approach for CloudIcp {
+    fn name(&self) -> &str {
+        if self.starts_at_gnss { "icp-gnss" } else { "icp" }
+    }
+
+    fn prepare(&mut self, vehicle: &Vehicle<'_>) -> Result<Message, AlignError> {
+        let thinned = IcpSource::of_sweep(&vehicle.frame.points.xyzi, &self.config);
+        let xyzi = thinned.points_m().iter().map(|p| [p.x as f32, p.y as f32, p.z as f32, 0.0]).collect();
+        let measured = vehicle.frame.gnss_world_from_lidar().filter(|_| self.starts_at_gnss);
+        let no_pose = PoseEstimate::NoPose { reason: NoPoseReason::NoSource, inlier_count: 0 };
+        let pose = measured.map_or(no_pose, |pose| PoseEstimate::new(pose, 1.0));
+        Ok(Message::Points(Points { pose, points: PointCloud { xyzi } }))
+    }
+
+    fn align(&self, ego: &Vehicle<'_>, own: &Message, received: &Message) -> Result<Isometry3<f64>, NotAligned> {
+        let (Message::Points(own), Message::Points(received)) = (own, received) else {
+            return Err(NotAligned::Message);
+        };
+        let start = self.start(&own.pose, &received.pose)?;
+        // The ego has its own sweep in full: flatter planes than from a thinned one.
+        let target = IcpTarget::of_sweep(&ego.frame.points.xyzi, &self.config);
+        let source = IcpSource::of_sweep(&received.points.xyzi, &self.config);
+        Ok(icp::register(&source, &target, &start, &self.config)?.target_from_source)
+    }
+}

@@ -1,0 +1,161 @@
+//! Approaches over scenes: the ego, which is a scenario's first agent, with every neighbour in range, at every moment.
+
+use std::time::{Duration, Instant};
+
+use agent::agent::Agent;
+use dataset::class_set::ClassSet;
+use dataset::frame::Frame;
+use dataset::ground_truth;
+use dataset::{LoadOptions, Scenario};
+use nalgebra::Isometry3;
+use protocol::message::Message;
+use protocol::{Box3d, HEADER_LEN, Stamp, wire};
+
+use super::{AlignError, Approach, NotAligned, Vehicle};
+use ego_fuser::ego::Ego;
+
+/// Where boxes come from.
+#[derive(Debug)]
+pub enum BoxSource {
+    /// A vehicle's own detections.
+    Detected(Box<Agent>),
+    /// The recording's annotations of what this vehicle has seen, as in the paper's table.
+    Annotated,
+}
+
+/// One approach on one pair at one moment.
+#[derive(Debug, Clone, PartialEq)]
+pub struct PairOutcome {
+    /// Place of the approach in the list that was compared.
+    pub approach: usize,
+    /// Payload that the neighbour sends for it, metadata and body, bytes.
+    pub bytes: u64,
+    /// Until the ego knows: what a vehicle prepares (both at the same time) and the alignment itself. Boxes are there
+    /// anyway: detecting them does not count.
+    pub time: Duration,
+    /// How far off it is, or why there is none.
+    pub result: Result<AlignmentError, NotAligned>,
+}
+
+/// How far an alignment is off.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct AlignmentError {
+    /// Metres, in three dimensions.
+    pub metres: f64,
+    /// Degrees, about any axis.
+    pub degrees: f64,
+}
+
+impl AlignmentError {
+    fn between(truth: &Isometry3<f64>, found: &Isometry3<f64>) -> Self {
+        let off = truth.inv_mul(found);
+        Self { metres: off.translation.vector.norm(), degrees: off.rotation.angle().to_degrees() }
+    }
+}
+
+/// Compares approaches on the moments of a scenario that `ticks` names; tells of every pair as it is done.
+///
+/// # Errors
+/// [`AlignError`] at the first frame that cannot be read or has no true pose.
+pub fn run(
+    approaches: &mut [Box<dyn Approach>],
+    box_source: &mut BoxSource,
+    scenario: &Scenario,
+    ticks: impl Iterator<Item = usize>,
+    on_outcome: &mut dyn FnMut(PairOutcome),
+) -> Result<(), AlignError> {
+    approaches.iter_mut().for_each(|approach| approach.begin());
+    for tick in ticks {
+        let frames = (scenario.present_agents(tick))
+            .map(|agent| Ok(scenario.load(agent, tick, &LoadOptions::default())?))
+            .collect::<Result<Vec<Frame>, AlignError>>()?;
+        let truth = (frames.iter().map(|frame| true_pose(frame, scenario, tick))).collect::<Result<Vec<_>, _>>()?;
+        moment(approaches, box_source, &frames, &truth, on_outcome)?;
+    }
+    Ok(())
+}
+
+fn true_pose(frame: &Frame, scenario: &Scenario, tick: usize) -> Result<Isometry3<f64>, AlignError> {
+    frame.world_from_lidar.map(|pose| pose.isometry()).ok_or_else(|| AlignError::NoTruth {
+        scenario: scenario.name.clone(),
+        stem: scenario.ticks[tick].stem.clone(),
+        cav: frame.cav.clone(),
+    })
+}
+
+/// All pairs of one moment; the ego comes first.
+fn moment(
+    approaches: &mut [Box<dyn Approach>],
+    box_source: &mut BoxSource,
+    frames: &[Frame],
+    truth: &[Isometry3<f64>],
+    on_outcome: &mut dyn FnMut(PairOutcome),
+) -> Result<(), AlignError> {
+    let ego_from = |index: usize| truth[0].inv_mul(&truth[index]);
+    let near: Vec<usize> =
+        (0..frames.len()).filter(|&index| ego_from(index).translation.vector.norm() <= Ego::COMM_RANGE_M).collect();
+    let boxes = near
+        .iter()
+        .map(|&index| match approaches.iter().any(|approach| approach.needs_boxes()) {
+            true => boxes(box_source, &frames[index], &truth[index]),
+            false => Ok(Vec::new()),
+        })
+        .collect::<Result<Vec<_>, _>>()?;
+    let vehicles: Vec<Vehicle<'_>> =
+        near.iter().zip(&boxes).map(|(&index, boxes)| Vehicle { frame: &frames[index], boxes }).collect();
+    for (number, approach) in approaches.iter_mut().enumerate() {
+        let prepared =
+            vehicles.iter().map(|vehicle| prepare(approach.as_mut(), vehicle)).collect::<Result<Vec<_>, _>>()?;
+        let Some((own, neighbours)) = prepared.split_first() else { continue };
+        for (received, &index) in neighbours.iter().zip(&near[1..]) {
+            let start = Instant::now();
+            let found = approach.align(&vehicles[0], &own.message, &received.message);
+            on_outcome(PairOutcome {
+                approach: number,
+                bytes: received.bytes,
+                time: own.time.max(received.time) + start.elapsed(),
+                result: found.map(|found| AlignmentError::between(&ego_from(index), &found)),
+            });
+        }
+    }
+    Ok(())
+}
+
+/// A vehicle's message, what it weighs and how long it took.
+struct Prepared {
+    message: Message,
+    bytes: u64,
+    time: Duration,
+}
+
+fn prepare(approach: &mut dyn Approach, vehicle: &Vehicle<'_>) -> Result<Prepared, AlignError> {
+    let start = Instant::now();
+    let message = approach.prepare(vehicle)?;
+    let time = start.elapsed();
+    let Frame { cav, capture_nanos, .. } = vehicle.frame;
+    let stamp =
+        Stamp { cav: cav.clone(), epoch: 0, sequence: 0, capture_nanos: *capture_nanos, publish_nanos: *capture_nanos };
+    let bytes = wire::encode_any(&stamp, message.clone())?.wire_bytes() - HEADER_LEN;
+    Ok(Prepared { message, bytes: bytes as u64, time })
+}
+
+/// A vehicle's boxes in the frame of its LiDAR, the surest first.
+fn boxes(source: &mut BoxSource, frame: &Frame, world_from_lidar: &Isometry3<f64>) -> Result<Vec<Box3d>, AlignError> {
+    match source {
+        BoxSource::Detected(agent) => {
+            let mut found = agent.perceive(&frame.points)?.detections;
+            found.sort_by(|a, b| b.score.total_cmp(&a.score));
+            Ok(found.into_iter().map(|detection| detection.box3d).collect())
+        }
+        BoxSource::Annotated => {
+            let lidar_from_world = world_from_lidar.inverse();
+            let targets = frame.objects.iter().filter(|object| ClassSet::VEHICLES.contains(object.class));
+            let mut found: Vec<Box3d> =
+                targets.map(|object| ground_truth::upright_box(object, &lidar_from_world)).collect();
+            // Nearest first: as good a guess as any of what is seen best.
+            let range = |found: &Box3d| found.center_m[0].hypot(found.center_m[1]);
+            found.sort_by(|a, b| range(a).total_cmp(&range(b)));
+            Ok(found)
+        }
+    }
+}

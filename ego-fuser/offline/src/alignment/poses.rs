@@ -1,0 +1,86 @@
+//! The approach of the paper: every vehicle finds its own pose, and poses are all that is exchanged.
+
+use std::collections::BTreeMap;
+use std::fmt;
+
+use localization::pose_source::{PoseInput, PoseSource, PoseSourceError};
+use nalgebra::Isometry3;
+use protocol::CavId;
+use protocol::message::Message;
+
+use super::{AlignError, Approach, NotAligned, Vehicle};
+
+/// Which pose of the recording a source is shown as measured.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Measured {
+    /// The true one: for sources that add an error to it. Sources that look at sweeps do not look at it.
+    True,
+    /// What the GNSS and IMU filter believed.
+    Gnss,
+}
+
+type Build = Box<dyn Fn() -> Result<Box<dyn PoseSource>, PoseSourceError>>;
+
+/// Aligns by the difference of both vehicles' poses.
+pub struct Poses {
+    name: String,
+    build: Build,
+    measured: Measured,
+    /// A source for each vehicle: some remember where it was.
+    sources: BTreeMap<CavId, Box<dyn PoseSource>>,
+}
+
+impl Poses {
+    /// An approach over any pose source; `build` makes one for each vehicle of a scene.
+    pub fn new(
+        name: impl Into<String>,
+        measured: Measured,
+        build: impl Fn() -> Result<Box<dyn PoseSource>, PoseSourceError> + 'static,
+    ) -> Self {
+        Self { name: name.into(), build: Box::new(build), measured, sources: BTreeMap::new() }
+    }
+}
+
+impl fmt::Debug for Poses {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("Poses").field("name", &self.name).field("measured", &self.measured).finish_non_exhaustive()
+    }
+}
+
+impl Approach for Poses {
+    fn name(&self) -> &str {
+        &self.name
+    }
+
+    fn begin(&mut self) {
+        self.sources.clear();
+    }
+
+    fn prepare(&mut self, vehicle: &Vehicle<'_>) -> Result<Message, AlignError> {
+        let frame = vehicle.frame;
+        let measured = match self.measured {
+            Measured::True => frame.world_from_lidar,
+            Measured::Gnss => frame.gnss_world_from_lidar(),
+        };
+        let source = match self.sources.entry(frame.cav.clone()) {
+            std::collections::btree_map::Entry::Occupied(known) => known.into_mut(),
+            std::collections::btree_map::Entry::Vacant(place) => place.insert((self.build)()?),
+        };
+        Ok(Message::Pose(source.estimate(&PoseInput {
+            cav: &frame.cav,
+            capture_nanos: frame.capture_nanos,
+            cloud: &frame.points,
+            measured: measured.as_ref(),
+        })))
+    }
+
+    fn align(&self, _: &Vehicle<'_>, own: &Message, received: &Message) -> Result<Isometry3<f64>, NotAligned> {
+        let (Message::Pose(own), Message::Pose(received)) = (own, received) else {
+            return Err(NotAligned::Message);
+        };
+        match (own.world_from_cav(), received.world_from_cav()) {
+            (Some(own), Some(received)) => Ok(own.from_world(received).isometry()),
+            _ => Err(NotAligned::NoPose),
+        }
+    }
+}

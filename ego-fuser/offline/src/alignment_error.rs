@@ -1,0 +1,218 @@
+//! How much of an offset between two vehicles a method's own alignment takes away.
+//!
+//! An offset of known size is put on the true pose of a neighbour, in a direction that a seed draws; what the method would
+//! move the neighbour's map by is put on top, and both poses are compared with the true one.
+
+use std::f64::consts::TAU;
+
+use dataset::{LoadOptions, ReadError, Scenario};
+use localization::statistics::{quantile, sorted};
+use perception::detector::{Detector, DetectorError};
+use perception::weights::{Weights, WeightsError};
+use protocol::{PointCloud, Pose};
+use rand::{Rng, SeedableRng};
+use rand_chacha::ChaCha8Rng;
+use serde::Serialize;
+use tch::{Kind, Tensor, no_grad};
+
+use ego_fuser::ego::Ego;
+use fusion::method::{Method, UnknownMethod};
+use fusion::model::METHOD_KEY;
+use fusion::warp::WarpError;
+use fusion::{FusionStage, StageError, ViewFacts};
+
+/// Why nothing is measured.
+#[derive(Debug, thiserror::Error)]
+pub enum ResidualError {
+    /// The weights are not readable.
+    #[error(transparent)]
+    Weights(#[from] WeightsError),
+    /// The detector refused.
+    #[error(transparent)]
+    Detector(#[from] DetectorError),
+    /// The weights name a method that is not known.
+    #[error(transparent)]
+    Method(#[from] UnknownMethod),
+    /// The fusion does not fit the weights.
+    #[error(transparent)]
+    Fusion(#[from] StageError),
+    /// A frame cannot be read.
+    #[error(transparent)]
+    Read(#[from] ReadError),
+    /// Maps cannot be aligned.
+    #[error(transparent)]
+    Warp(#[from] WarpError),
+    /// The tensor library refused.
+    #[error("residual: {0}")]
+    Torch(#[from] tch::TchError),
+    /// There is nothing to measure.
+    #[error("the fusion of these weights aligns nothing by itself")]
+    NoAlignment,
+}
+
+/// An offset put on the pose of a neighbour.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Offset {
+    /// Distance, metres.
+    pub shift_m: f64,
+    /// Angle, degrees, to either side.
+    pub turn_deg: f64,
+}
+
+/// Errors of relative poses before and after a method's own alignment.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct Residual {
+    /// What was put on true poses.
+    pub offset: Offset,
+    /// Pairs of vehicles.
+    pub pairs: usize,
+    /// Mean distance from the true place before and after, metres.
+    pub mean_m: [f64; 2],
+    /// Its median.
+    pub p50_m: [f64; 2],
+    /// Mean angle before and after, degrees.
+    pub mean_deg: [f64; 2],
+}
+
+/// Encoder and fusion of a weights file.
+#[derive(Debug)]
+pub struct ResidualMeter {
+    detector: Detector,
+    fusion: FusionStage,
+}
+
+/// Two maps, and where the second belongs.
+struct Pair {
+    maps: Tensor,
+    ego_from_cav: Pose,
+}
+
+impl ResidualMeter {
+    /// Reads the weights.
+    ///
+    /// # Errors
+    /// [`ResidualError`] names the file and what is wrong with it.
+    pub fn load(weights: &Weights) -> Result<Self, ResidualError> {
+        let method = weights.metadata(METHOD_KEY).unwrap_or(Method::None.name()).parse()?;
+        let detector = Detector::from_weights(weights, &weights.config()?)?;
+        let fusion = FusionStage::from_weights(weights, method, detector.config())?;
+        Ok(Self { detector, fusion })
+    }
+
+    /// Measures on every `every`-th tick of scenarios, the first vehicle being the ego; the same directions for the same
+    /// seed.
+    ///
+    /// # Errors
+    /// [`ResidualError`] at the first frame that cannot be read, and when the fusion aligns nothing by itself.
+    pub fn measure(
+        &mut self,
+        scenarios: &[Scenario],
+        every: usize,
+        offsets: &[Offset],
+        seed: u64,
+    ) -> Result<Vec<Residual>, ResidualError> {
+        let mut errors: Vec<Vec<[[f64; 2]; 2]>> = offsets.iter().map(|_| Vec::new()).collect();
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        for scenario in scenarios {
+            for tick in (0..scenario.ticks.len()).step_by(every.max(1)) {
+                for pair in self.pairs(scenario, tick)? {
+                    for (offset, errors) in offsets.iter().zip(&mut errors) {
+                        errors.push(self.around(&pair, offset, &mut rng)?);
+                    }
+                }
+            }
+        }
+        Ok(offsets.iter().zip(&errors).map(|(offset, errors)| summary(offset, errors)).collect())
+    }
+
+    /// The ego with each of its neighbours in reach.
+    fn pairs(&mut self, scenario: &Scenario, tick: usize) -> Result<Vec<Pair>, ResidualError> {
+        let ego = scenario.load(0, tick, &LoadOptions::default())?;
+        let Some(world_from_ego) = ego.world_from_lidar else { return Ok(Vec::new()) };
+        let own = self.map(&ego.points)?;
+        let mut pairs = Vec::new();
+        for agent in scenario.present_agents(tick).skip(1) {
+            let frame = scenario.load(agent, tick, &LoadOptions::default())?;
+            let Some(world_from_cav) = frame.world_from_lidar else { continue };
+            let ego_from_cav = world_from_ego.from_world(&world_from_cav);
+            let [x, y, _] = ego_from_cav.translation_m;
+            if x.hypot(y) <= Ego::COMM_RANGE_M {
+                let maps = Tensor::f_cat(&[&own, &self.map(&frame.points)?], 0)?;
+                pairs.push(Pair { maps, ego_from_cav });
+            }
+        }
+        Ok(pairs)
+    }
+
+    /// The map `[1, C, H, W]` of a sweep as others get it.
+    fn map(&mut self, points: &PointCloud) -> Result<Tensor, DetectorError> {
+        let encoded = self.detector.encode(points)?.features;
+        self.detector.through_compressor(&encoded)
+    }
+
+    /// Errors of a pair with an offset, before and after: metres and degrees.
+    fn around(&self, pair: &Pair, offset: &Offset, rng: &mut impl Rng) -> Result<[[f64; 2]; 2], ResidualError> {
+        let (sin, cos) = rng.random_range(0.0..TAU).sin_cos();
+        let turn_rad = offset.turn_deg.to_radians() * if rng.random_bool(0.5) { 1.0 } else { -1.0 };
+        let off = moved(&pair.ego_from_cav, [offset.shift_m * cos, offset.shift_m * sin, turn_rad]);
+        let facts = [ViewFacts::fresh(0, Pose::IDENTITY), ViewFacts::fresh(1, off)];
+        let correction = no_grad(|| {
+            let maps = self.fusion.align(&pair.maps, None, &facts)?;
+            self.fusion.fuse_and_correct(&maps, &facts, false)
+        })?;
+        let correction = correction.1.ok_or(ResidualError::NoAlignment)?;
+        let values: Vec<f64> = Vec::try_from(correction.f_to_kind(Kind::Double)?.f_view([-1])?)?;
+        let [dx, dy, theta] = [0, 1, 2].map(|index| values[index]);
+        let corrected = moved(&off, [dx, dy, theta]);
+        Ok([error(&pair.ego_from_cav, &off), error(&pair.ego_from_cav, &corrected)])
+    }
+}
+
+/// A pose shifted along the ego's axes and turned about its own place.
+fn moved(pose: &Pose, [dx, dy, turn_rad]: [f64; 3]) -> Pose {
+    let [x, y, z] = pose.translation_m;
+    Pose::from_xyz_yaw([x + dx, y + dy, z], pose.yaw_rad() + turn_rad)
+}
+
+/// Distance in the plane, metres, and angle, degrees.
+fn error(truth: &Pose, found: &Pose) -> [f64; 2] {
+    let [dx, dy] = [0, 1].map(|axis| found.translation_m[axis] - truth.translation_m[axis]);
+    let turn_rad = (found.yaw_rad() - truth.yaw_rad()).sin().asin();
+    [dx.hypot(dy), turn_rad.abs().to_degrees()]
+}
+
+fn summary(offset: &Offset, errors: &[[[f64; 2]; 2]]) -> Residual {
+    let values = |moment: usize, which: usize| errors.iter().map(move |error| error[moment][which]);
+    let mean = |moment, which| values(moment, which).sum::<f64>() / errors.len().max(1) as f64;
+    let median = |moment| quantile(&sorted(&values(moment, 0).collect::<Vec<_>>()), 0.5).unwrap_or(0.0);
+    Residual {
+        offset: *offset,
+        pairs: errors.len(),
+        mean_m: [mean(0, 0), mean(1, 0)],
+        p50_m: [median(0), median(1)],
+        mean_deg: [mean(0, 1), mean(1, 1)],
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_offset_is_its_own_error_and_its_opposite_takes_it_away() {
+        let truth = Pose::from_xyz_yaw([20.0, -5.0, 0.3], 3.1);
+        let off = moved(&truth, [0.6, -0.8, 0.1]);
+        let [distance_m, angle_deg] = error(&truth, &off);
+        assert!((distance_m - 1.0).abs() < 1e-9 && (angle_deg - 0.1_f64.to_degrees()).abs() < 1e-6);
+        let [distance_m, angle_deg] = error(&truth, &moved(&off, [-0.6, 0.8, -0.1]));
+        assert!(distance_m < 1e-9 && angle_deg < 1e-6);
+    }
+
+    #[test]
+    fn before_and_after_are_summed_up_apart() {
+        let offset = Offset { shift_m: 1.0, turn_deg: 0.0 };
+        let found = summary(&offset, &[[[1.0, 0.0], [0.5, 0.2]], [[1.0, 0.0], [0.1, 0.0]], [[1.0, 0.0], [0.3, 0.1]]]);
+        assert_eq!((found.pairs, found.p50_m), (3, [1.0, 0.3]));
+        assert!((found.mean_m[1] - 0.3).abs() < 1e-9 && (found.mean_deg[1] - 0.1).abs() < 1e-9);
+    }
+}

@@ -1,0 +1,198 @@
+//! `ego-fuser align`: approaches to alignment without GNSS, side by side.
+
+use std::path::PathBuf;
+use std::str::FromStr;
+use std::sync::Arc;
+
+use agent::agent::Agent;
+use agent_offline::icp_map::{IcpMapPose, read_map};
+use anyhow::{Context, Result};
+use clap::ValueEnum;
+use dataset::{IntensityScale, Scenario};
+use ego_fuser_offline::alignment::compare::{self, BoxSource};
+use ego_fuser_offline::alignment::table::{Row, Tally, markdown};
+use ego_fuser_offline::alignment::{Approach, BoxIcp, CloudIcp, FreeAlign, Measured, Poses};
+use localization::pose_source::{PoseSource, PoseSourceConfig, RecordedPose};
+use localization::registration::icp::IcpConfig;
+use perception::detector::Detector;
+use protocol::CavId;
+use support::output;
+
+use super::{BadInput, progress, scenarios};
+
+/// Compares ways to align the ego and a neighbour: time per pair, bytes on the air, success.
+///
+/// Pairs are the ego (each scenario's first agent) and every neighbour within 70 m, at every moment. A pair that is not
+/// aligned counts as missed.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Arguments {
+    /// Datasets, splits or scenarios with true poses.
+    #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
+    data: Vec<PathBuf>,
+    /// Number that stored intensities are divided by [default: auto; `sim-replay inspect --help` says by what].
+    #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
+    intensity_scale: IntensityScale,
+    /// Approaches; none named: all but icp-map.
+    #[arg(long, num_args = 1.., value_enum)]
+    method: Vec<Method>,
+    /// One more approach: the poses of a source, described as in a scenario file. May be repeated.
+    #[arg(long, value_name = "NAME=FILE.yaml")]
+    pose_source: Vec<NamedSource>,
+    /// Where boxes come from.
+    #[arg(long, value_enum, default_value = "detected")]
+    boxes: Boxes,
+    /// Weights of the detector, for detected boxes.
+    #[arg(long, value_name = "FILE")]
+    weights: Option<PathBuf>,
+    /// Drives through the same town with true poses that the map of icp-map is made of.
+    #[arg(long, num_args = 1.., value_name = "DIR")]
+    map: Vec<PathBuf>,
+    /// Way between two sweeps on the map, metres.
+    #[arg(long, default_value_t = 5.0)]
+    map_spacing: f64,
+    /// Only every so many moments of a scenario.
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..))]
+    every: u32,
+    /// At most so many moments of every scenario.
+    #[arg(long)]
+    frames: Option<usize>,
+    /// Torch threads.
+    #[arg(long, default_value_t = 1)]
+    threads: u16,
+    /// Print JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+/// A built-in approach.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Method {
+    /// The difference of what both GNSS and IMU filters believe.
+    Gnss,
+    /// ICP of the neighbour's sweep against the ego's, as if both stood at one place.
+    Icp,
+    /// The same, beginning at the difference of both GNSS poses.
+    IcpGnss,
+    /// Each vehicle's sweep against a map (`--map`), beginning at its GNSS pose.
+    IcpMap,
+    /// ICP on box centres, from one place: the row "ICP" of the paper.
+    BoxIcp,
+    /// Graph matching of boxes.
+    FreeAlign,
+}
+
+/// Where boxes come from.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
+enum Boxes {
+    /// The detector.
+    Detected,
+    /// The annotations of what a vehicle has seen, as in the paper.
+    Annotated,
+}
+
+/// `NAME=FILE.yaml`
+#[derive(Debug, Clone)]
+struct NamedSource {
+    name: String,
+    file: PathBuf,
+}
+
+impl FromStr for NamedSource {
+    type Err = String;
+
+    fn from_str(text: &str) -> Result<Self, String> {
+        match text.split_once('=') {
+            Some((name, file)) if !name.is_empty() && !file.is_empty() => {
+                Ok(Self { name: name.to_owned(), file: file.into() })
+            }
+            _ => Err(format!("{text:?} is not NAME=FILE.yaml")),
+        }
+    }
+}
+
+impl Arguments {
+    /// Compares, and prints the table.
+    pub(crate) fn run(self) -> Result<()> {
+        tch::set_num_threads(i32::from(self.threads.max(1)));
+        let scenarios = scenarios(&self.data, self.intensity_scale)?;
+        let mut approaches = self.approaches()?;
+        let mut boxes = self.box_source(&approaches)?;
+        let rows = self.compare(&mut approaches, &mut boxes, &scenarios)?;
+        if self.json {
+            output::line(serde_json::to_string_pretty(&rows)?)?;
+        } else {
+            output::text(markdown(&rows))?;
+        }
+        Ok(())
+    }
+
+    fn approaches(&self) -> Result<Vec<Box<dyn Approach>>> {
+        use Method::{BoxIcp as BoxIcpMethod, FreeAlign as FreeAlignMethod, Gnss, Icp, IcpGnss};
+        let all = [Gnss, Icp, IcpGnss, BoxIcpMethod, FreeAlignMethod];
+        let named = if self.method.is_empty() { &all[..] } else { &self.method };
+        let built_in = named.iter().map(|method| self.built_in(*method));
+        built_in.chain(self.pose_source.iter().map(from_source)).collect()
+    }
+
+    fn built_in(&self, method: Method) -> Result<Box<dyn Approach>> {
+        Ok(match method {
+            Method::Gnss => Box::new(Poses::new("gnss", Measured::Gnss, || Ok(Box::new(RecordedPose)))),
+            Method::Icp => Box::new(CloudIcp::new(IcpConfig::default(), false)),
+            Method::IcpGnss => Box::new(CloudIcp::new(IcpConfig::default(), true)),
+            Method::IcpMap => self.icp_map()?,
+            Method::BoxIcp => Box::new(BoxIcp),
+            Method::FreeAlign => Box::new(FreeAlign::default()),
+        })
+    }
+
+    fn icp_map(&self) -> Result<Box<dyn Approach>> {
+        if self.map.is_empty() || self.map_spacing.is_nan() || self.map_spacing < 0.0 {
+            return Err(BadInput("icp-map needs --map DIR, and a spacing that is not negative".into()).into());
+        }
+        let config = IcpConfig::default();
+        let map = read_map(&self.map, self.map_spacing, &config).map_err(|error| BadInput(error.to_string()))?;
+        tracing::info!(planes = map.planes(), "map");
+        let source = IcpMapPose::new(Arc::new(map), config);
+        let build = move || Ok(Box::new(source.clone()) as Box<dyn PoseSource>);
+        Ok(Box::new(Poses::new("icp-map", Measured::Gnss, build)))
+    }
+
+    fn box_source(&self, approaches: &[Box<dyn Approach>]) -> Result<BoxSource> {
+        if self.boxes == Boxes::Annotated || !approaches.iter().any(|approach| approach.needs_boxes()) {
+            return Ok(BoxSource::Annotated);
+        }
+        let Some(weights) = &self.weights else {
+            return Err(BadInput("detected boxes need --weights FILE; or say --boxes annotated".into()).into());
+        };
+        let detector = Detector::load(weights).map_err(|error| BadInput(error.to_string()))?;
+        let cav = CavId::new("detector").context("a name")?;
+        Ok(BoxSource::Detected(Box::new(Agent::new(cav, Box::new(RecordedPose), detector))))
+    }
+
+    fn compare(
+        &self,
+        approaches: &mut [Box<dyn Approach>],
+        boxes: &mut BoxSource,
+        scenarios: &[Scenario],
+    ) -> Result<Vec<Row>> {
+        let bar = progress("scenes", scenarios.len());
+        let mut tallies = vec![Tally::default(); approaches.len()];
+        for scenario in scenarios {
+            let ticks = (0..scenario.ticks.len()).step_by(self.every as usize).take(self.frames.unwrap_or(usize::MAX));
+            compare::run(approaches, boxes, scenario, ticks, &mut |outcome| tallies[outcome.approach].add(&outcome))?;
+            bar.inc(1);
+        }
+        bar.finish_and_clear();
+        Ok(tallies.iter().zip(approaches).map(|(tally, approach)| tally.row(approach.name())).collect())
+    }
+}
+
+fn from_source(source: &NamedSource) -> Result<Box<dyn Approach>> {
+    let NamedSource { name, file } = source;
+    let bad = |error: &dyn std::fmt::Display| BadInput(format!("{}: {error}", file.display()));
+    let text = std::fs::read_to_string(file).map_err(|error| bad(&error))?;
+    let config: PoseSourceConfig = serde_saphyr::from_str(&text).map_err(|error| bad(&error))?;
+    // Once in vain, so that a missing file is found before the first scene.
+    config.build().map_err(|error| bad(&error))?;
+    Ok(Box::new(Poses::new(name.clone(), Measured::True, move || config.build())))
+}

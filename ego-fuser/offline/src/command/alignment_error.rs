@@ -1,0 +1,73 @@
+//! `ego-fuser residual`: what a method's own alignment leaves of offsets.
+
+use std::path::PathBuf;
+
+use anyhow::Result;
+use dataset::IntensityScale;
+use ego_fuser_offline::alignment_error::{Offset, ResidualMeter};
+use perception::weights::Weights;
+use support::output;
+
+use super::{BadInput, scenarios};
+
+/// Put offsets on the true poses of neighbours and measure how much of them the method's own alignment takes away.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Arguments {
+    /// Datasets, splits or scenarios; the first vehicle of each scenario is the ego.
+    #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
+    data: Vec<PathBuf>,
+    /// Number that stored intensities are divided by [default: auto; `sim-replay inspect --help` says by what].
+    #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
+    intensity_scale: IntensityScale,
+    /// Weights of a method that aligns maps itself, as pastat does.
+    #[arg(long, value_name = "FILE")]
+    weights: PathBuf,
+    /// Distances, metres.
+    #[arg(long, value_delimiter = ',', default_value = "0,0.5,1,2")]
+    shifts: Vec<f64>,
+    /// Angles, degrees.
+    #[arg(long, value_delimiter = ',', default_value = "1,2")]
+    turns: Vec<f64>,
+    /// Take every N-th tick of each scenario.
+    #[arg(long, value_name = "N", default_value_t = 1)]
+    every: usize,
+    /// Seed of the directions.
+    #[arg(long, default_value_t = 0)]
+    seed: u64,
+    /// Print JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+impl Arguments {
+    /// Measures and prints a line per offset.
+    pub(crate) fn run(self) -> Result<()> {
+        tch::set_num_threads(1);
+        let is_sensible = |value: &f64| (0.0..=100.0).contains(value);
+        if !self.shifts.iter().chain(&self.turns).all(is_sensible) {
+            return Err(BadInput("--shifts and --turns are 0 to 100".into()).into());
+        }
+        let shifts = self.shifts.iter().map(|&shift_m| Offset { shift_m, turn_deg: 0.0 });
+        let turns = self.turns.iter().map(|&turn_deg| Offset { shift_m: 0.0, turn_deg });
+        let offsets: Vec<Offset> = shifts.chain(turns).collect();
+        let weights = Weights::load(&self.weights).map_err(|error| BadInput(error.to_string()))?;
+        let mut meter = ResidualMeter::load(&weights).map_err(|error| BadInput(error.to_string()))?;
+        let found = meter.measure(&scenarios(&self.data, self.intensity_scale)?, self.every, &offsets, self.seed)?;
+        if self.json {
+            output::line(serde_json::to_string_pretty(&found)?)?;
+            return Ok(());
+        }
+        output::line("offset        pairs  mean m before/after  median m before/after  mean degrees before/after")?;
+        for residual in found {
+            let Offset { shift_m, turn_deg } = residual.offset;
+            let [mean, median, angle] = [residual.mean_m, residual.p50_m, residual.mean_deg]
+                .map(|[before, after]| format!("{before:.3} / {after:.3}"));
+            output::line(format_args!(
+                "{:<13} {:>5}  {mean:>19}  {median:>21}  {angle:>25}",
+                format!("{shift_m} m {turn_deg} deg"),
+                residual.pairs
+            ))?;
+        }
+        Ok(())
+    }
+}

@@ -1,0 +1,240 @@
+//! `ego-fuser eval`: AP of a method on recorded scenes.
+
+use std::ops::ControlFlow;
+use std::path::{Path, PathBuf};
+
+use agent::rate::RateConfig;
+use anyhow::Result;
+use dataset::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
+use dataset::frame::Frame;
+use dataset::ground_truth;
+use dataset::{self, Dataset, IntensityScale, LeftOut, LoadOptions, OpenOptions, Scenario};
+use ego_fuser_offline::evaluation::{EvaluateConfig, EvaluatedFrame, Evaluator};
+use ego_fuser_offline::multi_scale::{MULTI_SCALE_KIND, OfflineDetector};
+use fusion::Method;
+use localization::pose_source::PoseSourceConfig;
+use perception::weights::{KIND_KEY, Weights};
+use protocol::CodecConfig;
+use serde_json::json;
+use support::output;
+use training::average_precision::{Ordering, Scorer, THRESHOLDS};
+
+use super::{BadInput, check_left_out, progress};
+
+/// A data set with the protocol that it is judged by.
+struct Data {
+    protocol: EvaluationProtocol,
+    scenarios: Vec<Scenario>,
+}
+
+/// Measures AP on datasets, with true poses, nothing late and nothing lost.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Arguments {
+    /// Datasets, splits or scenarios.
+    #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
+    data: Vec<PathBuf>,
+    /// Number that stored intensities are divided by [default: auto; `sim-replay inspect --help` says by what].
+    #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
+    intensity_scale: IntensityScale,
+    /// Weights of encoder and head.
+    #[arg(long, value_name = "FILE")]
+    weights: PathBuf,
+    /// Methods, one after another; none named: that of the weights.
+    #[arg(long, num_args = 1..)]
+    method: Vec<Method>,
+    /// At most so many frames of every scenario.
+    #[arg(long)]
+    frames: Option<usize>,
+    #[command(flatten)]
+    protocol: ProtocolConfig,
+    /// Torch threads.
+    #[arg(long, default_value_t = 1)]
+    threads: u16,
+    /// Print JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+impl Arguments {
+    /// Evaluates and prints a line per method.
+    pub(crate) fn run(self) -> Result<()> {
+        tch::set_num_threads(i32::from(self.threads.max(1)));
+        let mut left_out = LeftOut::default();
+        let data = self.open(&mut left_out)?;
+        if kind_of(&self.weights)?.as_deref() == Some(MULTI_SCALE_KIND) {
+            self.run_multi_scale(&data, &mut left_out)?;
+            return Ok(check_left_out(&left_out)?);
+        }
+        let methods =
+            if self.method.is_empty() { vec![None] } else { self.method.iter().map(|method| Some(*method)).collect() };
+        let mut rows = Vec::new();
+        for method in methods {
+            let config = |data: &Data| EvaluateConfig {
+                protocol: Some(data.protocol.clone()),
+                weights: self.weights.clone(),
+                method,
+                pose_source: PoseSourceConfig::Recorded,
+                codec: CodecConfig::default(),
+                rate: RateConfig::default(),
+                delay_nanos: 0,
+                attack: None,
+                trust: None,
+            };
+            let (row, lost) = evaluate(&config, &data, self.frames.unwrap_or(usize::MAX), self.json)?;
+            left_out.merge(&lost);
+            rows.push(row);
+        }
+        if self.json {
+            output::line(serde_json::to_string_pretty(&rows)?)?;
+        }
+        Ok(check_left_out(&left_out)?)
+    }
+}
+
+impl Arguments {
+    /// The data sets, each with the agents of its protocol.
+    fn open(&self, left_out: &mut LeftOut) -> Result<Vec<Data>> {
+        let options = OpenOptions { intensity_scale: self.intensity_scale, ..OpenOptions::default() };
+        let open = |folder: &PathBuf| {
+            let Dataset { layout, scenarios, problems } =
+                dataset::open_with(folder, &options).map_err(|error| BadInput(error.to_string()))?;
+            left_out.add_files(&problems);
+            let protocol = self.protocol.resolve(layout).map_err(BadInput)?;
+            let scenarios = scenarios.iter().filter_map(|scenario| protocol.arrange(scenario)).collect();
+            Ok(Data { protocol, scenarios })
+        };
+        self.data.iter().map(open).collect()
+    }
+
+    /// A network that fuses at every level is one method of its own.
+    fn run_multi_scale(&self, data: &[Data], left_out: &mut LeftOut) -> Result<()> {
+        if !self.method.is_empty() {
+            return Err(BadInput("a multi-scale network has one method: leave --method out".to_owned()).into());
+        }
+        let mut detector = OfflineDetector::load(&self.weights).map_err(|error| BadInput(error.to_string()))?;
+        let rule = detector.rule();
+        let frames = self.frames.unwrap_or(usize::MAX);
+        let mut tally = Tally::default();
+        for scenario in data.iter().flat_map(|data| &data.scenarios) {
+            for tick in 0..scenario.ticks.len().min(frames) {
+                let loaded = scenario.load_tick(tick, 0..scenario.agents.len(), &LoadOptions::default());
+                left_out.add_tick(&loaded);
+                if loaded.frames.first().is_none_or(|(agent, _)| *agent != 0) {
+                    continue;
+                }
+                let frames: Vec<Frame> = loaded.frames.into_iter().map(|(_, frame)| frame).collect();
+                let objects = ground_truth::merge(&frames.iter().collect::<Vec<_>>(), 0, &rule);
+                let objects: Vec<_> = objects.into_iter().map(|(_, object)| object).collect();
+                tally.frames += 1;
+                let (detections, sent_bytes) = detector.detect(&frames)?;
+                tally.scorer.add(&detections, &objects);
+                tally.payload_bytes.extend(sent_bytes);
+            }
+        }
+        let row = tally.row("multi_scale");
+        if self.json {
+            output::line(serde_json::to_string_pretty(&[row])?)?;
+        } else {
+            print_row(&row)?;
+        }
+        Ok(())
+    }
+}
+
+/// What the network of a weights file is for, where the file says it.
+fn kind_of(weights: &Path) -> Result<Option<String>, BadInput> {
+    let weights = Weights::load(weights).map_err(|error| BadInput(error.to_string()))?;
+    Ok(weights.metadata(KIND_KEY).map(ToOwned::to_owned))
+}
+
+/// The numbers of one method over all data, and what was left out.
+fn evaluate(
+    config: &dyn Fn(&Data) -> EvaluateConfig,
+    data: &[Data],
+    frames: usize,
+    json: bool,
+) -> Result<(serde_json::Value, LeftOut)> {
+    let (mut tally, mut left_out, mut name) = (Tally::default(), LeftOut::default(), "");
+    for data in data {
+        let mut evaluator = Evaluator::new(config(data)).map_err(|error| BadInput(error.to_string()))?;
+        name = evaluator.ego().method().name();
+        let bar = progress(name, data.scenarios.iter().map(|scenario| scenario.ticks.len().min(frames)).sum());
+        for scenario in &data.scenarios {
+            let mut done = 0;
+            let _ = evaluator.run(scenario, &mut |frame| {
+                tally.add(&frame);
+                bar.inc(1);
+                done += 1;
+                if done < frames { ControlFlow::Continue(()) } else { ControlFlow::Break(()) }
+            })?;
+        }
+        bar.finish_and_clear();
+        left_out.merge(evaluator.left_out());
+    }
+    let row = tally.row(name);
+    if !json {
+        print_row(&row)?;
+    }
+    Ok((row, left_out))
+}
+
+fn print_row(row: &serde_json::Value) -> std::io::Result<()> {
+    let ap = |name: &str| THRESHOLDS.map(|iou| format!("{:.4}", row[name][format!("{iou}")].as_f64().unwrap_or(0.0)));
+    let (global, frame) = (ap("ap_global").join(" "), ap("ap_frame_order").join(" "));
+    output::line(format_args!(
+        "{:<10} AP@0.3/0.5/0.7 global {global}, frame order {frame}, {} frames, {} bytes a neighbour",
+        row["method"].as_str().unwrap_or_default(),
+        row["frames"],
+        row["payload_bytes_mean"]
+    ))
+}
+
+/// What the frames of one method add up to.
+#[derive(Default)]
+struct Tally {
+    scorer: Scorer,
+    frames: usize,
+    payload_bytes: Vec<u64>,
+}
+
+impl Tally {
+    fn add(&mut self, frame: &EvaluatedFrame) {
+        self.frames += 1;
+        self.scorer.add(&frame.result.detections, &frame.objects);
+        self.payload_bytes.extend(frame.result.fused.iter().map(|neighbour| neighbour.payload_bytes));
+    }
+
+    fn row(&self, method: &str) -> serde_json::Value {
+        let by_iou = |ordering| {
+            let found = self.scorer.average_precisions(ordering);
+            THRESHOLDS
+                .iter()
+                .zip(found)
+                .map(|(iou, ap)| (iou.to_string(), json!(ap)))
+                .collect::<serde_json::Map<_, _>>()
+        };
+        let bytes = self.payload_bytes.iter().sum::<u64>() as f64 / self.payload_bytes.len().max(1) as f64;
+        json!({
+            "method": method,
+            "frames": self.frames,
+            "ap_global": by_iou(Ordering::Global),
+            "ap_frame_order": by_iou(Ordering::Frame),
+            "payload_bytes_mean": bytes,
+        })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::process::ExitCode;
+
+    use super::super::exit_code;
+    use super::*;
+
+    #[test]
+    fn weights_that_are_not_there_are_bad_input() {
+        let error = anyhow::Error::from(kind_of(Path::new("no/such.safetensors")).unwrap_err());
+        assert!(error.to_string().contains("no/such.safetensors"), "{error}");
+        assert_eq!(exit_code(&error), ExitCode::from(2));
+    }
+}

@@ -1,0 +1,324 @@
+//! `ego-fuser train`: arguments, and a progress bar or plain lines.
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use anyhow::{Context, Result};
+use dataset::evaluation_protocol::ProtocolConfig;
+use dataset::{IntensityScale, Layout, OpenOptions};
+use fusion::FusionConfig;
+use fusion::Method;
+use fusion::model::ModelError;
+use fusion::pastat::Part;
+use localization::pose_source::{NoiseMode, NoisyPoseConfig, PoseTable};
+use perception::model_config::DetectorConfig;
+use perception::train::{AdamWConfig, DataListing, RunConfig, TrainingBar, TrainingOptions};
+use perception::weights::Weights;
+use protocol::Dtype;
+use training::feature_store::KeptMaps;
+use training::loss::{LossConfig, Unassigned};
+use training::samples::{Augmentation, Moments, SampleConfig, SampleKind, SamplePoses};
+use training::train::{self, Accuracy, Observer, StepReport, TrainConfig, TrainError};
+
+use super::BadInput;
+
+/// Trains a method on scenes; writes checkpoint, curve.csv and curve.png, weights.safetensors and model-card.md.
+#[derive(Debug, clap::Args)]
+pub(crate) struct Arguments {
+    /// Datasets, splits or scenarios to learn from.
+    #[arg(long, required = true, num_args = 1.., value_name = "DIR")]
+    data: Vec<PathBuf>,
+    /// Datasets to measure AP on; none: no validation.
+    #[arg(long, num_args = 1.., value_name = "DIR")]
+    validation: Vec<PathBuf>,
+    /// Number that stored intensities are divided by [default: auto; `sim-replay inspect --help` says by what].
+    #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
+    intensity_scale: IntensityScale,
+    /// Method: none, early or one that exchanges feature maps; `ego-fuser methods` lists them.
+    #[arg(long, default_value = "none")]
+    method: Method,
+    /// Network: lean or full; --init overrides it.
+    #[arg(long, default_value = "lean", value_parser = parse_config)]
+    config: DetectorConfig,
+    /// Weights to begin with, for example those of `none`.
+    #[arg(long, value_name = "FILE")]
+    init: Option<PathBuf>,
+    /// Samples of a step.
+    #[arg(long, default_value_t = 4)]
+    batch: usize,
+    /// Highest learning rate.
+    #[arg(long, default_value_t = 2e-3)]
+    lr: f64,
+    /// Weight decay.
+    #[arg(long, default_value_t = 1e-2)]
+    weight_decay: f64,
+    /// Anchors between the overlap thresholds count for nothing, rather than as background as in OpenCOOD.
+    #[arg(long)]
+    ignore_unassigned: bool,
+    /// Probability that a neighbour is missing from a sample.
+    #[arg(long, default_value_t = 0.1)]
+    drop_neighbour: f64,
+    /// Poses to align maps by, as `agent localize` wrote them, of all scenes in one table or several [default: true poses].
+    #[arg(long, value_name = "FILE", num_args = 1..)]
+    poses: Vec<PathBuf>,
+    /// Standard deviation of an error of x, y and z on top of the vehicles' poses, metres.
+    #[arg(long, default_value_t = 0.0)]
+    position_noise: f64,
+    /// Standard deviation of an error of yaw on top of the vehicles' poses, degrees.
+    #[arg(long, default_value_t = 0.0)]
+    heading_noise: f64,
+    /// How the errors of a sample's vehicles and moments hang together.
+    #[arg(long, value_enum, default_value_t = Mode::Independent)]
+    noise_mode: Mode,
+    /// Share of the samples with that error.
+    #[arg(long, default_value_t = 1.0)]
+    noise_share: f64,
+    /// Share of the samples in which one neighbour is 5 to 30 m from where it believes to be, and as sure of it as ever.
+    #[arg(long, default_value_t = 0.0)]
+    lost_share: f64,
+    /// Neighbours' maps are up to so much older than the ego's in training, milliseconds.
+    #[arg(long, value_name = "MS", default_value_t = 0, value_parser = clap::value_parser!(u64).range(..=5_000))]
+    max_delay: u64,
+    /// Ticks between two time steps of a method with history at most; every sample draws its own number.
+    #[arg(long, default_value_t = 1)]
+    gap: usize,
+    /// Time steps of every vehicle [default: what the method takes].
+    #[arg(long)]
+    frames: Option<usize>,
+    /// Parts of pastat to leave out.
+    #[arg(long, value_enum, value_delimiter = ',')]
+    without: Vec<Part>,
+    /// Weight of what teaches a fusion that corrects poses (pastat) the errors that were put on top of them.
+    #[arg(long, default_value_t = 0.0)]
+    alignment_weight: f64,
+    /// Leave the encoder of --init as it is and learn the fusion and the head alone: fast, as maps are computed once.
+    #[arg(long, requires = "init")]
+    freeze_encoder: bool,
+    /// Where such maps are kept.
+    #[arg(long, value_name = "DIR", default_value = "runs/maps")]
+    maps: PathBuf,
+    /// Most gigabytes of them per set of data; sweeps beyond are encoded whenever they are needed.
+    #[arg(long, value_name = "GB", default_value_t = 8.0)]
+    maps_limit: f64,
+    /// How exactly they are kept.
+    #[arg(long, value_enum, default_value_t = Exactness::F16)]
+    maps_dtype: Exactness,
+    /// Largest turn of a vehicle's frame in training, degrees.
+    #[arg(long, default_value_t = 45.0)]
+    turn: f64,
+    /// Of the protocol's options, `--max-agents` is of a sample [default: 5]; the order of average precision has no effect.
+    #[command(flatten)]
+    protocol: ProtocolConfig,
+    /// Learn what an ego can find that nobody helps: samples of one vehicle, which is to find what its neighbours have annotated
+    /// as well [default for none: what itself has annotated].
+    #[arg(long)]
+    alone: bool,
+    /// Steps between two validations and checkpoints.
+    #[arg(long, default_value_t = 500)]
+    validate_every: u64,
+    /// Frames of a validation.
+    #[arg(long, default_value_t = 60)]
+    validation_frames: usize,
+    #[command(flatten)]
+    options: TrainingOptions,
+}
+
+fn parse_config(name: &str) -> Result<DetectorConfig, String> {
+    DetectorConfig::preset(name).ok_or_else(|| "there are lean and full".to_owned())
+}
+
+impl Arguments {
+    /// Trains and says what came of it.
+    pub(crate) fn run(&self) -> Result<()> {
+        let config = self.config()?;
+        let mut bar = Progress(TrainingBar::of(config.run.length));
+        if let Some(hint) = self.hint() {
+            bar.0.say(hint);
+        }
+        let summary = train::run(&config, &mut bar).map_err(blamed)?;
+        bar.0.finish();
+        self.options.print(&summary.trained, &serde_json::json!({"accuracy": summary.accuracy}))?;
+        Ok(())
+    }
+
+    /// What is faster where a training from scratch was not meant.
+    fn hint(&self) -> Option<&'static str> {
+        // Merged points are encoded together, by an encoder that learns with the rest.
+        (self.init.is_none() && self.method != Method::Early).then_some(
+            "training from scratch, encoder and all; --init deploy/weights/lean-max.safetensors --freeze-encoder learns \
+             fusion and head alone, several times faster",
+        )
+    }
+
+    fn config(&self) -> Result<TrainConfig> {
+        if !(0.0..=1.0).contains(&self.drop_neighbour) || self.validate_every == 0 {
+            let reason = "--drop-neighbour is a probability, --validate-every is above zero";
+            return Err(BadInput(reason.into()).into());
+        }
+        for folder in self.data.iter().chain(&self.validation) {
+            std::fs::read_dir(folder)
+                .map_err(|error| BadInput(format!("{}: {error}", folder.display())))
+                .context("datasets")?;
+        }
+        let rule = self.protocol.resolve(Layout::Opv2v).map_err(BadInput)?.ground_truth;
+        let samples = SampleConfig {
+            augmentation: Augmentation { turn_rad: self.turn.to_radians(), ..Augmentation::default() },
+            drop_neighbour: self.drop_neighbour,
+            poses: self.poses()?,
+            moments: Moments { frames: 1, gap: self.gap, max_delay_nanos: self.max_delay * 1_000_000 },
+            max_agents: self.protocol.max_agents.unwrap_or(5),
+            comm_range_m: rule.comm_range_m,
+            classes: rule.classes,
+            merged_truth: self.alone,
+            ..SampleConfig::training(SampleKind::Single)
+        };
+        let unassigned = if self.ignore_unassigned { Unassigned::Ignored } else { Unassigned::Background };
+        let run = self.options.run_config(self.batch, self.lr).map_err(|error| BadInput(error.to_string()))?;
+        Ok(TrainConfig {
+            data: self.data.clone(),
+            validation: self.validation.clone(),
+            protocol: self.protocol.clone(),
+            open: OpenOptions { intensity_scale: self.intensity_scale, ..OpenOptions::default() },
+            method: self.method,
+            detector: self.config.clone(),
+            init: self.init.clone(),
+            fusion: self.fusion()?,
+            frozen_encoder: self.freeze_encoder.then(|| KeptMaps {
+                folder: self.maps.clone(),
+                dtype: match self.maps_dtype {
+                    Exactness::F16 => Dtype::F16,
+                    Exactness::I8 => Dtype::I8,
+                },
+                limit_bytes: (self.maps_limit.max(0.0) * 1e9) as u64,
+                intensity_scale: self.intensity_scale,
+            }),
+            run: RunConfig { optimizer: AdamWConfig { weight_decay: self.weight_decay, ..run.optimizer }, ..run },
+            validate_every: self.validate_every,
+            validation_frames: self.validation_frames,
+            samples,
+            loss: LossConfig { unassigned, alignment_weight: self.alignment_weight, ..LossConfig::default() },
+        })
+    }
+
+    /// The poses that maps are aligned by.
+    fn poses(&self) -> Result<SamplePoses> {
+        let read = |file: &PathBuf| PoseTable::read(file).map(Arc::new).map_err(|error| BadInput(error.to_string()));
+        let is_noisy = self.position_noise != 0.0 || self.heading_noise != 0.0;
+        let noise = is_noisy.then(|| NoisyPoseConfig {
+            mode: match self.noise_mode {
+                Mode::Fixed => NoiseMode::Fixed,
+                Mode::Independent => NoiseMode::Independent,
+                Mode::Autoregressive => NoiseMode::Autoregressive,
+            },
+            position_std_m: self.position_noise,
+            heading_std_deg: self.heading_noise,
+            ..NoisyPoseConfig::default()
+        });
+        let tables = self.poses.iter().map(read).collect::<Result<_, _>>()?;
+        let poses = SamplePoses { tables, noise, noise_share: self.noise_share, lost_share: self.lost_share };
+        poses.validate().map_err(|error| BadInput(error.to_string()))?;
+        Ok(poses)
+    }
+
+    /// The fusion, where the command line changes it.
+    fn fusion(&self) -> Result<Option<FusionConfig>> {
+        if self.without.is_empty() && self.frames.is_none() {
+            return Ok(None);
+        }
+        let detector = match &self.init {
+            Some(init) => {
+                let config = Weights::load(init).and_then(|weights| weights.config());
+                config.map_err(|error| BadInput(error.to_string()))?
+            }
+            None => self.config.clone(),
+        };
+        let fusion = FusionConfig::for_detector(self.method, &detector).ablated(&self.without, self.frames);
+        Ok(Some(fusion.map_err(|error| BadInput(error.to_string()))?))
+    }
+}
+
+/// Whose fault it is that a training has ended early: that of what it was told, where no model could be begun with.
+fn blamed(error: TrainError) -> anyhow::Error {
+    match error {
+        TrainError::Model(ModelError::Weights(_) | ModelError::Config(_) | ModelError::Method(_))
+        | TrainError::NotTrained(_)
+        | TrainError::NothingToFreeze
+        | TrainError::NothingToKeep(_) => BadInput(error.to_string()).into(),
+        error => error.into(),
+    }
+}
+
+/// How exactly maps are kept.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+enum Exactness {
+    /// 2 bytes a value, packed.
+    F16,
+    /// 1 byte a value and a scale per channel, packed.
+    I8,
+}
+
+/// How errors of poses hang together.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+enum Mode {
+    /// One offset of all neighbours in all frames; the ego is exact.
+    Fixed,
+    /// Drawn anew for every vehicle and frame.
+    Independent,
+    /// Wanders, as a filter's error does.
+    Autoregressive,
+}
+
+/// Shows on standard error how it goes.
+struct Progress(TrainingBar);
+
+impl Observer for Progress {
+    fn opened(&mut self, data: &DataListing) {
+        data.left_out().iter().for_each(|text| self.0.say(text));
+    }
+
+    fn encoded(&mut self, done: usize, all: usize) {
+        if done.is_multiple_of(50) || done == all {
+            self.0.encoded(done, all);
+        }
+    }
+
+    fn stepped(&mut self, report: &StepReport) {
+        let text = format!(
+            "step {} epoch {:.2} loss {:.3} = scores {:.3} + boxes {:.3} lr {:.1e} {:.1} samples/s, {:.0} % waiting",
+            report.step,
+            report.epoch,
+            report.score_loss + report.box_loss,
+            report.score_loss,
+            report.box_loss,
+            report.learning_rate,
+            report.samples_per_second,
+            100.0 * report.waiting
+        );
+        self.0.report(report.progress, report.seconds, &text);
+    }
+
+    fn validated(&mut self, step: u64, accuracy: &Accuracy) {
+        let [ap_30, ap_50, ap_70] = accuracy.ap_global;
+        self.0.say(&format!(
+            "step {step}: AP@0.3/0.5/0.7 global {ap_30:.3} {ap_50:.3} {ap_70:.3} on {} frames",
+            accuracy.frames
+        ));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::path::Path;
+
+    use perception::train::TrainingError;
+
+    use super::*;
+
+    #[test]
+    fn weights_that_are_not_there_are_bad_input_and_a_training_that_diverges_is_not() {
+        let missing = Weights::load(Path::new("no/such.safetensors")).unwrap_err();
+        let blame = blamed(TrainError::Model(missing.into()));
+        assert!(blame.is::<BadInput>() && blame.to_string().contains("no/such.safetensors"), "{blame}");
+        assert!(!blamed(TrainError::Training(TrainingError::Diverged(9))).is::<BadInput>());
+    }
+}

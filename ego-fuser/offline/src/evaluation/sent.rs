@@ -1,0 +1,133 @@
+//! What a vehicle says of a frame, through the same messages as in a live run.
+
+use agent::agent::{Agent, AgentInput, Perception};
+use agent::attack::Overheard;
+use dataset::frame::Frame;
+use perception::detector::DetectorError;
+use protocol::message::{Bev, Boxes, Payload, Points};
+use protocol::{CavId, CodecConfig, HEADER_LEN, Header, Limits, PoseEstimate, RateChoice, Stamp, WireError, wire};
+use tch::Tensor;
+
+use super::EvaluateError;
+use ego_fuser::ego::{Content, View};
+use fusion::method::Exchange;
+
+/// What a vehicle sends for one frame.
+#[derive(Debug)]
+pub(super) struct Sent {
+    pub(super) cav: CavId,
+    pub(super) capture_nanos: u64,
+    pub(super) pose: PoseEstimate,
+    pub(super) content: Option<Content>,
+    pub(super) payload_bytes: u64,
+    pub(super) wire_bytes: u64,
+    /// Of these, the pose's own message.
+    pub(super) pose_bytes: u64,
+    /// Why a map is written as it is, where it had to keep within a limit.
+    pub(super) rate: Option<RateChoice>,
+}
+
+impl Sent {
+    /// As the ego sees it; nothing where nothing was sent.
+    pub(super) fn view(&self) -> Option<View> {
+        let Self { cav, capture_nanos, pose, content, .. } = self;
+        Some(View { cav: cav.clone(), pose: *pose, capture_nanos: *capture_nanos, content: content.clone()? })
+    }
+
+    /// As the ego sees it; nothing where nothing was sent.
+    pub(super) fn into_view(self) -> Option<ego_fuser::ego::View> {
+        let Self { cav, capture_nanos, pose, content, .. } = self;
+        Some(ego_fuser::ego::View { cav, pose, capture_nanos, content: content? })
+    }
+
+    /// As a vehicle that repeats it hears it.
+    pub(super) fn overheard(&self) -> Overheard {
+        let mut heard = Overheard::default();
+        match self.content.clone() {
+            Some(Content::Features(map)) => heard.features = Some(map.features),
+            Some(Content::Boxes(found)) => heard.detections = Some(found),
+            Some(Content::Points(points)) => heard.points = Some(points),
+            None => {}
+        }
+        heard
+    }
+
+    /// The same, with payload and wire bytes.
+    pub(super) fn heard(&self) -> Option<(View, (u64, u64))> {
+        Some((self.view()?, (self.payload_bytes, self.wire_bytes)))
+    }
+}
+
+/// What a vehicle sends for a frame: where it is and, with `exchange`, what it sees.
+///
+/// # Errors
+/// [`EvaluateError`] when it cannot see, write or read its own message.
+pub(super) fn view(
+    agent: &mut Agent,
+    frame: &Frame,
+    map: Option<&Tensor>,
+    exchange: Option<Exchange>,
+    codec: &CodecConfig,
+) -> Result<Sent, EvaluateError> {
+    let input = AgentInput {
+        capture_nanos: frame.capture_nanos,
+        cloud: &frame.points,
+        measured_pose: frame.world_from_lidar.as_ref(),
+    };
+    let pose = agent.estimate_pose(&input);
+    let stamp = stamp(agent.cav(), frame.capture_nanos);
+    let (_, pose_bytes) = through_the_wire(&stamp, pose)?;
+    let sent = |content, payload_bytes, wire_bytes| Sent {
+        cav: frame.cav.clone(),
+        capture_nanos: frame.capture_nanos,
+        pose,
+        content,
+        payload_bytes,
+        wire_bytes,
+        pose_bytes,
+        rate: None,
+    };
+    let (content, bytes) = match exchange {
+        None => return Ok(sent(None, 0, 0)),
+        Some(Exchange::Points) => {
+            let points = agent.share_points(&frame.points);
+            let (message, bytes) = through_the_wire(&stamp, Points { pose, points })?;
+            (Content::Points(message.points), bytes)
+        }
+        Some(Exchange::Boxes) => {
+            let detections = perceive(agent, frame, map)?.detections;
+            let (message, bytes) = through_the_wire(&stamp, Boxes { pose, detections })?;
+            (Content::Boxes(message.detections), bytes)
+        }
+        Some(Exchange::Features | Exchange::Nothing) => {
+            let Perception { features, confidence, .. } = perceive(agent, frame, map)?;
+            let features = agent.write_map(features, &confidence, codec, frame.capture_nanos)?;
+            let (message, bytes) = through_the_wire(&stamp, Bev { pose, features })?;
+            let rate = message.features.rate;
+            let content = Content::Features(message.features.decode(&Limits::default())?);
+            let sent = sent(Some(content), bytes - HEADER_LEN as u64, bytes + pose_bytes);
+            return Ok(Sent { rate, ..sent });
+        }
+    };
+    Ok(sent(Some(content), bytes - HEADER_LEN as u64, bytes + pose_bytes))
+}
+
+fn perceive(agent: &mut Agent, frame: &Frame, map: Option<&Tensor>) -> Result<Perception, DetectorError> {
+    match map {
+        Some(map) => agent.perceive_map(map),
+        None => agent.perceive(&frame.points),
+    }
+}
+
+/// Encodes and decodes a message; its size on the wire.
+fn through_the_wire<M: Payload>(stamp: &Stamp, message: M) -> Result<(M, u64), WireError> {
+    let encoded = wire::encode(stamp, message)?;
+    let bytes = encoded.pieces().iter().map(|piece| piece.len() as u64).sum();
+    let (_, message): (Header, M) = wire::decode(encoded.pieces(), &Limits::default())?;
+    Ok((message, bytes))
+}
+
+/// Who speaks for which sweep, at the moment of the sweep.
+pub(super) fn stamp(cav: &CavId, capture_nanos: u64) -> Stamp {
+    Stamp { cav: cav.clone(), epoch: 0, sequence: 0, capture_nanos, publish_nanos: capture_nanos }
+}

@@ -1,0 +1,401 @@
+//! Virtual time: who computes how long is given, the emulated air decides when what arrives, and the ego fuses at each
+//! tick exactly what has arrived by its deadline.
+//!
+//! Nothing here looks at a clock, so the same inputs and seed give the same result on a busy and on an idle machine. The
+//! pipelines, the pairing and the air are those of the live processes.
+
+mod compute;
+mod delayed_delivery;
+mod remote;
+
+use std::collections::{BTreeMap, VecDeque};
+use std::ops::{ControlFlow, Range};
+use std::path::PathBuf;
+
+use agent::agent::Agent;
+use agent::attack::Lie;
+use agent::rate::RateConfig;
+use dataset::frame::Frame;
+use dataset::ground_truth;
+use dataset::{LoadOptions, Scenario};
+use link::{Air, LinkConfig};
+use localization::pose_source::PoseSourceConfig;
+use protocol::{CavId, CodecConfig, PoseEstimate, RateChoice, SkippedNeighbour, StageTiming, Stream};
+use support::random::derive_seed;
+
+pub use compute::ComputeTimes;
+pub use remote::{RemoteCrew, RemoteError};
+
+use super::sent::{Sent, stamp, view};
+use super::sweeps::Sweep;
+use super::{EvaluateError, EvaluatedFrame, Evaluator, of_the_ego};
+use delayed_delivery::{Arrived, Courier, Letter};
+use ego_fuser::ego::{Skipped, View, own_content};
+use ego_fuser::pairing::{Paired, Pairing, PairingConfig};
+use fusion::method::{Exchange, Method};
+
+/// A fleet in virtual time.
+#[derive(Debug, Clone)]
+pub struct SteppedConfig {
+    /// The air between the neighbours and the ego.
+    pub link: LinkConfig,
+    /// Where paths of traces in it start.
+    pub link_folder: PathBuf,
+    /// Same seed, same losses and delays. Every scenario has its own of it.
+    pub seed: u64,
+    /// The ego fuses what has arrived so long after its tick, nanoseconds.
+    pub deadline_nanos: u64,
+    /// Which messages belong together.
+    pub pairing: PairingConfig,
+    /// How long everyone computes.
+    pub compute: ComputeTimes,
+    /// Who takes part.
+    pub crew: Crew,
+    /// Vehicles with settings of their own.
+    pub vehicles: BTreeMap<CavId, VehicleConfig>,
+    /// Which ticks of a scenario; clipped to those there are.
+    pub ticks: Range<usize>,
+    /// A variant of the sweeps, see [`Scenario::lidar_variants`].
+    pub lidar_variant: Option<String>,
+}
+
+/// Who takes part.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum Crew {
+    /// The first so many vehicles of a scenario, or all where it has fewer; the first is the ego. What the others see
+    /// counts as there all the same, so that the truth does not depend on how many talk.
+    First(usize),
+    /// These, the ego first; the others are not there at all.
+    Named(Vec<CavId>),
+}
+
+/// Settings of one vehicle.
+#[derive(Debug, Clone, PartialEq)]
+pub struct VehicleConfig {
+    /// Where its pose comes from.
+    pub pose_source: PoseSourceConfig,
+    /// How it writes its maps.
+    pub codec: CodecConfig,
+    /// What it fits them to. There is no queue to watch.
+    pub rate: RateConfig,
+    /// What it lies about; absent: nothing.
+    pub lie: Option<Lie>,
+}
+
+/// Runs a scenario; `on_frame` may end it. Each frame's stamp says when the ego published it.
+pub(super) fn run(
+    evaluator: &mut Evaluator,
+    config: &SteppedConfig,
+    scenario: &Scenario,
+    on_frame: &mut dyn FnMut(EvaluatedFrame) -> ControlFlow<()>,
+) -> Result<ControlFlow<()>, EvaluateError> {
+    let mut run = Run::open(evaluator, config, scenario)?;
+    let mut flow = ControlFlow::Continue(());
+    for tick in run.next..run.end {
+        let Some(frame) = run.decide(tick)? else { continue };
+        flow = on_frame(frame);
+        if flow.is_break() {
+            break;
+        }
+    }
+    run.close();
+    Ok(flow)
+}
+
+/// A vehicle that takes part.
+struct Member {
+    /// Its place among the scenario's.
+    place: usize,
+    cav: CavId,
+    pipeline: Pipeline,
+}
+
+/// Where a vehicle computes.
+enum Pipeline {
+    Here(Box<Agent>, CodecConfig),
+    /// In a process of its own.
+    Elsewhere,
+}
+
+/// A tick whose sweeps are computed.
+struct Computed {
+    /// Absent where the ego's sweep cannot be read.
+    own: Option<View>,
+    /// Neighbours that sent something.
+    senders: Vec<CavId>,
+    /// Of all vehicles that take part, the ego first.
+    frames: Vec<Frame>,
+    poses: Vec<PoseEstimate>,
+}
+
+struct Run<'a> {
+    evaluator: &'a mut Evaluator,
+    config: &'a SteppedConfig,
+    scenario: &'a Scenario,
+    /// The ego first.
+    crew: Vec<Member>,
+    /// Places of those that are only asked what there is.
+    witnesses: Vec<usize>,
+    /// The next tick to compute, and the one behind the last.
+    next: usize,
+    end: usize,
+    computed: VecDeque<Computed>,
+    courier: Courier,
+    pairing: Pairing<Letter>,
+    /// When messages arrived, by vehicle: capture time and arrival.
+    arrivals: BTreeMap<CavId, VecDeque<(u64, u64)>>,
+    /// When the ego has done with what it fuses.
+    ego_free_nanos: u64,
+}
+
+impl<'a> Run<'a> {
+    fn open(
+        evaluator: &'a mut Evaluator,
+        config: &'a SteppedConfig,
+        scenario: &'a Scenario,
+    ) -> Result<Self, EvaluateError> {
+        config.compute.check(scenario)?;
+        let places = places(scenario, &config.crew);
+        let mut crew = Vec::with_capacity(places.len());
+        for &place in &places {
+            let cav = &scenario.agents[place];
+            if evaluator.remote.is_some() {
+                crew.push(Member { place, cav: cav.clone(), pipeline: Pipeline::Elsewhere });
+                continue;
+            }
+            let own = config.vehicles.get(cav);
+            let codec = own.map_or(evaluator.config.codec, |own| own.codec);
+            let gate = codec.gate.or(evaluator.ego.method().gate());
+            let codec = if crew.is_empty() { of_the_ego(codec) } else { CodecConfig { gate, ..codec } };
+            let agent = evaluator.agent(scenario, cav, crew.is_empty(), own)?;
+            crew.push(Member { place, cav: cav.clone(), pipeline: Pipeline::Here(Box::new(agent), codec) });
+        }
+        let is_witness = |place: &usize| matches!(config.crew, Crew::First(_)) && !places.contains(place);
+        let witnesses = (0..scenario.agents.len()).filter(is_witness).collect();
+        let ticks = config.ticks.start.min(scenario.ticks.len())..config.ticks.end.min(scenario.ticks.len());
+        let began_nanos = scenario.ticks.get(ticks.start).map_or(0, |tick| tick.capture_nanos);
+        let letters: Vec<u64> = scenario.name.bytes().map(u64::from).collect();
+        let air = Air::new(config.link.clone(), &config.link_folder, derive_seed(config.seed, &letters))?;
+        let ego = crew.first().map_or_else(|| scenario.agents[0].clone(), |ego| ego.cav.clone());
+        Ok(Self {
+            courier: Courier::new(air, &ego, began_nanos),
+            evaluator,
+            config,
+            scenario,
+            crew,
+            witnesses,
+            next: ticks.start,
+            end: ticks.end,
+            computed: VecDeque::new(),
+            pairing: Pairing::new(config.pairing),
+            arrivals: BTreeMap::new(),
+            ego_free_nanos: 0,
+        })
+    }
+
+    /// Computes the sweeps of the next tick and hands what the neighbours send to the air.
+    fn compute(&mut self) -> Result<(), EvaluateError> {
+        let tick = self.next;
+        self.next += 1;
+        let method = self.evaluator.ego.method();
+        let load = self.load_options();
+        let places: Vec<usize> = self.crew.iter().map(|member| member.place).collect();
+        let ego_place = places.first().copied();
+        // Without an exchange, neighbours have nothing to encode; where they are is still asked.
+        let is_needed = |place: usize| Some(place) == ego_place || method != Method::None;
+        let is_here = self.evaluator.remote.is_none();
+        let with_maps = |place| is_here && is_needed(place);
+        let sweeps = self.evaluator.sweeps(self.scenario, tick, &places, &load, with_maps)?;
+        if sweeps.first().map(|ego| ego.place) != ego_place {
+            self.computed.push_back(Computed { own: None, senders: vec![], frames: vec![], poses: vec![] });
+            return Ok(());
+        }
+        let all = self.perceive(&sweeps)?;
+        let mut frames: Vec<Frame> = sweeps.into_iter().map(|sweep| sweep.frame).collect();
+        let (mut poses, mut senders, mut own) = (Vec::with_capacity(all.len()), Vec::new(), None);
+        for (place, sent) in all.into_iter().enumerate() {
+            poses.push(sent.pose);
+            if place == 0 {
+                own = sent.view();
+            } else if sent.content.is_some() && method != Method::None {
+                senders.push(sent.cav.clone());
+                let distance_m = distance_m(&frames[0], &frames[place]);
+                post(&mut self.courier, &self.config.compute, tick, sent, distance_m);
+            }
+        }
+        let blind = LoadOptions { points: false, ..load };
+        let witnesses = self.scenario.load_tick(tick, self.witnesses.iter().copied(), &blind);
+        self.evaluator.left_out.add_tick(&witnesses);
+        frames.extend(witnesses.frames.into_iter().map(|(_, frame)| frame));
+        self.computed.push_back(Computed { own, senders, frames, poses });
+        Ok(())
+    }
+
+    /// What everyone makes of the sweeps of a tick.
+    fn perceive(&mut self, sweeps: &[Sweep]) -> Result<Vec<Sent>, EvaluateError> {
+        if let Some(remote) = &self.evaluator.remote {
+            let frames: Vec<&Frame> = sweeps.iter().map(|sweep| &sweep.frame).collect();
+            return Ok(remote.ask(&frames).map_err(Box::new)?);
+        }
+        let method = self.evaluator.ego.method();
+        let mut all: Vec<Sent> = Vec::with_capacity(sweeps.len());
+        for Sweep { place, frame, map } in sweeps {
+            let is_needed = all.is_empty() || method != Method::None;
+            let exchange = is_needed.then(|| own_content(method));
+            let Some(member) = self.crew.iter_mut().find(|member| member.place == *place) else { continue };
+            if let Pipeline::Here(agent, codec) = &mut member.pipeline {
+                agent.overhear(|| all.last().map(Sent::overheard).unwrap_or_default());
+                all.push(view(agent, frame, map.as_ref(), exchange, codec)?);
+            }
+        }
+        Ok(all)
+    }
+
+    fn load_options(&self) -> LoadOptions {
+        let own = self.config.vehicles.values().any(|own| own.pose_source.looks_at_sweeps());
+        let points = own || self.evaluator.remote.is_some() || self.evaluator.needs_points();
+        LoadOptions { points, lidar_variant: self.config.lidar_variant.clone(), ..LoadOptions::default() }
+    }
+
+    /// Fuses a tick; nothing where the ego's sweep cannot be read.
+    fn decide(&mut self, tick: usize) -> Result<Option<EvaluatedFrame>, EvaluateError> {
+        let capture_nanos = self.scenario.ticks[tick].capture_nanos;
+        let compute = self.config.compute;
+        let ready_nanos = capture_nanos.saturating_add(compute.agent_nanos());
+        let closes_nanos = capture_nanos.saturating_add(self.config.deadline_nanos).max(ready_nanos);
+        while self.next < self.end && self.scenario.ticks[self.next].capture_nanos <= closes_nanos {
+            self.compute()?;
+        }
+        for arrived in self.courier.until(closes_nanos) {
+            self.take_in(arrived);
+        }
+        let computed = self.computed.pop_front().expect("a tick closes after it began");
+        let Computed { own: Some(own), senders, frames, poses } = computed else { return Ok(None) };
+        let decided_nanos = self.complete_nanos(capture_nanos, &senders).unwrap_or(closes_nanos).max(ready_nanos);
+        let done_nanos = decided_nanos.max(self.ego_free_nanos).saturating_add(compute.fuse_nanos());
+        self.ego_free_nanos = done_nanos;
+        let mut result = self.fuse(tick, &own, &senders)?;
+        // Measured times would be another every time.
+        let stage = |name: &str, nanos| StageTiming { stage: name.into(), nanos };
+        result.stages = vec![
+            stage("pose", compute.pose_nanos()),
+            stage("map", compute.map_nanos()),
+            stage("wait", decided_nanos - ready_nanos),
+            stage("fuse", done_nanos - decided_nanos),
+        ];
+        let objects = ground_truth::merge(&frames.iter().collect::<Vec<_>>(), 0, &self.evaluator.rule);
+        let objects = objects.into_iter().map(|(_, object)| object).collect();
+        let stamp = protocol::Stamp { publish_nanos: done_nanos, ..stamp(&own.cav, capture_nanos) };
+        Ok(Some(EvaluatedFrame { tick, stamp, result, frames, poses, objects }))
+    }
+
+    /// Lays a message where it waits for its tick.
+    fn take_in(&mut self, arrived: Arrived) {
+        let Arrived { nanos, letter } = arrived;
+        let (cav, capture_nanos) = (letter.view.cav.clone(), letter.view.capture_nanos);
+        let arrivals = self.arrivals.entry(cav.clone()).or_default();
+        arrivals.push_back((capture_nanos, nanos));
+        if arrivals.len() > self.config.pairing.depth {
+            arrivals.pop_front();
+        }
+        if let Some(lost) = self.pairing.insert(&cav, capture_nanos, letter) {
+            self.courier.dropped(&lost.cav, lost.reason);
+        }
+    }
+
+    /// When the last of the senders' messages of a tick had come; none where one is missing.
+    fn complete_nanos(&self, capture_nanos: u64, senders: &[CavId]) -> Option<u64> {
+        if self.evaluator.ego.method() == Method::None {
+            return Some(capture_nanos);
+        }
+        let of_tick = |(time, _): &&(u64, u64)| time.abs_diff(capture_nanos) <= self.config.pairing.max_lead_nanos;
+        let mut complete_nanos = capture_nanos;
+        for cav in senders {
+            let arrivals = self.arrivals.get(cav)?;
+            complete_nanos = complete_nanos.max(arrivals.iter().filter(of_tick).map(|(_, nanos)| *nanos).min()?);
+        }
+        Some(complete_nanos)
+    }
+
+    fn fuse(&mut self, tick: usize, own: &View, senders: &[CavId]) -> Result<protocol::Detections, EvaluateError> {
+        let (paired, dropped) = self.pairing.pair(own.capture_nanos);
+        let (mut views, mut bytes, mut first_uses) = (Vec::new(), Vec::new(), Vec::new());
+        for Paired { is_first_use, message, .. } in paired {
+            // A copy, as the message may serve the next tick too.
+            views.push(message.view.clone());
+            bytes.push((message.payload_bytes, message.wire_bytes));
+            first_uses.push(is_first_use);
+        }
+        let output = self.evaluator.ego.detect(own, &views)?;
+        for lost in &dropped {
+            self.courier.dropped(&lost.cav, lost.reason);
+        }
+        for (index, view) in views.iter().enumerate().filter(|(index, _)| first_uses[*index]) {
+            let left_out = output.skipped.iter().find(|(skipped, _)| *skipped == index);
+            match left_out {
+                Some((_, Skipped::Unusable(reason))) => self.courier.dropped(&view.cav, *reason),
+                Some((_, Skipped::NotNeeded)) | None => self.courier.received(&view.cav),
+            }
+        }
+        let mut result = self.evaluator.report(tick - self.config.ticks.start, own, &views, &bytes, output);
+        if self.evaluator.ego.method() != Method::None {
+            for cav in senders.iter().filter(|cav| views.iter().all(|view| view.cav != **cav)) {
+                let reason = dropped.iter().rev().find(|lost| lost.cav == *cav).map(|lost| lost.reason);
+                result.skipped.push(SkippedNeighbour { cav: cav.clone(), reason });
+            }
+        }
+        Ok(result)
+    }
+
+    /// Closes the books: what is still on its way or waits for a tick that will not come is in flight.
+    fn close(&mut self) {
+        for member in self.crew.iter().skip(1) {
+            let cav = &member.cav;
+            let waiting = self.pairing.forget(cav) as u64;
+            self.courier.close(cav, waiting);
+        }
+        self.evaluator.ledger.merge(self.courier.ledger());
+        self.evaluator.sent_bytes += self.courier.sent_bytes();
+    }
+}
+
+/// Hands over what a neighbour sends for a tick: its pose as soon as it is known, the rest when it is computed.
+fn post(courier: &mut Courier, compute: &ComputeTimes, tick: usize, sent: Sent, distance_m: f64) {
+    let sequence = tick as u64;
+    let pose_nanos = sent.capture_nanos.saturating_add(compute.pose_nanos());
+    let (cav, pose_bytes) = (sent.cav.clone(), sent.pose_bytes);
+    courier.post_pose(&cav, sequence, pose_bytes, pose_nanos, distance_m);
+    let (payload_bytes, wire_bytes) = (sent.payload_bytes, sent.wire_bytes);
+    let sent_nanos = sent.capture_nanos.saturating_add(compute.agent_nanos());
+    let stream = match sent.content.as_ref().map(ego_fuser::ego::Content::exchange) {
+        Some(Exchange::Boxes) => Stream::Boxes,
+        Some(Exchange::Points) => Stream::Points,
+        _ => Stream::Bev,
+    };
+    if let Some(RateChoice { reason, .. }) = sent.rate {
+        courier.adapted(&cav, stream, reason);
+    }
+    if let Some(view) = sent.into_view() {
+        let letter = Letter { view, payload_bytes, wire_bytes };
+        courier.post(stream, sequence, wire_bytes - pose_bytes, sent_nanos, distance_m, letter);
+    }
+}
+
+/// The places of those who take part, the ego first.
+fn places(scenario: &Scenario, crew: &Crew) -> Vec<usize> {
+    match crew {
+        Crew::First(count) => (0..scenario.agents.len()).take(*count).collect(),
+        Crew::Named(names) => {
+            names.iter().filter_map(|name| scenario.agents.iter().position(|agent| agent == name)).collect()
+        }
+    }
+}
+
+/// Between two vehicles, metres; 0 where the recording does not know.
+fn distance_m(one: &Frame, other: &Frame) -> f64 {
+    let place = |frame: &Frame| frame.world_from_lidar.map(|pose| pose.translation_m);
+    match (place(one), place(other)) {
+        (Some(one), Some(other)) => (one[0] - other[0]).hypot(one[1] - other[1]),
+        _ => 0.0,
+    }
+}

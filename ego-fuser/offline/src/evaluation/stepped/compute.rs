@@ -1,0 +1,116 @@
+//! How long the computers of a fleet take, in virtual time.
+
+use std::time::{Duration, Instant};
+
+use agent::agent::AgentInput;
+use dataset::{LoadOptions, Scenario};
+use localization::statistics::{quantile, sorted};
+use serde::{Deserialize, Serialize};
+
+use super::super::{EvaluateError, Evaluator, view};
+use ego_fuser::ego::own_content;
+
+/// Ticks that times are measured over.
+const MEASURED_TICKS: usize = 5;
+/// Vehicles that they are measured with: the ego and a neighbour.
+const MEASURED_VEHICLES: usize = 2;
+
+/// Compute time of each step, milliseconds: the same for all vehicles and ticks.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct ComputeTimes {
+    /// From the capture of a sweep to the publication of the pose.
+    pub pose_ms: f64,
+    /// From there to the publication of map, boxes or points.
+    pub map_ms: f64,
+    /// From the decision of the ego to the publication of its detections.
+    pub fuse_ms: f64,
+}
+
+impl ComputeTimes {
+    /// Computers that take no time at all.
+    pub const NONE: Self = Self { pose_ms: 0.0, map_ms: 0.0, fuse_ms: 0.0 };
+
+    pub(super) fn pose_nanos(&self) -> u64 {
+        nanos(self.pose_ms)
+    }
+
+    pub(super) fn map_nanos(&self) -> u64 {
+        nanos(self.map_ms)
+    }
+
+    pub(super) fn fuse_nanos(&self) -> u64 {
+        nanos(self.fuse_ms)
+    }
+
+    /// Until an agent has published everything of a sweep.
+    pub(super) fn agent_nanos(&self) -> u64 {
+        self.pose_nanos().saturating_add(self.map_nanos())
+    }
+
+    /// Virtual computers take every sweep: whoever cannot keep up would have to leave some out, and is refused.
+    pub(super) fn check(&self, scenario: &Scenario) -> Result<(), EvaluateError> {
+        let steps = scenario.ticks.windows(2).map(|pair| pair[1].capture_nanos.saturating_sub(pair[0].capture_nanos));
+        let Some(period_nanos) = steps.min() else { return Ok(()) };
+        let steps = [("an agent (pose_ms + map_ms)", self.agent_nanos()), ("the ego (fuse_ms)", self.fuse_nanos())];
+        for (what, takes_nanos) in steps {
+            if takes_nanos > period_nanos {
+                let [takes_ms, period_ms] = [takes_nanos, period_nanos].map(|nanos| nanos as f64 * 1e-6);
+                return Err(EvaluateError::TooSlow { what, takes_ms, period_ms });
+            }
+        }
+        Ok(())
+    }
+}
+
+impl Evaluator {
+    /// Measures the first ticks of a scenario on this machine: medians, rounded up to whole milliseconds. Written into a
+    /// scenario they make its run repeatable.
+    ///
+    /// # Errors
+    /// [`EvaluateError`] when a frame cannot be read or computed.
+    pub fn measure(&mut self, scenario: &Scenario) -> Result<ComputeTimes, EvaluateError> {
+        let exchange = own_content(self.ego.method());
+        let vehicles = scenario.agents.iter().take(MEASURED_VEHICLES);
+        let mut agents =
+            vehicles.map(|cav| self.agent(scenario, cav, true, None)).collect::<Result<Vec<_>, EvaluateError>>()?;
+        let [mut pose, mut map, mut fuse] = [const { Vec::<f64>::new() }; 3];
+        self.ego.forget();
+        for tick in 0..scenario.ticks.len().min(MEASURED_TICKS) {
+            let mut sent = Vec::with_capacity(agents.len());
+            for (place, agent) in agents.iter_mut().enumerate() {
+                if !scenario.is_present(place, tick) {
+                    continue;
+                }
+                let frame = scenario.load(place, tick, &LoadOptions::default())?;
+                let input = AgentInput {
+                    capture_nanos: frame.capture_nanos,
+                    cloud: &frame.points,
+                    measured_pose: frame.world_from_lidar.as_ref(),
+                };
+                let began = Instant::now();
+                agent.estimate_pose(&input);
+                let pose_time = began.elapsed();
+                sent.extend(view(agent, &frame, None, Some(exchange), &self.config.codec)?.into_view());
+                pose.push(ms(pose_time));
+                map.push(ms(began.elapsed().saturating_sub(2 * pose_time)));
+            }
+            let began = Instant::now();
+            if let [own, neighbours @ ..] = &sent[..] {
+                self.ego.detect(own, neighbours)?;
+            }
+            fuse.push(ms(began.elapsed()));
+        }
+        self.ego.forget();
+        let median = |sample: &[f64]| quantile(&sorted(sample), 0.5).unwrap_or(0.0).ceil();
+        Ok(ComputeTimes { pose_ms: median(&pose), map_ms: median(&map), fuse_ms: median(&fuse) })
+    }
+}
+
+fn ms(time: Duration) -> f64 {
+    time.as_secs_f64() * 1e3
+}
+
+fn nanos(ms: f64) -> u64 {
+    (ms * 1e6).round().max(0.0) as u64
+}

@@ -1,0 +1,196 @@
+//! Vehicles whose pipelines run in processes of their own: sweeps go out over the bus, what they see comes back.
+//!
+//! All advance in lockstep: nobody gets the next sweep before everyone has answered to this one. So nothing is ever
+//! overwritten on the way, and no clock decides anything; when an answer counts as sent, virtual time says.
+
+use std::collections::BTreeMap;
+use std::fmt;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use bus::bounded_queue::Taken;
+use bus::shutdown::Stop;
+use bus::{
+    Arrival, Barrier, Bus, BusError, Event, Inbox, NotReady, Publisher, PublisherOptions, Route, Subscription,
+    process_id,
+};
+use dataset::frame::Frame;
+use protocol::message::{Bev, Boxes, GnssSource, Points};
+use protocol::{
+    CavId, Gnss, HEADER_LEN, Lidar, Limits, PoseEstimate, ProcessId, RateChoice, Role, Stream, Topic, WireError,
+};
+
+use super::super::Sent;
+use ego_fuser::ego::Content;
+
+/// How long all vehicles together may take for a tick: a machine however busy, but not one that has lost a process.
+const PATIENCE: Duration = Duration::from_secs(120);
+
+/// Why the vehicles cannot be asked.
+#[derive(Debug, thiserror::Error)]
+pub enum RemoteError {
+    /// The bus refuses.
+    #[error(transparent)]
+    Bus(#[from] BusError),
+    /// Not all processes came up.
+    #[error(transparent)]
+    NotReady(#[from] NotReady),
+    /// A vehicle does not answer.
+    #[error("no answer of {cavs} to the sweep of {capture_nanos} ns; their logs may say why")]
+    Silent {
+        /// Which, with commas between.
+        cavs: String,
+        /// Capture time of the sweep.
+        capture_nanos: u64,
+    },
+    /// What a vehicle says is unsound.
+    #[error("{topic}: {source}")]
+    Unsound {
+        /// On which topic.
+        topic: Topic,
+        /// What is wrong with it.
+        source: WireError,
+    },
+}
+
+/// Where the sweeps of a vehicle go.
+struct Sensors {
+    gnss: Publisher,
+    lidar: Publisher,
+}
+
+/// All vehicles of a run in virtual time, each a process.
+pub struct RemoteCrew {
+    inbox: Arc<Inbox>,
+    sensors: BTreeMap<CavId, Sensors>,
+    _subscriptions: Vec<Subscription>,
+}
+
+impl fmt::Debug for RemoteCrew {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("RemoteCrew").field("vehicles", &self.sensors.keys()).finish_non_exhaustive()
+    }
+}
+
+/// What has come of an answer.
+#[derive(Default)]
+struct Answer {
+    pose: Option<(PoseEstimate, u64)>,
+    content: Option<(Content, u64, Option<RateChoice>)>,
+}
+
+impl RemoteCrew {
+    /// Waits until the process of every vehicle is there, for `patience` at most. Each sends the stream named beside it.
+    /// When `stop` is requested nobody is waited for any more.
+    ///
+    /// # Errors
+    /// [`RemoteError`] names those that are not there.
+    pub fn meet(bus: &Bus, vehicles: &[(CavId, Stream)], patience: Duration, stop: &Stop) -> Result<Self, RemoteError> {
+        let inbox = bus.inbox(2, 2 * vehicles.len());
+        stop.on_request({
+            let inbox = Arc::clone(&inbox);
+            move || inbox.close()
+        });
+        let (mut sensors, mut subscriptions, mut routes) = (BTreeMap::new(), Vec::new(), Vec::new());
+        let here = bus.identity().process.clone();
+        for (cav, stream) in vehicles {
+            let topic = |stream| Topic::Stream { cav: cav.clone(), stream };
+            let publisher = |stream| bus.publisher(topic(stream), PublisherOptions::SENSOR.lossless(1));
+            sensors.insert(cav.clone(), Sensors { gnss: publisher(Stream::Gnss)?, lidar: publisher(Stream::Lidar)? });
+            let there = process_id(Role::Agent, cav);
+            let route = |stream, receiver: &ProcessId| Route { topic: topic(stream), receiver: receiver.clone() };
+            routes.extend([route(Stream::Gnss, &there), route(Stream::Lidar, &there)]);
+            for stream in [Stream::Pose, *stream] {
+                subscriptions.push(bus.subscribe(topic(stream), &inbox)?);
+                routes.push(route(stream, &here));
+            }
+        }
+        Barrier::new(routes).attend(bus)?.wait(patience)?;
+        Ok(Self { inbox, sensors, _subscriptions: subscriptions })
+    }
+
+    /// There are no more sweeps.
+    pub(in super::super) fn finish(self) {
+        self.sensors.into_values().flat_map(|sensors| [sensors.gnss, sensors.lidar]).for_each(Publisher::finish);
+    }
+
+    /// Hands out the sweeps of a tick and waits for all answers, in the same order.
+    pub(super) fn ask(&self, frames: &[&Frame]) -> Result<Vec<Sent>, RemoteError> {
+        for frame in frames {
+            let Some(Sensors { gnss, lidar }) = self.sensors.get(&frame.cav) else { continue };
+            if let Some(world_from_lidar) = frame.world_from_lidar {
+                let source = GnssSource::Recorded;
+                let measured = Gnss { world_from_lidar, position_std_m: 0.0, heading_std_rad: 0.0, source };
+                gnss.offer(frame.capture_nanos, measured);
+            }
+            lidar.offer(frame.capture_nanos, Lidar { points: frame.points.clone() });
+        }
+        let deadline = Instant::now() + PATIENCE;
+        let mut answers: BTreeMap<&CavId, Answer> =
+            frames.iter().map(|frame| (&frame.cav, Answer::default())).collect();
+        let is_open = |(_, answer): &(&&CavId, &Answer)| answer.pose.is_none() || answer.content.is_none();
+        while answers.iter().any(|entry| is_open(&entry)) {
+            match self.inbox.take(Some(deadline)) {
+                Taken::Item(topic, Event::Message(arrival)) => {
+                    let Topic::Stream { cav, stream } = &topic else { continue };
+                    let asked = frames
+                        .iter()
+                        .any(|frame| frame.cav == *cav && frame.capture_nanos == arrival.header.stamp.capture_nanos);
+                    if let Some(answer) = answers.get_mut(cav).filter(|_| asked) {
+                        answer
+                            .note(*stream, &arrival)
+                            .map_err(|source| RemoteError::Unsound { topic: topic.clone(), source })?;
+                    }
+                }
+                Taken::Item(..) => {}
+                Taken::TimedOut | Taken::Closed => {
+                    let silent = answers.iter().filter(is_open).map(|(cav, _)| cav.to_string());
+                    let cavs = silent.collect::<Vec<_>>().join(", ");
+                    return Err(RemoteError::Silent {
+                        cavs,
+                        capture_nanos: frames.first().map_or(0, |f| f.capture_nanos),
+                    });
+                }
+            }
+        }
+        Ok(frames.iter().filter_map(|frame| answers.remove(&frame.cav)?.into_sent(frame)).collect())
+    }
+}
+
+impl Answer {
+    fn note(&mut self, stream: Stream, arrival: &Arrival) -> Result<(), WireError> {
+        let (limits, bytes) = (Limits::default(), arrival.wire_bytes());
+        match stream {
+            Stream::Pose => self.pose = Some((arrival.decode(&limits)?, bytes)),
+            Stream::Bev => {
+                let message: Bev = arrival.decode(&limits)?;
+                let rate = message.features.rate;
+                self.content = Some((Content::Features(message.features.decode(&limits)?), bytes, rate));
+            }
+            Stream::Boxes => {
+                let message: Boxes = arrival.decode(&limits)?;
+                self.content = Some((Content::Boxes(message.detections), bytes, None));
+            }
+            Stream::Points => {
+                let message: Points = arrival.decode(&limits)?;
+                self.content = Some((Content::Points(message.points), bytes, None));
+            }
+            _ => {}
+        }
+        Ok(())
+    }
+
+    fn into_sent(self, frame: &Frame) -> Option<Sent> {
+        let ((pose, pose_bytes), (content, bytes, rate)) = (self.pose?, self.content?);
+        Some(Sent {
+            cav: frame.cav.clone(),
+            capture_nanos: frame.capture_nanos,
+            pose,
+            content: Some(content),
+            payload_bytes: bytes - HEADER_LEN as u64,
+            wire_bytes: bytes + pose_bytes,
+            pose_bytes,
+            rate,
+        })
+    }
+}

@@ -1,0 +1,68 @@
+//! Sweeps of one tick: the frames of all agents that take part, with their kept feature maps.
+
+use dataset::frame::Frame;
+use dataset::{LeftOut, LoadOptions, Problem, ReadError, Scenario};
+use tch::Tensor;
+
+use super::{EvaluateError, Evaluator};
+use training::feature_store::FeatureStoreError;
+
+/// The sweep of one agent.
+#[derive(Debug)]
+pub(super) struct Sweep {
+    /// Index of the agent in the scenario.
+    pub(super) place: usize,
+    /// Pose, annotations and, where needed, points.
+    pub(super) frame: Frame,
+    /// The map `[1, C, H, W]` that its encoder made before; absent where none are kept.
+    pub(super) map: Option<Tensor>,
+}
+
+impl Evaluator {
+    /// Reads what the agents at `places` have at a tick. Absent agents and frames that cannot be read are left out and
+    /// counted; `with_maps` says whose maps are needed.
+    pub(super) fn sweeps(
+        &mut self,
+        scenario: &Scenario,
+        tick: usize,
+        places: &[usize],
+        load: &LoadOptions,
+        with_maps: impl Fn(usize) -> bool,
+    ) -> Result<Vec<Sweep>, EvaluateError> {
+        let loaded = scenario.load_tick(tick, places.iter().copied(), load);
+        self.left_out.add_tick(&loaded);
+        let mut sweeps = Vec::with_capacity(loaded.frames.len());
+        for (place, frame) in loaded.frames {
+            match self.map_of(scenario, place, tick, with_maps(place)) {
+                Ok(map) => sweeps.push(Sweep { place, frame, map }),
+                Err(FeatureStoreError::Read(error)) => self.left_out.add_unreadable(place, Problem::from(&error)),
+                Err(other) => return Err(Box::new(other).into()),
+            }
+        }
+        Ok(sweeps)
+    }
+
+    /// Adds to what was left out what was found when the data set was opened.
+    pub fn add_left_out_files(&mut self, problems: &[ReadError]) {
+        self.left_out.add_files(problems);
+    }
+
+    /// What was left out so far.
+    #[must_use]
+    pub fn left_out(&self) -> &LeftOut {
+        &self.left_out
+    }
+
+    /// The kept map of a sweep; none where none are kept or none is needed.
+    fn map_of(
+        &mut self,
+        scenario: &Scenario,
+        agent: usize,
+        tick: usize,
+        is_needed: bool,
+    ) -> Result<Option<Tensor>, FeatureStoreError> {
+        let Some(maps) = self.maps.as_mut().filter(|_| is_needed) else { return Ok(None) };
+        let Some(index) = maps.index_of(&scenario.name) else { return Ok(None) };
+        maps.map(index, scenario, agent, tick).map(Some)
+    }
+}

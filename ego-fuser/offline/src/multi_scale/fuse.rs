@@ -1,0 +1,116 @@
+//! The fusion of all levels.
+
+use perception::layers::agent_attention::attend_ego;
+use perception::layers::backbone::BevBackbone;
+use protocol::{BevGrid, Pose};
+use tch::{TchError, Tensor};
+
+use fusion::warp::{cav_from_ego_normalized, coalign};
+use fusion::where2comm::Aggregation;
+
+/// Where the maps of a sample lie; the first is the ego's.
+#[derive(Debug)]
+pub struct Placement {
+    /// Number of agents.
+    pub agents: i64,
+    /// `[agents, 2, 3]`, from coordinates -1..1 of the ego's map to those of each agent's, outer edges at -1 and 1: the
+    /// same at every level. `None`: clouds were brought to the frame of the ego before they were encoded.
+    pub theta: Option<Tensor>,
+}
+
+impl Placement {
+    /// By poses, the ego's first; `grid` is that of any level.
+    ///
+    /// # Errors
+    /// [`TchError`] when there is no pose.
+    pub fn of_poses(ego_from_cav: &[Pose], grid: &BevGrid) -> Result<Self, TchError> {
+        let entries: Vec<f32> = ego_from_cav.iter().flat_map(|pose| cav_from_ego_normalized(pose, grid)).collect();
+        let agents = ego_from_cav.len() as i64;
+        Ok(Self { agents, theta: Some(Tensor::f_from_slice(&entries)?.f_view([agents, 2, 3])?) })
+    }
+}
+
+/// How the levels are fused.
+#[derive(Debug)]
+pub struct Levels<'a> {
+    /// The agents of each sample, which follow each other along dimension 0 of the maps.
+    pub samples: &'a [Placement],
+    /// How a cell's features become one; cells that have not come are zeros, as where these networks were trained.
+    pub aggregation: Aggregation,
+    /// `[sum of agents, 1, h, w]`: what is sent of the first level's maps, and thereby of those below.
+    pub sent: Option<&'a Tensor>,
+}
+
+/// Runs a backbone on canvases `[sum of agents, C, H, W]` and fuses at each level: `[samples, sum of C_up, H', W']`.
+///
+/// # Errors
+/// [`TchError`] when the samples do not add up to the canvases.
+pub fn fuse_levels(backbone: &BevBackbone, canvas: &Tensor, levels: &Levels<'_>) -> Result<Tensor, TchError> {
+    let mut maps = canvas.shallow_clone();
+    let mut fused = Vec::with_capacity(backbone.levels());
+    for level in 0..backbone.levels() {
+        maps = backbone.level(level, &maps, false);
+        if let (0, Some(sent)) = (level, levels.sent) {
+            let (_, _, height, width) = maps.size4()?;
+            maps = maps.f_mul(&resized(sent, [height, width])?)?;
+        }
+        fused.push(fuse_samples(&maps, levels)?);
+    }
+    Ok(backbone.upsampled(&fused, false))
+}
+
+/// A mask of another level, read between its cells.
+pub(super) fn resized(mask: &Tensor, size: [i64; 2]) -> Result<Tensor, TchError> {
+    let (_, _, height, width) = mask.size4()?;
+    if [height, width] == size {
+        return Ok(mask.shallow_clone());
+    }
+    mask.f_upsample_bilinear2d(size, false, None, None)
+}
+
+fn fuse_samples(maps: &Tensor, levels: &Levels<'_>) -> Result<Tensor, TchError> {
+    let counts: Vec<i64> = levels.samples.iter().map(|sample| sample.agents).collect();
+    let fused = maps.f_split_with_sizes(&counts, 0)?.into_iter().zip(levels.samples).map(|(maps, sample)| {
+        let maps = match &sample.theta {
+            Some(theta) => coalign::warp_affine(&maps, theta)?,
+            None => maps,
+        };
+        match levels.aggregation {
+            Aggregation::Attention => attend_ego(&maps, None),
+            Aggregation::Max => maps.f_amax([0i64].as_slice(), false),
+        }
+    });
+    Tensor::f_stack(&fused.collect::<Result<Vec<_>, _>>()?, 0)
+}
+
+#[cfg(test)]
+mod tests {
+    use perception::model_config::DetectorConfig;
+    use tch::nn::VarStore;
+    use tch::{Device, Kind, no_grad};
+
+    use super::*;
+
+    #[test]
+    fn alone_it_is_the_backbone_and_wrong_counts_are_refused() {
+        tch::set_num_threads(1);
+        let config = DetectorConfig { lidar_range_m: [-6.4, -6.4, -3.0, 6.4, 6.4, 1.0], ..DetectorConfig::lean() };
+        let variables = VarStore::new(Device::Cpu);
+        let backbone = BevBackbone::new(&variables.root(), &config);
+        let canvas = Tensor::randn([2, config.pillar_channels, 32, 32], (Kind::Float, Device::Cpu));
+        let fused = |samples: &[Placement], aggregation| {
+            no_grad(|| fuse_levels(&backbone, &canvas, &Levels { samples, aggregation, sent: None }))
+        };
+        let expected = no_grad(|| backbone.forward(&canvas, false));
+        let grid = config.feature_grid();
+        let alone = || Placement::of_poses(&[Pose::IDENTITY], &grid).unwrap();
+        for aggregation in [Aggregation::Attention, Aggregation::Max] {
+            let alone = fused(&[alone(), alone()], aggregation).unwrap();
+            assert!(alone.allclose(&expected, 1e-4, 1e-4, false), "{aggregation:?}");
+            let together = fused(&[Placement { agents: 2, theta: None }], aggregation).unwrap();
+            assert_eq!(together.size()[0], 1);
+            assert!(!together.get(0).allclose(&expected.get(0), 1e-3, 1e-3, false), "{aggregation:?}");
+        }
+        assert!(fused(&[Placement { agents: 3, theta: None }], Aggregation::Max).is_err());
+    }
+}

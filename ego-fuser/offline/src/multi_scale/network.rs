@@ -1,0 +1,179 @@
+//! A whole network from pillars to heads that fuses at every level.
+
+use std::path::Path;
+
+use perception::layers::head::HeadOutput;
+use perception::model_config::{ConfigError, DetectorConfig};
+use perception::pillars::batch::PillarBatch;
+use perception::pillars::point_pillars::PointPillars;
+use perception::weights::Weights;
+use serde::{Deserialize, Serialize};
+use tch::nn::VarStore;
+use tch::{Device, Kind, TchError, Tensor};
+
+use super::fuse::{Levels, Placement, fuse_levels, resized};
+use fusion::FUSION_KEY;
+use fusion::model::ModelError;
+use fusion::where2comm::{Aggregation, Communication, CommunicationConfig};
+
+/// Kind of the weights files of these networks.
+pub const MULTI_SCALE_KIND: &str = "multi_scale_detector";
+
+/// Who leaves cells out, where agents choose what to send.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Senders {
+    /// All but the ego, as in OpenCOOD.
+    #[default]
+    Neighbours,
+    /// Every second agent of a sample, the first being the ego: as in Where2comm's own code, which was written for pairs.
+    EverySecond,
+}
+
+/// What a network has beside its detector, stored as JSON beside its weights.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct MultiScaleConfig {
+    /// How a cell's features become one.
+    pub aggregation: Aggregation,
+    /// Which cells agents send; absent: all.
+    #[serde(default)]
+    pub communication: Option<CommunicationConfig>,
+    /// Who leaves cells out.
+    #[serde(default)]
+    pub senders: Senders,
+    /// Whether it was trained on clouds brought to the frame of the ego, so that maps are not moved.
+    #[serde(default)]
+    pub one_frame: bool,
+}
+
+/// A detector that fuses the maps of several agents at every level of its backbone, for inference.
+#[derive(Debug)]
+pub struct MultiScaleNetwork {
+    /// Every variable, by the names of the weights file.
+    pub variables: VarStore,
+    config: MultiScaleConfig,
+    network: PointPillars,
+    communication: Option<Communication>,
+}
+
+/// What a network says of samples.
+#[derive(Debug)]
+pub struct MultiScaleOutput {
+    /// Scores and offsets, `[samples, ...]`.
+    pub heads: HeadOutput,
+    /// Share of their cells that agents send, the ego's own counted as if it sent; 1 where all do.
+    pub rate: f64,
+    /// What each agent has to send, bytes: the map of its first level in `f32`, from which the others follow; where it leaves
+    /// cells out, those that it sends and a mask of them.
+    pub sent_bytes: Vec<u64>,
+}
+
+impl MultiScaleNetwork {
+    /// A network with random parameters: those of [`PointPillars`] and, where agents choose what to send,
+    /// `fusion_net.naive_communication.*`.
+    ///
+    /// # Errors
+    /// [`ConfigError`] when none can be built.
+    pub fn new(detector: &DetectorConfig, config: &MultiScaleConfig, device: Device) -> Result<Self, ConfigError> {
+        if detector.compress_ratio.is_some() {
+            let (field, value) = ("compress_ratio", format!("{:?}", detector.compress_ratio));
+            return Err(ConfigError::Value { field, value, must: "absent where levels are fused" });
+        }
+        let variables = VarStore::new(device);
+        let network = PointPillars::new(&variables.root(), detector)?;
+        let path = variables.root() / "fusion_net" / "naive_communication";
+        let communication =
+            config.communication.as_ref().map(|config| Communication::new(&path, config)).transpose()?;
+        Ok(Self { variables, config: config.clone(), network, communication })
+    }
+
+    /// Reads a weights file whose metadata hold the configurations of detector (`config`) and fusion (`fusion`).
+    ///
+    /// # Errors
+    /// [`ModelError`] names the file and what does not fit.
+    pub fn load(path: &Path, device: Device) -> Result<Self, ModelError> {
+        let weights = Weights::load(path)?;
+        weights.check_kind(MULTI_SCALE_KIND)?;
+        let model = Self::new(&weights.config()?, &weights.metadata_json(FUSION_KEY)?, device)?;
+        weights.copy_into(&model.variables)?;
+        Ok(model)
+    }
+
+    /// The detector.
+    #[must_use]
+    pub fn network(&self) -> &PointPillars {
+        &self.network
+    }
+
+    /// What it has beside its detector.
+    #[must_use]
+    pub fn config(&self) -> &MultiScaleConfig {
+        &self.config
+    }
+
+    /// From the pillars of all agents to scores and offsets of every sample.
+    ///
+    /// # Errors
+    /// [`TchError`] when the samples do not add up to the sweeps.
+    pub fn forward(&self, pillars: &PillarBatch, samples: &[Placement]) -> Result<MultiScaleOutput, TchError> {
+        let network = &self.network;
+        let canvas = pillars.scatter(&network.encoder.forward(pillars, false), network.lattice());
+        let (sent, rate) = match &self.communication {
+            Some(communication) => {
+                let alone = network.heads(&network.features_of_canvas(&canvas, false))?;
+                let masks = communication.masks(&alone.scores)?;
+                let rate = mean_rate(&masks, samples)?;
+                (Some(self.without_the_exempt(&masks, samples)?), rate)
+            }
+            None => (None, 1.0),
+        };
+        let sent_bytes = self.sent_bytes(sent.as_ref(), samples)?;
+        let levels = Levels { samples, aggregation: self.config.aggregation, sent: sent.as_ref() };
+        let fused = fuse_levels(&network.backbone, &canvas, &levels)?;
+        let fused = match &network.shrink {
+            Some(shrink) => shrink.forward(&fused, false),
+            None => fused,
+        };
+        Ok(MultiScaleOutput { heads: network.heads(&fused)?, rate, sent_bytes })
+    }
+
+    /// Bytes of the first level's map of each agent.
+    fn sent_bytes(&self, sent: Option<&Tensor>, samples: &[Placement]) -> Result<Vec<u64>, TchError> {
+        let (lattice, config) = (self.network.lattice(), &self.network.config);
+        let stride = config.layer_strides[0];
+        let [height, width] = [lattice.height, lattice.width].map(|extent| extent as u64);
+        let [height, width] = [height, width].map(|extent| extent.div_ceil(stride.unsigned_abs()));
+        let (cells, cell_bytes) = (height * width, 4 * config.num_filters[0].unsigned_abs());
+        let agents = samples.iter().map(|sample| sample.agents).sum::<i64>();
+        let Some(sent) = sent else { return Ok(vec![cells * cell_bytes; agents.unsigned_abs() as usize]) };
+        let selected = resized(sent, [height as i64, width as i64])?.f_gt(0.0)?;
+        let selected: Vec<i64> =
+            Vec::try_from(&selected.f_sum_dim_intlist([1i64, 2, 3].as_slice(), false, Kind::Int64)?)?;
+        let bytes = |selected: u64| {
+            if selected == cells { cells * cell_bytes } else { cells.div_ceil(8) + selected * cell_bytes }
+        };
+        Ok(selected.into_iter().map(|selected| bytes(selected.unsigned_abs())).collect())
+    }
+
+    /// The masks with those at one everywhere who send all.
+    fn without_the_exempt(&self, masks: &Tensor, samples: &[Placement]) -> Result<Tensor, TchError> {
+        let sends_all = samples.iter().flat_map(|sample| {
+            (0..sample.agents).map(|agent| match self.config.senders {
+                Senders::Neighbours => agent == 0,
+                Senders::EverySecond => agent % 2 == 0,
+            })
+        });
+        let sends_all: Vec<f32> = sends_all.map(|all| if all { 1.0 } else { 0.0 }).collect();
+        let sends_all = Tensor::f_from_slice(&sends_all)?.f_view([-1, 1, 1, 1])?.f_to_device(masks.device())?;
+        masks.f_maximum(&sends_all)
+    }
+}
+
+/// The share of cells that is sent, averaged over samples as the reference does.
+fn mean_rate(masks: &Tensor, samples: &[Placement]) -> Result<f64, TchError> {
+    let counts: Vec<i64> = samples.iter().map(|sample| sample.agents).collect();
+    let shares = masks.f_split_with_sizes(&counts, 0)?;
+    let sum: f64 = shares.iter().map(|sample| sample.mean(Kind::Double).double_value(&[])).sum();
+    Ok(sum / samples.len().max(1) as f64)
+}

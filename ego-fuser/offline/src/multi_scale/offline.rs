@@ -1,0 +1,126 @@
+//! Multi-scale networks on recorded frames.
+
+use std::path::Path;
+
+use dataset::frame::Frame;
+use dataset::ground_truth::GroundTruthRule;
+use nalgebra::Isometry3;
+use perception::boxes::anchors::Anchors;
+use perception::boxes::decode::decode;
+use perception::boxes::postprocess::{AgentBoxes, PostprocessConfig, postprocess};
+use perception::crop::Crop;
+use perception::model_config::YAxis;
+use perception::pillars::batch::PillarBatch;
+use perception::pillars::voxels::{Pillars, Voxeliser};
+use protocol::{Detection, PointCloud, Pose};
+use tch::{Device, no_grad};
+
+use super::{MultiScaleNetwork, MultiScaleOutput, Placement};
+use crate::evaluation::rule_for;
+use ego_fuser::ego::Ego;
+use fusion::model::{ModelError, flat};
+use fusion::points::merge_points;
+
+/// Detects in the recorded sweeps of several vehicles, by their recorded poses.
+#[derive(Debug)]
+pub struct OfflineDetector {
+    network: MultiScaleNetwork,
+    crop: Crop,
+    voxeliser: Voxeliser,
+    anchors: Anchors,
+    limits: PostprocessConfig,
+}
+
+impl OfflineDetector {
+    /// Reads a weights file of a multi-scale network.
+    ///
+    /// # Errors
+    /// [`ModelError`] names the file and what does not fit.
+    pub fn load(path: &Path) -> Result<Self, ModelError> {
+        let network = MultiScaleNetwork::load(path, Device::Cpu)?;
+        let config = &network.network().config;
+        Ok(Self {
+            crop: Crop::for_detector(config),
+            voxeliser: Voxeliser::for_detector(config),
+            anchors: Anchors::for_detector(config),
+            limits: PostprocessConfig::for_detector(config),
+            network,
+        })
+    }
+
+    /// The network.
+    #[must_use]
+    pub fn network(&self) -> &MultiScaleNetwork {
+        &self.network
+    }
+
+    /// The objects that count over its area.
+    #[must_use]
+    pub fn rule(&self) -> GroundTruthRule {
+        rule_for(&self.network.network().config)
+    }
+
+    /// Detections in the frame of the first vehicle, and what each of the others that took part had to send, bytes: those
+    /// with a pose, in reach.
+    ///
+    /// # Errors
+    /// [`ModelError`] when the tensor library refuses.
+    pub fn detect(&mut self, frames: &[Frame]) -> Result<(Vec<Detection>, Vec<u64>), ModelError> {
+        let Some((ego, others)) = frames.split_first() else { return Ok((Vec::new(), Vec::new())) };
+        let placed = |frame: &Frame| {
+            let pose = ego.world_from_lidar?.from_world(&frame.world_from_lidar?);
+            let [x, y, _] = pose.translation_m;
+            (x.hypot(y) <= Ego::COMM_RANGE_M).then_some(pose)
+        };
+        let mut poses = vec![Pose::IDENTITY];
+        let mut sweeps = vec![self.pillars(&ego.points, &Pose::IDENTITY)];
+        for frame in others {
+            if let Some(pose) = placed(frame) {
+                sweeps.push(self.pillars(&frame.points, &pose));
+                poses.push(pose);
+            }
+        }
+        self.boxes(&sweeps, &poses)
+    }
+
+    /// The pillars of a vehicle's sweep, in the frame that its network encodes in.
+    fn pillars(&mut self, cloud: &PointCloud, ego_from_cav: &Pose) -> Pillars {
+        let cloud = self.crop.without_own_body(cloud);
+        let cloud = if self.network.config().one_frame { merge_points([&cloud], &[*ego_from_cav]) } else { cloud };
+        let mut kept = Vec::new();
+        self.crop.range_only().keep(&cloud.xyzi, &mut kept);
+        if self.is_mirrored() {
+            kept.iter_mut().for_each(|point| point[1] = -point[1]);
+        }
+        self.voxeliser.voxelise(&kept)
+    }
+
+    fn is_mirrored(&self) -> bool {
+        self.network.network().config.y_axis == YAxis::Right
+    }
+
+    fn boxes(&self, sweeps: &[Pillars], poses: &[Pose]) -> Result<(Vec<Detection>, Vec<u64>), ModelError> {
+        let network = self.network.network();
+        let batch = PillarBatch::new(&sweeps.iter().collect::<Vec<_>>(), network.lattice());
+        let mirrored: Vec<Pose> = poses.iter().map(Pose::mirrored_y).collect();
+        let poses = if self.is_mirrored() { &mirrored } else { poses };
+        let placement = if self.network.config().one_frame {
+            Placement { agents: poses.len() as i64, theta: None }
+        } else {
+            Placement::of_poses(poses, &network.config.feature_grid())?
+        };
+        let MultiScaleOutput { heads, sent_bytes, .. } = no_grad(|| self.network.forward(&batch, &[placement]))?;
+        let (scores, offsets) = (flat(&heads.scores, 0)?, flat(&heads.offsets, 0)?);
+        let mut boxes = decode(&scores, &offsets, &self.anchors, self.limits.score_threshold)?;
+        if self.is_mirrored() {
+            for found in &mut boxes {
+                found.box3d = found.box3d.mirrored_y();
+            }
+        }
+        let own = AgentBoxes { boxes: &boxes, output_from_agent: Isometry3::identity() };
+        let found = postprocess(&[own], &self.limits);
+        // What the ego has itself does not cross the air.
+        let sent_bytes = sent_bytes.into_iter().skip(1).collect();
+        Ok((found.iter().map(|candidate| candidate.detection(None)).collect(), sent_bytes))
+    }
+}

@@ -1,0 +1,187 @@
+//! What one vehicle's message shows, looked at alone and in its own frame.
+
+use nalgebra::Isometry3;
+use perception::boxes::postprocess::{AgentBoxes, PostprocessConfig, postprocess};
+use perception::detector::{Detector, DetectorError};
+use perception::model_config::YAxis;
+use protocol::BevGrid;
+use tch::Tensor;
+
+use crate::ego::Content;
+
+/// Boxes below this score say nothing about who sent them.
+const SURE: f32 = 0.3;
+/// Boxes at or below this score are no evidence for or against who sent them. It has nothing to do with which boxes are
+/// judged.
+const EVIDENT: f32 = 0.2;
+/// Values of a map that are compared to tell copies, spread over it.
+const PRINT_VALUES: usize = 4096;
+/// How far a detector looks, where there is no map to say so, metres.
+const REACH_M: f64 = 35.0;
+
+/// What a message shows.
+#[derive(Debug)]
+pub(super) struct Seen {
+    /// Where there are vehicles, sure ones only, metres.
+    pub(super) vehicles: Vec<[f64; 2]>,
+    /// How sure the head is of a vehicle at each cell; or all boxes and their scores, where there are boxes only.
+    sure: Sure,
+    /// Enough of it to tell a copy.
+    pub(super) print: Vec<f32>,
+    /// Whether these are points in which there is not one vehicle.
+    pub(super) is_blind: bool,
+}
+
+#[derive(Debug)]
+enum Sure {
+    Cells(BevGrid, Vec<f32>),
+    Boxes(Vec<([f64; 2], f32)>),
+}
+
+impl Seen {
+    /// Looks at a message; `empty` is the map of an empty world, `[C, H, W]`. Points are encoded for it.
+    pub(super) fn in_message(content: &Content, detector: &mut Detector, empty: &[f32]) -> Result<Self, DetectorError> {
+        match content {
+            Content::Features(map) => Self::in_map(&detector.received(map)?, map.sent.as_deref(), detector, empty),
+            Content::Boxes(found) => {
+                let at = |[x, y, _]: [f64; 3]| [x, y];
+                let evident = found.iter().filter(|found| found.score > EVIDENT);
+                Ok(Self::of_boxes(evident.map(|found| (at(found.box3d.center_m), found.score)).collect()))
+            }
+            Content::Points(points) => {
+                let encoded = detector.encode(points)?.features;
+                let seen = Self::in_map(&detector.through_compressor(&encoded)?, None, detector, empty)?;
+                Ok(Self { is_blind: seen.vehicles.is_empty(), ..seen })
+            }
+        }
+    }
+
+    pub(super) fn of_boxes(all: Vec<([f64; 2], f32)>) -> Self {
+        let vehicles: Vec<_> = all.iter().filter(|(_, score)| *score >= SURE).map(|(at_m, _)| *at_m).collect();
+        let print = all.iter().flat_map(|([x, y], score)| [*x as f32, *y as f32, *score]).collect();
+        Self { vehicles, sure: Sure::Boxes(all), print, is_blind: false }
+    }
+
+    /// In a map `[1, C, H, W]`, of which the `sent` cells came; all where absent.
+    fn in_map(map: &Tensor, sent: Option<&[bool]>, detector: &Detector, empty: &[f32]) -> Result<Self, DetectorError> {
+        let grid = detector.grid();
+        let heads = detector.heads(map)?;
+        // What was left out has no features that a head could make sense of.
+        let was_sent = |cell: usize| sent.is_none_or(|sent| sent[cell]);
+        let limits =
+            PostprocessConfig { score_threshold: SURE, ..PostprocessConfig::for_late_fusion(detector.config()) };
+        let boxes = detector.boxes(&heads, SURE)?;
+        let own = AgentBoxes { boxes: &boxes, output_from_agent: Isometry3::identity() };
+        let found = postprocess(&[own], &limits).into_iter().filter_map(|found| {
+            let [x, y, _] = found.detection(None).box3d.center_m;
+            cell_of(&grid, x, y).is_none_or(was_sent).then_some(([x, y], found.score))
+        });
+        let found: Vec<_> = found.collect();
+        let values: Vec<f32> = Vec::try_from(&map.f_contiguous()?.f_view([-1])?)?;
+        let print = values.iter().zip(empty).step_by((empty.len() / PRINT_VALUES).max(1));
+        let print = print.map(|(value, nothing)| value - nothing).collect();
+        if detector.config().y_axis == YAxis::Right {
+            // The cells of a mirrored world lie elsewhere; its boxes do not.
+            return Ok(Self { print, ..Self::of_boxes(found) });
+        }
+        let mut cells = heads.confidence;
+        cells.iter_mut().enumerate().filter(|(cell, _)| !was_sent(*cell)).for_each(|(_, sure)| *sure = 0.0);
+        let vehicles = found.into_iter().map(|(at_m, _)| at_m).collect();
+        Ok(Self { vehicles, sure: Sure::Cells(grid, cells), print, is_blind: false })
+    }
+
+    /// Whether only boxes are known: then a place without one may be empty or merely doubtful.
+    pub(super) fn is_boxes(&self) -> bool {
+        matches!(self.sure, Sure::Boxes(_))
+    }
+
+    /// How sure the detector is of a vehicle within `radius_m` of a place, 0..1; nothing where it does not look.
+    pub(super) fn sure_at(&self, at_m: [f64; 2], radius_m: f64) -> Option<f32> {
+        match &self.sure {
+            Sure::Cells(grid, cells) => around(grid, at_m, radius_m).map(|cell| cells[cell]).reduce(f32::max),
+            Sure::Boxes(_) if at_m[0].hypot(at_m[1]) > REACH_M => None,
+            Sure::Boxes(all) => {
+                let near = all.iter().filter(|([x, y], _)| (x - at_m[0]).hypot(y - at_m[1]) <= radius_m);
+                Some(near.map(|(_, score)| *score).fold(0.0, f32::max))
+            }
+        }
+    }
+}
+
+/// The cell of a lattice that a point lies in.
+fn cell_of(grid: &BevGrid, x_m: f64, y_m: f64) -> Option<usize> {
+    let column = ((x_m - grid.x_min_m) / grid.cell_m).floor();
+    let row = ((y_m - grid.y_min_m) / grid.cell_m).floor();
+    let inside = (0.0..f64::from(grid.width)).contains(&column) && (0.0..f64::from(grid.height)).contains(&row);
+    inside.then(|| row as usize * grid.width as usize + column as usize)
+}
+
+/// The cells of a lattice whose middles lie within a radius; none for a place outside.
+fn around(grid: &BevGrid, [x, y]: [f64; 2], radius_m: f64) -> impl Iterator<Item = usize> + use<> {
+    let grid = *grid;
+    let reach = (radius_m / grid.cell_m).ceil() as i64;
+    let inside = cell_of(&grid, x, y).is_some();
+    let steps = move || (-reach..=reach).map(move |step| step as f64 * grid.cell_m);
+    let offsets = steps().flat_map(move |down| steps().map(move |right| (down, right)));
+    offsets
+        .filter(move |(down, right)| inside && down.hypot(*right) <= radius_m)
+        .filter_map(move |(down, right)| cell_of(&grid, x + right, y + down))
+}
+
+/// How alike two messages are, -1..1; 1 for copies.
+pub(super) fn likeness(one: &[f32], other: &[f32]) -> f64 {
+    if one.len() != other.len() || one.is_empty() {
+        return 0.0;
+    }
+    let dot = |a: &[f32], b: &[f32]| a.iter().zip(b).map(|(a, b)| f64::from(*a) * f64::from(*b)).sum::<f64>();
+    dot(one, other) / (dot(one, one) * dot(other, other)).sqrt().max(1e-12)
+}
+
+#[cfg(test)]
+mod tests {
+    use perception::model_config::DetectorConfig;
+    use perception::pillars::point_pillars::PointPillars;
+    use protocol::{Box3d, Detection};
+    use tch::nn::VarStore;
+
+    use super::*;
+
+    #[test]
+    fn cells_around_a_place_are_found_and_none_outside() {
+        let grid = BevGrid { x_min_m: -4.0, y_min_m: -2.0, cell_m: 0.5, width: 16, height: 8 };
+        assert_eq!(cell_of(&grid, -3.9, -1.9), Some(0));
+        assert_eq!(cell_of(&grid, 3.9, 1.9), Some(127));
+        assert_eq!(around(&grid, [0.1, 0.1], 0.5).count(), 5);
+        assert_eq!(around(&grid, [9.0, 0.0], 6.0).count(), 0);
+        let mut sure = vec![0.0; 128];
+        sure[cell_of(&grid, 1.2, 0.7).unwrap()] = 0.8;
+        let seen = Seen { vehicles: vec![], sure: Sure::Cells(grid, sure), print: vec![], is_blind: false };
+        assert_eq!(seen.sure_at([1.0, 0.5], 1.0), Some(0.8));
+        assert_eq!(seen.sure_at([-2.0, 0.5], 1.0), Some(0.0));
+        assert_eq!(seen.sure_at([20.0, 0.5], 1.0), None);
+    }
+
+    #[test]
+    fn boxes_that_are_judged_but_hardly_seen_are_no_evidence() {
+        let network = VarStore::new(tch::Device::Cpu);
+        let config = DetectorConfig { lidar_range_m: [-12.8, -6.4, -3.0, 12.8, 6.4, 1.0], ..DetectorConfig::lean() };
+        let mut detector = Detector::from_network(PointPillars::new(&network.root(), &config).unwrap());
+        let found = [(4.0, 0.7), (8.0, 0.25), (12.0, 0.15)].map(|(x, score)| Detection {
+            box3d: Box3d { center_m: [x, 0.0, -1.0], size_m: [4.4, 1.9, 1.6], heading_rad: 0.0 },
+            score,
+            source: None,
+        });
+        let seen = Seen::in_message(&Content::Boxes(found.to_vec()), &mut detector, &[]).unwrap();
+        assert_eq!(seen.vehicles, [[4.0, 0.0]]);
+        assert_eq!((seen.sure_at([8.0, 0.0], 1.0), seen.sure_at([12.0, 0.0], 1.0)), (Some(0.25), Some(0.0)));
+        assert_eq!(seen.print.len(), 2 * 3);
+    }
+
+    #[test]
+    fn copies_are_alike_and_others_are_not() {
+        let one: Vec<f32> = (0..100).map(|step| (step as f32 * 0.37).sin()).collect();
+        let other: Vec<f32> = (0..100).map(|step| (step as f32 * 0.91).cos()).collect();
+        assert!(likeness(&one, &one) > 0.9999 && likeness(&one, &other).abs() < 0.5);
+        assert_eq!((likeness(&one, &one[1..]), likeness(&[], &[])), (0.0, 0.0));
+    }
+}

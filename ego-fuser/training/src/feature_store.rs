@@ -1,0 +1,312 @@
+//! The maps of a frozen encoder, computed once and kept on disk.
+//!
+//! Methods that share an encoder differ in what they make of its maps; what takes the time, the encoder, need not run
+//! again for each of them, nor for each pass over the data. The file belongs to one encoder, one set of data (its contents)
+//! and one wire version: all are in its name. It holds one packed message per sweep, as on the wire, each after its length: what
+//! is cut off or changed is found out.
+
+use std::fs::{self, File, OpenOptions};
+use std::io::{self, Write};
+use std::os::unix::fs::FileExt;
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use dataset::{self, IntensityScale, LoadOptions, ReadError, Scenario};
+use perception::detector::{Detector, DetectorError};
+use perception::weights::{Weights, WeightsError};
+use protocol::codec::encode_features;
+use protocol::message::Bev;
+use protocol::{
+    BevFeatures, CavId, CodecConfig, Dtype, Header, Limits, NoPoseReason, PoseEstimate, Stamp, WIRE_VERSION, WireError,
+    wire,
+};
+use tch::{TchError, Tensor};
+
+/// Digits of each hash in the name of a file.
+const HASH_DIGITS: usize = 12;
+/// zstd level of a message: more costs time and saves nothing.
+const PACKING: i32 = 1;
+
+/// Why maps cannot be kept or read.
+#[derive(Debug, thiserror::Error)]
+pub enum FeatureStoreError {
+    /// The system refused.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// A map cannot be packed or unpacked.
+    #[error("{}: {source}", path.display())]
+    Wire {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong.
+        source: WireError,
+    },
+    /// A sweep cannot be read.
+    #[error(transparent)]
+    Read(#[from] ReadError),
+    /// The encoder's weights cannot be used.
+    #[error(transparent)]
+    Weights(#[from] WeightsError),
+    /// The encoder refused.
+    #[error(transparent)]
+    Detector(#[from] DetectorError),
+    /// The tensor library refused.
+    #[error("kept maps: {0}")]
+    Torch(#[from] TchError),
+}
+
+/// Where maps are kept, how exactly and how many.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct KeptMaps {
+    /// The folder; a file per encoder, contents of the data and kind of number.
+    pub folder: PathBuf,
+    /// How exactly.
+    pub dtype: Dtype,
+    /// Size of a file at most, bytes; sweeps beyond are encoded whenever they are needed.
+    pub limit_bytes: u64,
+    /// Scale of the intensities that were encoded: maps of another scale are other maps.
+    pub intensity_scale: IntensityScale,
+}
+
+/// Whether a parameter is one of the encoder.
+#[must_use]
+pub fn is_encoder(name: &str) -> bool {
+    ["pillar_vfe.", "backbone.", "shrink_conv."].iter().any(|prefix| name.starts_with(prefix))
+}
+
+/// Maps of the sweeps of some scenarios, one after another in a file.
+#[derive(Debug)]
+pub struct FeatureStore {
+    path: PathBuf,
+    file: File,
+    dtype: Dtype,
+    /// Names of the scenarios.
+    names: Vec<String>,
+    /// Place of each scenario's first sweep, and of the end.
+    first: Vec<usize>,
+    /// Ticks of each scenario.
+    ticks: Vec<usize>,
+    /// Where each message that is there begins, and where the last one ends.
+    starts: Vec<u64>,
+}
+
+impl FeatureStore {
+    /// Opens the file of these scenarios and encodes what it does not have yet, up to its size.
+    ///
+    /// `on_sweep` is told how many sweeps are there, and of how many. An interrupted run is gone on with.
+    ///
+    /// # Errors
+    /// [`FeatureStoreError`] names the file.
+    pub fn open(
+        kept: &KeptMaps,
+        weights: &Weights,
+        scenarios: &[Scenario],
+        on_sweep: &mut dyn FnMut(usize, usize),
+    ) -> Result<Self, FeatureStoreError> {
+        let [encoder, data] = [weights.sha256_of(is_encoder), dataset::content_sha256(scenarios)];
+        let dtype = format!("{:?}", kept.dtype).to_lowercase();
+        let scale = match kept.intensity_scale {
+            IntensityScale::AUTO => String::new(),
+            scale => format!("-intensity{scale}"),
+        };
+        let [encoder, data] = [&encoder[..HASH_DIGITS], &data[..HASH_DIGITS]];
+        let name = format!("{encoder}-{data}-{dtype}{scale}-wire{WIRE_VERSION}.maps");
+        let path = kept.folder.join(name);
+        let io = |source| FeatureStoreError::Io { path: path.clone(), source };
+        fs::create_dir_all(&kept.folder).map_err(io)?;
+        let file = OpenOptions::new().create(true).read(true).append(true).open(&path).map_err(io)?;
+        // Of two trainings that begin together one encodes, the other waits for it.
+        file.lock().map_err(io)?;
+        let starts = starts(&file).map_err(io)?;
+        // A message that was cut off is made anew.
+        file.set_len(starts[starts.len() - 1]).map_err(io)?;
+        let mut first = vec![0];
+        for scenario in scenarios {
+            first.push(first[first.len() - 1] + scenario.agents.len() * scenario.ticks.len());
+        }
+        let names = scenarios.iter().map(|scenario| scenario.name.clone()).collect();
+        let ticks = scenarios.iter().map(|scenario| scenario.ticks.len()).collect();
+        let mut store = Self { path: path.clone(), file, dtype: kept.dtype, names, first, ticks, starts };
+        store.fill(weights, scenarios, kept.limit_bytes, on_sweep)?;
+        store.file.unlock().map_err(|source| store.io(source))?;
+        Ok(store)
+    }
+
+    fn fill(
+        &mut self,
+        weights: &Weights,
+        scenarios: &[Scenario],
+        limit_bytes: u64,
+        on_sweep: &mut dyn FnMut(usize, usize),
+    ) -> Result<(), FeatureStoreError> {
+        let (stored, all) = self.sweeps();
+        if stored == all || self.bytes() >= limit_bytes {
+            return Ok(());
+        }
+        let mut detector = Detector::from_weights(weights, &weights.config()?)?;
+        for (index, scenario) in scenarios.iter().enumerate() {
+            for sweep in 0..self.first[index + 1] - self.first[index] {
+                if self.first[index] + sweep < stored {
+                    continue;
+                }
+                if self.bytes() >= limit_bytes {
+                    return Ok(());
+                }
+                let (agent, tick) = (sweep / self.ticks[index], sweep % self.ticks[index]);
+                // A sweep that is absent or cannot be read has an empty place.
+                let message = match scenario.load(agent, tick, &LoadOptions::default()) {
+                    Ok(frame) => {
+                        let map = detector.encode(&frame.points)?.features;
+                        self.packed(detector.to_kept(&map)?)?
+                    }
+                    Err(_) => Vec::new(),
+                };
+                let length = u32::try_from(message.len()).map_err(|_| self.io(io::ErrorKind::FileTooLarge.into()))?;
+                let record = [&length.to_le_bytes()[..], &message].concat();
+                self.file.write_all(&record).map_err(|source| self.io(source))?;
+                self.starts.push(self.bytes() + record.len() as u64);
+                on_sweep(self.sweeps().0, all);
+            }
+        }
+        Ok(())
+    }
+
+    fn packed(&self, features: BevFeatures) -> Result<Vec<u8>, FeatureStoreError> {
+        let codec = CodecConfig { dtype: self.dtype, zstd_level: Some(PACKING), ..CodecConfig::default() };
+        // Whose map it is, and when, is told by its place.
+        let cav = CavId::new("0").map_err(|_| self.io(io::ErrorKind::InvalidInput.into()))?;
+        let stamp = Stamp { cav, epoch: 0, sequence: 0, capture_nanos: 0, publish_nanos: 0 };
+        let pose = PoseEstimate::NoPose { reason: NoPoseReason::NoSource, inlier_count: 0 };
+        let encode = || -> Result<_, WireError> {
+            let features = encode_features(features, &codec, None)?;
+            Ok(wire::encode(&stamp, Bev { pose, features })?.to_vec())
+        };
+        encode().map_err(|source| FeatureStoreError::Wire { path: self.path.clone(), source })
+    }
+
+    /// The map of a sweep, `[1, C, H, W]`, by scenario, agent and tick; nothing where it did not fit or the sweep could
+    /// not be read.
+    ///
+    /// # Errors
+    /// [`FeatureStoreError`] when the file cannot be read or was changed.
+    pub fn map(&self, scenario: usize, agent: usize, tick: usize) -> Result<Option<Tensor>, FeatureStoreError> {
+        let place = self.first[scenario] + agent * self.ticks[scenario] + tick;
+        let Some(&[start, end]) = self.starts.get(place..place + 2) else {
+            return Ok(None);
+        };
+        let start = start + LENGTH_BYTES;
+        if start == end {
+            return Ok(None);
+        }
+        let mut bytes = vec![0; (end - start) as usize];
+        self.file.read_exact_at(&mut bytes, start).map_err(|source| self.io(source))?;
+        let decode = || -> Result<_, WireError> {
+            let (_, message): (Header, Bev) = wire::decode([bytes.as_slice()], &Limits::default())?;
+            message.features.decode(&Limits::default())
+        };
+        let features = decode().map_err(|source| FeatureStoreError::Wire { path: self.path.clone(), source })?.features;
+        let size = [1, i64::from(features.channels), i64::from(features.grid.height), i64::from(features.grid.width)];
+        Ok(Some(Tensor::f_from_slice(&features.values)?.f_view(size)?))
+    }
+
+    /// The index of a scenario.
+    #[must_use]
+    pub fn index_of(&self, scenario: &str) -> Option<usize> {
+        self.names.iter().position(|name| name == scenario)
+    }
+
+    /// Sweeps that are there, and all of the scenarios.
+    #[must_use]
+    pub fn sweeps(&self) -> (usize, usize) {
+        (self.starts.len() - 1, self.first[self.first.len() - 1])
+    }
+
+    fn bytes(&self) -> u64 {
+        self.starts[self.starts.len() - 1]
+    }
+
+    fn io(&self, source: io::Error) -> FeatureStoreError {
+        FeatureStoreError::Io { path: self.path.clone(), source }
+    }
+}
+
+/// Bytes that tell the length of the message behind them.
+const LENGTH_BYTES: u64 = 4;
+
+/// Where each whole message of a file begins, and where the last one ends.
+fn starts(file: &File) -> io::Result<Vec<u64>> {
+    let end = file.metadata()?.len();
+    let mut starts = vec![0];
+    loop {
+        let start = starts[starts.len() - 1];
+        if start + LENGTH_BYTES > end {
+            return Ok(starts);
+        }
+        let mut length = [0; LENGTH_BYTES as usize];
+        file.read_exact_at(&mut length, start)?;
+        let next = start + LENGTH_BYTES + u64::from(u32::from_le_bytes(length));
+        if next > end {
+            return Ok(starts);
+        }
+        starts.push(next);
+    }
+}
+
+/// Maps from a store, and from the encoder where that has none.
+#[derive(Debug)]
+pub struct MapSource {
+    store: Arc<FeatureStore>,
+    weights: Arc<Weights>,
+    encoder: Option<Detector>,
+}
+
+impl Clone for MapSource {
+    /// The encoder is made anew where it is needed: every thread has its own.
+    fn clone(&self) -> Self {
+        Self { store: Arc::clone(&self.store), weights: Arc::clone(&self.weights), encoder: None }
+    }
+}
+
+impl MapSource {
+    /// Reads from `store`, which was made with `weights`.
+    #[must_use]
+    pub fn new(store: Arc<FeatureStore>, weights: Arc<Weights>) -> Self {
+        Self { store, weights, encoder: None }
+    }
+
+    /// The index of a scenario.
+    #[must_use]
+    pub fn index_of(&self, scenario: &str) -> Option<usize> {
+        self.store.index_of(scenario)
+    }
+
+    /// The map of a sweep, `[1, C, H, W]`; `scenario` is the one of that index.
+    ///
+    /// # Errors
+    /// [`FeatureStoreError`] when it cannot be read.
+    pub fn map(
+        &mut self,
+        index: usize,
+        scenario: &Scenario,
+        agent: usize,
+        tick: usize,
+    ) -> Result<Tensor, FeatureStoreError> {
+        if let Some(map) = self.store.map(index, agent, tick)? {
+            return Ok(map);
+        }
+        let frame = scenario.load(agent, tick, &LoadOptions::default())?;
+        let encoder = match &mut self.encoder {
+            Some(encoder) => encoder,
+            None => {
+                let config = self.weights.config()?;
+                self.encoder.insert(Detector::from_weights(&self.weights, &config)?)
+            }
+        };
+        Ok(encoder.encode(&frame.points)?.features)
+    }
+}

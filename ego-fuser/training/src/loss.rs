@@ -1,0 +1,268 @@
+//! The detection loss: sigmoid focal loss on scores, smooth L1 on boxes with the sine of the yaw difference.
+//!
+//! As PointPillars and OpenCOOD define it: per sample divided by its number of positives (at least one), summed, divided
+//! by the batch size.
+
+use tch::{Device, Kind, TchError, Tensor};
+
+use crate::samples::Offset;
+use fusion::targets::{BOX_CODE, Labels};
+
+/// What a turn by a radian weighs against a shift by a metre: about the distance at which neighbours see what the ego sees.
+const METRES_PER_RADIAN: f64 = 20.0;
+/// What is left of a pose's error beyond this is not undone by looking at maps from near, metres.
+const RECOVERABLE_M: f64 = 5.0;
+
+/// Weights and shapes of the two terms.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LossConfig {
+    /// Focal loss: share of the positives.
+    pub alpha: f64,
+    /// Focal loss: exponent that quietens easy anchors.
+    pub gamma: f64,
+    /// Smooth L1: where the square ends.
+    pub beta: f64,
+    /// Weight of the classification term.
+    pub score_weight: f64,
+    /// Weight of the regression term.
+    pub box_weight: f64,
+    /// Weight of the alignment term: how far a fusion's own corrections of poses are from the errors that were put on top
+    /// of them. None: the detection loss alone teaches a fusion to align, as in the paper.
+    pub alignment_weight: f64,
+    /// What unassigned anchors count as.
+    pub unassigned: Unassigned,
+}
+
+impl Default for LossConfig {
+    fn default() -> Self {
+        Self {
+            alpha: 0.25,
+            gamma: 2.0,
+            beta: 1.0 / 9.0,
+            score_weight: 1.0,
+            box_weight: 2.0,
+            alignment_weight: 0.0,
+            unassigned: Unassigned::Background,
+        }
+    }
+}
+
+/// What the loss does with anchors between the two overlap thresholds.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Unassigned {
+    /// They count as background: what OpenCOOD does.
+    Background,
+    /// They count for nothing: what its label generator intends.
+    Ignored,
+}
+
+/// The terms of the loss, each a scalar tensor that carries its gradient.
+#[derive(Debug)]
+pub struct Loss {
+    /// Weighted classification term.
+    pub score: Tensor,
+    /// Weighted regression term.
+    pub boxes: Tensor,
+}
+
+impl Loss {
+    /// What is minimised.
+    pub fn total(&self) -> Tensor {
+        &self.score + &self.boxes
+    }
+}
+
+/// Labels of a batch as tensors on the device of the network.
+#[derive(Debug)]
+pub struct LabelTensors {
+    /// `[B, H*W*A]` 1 at positives.
+    positive: Tensor,
+    /// `[B, H*W*A]` weight of every anchor in the classification term.
+    score_weight: Tensor,
+    /// `[P]` flat indices of positives into `B*H*W*A`.
+    index: Tensor,
+    /// `[P, 7]` targets.
+    code: Tensor,
+    /// `[P]` weight of every positive in the regression term.
+    box_weight: Tensor,
+}
+
+impl LabelTensors {
+    /// Gathers the labels of a batch; every sample has the same number of anchors.
+    #[must_use]
+    pub fn gather(samples: &[Labels], unassigned: Unassigned, device: Device) -> Self {
+        let anchors = samples.first().map_or(0, |labels| labels.anchors);
+        let mut positive = vec![0f32; anchors * samples.len()];
+        let mut score_weight = vec![0f32; anchors * samples.len()];
+        let (mut index, mut code, mut box_weight) = (Vec::new(), Vec::new(), Vec::new());
+        for (sample, labels) in samples.iter().enumerate() {
+            let first = sample * anchors;
+            let weight = 1.0 / labels.positives.len().max(1) as f32;
+            score_weight[first..first + anchors].fill(weight);
+            if unassigned == Unassigned::Ignored {
+                labels.unassigned.iter().for_each(|&anchor| score_weight[first + anchor] = 0.0);
+            }
+            for entry in &labels.positives {
+                positive[first + entry.anchor] = 1.0;
+                index.push((first + entry.anchor) as i64);
+                code.extend(entry.code.map(|value| value as f32));
+                box_weight.push(weight);
+            }
+        }
+        let shape = [samples.len() as i64, anchors as i64];
+        Self {
+            positive: Tensor::from_slice(&positive).view(shape).to_device(device),
+            score_weight: Tensor::from_slice(&score_weight).view(shape).to_device(device),
+            code: Tensor::from_slice(&code).view([index.len() as i64, BOX_CODE as i64]).to_device(device),
+            index: Tensor::from_slice(&index).to_device(device),
+            box_weight: Tensor::from_slice(&box_weight).to_device(device),
+        }
+    }
+}
+
+/// The loss of a batch.
+///
+/// # Shapes
+/// - `scores`: `[B, A, H, W]` logits
+/// - `boxes`: `[B, 7A, H, W]`, channel `7 * anchor + component`
+///
+/// # Errors
+/// [`TchError`] when the maps do not fit the labels.
+pub fn detection_loss(
+    scores: &Tensor,
+    boxes: &Tensor,
+    labels: &LabelTensors,
+    config: &LossConfig,
+) -> Result<Loss, TchError> {
+    let batch = scores.size()[0].max(1) as f64;
+    let score = focal_loss(scores, labels, config)?.f_sum(Kind::Float)? * (config.score_weight / batch);
+    let boxes = box_loss(boxes, labels, config)?.f_sum(Kind::Float)? * (config.box_weight / batch);
+    Ok(Loss { score, boxes })
+}
+
+/// How far corrections are from what would undo the errors put on poses: smooth L1 per view, mean over views and samples.
+///
+/// A turn by a radian counts as a shift by 20 m. No true pose takes part: an error that was put on top is
+/// known whatever lies below. Where more than 5 m are left nothing is asked: such a map was not found from afar.
+///
+/// # Errors
+/// [`TchError`] when a sample has other views than offsets.
+pub fn alignment_loss(corrections: &[Option<Tensor>], offsets: &[Vec<Offset>]) -> Result<Tensor, TchError> {
+    let unit = Tensor::f_from_slice(&[1.0, 1.0, METRES_PER_RADIAN as f32])?;
+    let mut losses = Vec::new();
+    for (moved_by, offsets) in corrections.iter().zip(offsets) {
+        let Some(moved_by) = moved_by else { continue };
+        let wanted: Vec<f32> =
+            offsets.iter().skip(1).flat_map(|Offset(offset)| offset.map(|value| value as f32)).collect();
+        let wanted = Tensor::f_from_slice(&wanted)?.f_view([-1, 3])?.f_to_device(moved_by.device())?;
+        let off = (moved_by.f_to_kind(Kind::Float)? - wanted) * unit.f_to_device(moved_by.device())?;
+        let left_m = off.f_abs()?.f_amax([1_i64].as_slice(), true)?;
+        let off = off * left_m.f_le(RECOVERABLE_M)?;
+        losses.push(off.f_smooth_l1_loss(&off.f_zeros_like()?, tch::Reduction::Mean, 1.0)?);
+    }
+    match losses.as_slice() {
+        [] => Tensor::f_zeros([], (Kind::Float, Device::Cpu)),
+        _ => Tensor::f_stack(&losses, 0)?.f_mean(Kind::Float),
+    }
+}
+
+/// Weighted focal loss of every anchor, `[B, H*W*A]`.
+fn focal_loss(scores: &Tensor, labels: &LabelTensors, config: &LossConfig) -> Result<Tensor, TchError> {
+    let target = &labels.positive;
+    let logits = scores.f_to_kind(Kind::Float)?.f_permute([0, 2, 3, 1])?.f_reshape(target.size())?;
+    let probability = logits.f_sigmoid()?;
+    let background: Tensor = 1.0 - target;
+    // 1 - p_t of the paper: how wrong the prediction is.
+    let wrong: Tensor = target * (1.0 - &probability) + &background * &probability;
+    let balance = target * config.alpha + &background * (1.0 - config.alpha);
+    let entropy =
+        logits.f_binary_cross_entropy_with_logits(target, None::<&Tensor>, None::<&Tensor>, tch::Reduction::None)?;
+    Ok(balance * wrong.f_pow_tensor_scalar(config.gamma)? * entropy * &labels.score_weight)
+}
+
+/// Weighted smooth L1 of every positive, `[P, 7]`.
+fn box_loss(boxes: &Tensor, labels: &LabelTensors, config: &LossConfig) -> Result<Tensor, TchError> {
+    let code = BOX_CODE as i64;
+    let predicted = boxes.f_permute([0, 2, 3, 1])?.f_reshape([-1, code])?.f_index_select(0, &labels.index)?;
+    let difference = predicted.f_to_kind(Kind::Float)? - &labels.code;
+    let linear = difference.f_narrow(1, 0, code - 1)?;
+    let turn = difference.f_narrow(1, code - 1, 1)?.f_sin()?;
+    let distance = Tensor::f_cat(&[linear, turn], 1)?.f_abs()?;
+    let squared = distance.f_square()? * (0.5 / config.beta);
+    let loss = squared.f_where_self(&distance.f_lt(config.beta)?, &(&distance - 0.5 * config.beta))?;
+    Ok(loss * labels.box_weight.f_unsqueeze(1)?)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use fusion::targets::Positive;
+
+    fn labels(positives: Vec<Positive>, unassigned: Vec<usize>) -> Labels {
+        Labels { anchors: 2 * 3 * 2, positives, unassigned }
+    }
+
+    fn loss(scores: &Tensor, boxes: &Tensor, labels: &[Labels], unassigned: Unassigned) -> (f64, f64) {
+        let config = LossConfig { unassigned, ..LossConfig::default() };
+        let tensors = LabelTensors::gather(labels, unassigned, Device::Cpu);
+        let loss = detection_loss(scores, boxes, &tensors, &config).unwrap();
+        (loss.score.double_value(&[]), loss.boxes.double_value(&[]))
+    }
+
+    fn maps() -> (Tensor, Tensor) {
+        let options = (Kind::Float, Device::Cpu);
+        (Tensor::zeros([1, 2, 2, 3], options), Tensor::zeros([1, 14, 2, 3], options))
+    }
+
+    #[test]
+    fn an_undecided_map_costs_its_entropy() {
+        let (scores, boxes) = maps();
+        let (score, regression) = loss(&scores, &boxes, &[labels(vec![], vec![])], Unassigned::Background);
+        // Twelve negatives at p = 1/2: 0.75 * (1/2)^2 * ln 2 each.
+        assert!((score - 12.0 * 0.75 * 0.25 * 2f64.ln()).abs() < 1e-5);
+        assert_eq!(regression, 0.0);
+    }
+
+    #[test]
+    fn unassigned_anchors_count_only_where_asked() {
+        let (scores, boxes) = maps();
+        let sample = [labels(vec![], vec![3, 4])];
+        let as_background = loss(&scores, &boxes, &sample, Unassigned::Background).0;
+        let ignored = loss(&scores, &boxes, &sample, Unassigned::Ignored).0;
+        assert!((ignored / as_background - 10.0 / 12.0).abs() < 1e-5);
+    }
+
+    #[test]
+    fn the_alignment_term_is_zero_where_errors_are_undone_and_weighs_turns_by_an_arm() {
+        let offsets = vec![vec![Offset::default(), Offset([1.0, -0.5, 0.02]), Offset([0.0, 2.0, 0.0])]];
+        let undone = Tensor::from_slice(&[1.0f32, -0.5, 0.02, 0.0, 2.0, 0.0]).view([2, 3]);
+        let loss = |corrections: &[Option<Tensor>], offsets: &[Vec<Offset>]| {
+            alignment_loss(corrections, offsets).unwrap().double_value(&[])
+        };
+        assert!(loss(&[Some(undone.shallow_clone())], &offsets) < 1e-12);
+        // Nothing moved: |1|, |-0.5|, 20 m * |0.02|, |2| by smooth L1, over six numbers.
+        let still = Tensor::zeros([2, 3], (Kind::Float, Device::Cpu)).set_requires_grad(true);
+        let expected = (0.5 + 0.125 + 0.08 + 1.5) / 6.0;
+        assert!((loss(&[Some(still.shallow_clone())], &offsets) - expected).abs() < 1e-6);
+        alignment_loss(&[Some(still.shallow_clone()), None], &[offsets[0].clone(), vec![]]).unwrap().backward();
+        assert!(still.grad().double_value(&[0, 0]) < 0.0, "towards the offset");
+        let lost = vec![vec![Offset::default(), Offset([9.0, 0.0, 0.0]), Offset([0.0, 0.0, 1.0])]];
+        assert_eq!(loss(&[Some(still.detach())], &lost), 0.0, "of a lost vehicle nothing is asked");
+        assert_eq!(loss(&[None], &[vec![Offset::default()]]), 0.0, "an ego alone has nothing to align");
+    }
+
+    #[test]
+    fn the_box_term_reads_the_channels_of_its_anchor() {
+        let (scores, mut boxes) = maps();
+        // Row 1, column 2, anchor 1.
+        let positive = Positive { anchor: (3 + 2) * 2 + 1, code: [0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 3.0] };
+        let _ = boxes.get(0).get(7 + 4).get(1).get(2).fill_(1.0);
+        let _ = boxes.get(0).get(7 + 6).get(1).get(2).fill_(3.0);
+        let (_, regression) = loss(&scores, &boxes, &[labels(vec![positive], vec![])], Unassigned::Background);
+        assert!(regression.abs() < 1e-6);
+        let _ = boxes.get(0).get(7).get(1).get(2).fill_(1.0);
+        let (_, regression) = loss(&scores, &boxes, &[labels(vec![positive], vec![])], Unassigned::Background);
+        assert!((regression - 2.0 * (1.0 - 0.5 / 9.0)).abs() < 1e-5);
+        let _ = boxes.fill_(0.0);
+    }
+}

@@ -1,0 +1,333 @@
+//! One tick of a scene becomes one sample.
+
+use std::sync::Arc;
+
+use dataset::class_set::ClassSet;
+use dataset::frame::Frame;
+use dataset::ground_truth::{self, GroundTruthRule};
+use perception::crop::Crop;
+use perception::model_config::DetectorConfig;
+use perception::pillars::voxels::{Pillars, Voxeliser};
+use protocol::{Box3d, NoPoseReason, Pose, PoseEstimate};
+use rand::Rng;
+use tch::Tensor;
+
+use super::poses::DrawnError;
+use super::{Augmentation, Moments, Offset, SampleError, SamplePoses, SceneSet, TickRef, ViewAugment};
+use crate::feature_store::MapSource;
+use fusion::ViewFacts;
+use fusion::points::merge_points;
+use fusion::targets::{Labels, TargetAssigner};
+
+/// Beyond any lattice, metres: which objects count is decided after the augmentation.
+const ANYWHERE_M: [f64; 2] = [-1e3, 1e3];
+
+/// Which views a sample has.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum SampleKind {
+    /// One vehicle, and the objects that it has annotated itself.
+    Single,
+    /// One sweep: the points of all vehicles in the ego frame.
+    Merged,
+    /// The sweeps of all vehicles, each in its own frame.
+    Cooperative,
+}
+
+/// How samples are made.
+#[derive(Debug, Clone)]
+pub struct SampleConfig {
+    /// Which views.
+    pub kind: SampleKind,
+    /// Random changes of the scene.
+    pub augmentation: Augmentation,
+    /// Probability that a neighbour is missing.
+    pub drop_neighbour: f64,
+    /// The poses that maps are aligned by.
+    pub poses: SamplePoses,
+    /// From which moments maps are.
+    pub moments: Moments,
+    /// Vehicles of a sample at most, the ego included.
+    pub max_agents: usize,
+    /// Vehicles farther away do not take part, metres in the plane.
+    pub comm_range_m: f64,
+    /// Classes of the objects that are to be found.
+    pub classes: ClassSet,
+    /// Whether a single vehicle is also to find what only its neighbours have annotated: the rule of the evaluation. A
+    /// training by it is of single vehicles, whatever their method shares; a neighbour that is dropped has annotated nothing.
+    pub merged_truth: bool,
+}
+
+impl SampleConfig {
+    /// Samples for training.
+    #[must_use]
+    pub fn training(kind: SampleKind) -> Self {
+        Self {
+            kind,
+            augmentation: Augmentation::default(),
+            drop_neighbour: 0.1,
+            poses: SamplePoses::default(),
+            moments: Moments::default(),
+            max_agents: 5,
+            comm_range_m: 70.0,
+            classes: ClassSet::VEHICLES,
+            merged_truth: false,
+        }
+    }
+}
+
+/// What the views of a sample are given as.
+#[derive(Debug)]
+pub enum SampleViews {
+    /// Pillars, to be encoded.
+    Pillars(Vec<Pillars>),
+    /// `[N, C, H, W]` maps, of an encoder that does not learn.
+    Maps(Tensor),
+}
+
+/// Views of one tick with what is to be found in them.
+#[derive(Debug)]
+pub struct Sample {
+    /// Every view, the ego's newest first, then the neighbours' newest, then older ones.
+    pub views: SampleViews,
+    /// What is known of every view, the ego's pose being the identity.
+    pub facts: Vec<ViewFacts>,
+    /// How far each view's pose is off by what was put on top of it.
+    pub offsets: Vec<Offset>,
+    /// True boxes in the ego frame with their centre on the lattice.
+    pub objects: Vec<Box3d>,
+    /// Targets of those boxes.
+    pub labels: Labels,
+}
+
+/// Makes samples; one per loader thread, as it keeps the tables of the voxeliser.
+#[derive(Debug, Clone)]
+pub struct SampleBuilder {
+    scenes: Arc<SceneSet>,
+    config: SampleConfig,
+    detector: DetectorConfig,
+    assigner: Arc<TargetAssigner>,
+    crop: Crop,
+    voxeliser: Voxeliser,
+    maps: Option<MapSource>,
+}
+
+/// One view on its way into a sample.
+struct Entry {
+    /// Place of its vehicle in the scenario.
+    agent: usize,
+    /// Place of its vehicle in the sample, the ego's being 0.
+    place: usize,
+    tick: usize,
+    world_from_cav: Pose,
+    /// The same without what was put on top.
+    found: Pose,
+    confidence: f64,
+    age_secs: f64,
+}
+
+impl SampleBuilder {
+    /// A builder over `scenes`; `assigner` holds the anchors of `detector`.
+    #[must_use]
+    pub fn new(
+        scenes: Arc<SceneSet>,
+        config: SampleConfig,
+        detector: DetectorConfig,
+        assigner: Arc<TargetAssigner>,
+    ) -> Self {
+        let voxeliser = Voxeliser::for_detector(&detector);
+        let crop = Crop::for_detector(&detector);
+        Self { scenes, config, detector, assigner, crop, voxeliser, maps: None }
+    }
+
+    /// The same with maps of an encoder that does not learn, in place of pillars.
+    #[must_use]
+    pub fn with_maps(self, maps: MapSource) -> Self {
+        Self { maps: Some(maps), ..self }
+    }
+
+    /// The scenes it draws from.
+    #[must_use]
+    pub fn scenes(&self) -> &SceneSet {
+        &self.scenes
+    }
+
+    /// The sample of a tick, seen from a random vehicle.
+    ///
+    /// # Errors
+    /// [`SampleError`] when a file is missing or malformed, or nothing is known of a vehicle's pose.
+    pub fn build(&mut self, tick: TickRef, rng: &mut impl Rng) -> Result<Sample, SampleError> {
+        let frames = self.scenes.annotations(tick);
+        let present: Vec<usize> = (0..frames.len()).filter(|&agent| frames[agent].is_some()).collect();
+        if present.is_empty() {
+            return Err(SampleError::Empty(format!(
+                "no readable frame at tick {} of scenario {}",
+                tick.tick,
+                self.scenes.scenario(tick).name
+            )));
+        }
+        let ego = present[rng.random_range(0..present.len())];
+        let agents = self.choose_agents(tick, &frames, ego, rng)?;
+        let single = self.config.kind == SampleKind::Single;
+        let annotators = if single && !self.config.merged_truth { &agents[..1] } else { &agents[..] };
+        let entries = self.entries(tick, if single { &agents[..1] } else { &agents[..] }, rng)?;
+        let scene = self.config.augmentation.scene(rng);
+        let changes: Vec<ViewAugment> = entries.iter().map(|_| scene.view(rng)).collect();
+        let objects = self.objects(&frames, annotators, &changes[0]);
+        let (mut facts, offsets) = told(&entries, &changes);
+        // Not but for the last bits: what moves nothing is known by it.
+        facts[0].ego_from_cav = Pose::IDENTITY;
+        let views = match &mut self.maps {
+            Some(maps) => {
+                let scenario = self.scenes.scenario(tick);
+                let map = |entry: &Entry| maps.map(tick.scenario, scenario, entry.agent, entry.tick);
+                let maps: Vec<Tensor> = entries.iter().map(map).collect::<Result<_, _>>()?;
+                SampleViews::Maps(Tensor::f_cat(&maps, 0)?)
+            }
+            None => SampleViews::Pillars(self.pillars(tick.scenario, &entries, &changes, &mut facts)?),
+        };
+        Ok(Sample { views, facts, offsets, labels: self.assigner.assign(&objects), objects })
+    }
+
+    /// Which views a sample has: the newest of every vehicle, the ego first, then older ones. Vehicles that do not know
+    /// where they are have no part; an ego that does not is alone with its newest view.
+    fn entries(&self, now: TickRef, agents: &[usize], rng: &mut impl Rng) -> Result<Vec<Entry>, SampleError> {
+        let ticks = &self.scenes.scenario(now).ticks;
+        let gap = self.config.moments.draw_gap(rng);
+        let error = self.config.poses.draw(rng)?;
+        let (mut newest, mut older) = (Vec::new(), Vec::new());
+        for (index, &agent) in agents.iter().enumerate() {
+            let is_ego = index == 0;
+            let last = if is_ego { now.tick } else { self.config.moments.draw_newest(ticks, now.tick, rng) };
+            let place = newest.len();
+            for (step, tick) in self.config.moments.steps(ticks, now.tick, last, gap).into_iter().enumerate() {
+                let [found, pose] = self.pose_at(TickRef { tick, ..now }, agent, [index, agents.len()], &error)?;
+                let PoseEstimate::Pose { world_from_cav, confidence } = pose else {
+                    match step {
+                        0 => break,
+                        _ => continue,
+                    }
+                };
+                let age_secs = (ticks[now.tick].capture_nanos - ticks[tick].capture_nanos) as f64 * 1e-9;
+                let found = found.world_from_cav().copied().unwrap_or(world_from_cav);
+                let confidence = f64::from(confidence);
+                let entry = Entry { agent, place, tick, world_from_cav, found, confidence, age_secs };
+                if step == 0 { newest.push(entry) } else { older.push(entry) }
+            }
+            if is_ego && newest.is_empty() {
+                let world_from_cav = Pose::IDENTITY;
+                return Ok(vec![Entry {
+                    agent,
+                    place,
+                    tick: now.tick,
+                    world_from_cav,
+                    found: world_from_cav,
+                    confidence: 0.0,
+                    age_secs: 0.0,
+                }]);
+            }
+        }
+        newest.append(&mut older);
+        Ok(newest)
+    }
+
+    /// The pose that was found, and the same with what is put on top; `place` is the agent's and of how many.
+    fn pose_at(
+        &self,
+        tick: TickRef,
+        agent: usize,
+        place: [usize; 2],
+        error: &DrawnError,
+    ) -> Result<[PoseEstimate; 2], SampleError> {
+        let frames = self.scenes.annotations(tick);
+        let Some(frame) = &frames[agent] else {
+            let absent = PoseEstimate::NoPose { reason: NoPoseReason::NoSource, inlier_count: 0 };
+            return Ok([absent; 2]);
+        };
+        let found = self.config.poses.found(&self.scenes.scenario(tick).name, frame)?;
+        Ok([found, error.added(found, &frame.cav, frame.capture_nanos, place)])
+    }
+
+    /// The pillars of all views; of one view where all points are merged.
+    fn pillars(
+        &mut self,
+        scenario: usize,
+        entries: &[Entry],
+        changes: &[ViewAugment],
+        facts: &mut Vec<ViewFacts>,
+    ) -> Result<Vec<Pillars>, SampleError> {
+        let mut clouds = Vec::with_capacity(entries.len());
+        for (entry, change) in entries.iter().zip(changes) {
+            let points = self.scenes.points(TickRef { scenario, tick: entry.tick }, entry.agent)?;
+            // Hits on the vehicle that carries the LiDAR are cut out before anything turns.
+            let mut points = self.crop.without_own_body(&points);
+            change.points(&mut points.xyzi);
+            clouds.push(points);
+        }
+        if self.config.kind == SampleKind::Merged {
+            let poses: Vec<Pose> = facts.iter().map(|facts| facts.ego_from_cav).collect();
+            clouds = vec![merge_points(&clouds, &poses)];
+            facts.truncate(1);
+        }
+        Ok(clouds.iter().map(|cloud| self.voxeliser.voxelise(&cloud.xyzi)).collect())
+    }
+
+    /// The ego, then the neighbours in reach that are not dropped.
+    fn choose_agents(
+        &self,
+        tick: TickRef,
+        frames: &[Option<Frame>],
+        ego: usize,
+        rng: &mut impl Rng,
+    ) -> Result<Vec<usize>, SampleError> {
+        let mut agents = vec![ego];
+        let Some(ego_frame) = &frames[ego] else { return Ok(agents) };
+        let [ego_x, ego_y, _] = self.world_from_lidar(tick, ego_frame)?.translation_m;
+        for (agent, frame) in frames.iter().enumerate().filter_map(|(agent, frame)| Some((agent, frame.as_ref()?))) {
+            let [x, y, _] = self.world_from_lidar(tick, frame)?.translation_m;
+            let in_reach = (x - ego_x).hypot(y - ego_y) <= self.config.comm_range_m;
+            let dropped = rng.random_bool(self.config.drop_neighbour);
+            if agent != ego && in_reach && !dropped && agents.len() < self.config.max_agents {
+                agents.push(agent);
+            }
+        }
+        Ok(agents)
+    }
+
+    fn world_from_lidar(&self, tick: TickRef, frame: &Frame) -> Result<Pose, SampleError> {
+        frame.world_from_lidar.ok_or_else(|| SampleError::NoPose {
+            scenario: self.scenes.scenario(tick).name.clone(),
+            capture_nanos: frame.capture_nanos,
+            cav: frame.cav.to_string(),
+        })
+    }
+
+    /// What `annotators`, the ego first, have annotated, in the changed ego frame, on the lattice.
+    fn objects(&self, frames: &[Option<Frame>], annotators: &[usize], ego_view: &ViewAugment) -> Vec<Box3d> {
+        let range = self.detector.lidar_range_m;
+        let rule = GroundTruthRule {
+            x_m: ANYWHERE_M,
+            y_m: ANYWHERE_M,
+            z_m: [range[2], range[5]],
+            comm_range_m: self.config.comm_range_m,
+            min_corners: 8,
+            classes: self.config.classes,
+        };
+        let views: Vec<&Frame> = annotators.iter().filter_map(|&agent| frames[agent].as_ref()).collect();
+        let on_lattice =
+            |object: &Box3d| (0..2).all(|axis| (range[axis]..range[axis + 3]).contains(&object.center_m[axis]));
+        let merged = ground_truth::merge(&views, 0, &rule);
+        merged.iter().map(|(_, object)| ego_view.box3d(object)).filter(on_lattice).collect()
+    }
+}
+
+/// What is told of the views, and how far that is off; both after the changes of the scene.
+fn told(entries: &[Entry], changes: &[ViewAugment]) -> (Vec<ViewFacts>, Vec<Offset>) {
+    let relative = |ego: &Pose, cav: &Pose, change: &ViewAugment| changes[0].pose(&ego.from_world(cav), change);
+    let of_entry = |(entry, change): (&Entry, &ViewAugment)| {
+        let Entry { place: agent, confidence, age_secs, .. } = *entry;
+        let ego_from_cav = relative(&entries[0].world_from_cav, &entry.world_from_cav, change);
+        let real = relative(&entries[0].found, &entry.found, change);
+        (ViewFacts { agent, ego_from_cav, confidence, age_secs }, Offset::between(&ego_from_cav, &real))
+    };
+    entries.iter().zip(changes).map(of_entry).unzip()
+}

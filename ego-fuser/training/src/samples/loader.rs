@@ -1,0 +1,149 @@
+//! Samples in batches, in the order of a training.
+
+use perception::pillars::batch::{PillarBatch, PillarLattice};
+use perception::train::{Prefetch, RunConfig};
+use rand::SeedableRng;
+use rand::seq::SliceRandom;
+use rand_chacha::ChaCha8Rng;
+use tch::Tensor;
+
+use super::{Offset, Sample, SampleBuilder, SampleError, SampleViews, TickRef};
+use fusion::ViewFacts;
+use fusion::model::{CooperativeModel, CooperativeOutput, ModelError};
+use fusion::targets::Labels;
+
+/// The views of all samples of a batch.
+#[derive(Debug)]
+pub enum BatchViews {
+    /// Pillars, to be encoded.
+    Pillars(PillarBatch),
+    /// `[sum of views, C, H, W]` maps, of an encoder that does not learn.
+    Maps(Tensor),
+}
+
+/// Samples of one training step.
+#[derive(Debug)]
+pub struct Batch {
+    /// All views of all samples.
+    pub views: BatchViews,
+    /// What is known of the views of each sample, ego first.
+    pub facts: Vec<Vec<ViewFacts>>,
+    /// How far the poses of the views of each sample are off, by what was put on top of them.
+    pub offsets: Vec<Vec<Offset>>,
+    /// Targets of each sample.
+    pub labels: Vec<Labels>,
+}
+
+impl Batch {
+    /// Puts samples together, all of pillars or all of maps.
+    ///
+    /// # Errors
+    /// [`SampleError::Torch`] when maps are of different shapes.
+    pub fn collate(samples: Vec<Sample>, lattice: &PillarLattice) -> Result<Self, SampleError> {
+        let (mut pillars, mut maps) = (Vec::new(), Vec::new());
+        for sample in &samples {
+            match &sample.views {
+                SampleViews::Pillars(of_sample) => pillars.extend(of_sample),
+                SampleViews::Maps(of_sample) => maps.push(of_sample),
+            }
+        }
+        let views = if maps.is_empty() {
+            BatchViews::Pillars(PillarBatch::new(&pillars, lattice))
+        } else {
+            BatchViews::Maps(Tensor::f_cat(&maps, 0)?)
+        };
+        let mut batch = Self { views, facts: Vec::new(), offsets: Vec::new(), labels: Vec::new() };
+        for sample in samples {
+            batch.facts.push(sample.facts);
+            batch.offsets.push(sample.offsets);
+            batch.labels.push(sample.labels);
+        }
+        Ok(batch)
+    }
+
+    /// The output of a model for all samples.
+    ///
+    /// # Errors
+    /// [`ModelError`] when facts and views do not add up.
+    pub fn output(&self, model: &CooperativeModel, train: bool) -> Result<CooperativeOutput, ModelError> {
+        match &self.views {
+            BatchViews::Pillars(pillars) => model.forward(&pillars.to_device(model.device()), &self.facts, train),
+            BatchViews::Maps(maps) => {
+                let maps = maps.f_to_device(model.device())?;
+                model.fuse_and_detect(&model.network().through_compressor(&maps, train), &self.facts, train)
+            }
+        }
+    }
+}
+
+/// Batches from number `first` on, the same for any number of threads.
+#[must_use]
+pub fn batches(
+    builder: &SampleBuilder,
+    lattice: PillarLattice,
+    run: &RunConfig,
+    first: u64,
+) -> Prefetch<Result<Batch, SampleError>> {
+    let mut order = Order::new(builder.scenes().ticks().to_vec(), run.seed);
+    let mut builder = builder.clone();
+    let size = run.batch as u64;
+    Prefetch::start(run.loader_threads, first, move |number| {
+        let sample = |index| {
+            let mut rng = ChaCha8Rng::seed_from_u64(order.seed);
+            // Streams are independent sequences of one seed.
+            rng.set_stream(index + 1);
+            builder.build(order.tick(index), &mut rng)
+        };
+        let samples: Result<Vec<Sample>, _> = (number * size..(number + 1) * size).map(sample).collect();
+        Batch::collate(samples?, &lattice)
+    })
+}
+
+/// Every tick once per epoch, in an order that only the seed and the epoch decide.
+#[derive(Clone)]
+struct Order {
+    ticks: Vec<TickRef>,
+    shuffled: Vec<TickRef>,
+    epoch: Option<u64>,
+    seed: u64,
+}
+
+impl Order {
+    fn new(ticks: Vec<TickRef>, seed: u64) -> Self {
+        Self { ticks, shuffled: Vec::new(), epoch: None, seed }
+    }
+
+    fn tick(&mut self, index: u64) -> TickRef {
+        let count = self.ticks.len() as u64;
+        let epoch = index / count;
+        if self.epoch != Some(epoch) {
+            self.shuffled.clone_from(&self.ticks);
+            let mut rng = ChaCha8Rng::seed_from_u64(self.seed.wrapping_add(epoch.wrapping_mul(0x9E37_79B9_7F4A_7C15)));
+            self.shuffled.shuffle(&mut rng);
+            self.epoch = Some(epoch);
+        }
+        self.shuffled[(index % count) as usize]
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_epoch_has_every_tick_once_and_the_next_another_order() {
+        let ticks: Vec<TickRef> = (0..50).map(|tick| TickRef { scenario: 0, tick }).collect();
+        let mut order = Order::new(ticks.clone(), 7);
+        let first: Vec<TickRef> = (0..50).map(|index| order.tick(index)).collect();
+        let second: Vec<TickRef> = (50..100).map(|index| order.tick(index)).collect();
+        assert_ne!(first, second);
+        for epoch in [&first, &second] {
+            let mut sorted = epoch.clone();
+            sorted.sort_by_key(|tick| tick.tick);
+            assert_eq!(sorted, ticks);
+        }
+        // A resumed training that begins in the middle meets the same ticks.
+        let mut resumed = Order::new(ticks, 7);
+        assert_eq!(resumed.tick(73), second[23]);
+    }
+}

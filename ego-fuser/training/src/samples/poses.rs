@@ -1,0 +1,233 @@
+//! Where vehicles of a sample believe to be.
+
+use std::f64::consts::{PI, TAU};
+use std::sync::Arc;
+
+use dataset::frame::Frame;
+use localization::pose_source::{NoiseMode, NoisyPose, NoisyPoseConfig, PoseSourceError, PoseTable};
+use protocol::{CavId, Pose, PoseEstimate};
+use rand::Rng;
+
+use super::SampleError;
+
+/// Poses of samples: the recording's, or those that a pose generator found; some samples with an error on top.
+#[derive(Debug, Clone, Default)]
+pub struct SamplePoses {
+    /// Poses that were found, in place of the recording's; each table is of some of the scenarios.
+    pub tables: Vec<Arc<PoseTable>>,
+    /// Error on top; its seed is drawn anew for every sample.
+    pub noise: Option<NoisyPoseConfig>,
+    /// Share of the samples that have that error.
+    pub noise_share: f64,
+    /// Share of the samples in which one neighbour is somewhere else than it believes, as sure of it as before.
+    pub lost_share: f64,
+}
+
+/// How far from where it believes to be a neighbour that is lost is, metres.
+const LOST_M: std::ops::Range<f64> = 5.0..30.0;
+
+impl SamplePoses {
+    /// Checks the numbers of the error.
+    ///
+    /// # Errors
+    /// [`PoseSourceError`] names the field.
+    pub fn validate(&self) -> Result<(), PoseSourceError> {
+        for (field, value) in [("noise_share", self.noise_share), ("lost_share", self.lost_share)] {
+            if !(0.0..=1.0).contains(&value) {
+                return Err(PoseSourceError::Value { field, value, must: "a share, 0 to 1" });
+            }
+        }
+        self.noise.as_ref().map_or(Ok(()), |noise| NoisyPose::new(noise).map(|_| ()))
+    }
+
+    /// The same without an error on top.
+    #[must_use]
+    pub fn without_noise(&self) -> Self {
+        Self { noise: None, lost_share: 0.0, ..self.clone() }
+    }
+
+    /// Draws the error of one sample.
+    pub(super) fn draw(&self, rng: &mut impl Rng) -> Result<DrawnError, SampleError> {
+        // One draw less where the share is all or nothing: samples of before stay what they were.
+        let lost = (self.lost_share > 0.0 && rng.random_bool(self.lost_share)).then(|| Lost::draw(rng));
+        let is_noisy = self.noise_share >= 1.0 || rng.random_bool(self.noise_share);
+        let seed = rng.random();
+        let Some(noise) = self.noise.as_ref().filter(|_| is_noisy) else {
+            return Ok(DrawnError { lost, ..DrawnError::default() });
+        };
+        let spares_ego = noise.mode == NoiseMode::Fixed;
+        let noise = NoisyPose::new(&NoisyPoseConfig { seed, ..noise.clone() })?;
+        Ok(DrawnError { noise: Some(noise), spares_ego, lost })
+    }
+
+    /// Where a vehicle believes to have been, without an error on top.
+    pub(super) fn found(&self, scenario: &str, frame: &Frame) -> Result<PoseEstimate, SampleError> {
+        let missing = || SampleError::NoPose {
+            scenario: scenario.to_owned(),
+            capture_nanos: frame.capture_nanos,
+            cav: frame.cav.to_string(),
+        };
+        if self.tables.is_empty() {
+            return Ok(PoseEstimate::new(frame.world_from_lidar.ok_or_else(missing)?, 1.0));
+        }
+        let found = self.tables.iter().find_map(|table| table.get(scenario, &frame.cav, frame.capture_nanos));
+        found.copied().ok_or_else(missing)
+    }
+}
+
+/// What would bring a map that was moved by a wrong pose to its place: a shift along x and y of the ego, metres, and a turn
+/// about the map's sender, radians.
+#[derive(Debug, Clone, Copy, PartialEq, Default)]
+pub struct Offset(pub [f64; 3]);
+
+impl Offset {
+    /// The offset between where a sender was said to be and where it is, both in the ego frame.
+    #[must_use]
+    pub fn between(said: &Pose, real: &Pose) -> Self {
+        let along = |axis: usize| real.translation_m[axis] - said.translation_m[axis];
+        let turn_rad = real.yaw_rad() - said.yaw_rad();
+        Self([along(0), along(1), turn_rad.sin().atan2(turn_rad.cos())])
+    }
+}
+
+/// The error of the poses of one sample.
+#[derive(Debug, Default)]
+pub(super) struct DrawnError {
+    noise: Option<NoisyPose>,
+    /// The reference code leaves the ego exact where all others are off by the same.
+    spares_ego: bool,
+    lost: Option<Lost>,
+}
+
+/// A neighbour that is somewhere else than it believes.
+#[derive(Debug, Clone, Copy)]
+struct Lost {
+    /// Decides which neighbour it is.
+    draw: usize,
+    shift_m: [f64; 2],
+    turn_rad: f64,
+}
+
+impl Lost {
+    fn draw(rng: &mut impl Rng) -> Self {
+        let (distance_m, (sin, cos)) = (rng.random_range(LOST_M), rng.random_range(0.0..TAU).sin_cos());
+        // Half of them know their heading.
+        let turn_rad = if rng.random_bool(0.5) { rng.random_range(-PI..PI) } else { 0.0 };
+        Self { draw: rng.random_range(0..usize::MAX), shift_m: [distance_m * cos, distance_m * sin], turn_rad }
+    }
+}
+
+impl DrawnError {
+    /// A pose with the error on top; the confidence falls with it, unless the vehicle is lost.
+    ///
+    /// `agent` is its place in a sample of `agents`, the ego being 0.
+    pub(super) fn added(
+        &self,
+        found: PoseEstimate,
+        cav: &CavId,
+        capture_nanos: u64,
+        [agent, agents]: [usize; 2],
+    ) -> PoseEstimate {
+        let noisy = self.noisy(found, cav, capture_nanos, agent == 0);
+        let is_lost = |lost: &&Lost| agent > 0 && lost.draw % (agents - 1) == agent - 1;
+        match (self.lost.as_ref().filter(is_lost), noisy) {
+            (Some(lost), PoseEstimate::Pose { world_from_cav, confidence }) => {
+                let [x, y, z] = world_from_cav.translation_m;
+                let shifted = [x + lost.shift_m[0], y + lost.shift_m[1], z];
+                PoseEstimate::new(Pose::from_xyz_yaw(shifted, world_from_cav.yaw_rad() + lost.turn_rad), confidence)
+            }
+            _ => noisy,
+        }
+    }
+
+    fn noisy(&self, found: PoseEstimate, cav: &CavId, capture_nanos: u64, is_ego: bool) -> PoseEstimate {
+        let (Some(noise), PoseEstimate::Pose { world_from_cav, confidence }) = (&self.noise, found) else {
+            return found;
+        };
+        if is_ego && self.spares_ego {
+            return found;
+        }
+        match noise.disturbed(cav, capture_nanos, &world_from_cav) {
+            PoseEstimate::Pose { world_from_cav, confidence: of_error } => {
+                PoseEstimate::new(world_from_cav, confidence * of_error)
+            }
+            none @ PoseEstimate::NoPose { .. } => none,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use rand::SeedableRng;
+    use rand_chacha::ChaCha8Rng;
+
+    use super::*;
+
+    fn drawn(mode: NoiseMode, noise_share: f64, seed: u64) -> DrawnError {
+        let noise = NoisyPoseConfig { mode, position_std_m: 1.0, ..NoisyPoseConfig::default() };
+        let poses = SamplePoses { noise: Some(noise), noise_share, ..SamplePoses::default() };
+        poses.validate().unwrap();
+        poses.draw(&mut ChaCha8Rng::seed_from_u64(seed)).unwrap()
+    }
+
+    #[test]
+    fn each_sample_draws_its_own_error_and_confidence_falls_with_it() {
+        let cav = CavId::new("a").unwrap();
+        let found = PoseEstimate::new(Pose::IDENTITY, 0.8);
+        let off = |seed| drawn(NoiseMode::Independent, 1.0, seed).added(found, &cav, 5, [0, 2]);
+        assert_eq!(off(1), off(1));
+        assert_ne!(off(1), off(2));
+        let PoseEstimate::Pose { world_from_cav, confidence } = off(1) else { panic!() };
+        let [x, y, z] = world_from_cav.translation_m;
+        let square = x * x + y * y + z * z;
+        assert!((f64::from(confidence) - 0.8 / (1.0 + square)).abs() < 1e-5);
+    }
+
+    #[test]
+    fn a_share_that_is_none_is_refused_by_name() {
+        for share in [-0.1, 1.1, f64::NAN] {
+            let refused = |poses: SamplePoses| poses.validate().unwrap_err().to_string();
+            assert!(refused(SamplePoses { lost_share: share, ..SamplePoses::default() }).contains("lost_share"));
+            assert!(refused(SamplePoses { noise_share: share, ..SamplePoses::default() }).contains("noise_share"));
+        }
+    }
+
+    #[test]
+    fn one_neighbour_is_lost_at_all_moments_and_does_not_know() {
+        let cav = CavId::new("a").unwrap();
+        let found = PoseEstimate::new(Pose::IDENTITY, 0.8);
+        let poses = SamplePoses { lost_share: 1.0, ..SamplePoses::default() };
+        for seed in 0..20 {
+            let error = poses.draw(&mut ChaCha8Rng::seed_from_u64(seed)).unwrap();
+            let said: Vec<_> = (0..4).map(|agent| error.added(found, &cav, 5, [agent, 4])).collect();
+            let lost: Vec<_> = (0..4).filter(|&agent| said[agent] != found).collect();
+            assert!(lost.len() == 1 && lost[0] > 0, "{lost:?}");
+            let PoseEstimate::Pose { world_from_cav, confidence } = said[lost[0]] else { panic!() };
+            let [x, y, _] = world_from_cav.translation_m;
+            assert!(LOST_M.contains(&x.hypot(y)) && (confidence - 0.8).abs() < 1e-6);
+            assert_eq!(error.added(found, &cav, 99, [lost[0], 4]), said[lost[0]]);
+            assert_eq!(error.added(found, &cav, 5, [0, 1]), found, "an ego alone");
+        }
+    }
+
+    #[test]
+    fn an_offset_brings_a_map_back() {
+        let real = Pose::from_xyz_yaw([20.0, -5.0, 0.0], 3.1);
+        let said = Pose::from_xyz_yaw([21.0, -5.5, 0.0], -3.1);
+        let Offset([dx, dy, turn_rad]) = Offset::between(&said, &real);
+        assert!((dx + 1.0).abs() < 1e-9 && (dy - 0.5).abs() < 1e-9);
+        assert!((turn_rad - (6.2 - std::f64::consts::TAU)).abs() < 1e-9, "{turn_rad}");
+        assert_eq!(Offset::between(&real, &real), Offset::default());
+    }
+
+    #[test]
+    fn a_fixed_error_spares_the_ego_and_some_samples_have_none() {
+        let cav = CavId::new("a").unwrap();
+        let found = PoseEstimate::new(Pose::IDENTITY, 0.8);
+        let fixed = drawn(NoiseMode::Fixed, 1.0, 3);
+        assert_eq!(fixed.added(found, &cav, 5, [0, 2]), found);
+        assert_ne!(fixed.added(found, &cav, 5, [1, 2]), found);
+        let noisy = (0..200).filter(|&seed| drawn(NoiseMode::Independent, 0.25, seed).noise.is_some()).count();
+        assert!((30..70).contains(&noisy), "{noisy}");
+    }
+}

@@ -1,0 +1,139 @@
+//! Datasets as one list of ticks, with poses and annotations kept in memory.
+
+use std::collections::{BTreeSet, HashMap};
+use std::path::PathBuf;
+use std::sync::{Arc, Mutex, MutexGuard, OnceLock, PoisonError};
+
+use dataset::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
+use dataset::frame::Frame;
+use dataset::{self, LoadOptions, OpenOptions, Scenario};
+use perception::train::DataListing;
+use protocol::PointCloud;
+
+use super::SampleError;
+
+/// A tick of a [`SceneSet`].
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub struct TickRef {
+    /// Index of the scenario.
+    pub scenario: usize,
+    /// Index of the tick in it.
+    pub tick: usize,
+}
+
+/// Scenes of one or more datasets.
+///
+/// Poses and annotations of a tick are read once and kept (some kilobytes each); points are read whenever they are
+/// asked for, and the system's page cache does the rest.
+#[derive(Debug)]
+pub struct SceneSet {
+    scenarios: Vec<Scenario>,
+    ticks: Vec<TickRef>,
+    /// What was wrong with the datasets and could be left out.
+    problems: Vec<String>,
+    known: Mutex<HashMap<TickRef, Arc<Vec<Option<Frame>>>>>,
+    /// Frames that could not be read, as they were met.
+    unreadable: Mutex<BTreeSet<String>>,
+    /// Hash of the contents, once someone has asked: it reads a little of every file.
+    sha256: OnceLock<String>,
+}
+
+impl SceneSet {
+    /// Opens datasets, splits or scenarios, with the agents of the protocol, however many.
+    ///
+    /// # Errors
+    /// [`SampleError::Read`] when a folder cannot be read, [`SampleError::Protocol`] when the protocol contradicts
+    /// itself, [`SampleError::Empty`] when there is no tick in any of them.
+    pub fn open(folders: &[PathBuf], options: &OpenOptions, protocol: &ProtocolConfig) -> Result<Self, SampleError> {
+        let (mut scenarios, mut problems) = (Vec::new(), Vec::new());
+        for folder in folders {
+            let dataset = dataset::open_with(folder, options)?;
+            let protocol = protocol.resolve(dataset.layout).map_err(SampleError::Protocol)?;
+            let protocol = EvaluationProtocol { max_agents: usize::MAX, ..protocol };
+            scenarios.extend(dataset.scenarios.iter().filter_map(|scenario| protocol.arrange(scenario)));
+            problems.extend(dataset.problems.iter().map(ToString::to_string));
+        }
+        let set = Self { problems, ..Self::new(scenarios) };
+        if set.ticks.is_empty() {
+            return Err(SampleError::Empty(format!("no tick of any scenario in {folders:?}")));
+        }
+        Ok(set)
+    }
+
+    /// A set of scenarios that are open already.
+    #[must_use]
+    pub fn new(scenarios: Vec<Scenario>) -> Self {
+        let of_scenario = |(scenario, found): (usize, &Scenario)| {
+            (0..found.ticks.len()).map(move |tick| TickRef { scenario, tick }).collect::<Vec<_>>()
+        };
+        let ticks = scenarios.iter().enumerate().flat_map(of_scenario).collect();
+        Self {
+            scenarios,
+            ticks,
+            problems: Vec::new(),
+            known: Mutex::default(),
+            unreadable: Mutex::default(),
+            sha256: OnceLock::new(),
+        }
+    }
+
+    /// All ticks, scenario after scenario.
+    #[must_use]
+    pub fn ticks(&self) -> &[TickRef] {
+        &self.ticks
+    }
+
+    /// The scenario of a tick.
+    #[must_use]
+    pub fn scenario(&self, tick: TickRef) -> &Scenario {
+        &self.scenarios[tick.scenario]
+    }
+
+    /// All scenarios.
+    #[must_use]
+    pub fn scenarios(&self) -> &[Scenario] {
+        &self.scenarios
+    }
+
+    /// Poses and annotations of all agents at a tick, without points, in the order of the scenario's agents; nothing of
+    /// those that are absent or whose file cannot be read.
+    #[must_use]
+    pub fn annotations(&self, tick: TickRef) -> Arc<Vec<Option<Frame>>> {
+        let known = |set: &Self| lock(&set.known).get(&tick).cloned();
+        if let Some(frames) = known(self) {
+            return frames;
+        }
+        let options = LoadOptions { points: false, ..LoadOptions::default() };
+        let scenario = self.scenario(tick);
+        let loaded = scenario.load_tick(tick.tick, 0..scenario.agents.len(), &options);
+        let mut frames: Vec<Option<Frame>> = scenario.agents.iter().map(|_| None).collect();
+        for (agent, frame) in loaded.frames {
+            lock(&self.unreadable).extend(frame.problems.iter().map(|problem| problem.message.clone()));
+            frames[agent] = Some(frame);
+        }
+        lock(&self.unreadable).extend(loaded.unreadable.into_iter().map(|(_, problem)| problem.message));
+        let frames = Arc::new(frames);
+        lock(&self.known).insert(tick, Arc::clone(&frames));
+        frames
+    }
+
+    /// The sweep of one agent.
+    ///
+    /// # Errors
+    /// [`SampleError::Read`] when a file is missing or malformed.
+    pub fn points(&self, tick: TickRef, agent: usize) -> Result<PointCloud, SampleError> {
+        Ok(self.scenario(tick).load(agent, tick.tick, &LoadOptions::default())?.points)
+    }
+
+    /// Which data it is, and what was wrong with it.
+    #[must_use]
+    pub fn data(&self) -> DataListing {
+        let sha256 = self.sha256.get_or_init(|| dataset::content_sha256(&self.scenarios)).clone();
+        let problems = self.problems.iter().chain(lock(&self.unreadable).iter()).cloned().collect();
+        DataListing { sha256, problems, without_pose: 0 }
+    }
+}
+
+fn lock<T>(shared: &Mutex<T>) -> MutexGuard<'_, T> {
+    shared.lock().unwrap_or_else(PoisonError::into_inner)
+}

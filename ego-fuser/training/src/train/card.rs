@@ -1,0 +1,91 @@
+//! The model card: what was trained on what, and how good it is.
+
+use perception::train::ModelCard;
+
+use super::{Summary, TrainConfig};
+use crate::samples::{SampleConfig, SceneSet};
+use fusion::model::CooperativeModel;
+
+/// The card of a detector.
+pub(super) fn card(config: &TrainConfig, model: &CooperativeModel, scenes: &SceneSet, summary: &Summary) -> ModelCard {
+    let (detector, method) = (model.config(), model.method);
+    let mut card = ModelCard::new(
+        &format!("{} detector, method `{method}`", detector.name),
+        &format!("PointPillars over {:?} m, trained for `{method}`: {}.", detector.lidar_range_m, method.summary()),
+    );
+    let data = format!("{} ticks of {} scenarios", scenes.ticks().len(), scenes.scenarios().len());
+    let run = &config.run;
+    card.trained(run, &summary.trained, &data, "samples");
+    card.row(
+        "peak learning rate",
+        format_args!("{:e}, weight decay {:e}", run.learning_rate, run.optimizer.weight_decay),
+    );
+    card.row("anchors between the thresholds", format_args!("{:?}", config.loss.unassigned));
+    let samples = super::frozen::sample_config(config, model);
+    let SampleConfig { augmentation, drop_neighbour, poses, moments, max_agents, comm_range_m, merged_truth, .. } =
+        &samples;
+    card.row(
+        "augmentation",
+        format_args!(
+            "mirrored {:.0} %, turned up to {:.0} degrees, scaled up to {:.0} %",
+            100.0 * augmentation.mirror,
+            augmentation.turn_rad.to_degrees(),
+            100.0 * augmentation.scale
+        ),
+    );
+    card.row(
+        "vehicles",
+        format_args!(
+            "up to {max_agents} within {comm_range_m} m, each neighbour missing in {:.0} % and up to {:.1} s late",
+            100.0 * drop_neighbour,
+            moments.max_delay_nanos as f64 * 1e-9
+        ),
+    );
+    if *merged_truth {
+        card.row("alone", "samples of one vehicle, which is to find what its neighbours have annotated as well");
+    }
+    card.row(
+        "moments",
+        format_args!("{} frames of each vehicle, up to {} ticks from one to the next", moments.frames, moments.gap),
+    );
+    card.row("poses", if poses.tables.is_empty() { "true" } else { "found by a pose generator" });
+    if let Some(noise) = &poses.noise {
+        card.row(
+            "error on top of poses",
+            format_args!(
+                "{:?}, {} m and {} degrees, in {:.0} % of the samples",
+                noise.mode,
+                noise.position_std_m,
+                noise.heading_std_deg,
+                100.0 * poses.noise_share
+            ),
+        );
+    }
+    if poses.lost_share > 0.0 {
+        let share = 100.0 * poses.lost_share;
+        card.row("lost vehicles", format_args!("one neighbour in {share:.0} % of the samples, sure of a wrong pose"));
+    }
+    if config.loss.alignment_weight > 0.0 {
+        let weight = config.loss.alignment_weight;
+        card.row("alignment", format_args!("learns to undo that error, loss with weight {weight}"));
+    }
+    if config.frozen_encoder.is_some() {
+        card.row("encoder", "frozen, its maps kept");
+    }
+    if let Some(accuracy) = &summary.accuracy {
+        card.paragraph(&format!(
+            "Validation on {} frames, ground truth of all vehicles within {comm_range_m} m, area of the network:",
+            accuracy.frames
+        ));
+        let row =
+            |name: &str, [ap_30, ap_50, ap_70]: [f64; 3]| format!("| {name} | {ap_30:.4} | {ap_50:.4} | {ap_70:.4} |");
+        card.paragraph(&format!(
+            "| AP | 0.3 | 0.5 | 0.7 |\n| --- | --- | --- | --- |\n{}\n{}",
+            row("global", accuracy.ap_global),
+            row("frame order", accuracy.ap_frame_order)
+        ));
+    }
+    card.configuration(detector);
+    card.configuration(model.fusion().config());
+    card
+}

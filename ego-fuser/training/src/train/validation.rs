@@ -1,0 +1,106 @@
+//! How good a model is in the middle of its training, on frames that it does not learn from.
+
+use std::sync::Arc;
+
+use perception::boxes::postprocess::is_within;
+use protocol::Box3d;
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use serde::Serialize;
+use tch::no_grad;
+
+use super::TrainError;
+use crate::average_precision::{Ordering, Scorer};
+use crate::feature_store::MapSource;
+use fusion::model::CooperativeModel;
+
+use crate::samples::{Augmentation, Batch, Moments, SampleBuilder, SampleConfig, SampleError, SceneSet, TickRef};
+
+/// AP over the frames of a validation.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
+pub struct Accuracy {
+    /// Frames.
+    pub frames: usize,
+    /// AP at 0.3, 0.5 and 0.7, sorted over all frames.
+    pub ap_global: [f64; 3],
+    /// The same in the order of frames.
+    pub ap_frame_order: [f64; 3],
+}
+
+/// Measures AP on a fixed choice of frames, each seen from a fixed vehicle, with nobody missing or late and no error on top
+/// of poses.
+#[derive(Debug)]
+pub struct Validator {
+    builder: SampleBuilder,
+    ticks: Vec<TickRef>,
+}
+
+impl Validator {
+    /// Chooses `frames` ticks of `scenes`, evenly spread.
+    ///
+    /// # Errors
+    /// [`TrainError::Sample`] when a folder cannot be read.
+    pub fn open(
+        scenes: SceneSet,
+        samples: &SampleConfig,
+        model: &CooperativeModel,
+        frames: usize,
+    ) -> Result<Self, TrainError> {
+        let scenes = Arc::new(scenes);
+        let all = scenes.ticks();
+        let frames = frames.clamp(1, all.len());
+        let ticks = (0..frames).map(|frame| all[frame * all.len() / frames]).collect();
+        let samples = SampleConfig {
+            augmentation: Augmentation::OFF,
+            drop_neighbour: 0.0,
+            poses: samples.poses.without_noise(),
+            moments: Moments { max_delay_nanos: 0, gap: 1, ..samples.moments },
+            merged_truth: true,
+            ..samples.clone()
+        };
+        let assigner = Arc::new(model.assigner().map_err(SampleError::from)?);
+        let builder = SampleBuilder::new(scenes, samples, model.config().clone(), assigner);
+        Ok(Self { builder, ticks })
+    }
+
+    /// The scenes that frames are chosen from.
+    pub(super) fn scenes(&self) -> &SceneSet {
+        self.builder.scenes()
+    }
+
+    /// From now on samples are of maps that were kept.
+    pub(super) fn use_maps(&mut self, maps: MapSource) {
+        self.builder = self.builder.clone().with_maps(maps);
+    }
+
+    /// AP of `model` now.
+    ///
+    /// # Errors
+    /// [`TrainError`] when a frame cannot be read or does not fit the model.
+    pub fn measure(&mut self, model: &CooperativeModel) -> Result<Accuracy, TrainError> {
+        let mut scorer = Scorer::default();
+        let limits = model.limits();
+        for (number, &tick) in self.ticks.iter().enumerate() {
+            let mut rng = ChaCha8Rng::seed_from_u64(number as u64);
+            let sample = self.builder.build(tick, &mut rng)?;
+            // The truth obeys the same limits as the detections.
+            let inside = |object: &&Box3d| {
+                let corners = object.corners();
+                is_within(&corners, limits.keep_range_m)
+                    && corners.iter().all(|corner| (limits.z_range_m[0]..=limits.z_range_m[1]).contains(&corner[2]))
+            };
+            let objects: Vec<_> = sample.objects.iter().filter(inside).copied().collect();
+            let batch = Batch::collate(vec![sample], model.network().lattice())?;
+            let output = no_grad(|| batch.output(model, false))?;
+            for detections in model.detections(&output.head, &limits)? {
+                scorer.add(&detections, &objects);
+            }
+        }
+        let three = |values: Vec<f64>| std::array::from_fn(|index| values[index]);
+        Ok(Accuracy {
+            frames: self.ticks.len(),
+            ap_global: three(scorer.average_precisions(Ordering::Global)),
+            ap_frame_order: three(scorer.average_precisions(Ordering::Frame)),
+        })
+    }
+}

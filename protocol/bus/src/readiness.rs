@@ -1,0 +1,243 @@
+//! The barrier in front of a scene: no clock starts before every route has carried something.
+//!
+//! A message published before its route exists is lost without a word, and knowing that *some* subscriber matches does
+//! not tell which. So every publisher sends probes on its real key until its first real message, every subscriber
+//! answers each probe on `ready/<process>`, and the process that holds the clock waits until all the routes it expects
+//! have been heard of.
+
+use std::collections::BTreeSet;
+use std::fmt;
+use std::str::FromStr;
+use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use protocol::{CavId, Control, Limits, Party, ProcessId, Role, Selector, Topic};
+
+use super::bounded_queue::Taken;
+use super::{Bus, BusError, Event, Inbox, Subscription};
+
+/// Answers of one process that may wait: each repeats what the one before it said.
+const PLACES: usize = 1;
+/// Processes whose answers may wait at once; a run of 64 vehicles has fewer.
+const MAX_PROCESSES: usize = 256;
+
+/// How often a waiting barrier asks whether it should still wait.
+const ASK_AGAIN: Duration = Duration::from_millis(100);
+/// Routes that an error names; a fleet of many misses many at once.
+const NAMED: usize = 20;
+
+/// From the publisher of a topic to one process that listens to it, written `4279/lidar>agent-4279`.
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct Route {
+    /// What is published.
+    pub topic: Topic,
+    /// Who has to hear it.
+    pub receiver: ProcessId,
+}
+
+impl fmt::Display for Route {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "{}>{}", self.topic, self.receiver)
+    }
+}
+
+/// The name of a process in ledgers and routes: `agent-4279`, or the role alone where the vehicle is only a stand-in for
+/// it (`replay`).
+#[must_use]
+pub fn process_id(role: Role, cav: &CavId) -> ProcessId {
+    Party::new(role, cav).name()
+}
+
+/// A text that is not a route.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{text:?} is not a route TOPIC>PROCESS such as 4279/lidar>agent-4279: {detail}")]
+pub struct RouteError {
+    text: String,
+    detail: String,
+}
+
+impl FromStr for Route {
+    type Err = RouteError;
+
+    fn from_str(text: &str) -> Result<Self, RouteError> {
+        let error = |detail: String| RouteError { text: text.chars().take(100).collect(), detail };
+        let (topic, receiver) = text.split_once('>').ok_or_else(|| error("there is no '>'".into()))?;
+        Ok(Self {
+            topic: topic.parse().map_err(|cause: protocol::KeyError| error(cause.to_string()))?,
+            receiver: receiver.parse().map_err(|cause: protocol::IdError| error(cause.to_string()))?,
+        })
+    }
+}
+
+/// Not every route came up.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("after {:.1} s nothing has come through {}{}; is that process running, and in the same run?", .waited.as_secs_f64(),
+    .missing.iter().take(NAMED).map(ToString::to_string).collect::<Vec<_>>().join(", "),
+    if .missing.len() > NAMED { format!(" and {} more", .missing.len() - NAMED) } else { String::new() })]
+pub struct NotReady {
+    /// Routes nobody has answered on, in order.
+    pub missing: Vec<Route>,
+    /// How long the barrier waited.
+    pub waited: Duration,
+}
+
+/// Routes that are still to be heard of.
+#[derive(Default)]
+pub struct Barrier {
+    missing: Mutex<BTreeSet<Route>>,
+    changed: Condvar,
+}
+
+impl Barrier {
+    /// A barrier that opens when all of `expected` have been heard of; at once if there are none.
+    #[must_use]
+    pub fn new(expected: impl IntoIterator<Item = Route>) -> Self {
+        Self { missing: Mutex::new(expected.into_iter().collect()), changed: Condvar::new() }
+    }
+
+    /// Listens on `bus` for the answers to probes.
+    ///
+    /// # Errors
+    /// [`BusError`] when the bus is closed or the system gives no thread.
+    pub fn attend(self, bus: &Bus) -> Result<Attended, BusError> {
+        let (barrier, inbox) = (Arc::new(self), bus.inbox(PLACES, MAX_PROCESSES));
+        let subscription = bus.subscribe_all(&Selector::ready(&bus.identity().run), &inbox)?;
+        let attending = (Arc::clone(&barrier), Arc::clone(&inbox));
+        thread::Builder::new()
+            .name("readiness".into())
+            .spawn(move || attending.0.listen(&attending.1))
+            .map_err(|cause| BusError::Thread { what: "readiness".into(), cause })?;
+        Ok(Attended { barrier, inbox, _subscription: subscription })
+    }
+
+    fn listen(&self, inbox: &Inbox) {
+        while let Taken::Item(topic, event) = inbox.take(None) {
+            let (Topic::Ready(sender), Event::Message(arrival)) = (&topic, event) else { continue };
+            match inbox.decode(&arrival, &Limits::DEFAULT) {
+                // Nobody says for another what that one has heard.
+                Some(Control::Ready { process, heard }) if process == *sender => {
+                    for topic in heard {
+                        self.heard(&Route { topic, receiver: sender.clone() });
+                    }
+                }
+                Some(_) => inbox.misused(&topic, "not the sender's own notice of readiness"),
+                None => {}
+            }
+        }
+    }
+
+    /// Someone answered a probe on `route`. Routes that nobody expects change nothing.
+    pub fn heard(&self, route: &Route) {
+        if self.lock().remove(route) {
+            self.changed.notify_all();
+        }
+    }
+
+    /// Routes still missing.
+    #[must_use]
+    pub fn missing(&self) -> Vec<Route> {
+        self.lock().iter().cloned().collect()
+    }
+
+    /// Waits until the barrier is open, at most for `patience`.
+    ///
+    /// # Errors
+    /// [`NotReady`] names the routes that are missing.
+    pub fn wait(&self, patience: Duration) -> Result<(), NotReady> {
+        self.wait_unless(patience, || false)
+    }
+
+    /// [`Self::wait`] that gives up as soon as `given_up` says so.
+    ///
+    /// # Errors
+    /// [`NotReady`] names the routes that are missing.
+    pub fn wait_unless(&self, patience: Duration, given_up: impl Fn() -> bool) -> Result<(), NotReady> {
+        let began = Instant::now();
+        let mut missing = self.lock();
+        while !missing.is_empty() {
+            let left = patience.saturating_sub(began.elapsed());
+            if left.is_zero() || given_up() {
+                let waited = began.elapsed();
+                return Err(NotReady { missing: missing.iter().cloned().collect(), waited });
+            }
+            let nap = left.min(ASK_AGAIN);
+            missing = self.changed.wait_timeout(missing, nap).unwrap_or_else(PoisonError::into_inner).0;
+        }
+        Ok(())
+    }
+
+    fn lock(&self) -> MutexGuard<'_, BTreeSet<Route>> {
+        self.missing.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// A [`Barrier`] that hears the answers to probes, until it is dropped.
+pub struct Attended {
+    barrier: Arc<Barrier>,
+    inbox: Arc<Inbox>,
+    _subscription: Subscription,
+}
+
+impl std::ops::Deref for Attended {
+    type Target = Barrier;
+
+    fn deref(&self) -> &Barrier {
+        &self.barrier
+    }
+}
+
+impl Drop for Attended {
+    fn drop(&mut self) {
+        self.inbox.close();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn route(text: &str) -> Route {
+        text.parse().unwrap()
+    }
+
+    #[test]
+    fn routes_are_written_and_read_back() {
+        for text in ["4279/lidar>agent-4279", "truth>scorer", "rx/4279/4288/bev>ego-4279"] {
+            assert_eq!(route(text).to_string(), text);
+        }
+        for (text, says) in [("4279/lidar", "'>'"), ("4279/nothing>a", "key"), ("truth>A", "process name")] {
+            let error = text.parse::<Route>().unwrap_err().to_string();
+            assert!(error.contains(says), "{error}");
+        }
+    }
+
+    #[test]
+    fn processes_are_named_by_role_and_vehicle() {
+        assert_eq!(process_id(Role::Agent, &CavId::new("-1").unwrap()).as_str(), "agent--1");
+        assert_eq!(process_id(Role::Replay, &CavId::new("replay").unwrap()).as_str(), "replay");
+        assert_eq!(process_id(Role::Replay, &CavId::new(&"z".repeat(32)).unwrap()).as_str().len(), 39);
+    }
+
+    #[test]
+    fn opens_when_all_have_been_heard() {
+        let barrier = Barrier::new([route("1/lidar>a"), route("2/lidar>b")]);
+        barrier.heard(&route("1/lidar>a"));
+        barrier.heard(&route("3/lidar>c"));
+        let error = barrier.wait(Duration::from_millis(5)).unwrap_err();
+        assert_eq!(error.missing, [route("2/lidar>b")]);
+        assert!(error.to_string().contains("2/lidar>b"), "{error}");
+        std::thread::scope(|scope| {
+            let waiting = scope.spawn(|| barrier.wait(Duration::from_secs(60)));
+            barrier.heard(&route("2/lidar>b"));
+            assert_eq!(waiting.join().unwrap(), Ok(()));
+        });
+    }
+
+    #[test]
+    fn an_error_does_not_name_a_thousand_routes() {
+        let barrier = Barrier::new((0..1000).map(|index| route(&format!("{index}/lidar>a"))));
+        let text = barrier.wait(Duration::ZERO).unwrap_err().to_string();
+        assert!(text.contains("and 980 more") && text.len() < 1000, "{text}");
+    }
+}

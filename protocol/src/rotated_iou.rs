@@ -1,0 +1,206 @@
+//! Overlap of boxes seen from above, exact: convex polygons are clipped by each other.
+
+/// Corners of a footprint, metres, in order around it.
+pub type Footprint = [[f64; 2]; 4];
+
+/// A quadrilateral clipped by four half planes has at most eight corners; each clip adds one.
+const MAX_CORNERS: usize = 8;
+
+/// A footprint with what every comparison needs: bounds and area.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Polygon {
+    /// Corners, counter-clockwise.
+    corners: Footprint,
+    low: [f64; 2],
+    high: [f64; 2],
+    area: f64,
+}
+
+impl Polygon {
+    /// A convex quadrilateral from its corners, in either direction around it.
+    #[must_use]
+    pub fn new(mut corners: Footprint) -> Self {
+        let mut area = signed_area(&corners);
+        if area < 0.0 {
+            corners.reverse();
+            area = -area;
+        }
+        let bound = |pick: fn(f64, f64) -> f64| {
+            std::array::from_fn(|axis| corners.iter().map(|corner| corner[axis]).fold(corners[0][axis], pick))
+        };
+        Self { corners, low: bound(f64::min), high: bound(f64::max), area }
+    }
+
+    /// Area, square metres.
+    #[must_use]
+    pub fn area(&self) -> f64 {
+        self.area
+    }
+
+    /// Area of overlap of the axis-aligned bounds: never less than that of the polygons.
+    #[must_use]
+    pub fn bounds_overlap(&self, other: &Self) -> f64 {
+        let side = |axis: usize| self.high[axis].min(other.high[axis]) - self.low[axis].max(other.low[axis]);
+        side(0).max(0.0) * side(1).max(0.0)
+    }
+
+    /// Area that both cover, square metres.
+    #[must_use]
+    pub fn intersection(&self, other: &Self) -> f64 {
+        if self.bounds_overlap(other) <= 0.0 {
+            return 0.0;
+        }
+        let mut clipped = Clipped::from(&self.corners);
+        for edge in 0..4 {
+            clipped = clipped.keep_left_of(other.corners[edge], other.corners[(edge + 1) % 4]);
+            if clipped.len < 3 {
+                return 0.0;
+            }
+        }
+        signed_area(&clipped.corners[..clipped.len]).clamp(0.0, self.area.min(other.area))
+    }
+
+    /// Intersection over union, 0..1; 0 when neither has an area.
+    #[must_use]
+    pub fn iou(&self, other: &Self) -> f64 {
+        let intersection = self.intersection(other);
+        let union = self.area + other.area - intersection;
+        if union > 0.0 { intersection / union } else { 0.0 }
+    }
+
+    /// Whether the IoU is above `threshold`; answers without clipping where bounds and areas already tell.
+    #[must_use]
+    pub fn overlaps_more_than(&self, other: &Self, threshold: f64) -> bool {
+        let most = self.bounds_overlap(other).min(self.area).min(other.area);
+        // IoU rises with the intersection, so what the bound cannot reach the polygons cannot either.
+        if most <= threshold * (self.area + other.area - most) {
+            return false;
+        }
+        // The reference compares in f32; so does this, or a pair at the threshold could differ.
+        self.iou(other) as f32 > threshold as f32
+    }
+}
+
+/// A polygon in the course of clipping.
+#[derive(Clone, Copy)]
+struct Clipped {
+    corners: [[f64; 2]; MAX_CORNERS],
+    len: usize,
+}
+
+impl From<&Footprint> for Clipped {
+    fn from(corners: &Footprint) -> Self {
+        let mut clipped = Self { corners: [[0.0; 2]; MAX_CORNERS], len: 4 };
+        clipped.corners[..4].copy_from_slice(corners);
+        clipped
+    }
+}
+
+impl Clipped {
+    /// The part to the left of the line from `a` to `b` (Sutherland and Hodgman's step).
+    ///
+    /// A cut lies on the segment between its two corners whatever the rounding, so touching and coinciding edges
+    /// cannot throw a corner far away.
+    fn keep_left_of(&self, a: [f64; 2], b: [f64; 2]) -> Self {
+        let side = |p: [f64; 2]| (b[0] - a[0]) * (p[1] - a[1]) - (b[1] - a[1]) * (p[0] - a[0]);
+        let mut kept = Self { corners: [[0.0; 2]; MAX_CORNERS], len: 0 };
+        let mut previous = self.corners[self.len - 1];
+        let mut previous_side = side(previous);
+        for &corner in &self.corners[..self.len] {
+            let corner_side = side(corner);
+            if (previous_side < 0.0) != (corner_side < 0.0) {
+                let t = previous_side / (previous_side - corner_side);
+                kept.push(std::array::from_fn(|axis| previous[axis] + t * (corner[axis] - previous[axis])));
+            }
+            if corner_side >= 0.0 {
+                kept.push(corner);
+            }
+            (previous, previous_side) = (corner, corner_side);
+        }
+        kept
+    }
+
+    /// Rounding on nearly coinciding edges can ask for a ninth corner; it lies within rounding of another one.
+    fn push(&mut self, corner: [f64; 2]) {
+        if self.len < MAX_CORNERS {
+            self.corners[self.len] = corner;
+            self.len += 1;
+        }
+    }
+}
+
+/// Area of a polygon, positive when counter-clockwise. Coordinates are taken relative to the first corner: far from
+/// the origin the products would otherwise lose the digits that matter.
+fn signed_area(corners: &[[f64; 2]]) -> f64 {
+    let [x0, y0] = corners[0];
+    let mut doubled = 0.0;
+    for pair in corners.windows(2) {
+        doubled += (pair[0][0] - x0) * (pair[1][1] - y0) - (pair[1][0] - x0) * (pair[0][1] - y0);
+    }
+    doubled / 2.0
+}
+
+#[cfg(test)]
+mod tests {
+    use std::f64::consts::{FRAC_PI_4, PI};
+
+    use crate::Box3d;
+    use proptest::prelude::*;
+
+    use super::*;
+
+    fn polygon(x: f64, y: f64, l: f64, w: f64, heading_rad: f64) -> Polygon {
+        let box3d = Box3d { center_m: [x, y, 0.0], size_m: [l, w, 1.0], heading_rad };
+        let corners = box3d.corners();
+        Polygon::new(std::array::from_fn(|corner| [corners[corner][0], corners[corner][1]]))
+    }
+
+    #[test]
+    fn known_overlaps() {
+        let car = polygon(100.0, -30.0, 4.0, 2.0, 0.3);
+        assert!((car.iou(&car) - 1.0).abs() < 1e-12);
+        assert!((car.iou(&polygon(100.0, -30.0, 4.0, 2.0, 0.3 + PI)) - 1.0).abs() < 1e-9);
+        let half = polygon(0.0, 0.0, 4.0, 2.0, 0.0).iou(&polygon(2.0, 0.0, 4.0, 2.0, 0.0));
+        assert!((half - 4.0 / 12.0).abs() < 1e-12);
+        // A square and the same turned by 45 degrees meet in a regular octagon.
+        let octagon = polygon(0.0, 0.0, 2.0, 2.0, 0.0).intersection(&polygon(0.0, 0.0, 2.0, 2.0, FRAC_PI_4));
+        assert!((octagon - 8.0 * (2.0_f64.sqrt() - 1.0)).abs() < 1e-12);
+    }
+
+    #[test]
+    fn touching_boxes_do_not_overlap_and_a_point_has_no_area() {
+        let left = polygon(0.0, 0.0, 2.0, 2.0, 0.0);
+        assert_eq!(left.iou(&polygon(2.0, 0.0, 2.0, 2.0, 0.0)), 0.0);
+        assert_eq!(left.iou(&polygon(2.0, 2.0, 2.0, 2.0, 0.0)), 0.0);
+        let point = Polygon::new([[0.5, 0.5]; 4]);
+        assert_eq!((left.iou(&point), point.iou(&point)), (0.0, 0.0));
+    }
+
+    #[test]
+    fn clockwise_corners_are_taken_as_well() {
+        let mut corners = [[0.0, 0.0], [2.0, 0.0], [2.0, 1.0], [0.0, 1.0]];
+        let counter_clockwise = Polygon::new(corners);
+        corners.reverse();
+        assert!((Polygon::new(corners).iou(&counter_clockwise) - 1.0).abs() < 1e-12);
+    }
+
+    fn any_polygon() -> impl Strategy<Value = Polygon> {
+        (-5.0..5.0, -5.0..5.0, 0.5..6.0, 0.5..3.0, -PI..PI).prop_map(|(x, y, l, w, yaw)| polygon(x, y, l, w, yaw))
+    }
+
+    proptest! {
+        #[test]
+        fn iou_is_symmetric_and_the_short_cut_agrees(a in any_polygon(), b in any_polygon(), threshold in 0.0_f64..0.9) {
+            let iou: f64 = a.iou(&b);
+            prop_assert!((0.0..=1.0).contains(&iou) && (iou - b.iou(&a)).abs() < 1e-9);
+            prop_assume!((iou - threshold).abs() > 1e-6);
+            prop_assert_eq!(a.overlaps_more_than(&b, threshold), iou > threshold);
+        }
+
+        #[test]
+        fn a_box_nearly_on_itself_overlaps_nearly_fully(a in any_polygon(), shift in -1e-9..1e-9) {
+            let moved = Polygon::new(a.corners.map(|[x, y]| [x + shift, y - shift]));
+            prop_assert!(a.iou(&moved) > 1.0 - 1e-6);
+        }
+    }
+}

@@ -1,0 +1,93 @@
+//! Poses of the two sides from their calibration files, one per frame.
+
+use std::path::Path;
+
+use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion};
+
+use super::Sides;
+use super::index::{Kind, Pair};
+use crate::ReadError;
+use crate::json::{self, Field};
+
+/// Folders of the vehicle's calibration: from LiDAR to its GNSS and IMU unit (NovAtel), and from there to the world.
+pub(super) const VEHICLE: [&str; 2] = ["vehicle-side/calib/lidar_to_novatel", "vehicle-side/calib/novatel_to_world"];
+/// Folder of the roadside unit's. Its LiDAR frame is level: a virtual one.
+pub(super) const INFRASTRUCTURE: &str = "infrastructure-side/calib/virtuallidar_to_world";
+
+/// How far a published matrix may be off orthonormal. Some are off by a few thousandths; the nearest rotation is taken.
+const ROTATION_TOLERANCE: f64 = 0.05;
+
+/// Where the vehicle is.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct VehiclePoses {
+    pub(super) world_from_novatel: Isometry3<f64>,
+    novatel_from_lidar: Isometry3<f64>,
+}
+
+impl VehiclePoses {
+    pub(super) fn world_from_lidar(&self) -> Isometry3<f64> {
+        self.world_from_novatel * self.novatel_from_lidar
+    }
+}
+
+/// Reads the poses of the vehicle.
+pub(super) fn vehicle(sides: &Sides, pair: &Pair) -> Result<VehiclePoses, ReadError> {
+    let [novatel_from_lidar, world_from_novatel] = VEHICLE.map(|folder| sides.calibration(folder, &pair.vehicle));
+    Ok(VehiclePoses {
+        world_from_novatel: read_transform(&world_from_novatel)?.0,
+        novatel_from_lidar: read_transform(&novatel_from_lidar)?.0,
+    })
+}
+
+/// Reads the pose of the roadside unit's LiDAR.
+///
+/// The two sides' worlds do not quite agree. DAIR-V2X adds the pair's offset in the world, V2X-Seq in the vehicle's LiDAR
+/// frame (`Coord_transformation` and `Coord_transformation_spd` of the data sets' own code). Without an offset of the pair
+/// that of the calibration file counts (`relative_error`), as in early releases.
+pub(super) fn infrastructure(sides: &Sides, pair: &Pair) -> Result<Isometry3<f64>, ReadError> {
+    let path = sides.calibration(INFRASTRUCTURE, &pair.infrastructure);
+    let (world_from_lidar, own_offset_m) = read_transform(&path)?;
+    let [x_m, y_m] = pair.offset_m.unwrap_or(own_offset_m);
+    let offset = Translation3::new(x_m, y_m, 0.0);
+    if sides.kind == Kind::Dair || [x_m, y_m] == [0.0; 2] {
+        return Ok(offset * world_from_lidar);
+    }
+    let world_from_vehicle = vehicle(sides, pair)?.world_from_lidar();
+    Ok(world_from_vehicle * offset * world_from_vehicle.inverse() * world_from_lidar)
+}
+
+/// A transform, and the offset beside it, metres: `{rotation, translation}`, some below `transform`.
+fn read_transform(path: &Path) -> Result<(Isometry3<f64>, [f64; 2]), ReadError> {
+    let value = json::read(path)?;
+    let root = Field::root(path, &value);
+    let offset_m = root.optional("relative_error")?.map(|offset| self::offset_m(&offset)).transpose()?;
+    let transform = root.optional("transform")?.unwrap_or(root);
+    let rotation = nearest_rotation(&transform.required("rotation")?)?;
+    let translation = Translation3::from(transform.required("translation")?.numbers::<3>()?);
+    Ok((Isometry3::from_parts(translation, rotation), offset_m.unwrap_or_default()))
+}
+
+/// `{delta_x, delta_y}` in metres. One that is missing or an empty text is 0.
+pub(super) fn offset_m(offset: &Field<'_>) -> Result<[f64; 2], ReadError> {
+    let delta = |key| offset.optional(key)?.map_or(Ok(0.0), |delta| delta.number());
+    Ok([delta("delta_x")?, delta("delta_y")?])
+}
+
+/// The rotation nearest to a 3x3 matrix, row by row.
+fn nearest_rotation(field: &Field<'_>) -> Result<UnitQuaternion<f64>, ReadError> {
+    let matrix = Matrix3::from_row_slice(&field.numbers::<9>()?);
+    let deviation = (matrix * matrix.transpose() - Matrix3::identity()).amax();
+    let determinant = matrix.determinant();
+    let is_rotation = deviation <= ROTATION_TOLERANCE && determinant > 0.0;
+    if !is_rotation {
+        let reason = format!(
+            "no rotation: off orthonormal by {deviation:.3}, determinant {determinant:.3}, expected at most \
+             {ROTATION_TOLERANCE} and 1"
+        );
+        return Err(field.error(reason));
+    }
+    let parts = matrix.svd(true, true);
+    let (Some(u), Some(v_transposed)) = (parts.u, parts.v_t) else { return Err(field.error("no rotation")) };
+    let rotation = Rotation3::from_matrix_unchecked(u * v_transposed);
+    Ok(UnitQuaternion::from_rotation_matrix(&rotation))
+}

@@ -1,0 +1,217 @@
+//! Which frames belong together, when and in which batch or sequence: the three files `data_info.json`.
+
+use std::collections::{BTreeMap, HashMap, HashSet};
+use std::path::Path;
+
+use super::calibration::offset_m;
+use super::{Side, VEHICLE_SIDE};
+use crate::json::Field;
+use crate::{Layout, ReadError, Tick, json_table};
+
+/// The pairs, below the root.
+pub(super) const COOPERATIVE: &str = "cooperative/data_info.json";
+/// Largest `data_info.json` that is read, bytes. Those published have up to 20 MB.
+const MAX_BYTES: u64 = 512 << 20;
+
+/// Which of the two data sets.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Kind {
+    Dair,
+    V2xSeq,
+}
+
+impl Kind {
+    pub(super) fn layout(self) -> Layout {
+        match self {
+            Self::Dair => Layout::Dair,
+            Self::V2xSeq => Layout::V2xSeq,
+        }
+    }
+
+    /// What the frames of one drive are called, and the key of its id.
+    fn group(self) -> (&'static str, &'static str) {
+        match self {
+            Self::Dair => ("batch", "batch_id"),
+            Self::V2xSeq => ("sequence", "sequence_id"),
+        }
+    }
+}
+
+/// Two frames that belong together, by their ids.
+#[derive(Debug, Clone, PartialEq)]
+pub(super) struct Pair {
+    pub(super) vehicle: String,
+    pub(super) infrastructure: String,
+    /// Correction of the roadside unit's position, metres, where the pair states one.
+    pub(super) offset_m: Option<[f64; 2]>,
+    /// The sequence, where the pair states it.
+    sequence: Option<String>,
+}
+
+/// When and in which batch or sequence a frame of the vehicle was captured.
+#[derive(Debug)]
+struct Capture {
+    micros: u64,
+    group: Option<String>,
+}
+
+/// The pairs of a data set, in the order of their time.
+#[derive(Debug)]
+pub(super) struct Index {
+    pub(super) kind: Kind,
+    /// By the name of the batch or sequence.
+    pub(super) groups: BTreeMap<String, Vec<(Tick, Pair)>>,
+}
+
+impl Index {
+    /// Reads the pairs of `root`. Entries that cannot be used are left out, with a problem each.
+    ///
+    /// # Errors
+    /// Where there is no pair at all.
+    pub(super) fn read(root: &Path, period_nanos: u64, problems: &mut Vec<ReadError>) -> Result<Self, ReadError> {
+        let path = root.join(COOPERATIVE);
+        let (kind, pairs) = read_pairs(&path, problems)?;
+        if pairs.is_empty() {
+            return Err(ReadError::malformed(
+                &path,
+                "lists no pair of frames of vehicle and roadside unit that can be read (DAIR-V2X)",
+            ));
+        }
+        let captures = read_captures(root, kind, problems);
+        let mut groups: BTreeMap<String, Vec<(u64, Pair)>> = BTreeMap::new();
+        for pair in pairs {
+            match captures.get(&pair.vehicle) {
+                Some(Capture { micros, group }) => {
+                    let group = group.as_ref().or(pair.sequence.as_ref());
+                    groups.entry(group_name(kind, group)).or_default().push((*micros, pair));
+                }
+                // Without any time stamp the order of the list is the best there is.
+                None if captures.is_empty() => {
+                    let group = groups.entry(group_name(kind, pair.sequence.as_ref())).or_default();
+                    let micros = (group.len() as u64).saturating_mul(period_nanos / 1000);
+                    group.push((micros, pair));
+                }
+                None => {
+                    let reason = format!("no entry for vehicle frame {}: the pair is left out", pair.vehicle);
+                    problems.push(ReadError::malformed(&root.join(VEHICLE_SIDE).join("data_info.json"), reason));
+                }
+            }
+        }
+        Ok(Self { kind, groups: groups.into_iter().map(|(name, group)| (name, in_order(group))).collect() })
+    }
+}
+
+fn group_name(kind: Kind, group: Option<&String>) -> String {
+    let (noun, _) = kind.group();
+    group.map_or_else(|| noun.to_owned(), |group| format!("{noun}_{group}"))
+}
+
+/// Ticks by time, from the first on.
+fn in_order(mut pairs: Vec<(u64, Pair)>) -> Vec<(Tick, Pair)> {
+    pairs.sort_by(|(a, first), (b, second)| (a, &first.vehicle).cmp(&(b, &second.vehicle)));
+    let start = pairs.first().map_or(0, |(micros, _)| *micros);
+    let tick = |(micros, pair): (u64, Pair)| {
+        let capture_nanos = (micros - start).saturating_mul(1000);
+        (Tick { stem: pair.vehicle.clone(), capture_nanos }, pair)
+    };
+    pairs.into_iter().map(tick).collect()
+}
+
+fn read_pairs(path: &Path, problems: &mut Vec<ReadError>) -> Result<(Kind, Vec<Pair>), ReadError> {
+    let mut kind = None;
+    let mut pairs: Vec<Pair> = Vec::new();
+    let mut seen = HashSet::new();
+    json_table::read(
+        path,
+        MAX_BYTES,
+        problems,
+        |_| true,
+        |entry| {
+            let pair = pair(entry, &mut kind)?;
+            if !seen.insert(pair.vehicle.clone()) {
+                return Err(entry.error(format!("vehicle frame {} is in a pair already", pair.vehicle)));
+            }
+            pairs.push(pair);
+            Ok(())
+        },
+    )?;
+    Ok((kind.unwrap_or(Kind::Dair), pairs))
+}
+
+/// The first entry decides which of the two data sets it is.
+fn pair(entry: &Field<'_>, kind: &mut Option<Kind>) -> Result<Pair, ReadError> {
+    let is_sequence = entry.optional("vehicle_frame")?.is_some();
+    let kind = *kind.get_or_insert(if is_sequence { Kind::V2xSeq } else { Kind::Dair });
+    let id = |side: Side| {
+        let name = if side == Side::Vehicle { "vehicle" } else { "infrastructure" };
+        match kind {
+            Kind::V2xSeq => frame_id(&entry.required(&format!("{name}_frame"))?),
+            Kind::Dair => match entry.optional(&format!("{name}_image_path"))? {
+                // Points are read by the same id.
+                Some(image) if entry.optional(&format!("{name}_pointcloud_path"))?.is_none() => stem(&image),
+                _ => stem(&entry.required(&format!("{name}_pointcloud_path"))?),
+            },
+        }
+    };
+    Ok(Pair {
+        vehicle: id(Side::Vehicle)?,
+        infrastructure: id(Side::Infrastructure)?,
+        offset_m: entry.optional("system_error_offset")?.map(|offset| offset_m(&offset)).transpose()?,
+        sequence: entry.optional("vehicle_sequence")?.map(|sequence| frame_id(&sequence)).transpose()?,
+    })
+}
+
+/// The id of a frame: the name of its files without suffix.
+fn stem(path: &Field<'_>) -> Result<String, ReadError> {
+    let text = path.text()?;
+    let name = text.rsplit(['/', '\\']).next().unwrap_or(text);
+    checked_id(path, name.rsplit_once('.').map_or(name, |(stem, _)| stem))
+}
+
+fn frame_id(field: &Field<'_>) -> Result<String, ReadError> {
+    checked_id(field, &field.id()?)
+}
+
+/// Ids become names of files.
+fn checked_id(field: &Field<'_>, id: &str) -> Result<String, ReadError> {
+    let is_name = |letter: char| letter.is_ascii_alphanumeric() || letter == '_' || letter == '-';
+    if id.is_empty() || id.len() > 64 || !id.chars().all(is_name) {
+        let shown: String = id.chars().take(40).collect();
+        return Err(field.error(format!("{shown:?} is no id of a frame: expected up to 64 letters, digits, _ and -")));
+    }
+    Ok(id.to_owned())
+}
+
+/// Captures of the vehicle by frame id. What cannot be read is left out, with a problem.
+fn read_captures(root: &Path, kind: Kind, problems: &mut Vec<ReadError>) -> HashMap<String, Capture> {
+    let path = root.join(VEHICLE_SIDE).join("data_info.json");
+    let mut captures = HashMap::new();
+    let read = json_table::read(
+        &path,
+        MAX_BYTES,
+        problems,
+        |_| true,
+        |entry| {
+            let (id, capture) = capture(entry, kind)?;
+            captures.insert(id, capture);
+            Ok(())
+        },
+    );
+    problems.extend(read.err());
+    if captures.is_empty() {
+        let reason =
+            "no time stamps: frames are taken as evenly spaced, in the order of the pairs, and all in one scenario";
+        problems.push(ReadError::malformed(&path, reason));
+    }
+    captures
+}
+
+fn capture(entry: &Field<'_>, kind: Kind) -> Result<(String, Capture), ReadError> {
+    let id = match entry.optional("frame_id")? {
+        Some(id) => frame_id(&id)?,
+        None => stem(&entry.required("pointcloud_path")?)?,
+    };
+    let (_, group_key) = kind.group();
+    let group = entry.optional(group_key)?.map(|group| frame_id(&group)).transpose()?;
+    Ok((id, Capture { micros: entry.required("pointcloud_timestamp")?.count()?, group }))
+}

@@ -1,0 +1,186 @@
+//! Labels of DAIR-V2X and V2X-Seq: lists of boxes in the world or in a LiDAR frame.
+
+use std::path::Path;
+
+use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion, Vector3};
+use protocol::Pose;
+
+use crate::frame::{Object, ObjectClass};
+use crate::ground_truth::upright_box;
+use crate::json::{self, Field};
+use crate::{Problem, ReadError, classes};
+use protocol::rotated_iou::Polygon;
+
+/// Most boxes of a file.
+const MAX_BOXES: usize = 10_000;
+/// Largest edge of a box, metres.
+const MAX_SIZE_M: f64 = 200.0;
+/// How far the angles of a box's corners may be off 90 degrees, as a cosine.
+const MAX_SKEW: f64 = 0.1;
+/// Ids of a list: `block + number`. Farther apart than any number.
+const BLOCK: i64 = 1 << 40;
+/// Boxes of the two sides that overlap more than this, seen from above, are one object: the threshold with which the
+/// public evaluation merges the two lists.
+const SAME_OBJECT_IOU: f64 = 0.05;
+
+/// Objects that can be used, and what is wrong with the others.
+pub(super) type Objects = (Vec<Object>, Vec<Problem>);
+
+/// Whose list it is. The lists number their objects independently, so each has a range of ids of its own.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Block {
+    Cooperative,
+    Vehicle,
+    Infrastructure,
+}
+
+impl Block {
+    pub(super) fn id(self, number: i64) -> i64 {
+        number.saturating_add(self as i64 * BLOCK)
+    }
+}
+
+/// Cooperative labels of DAIR-V2X: eight corners in the world. They have no ids: the number in the list is one, and says
+/// nothing of the object at another tick.
+pub(super) fn in_world(path: &Path) -> Result<Objects, ReadError> {
+    read(path, |number, label| {
+        let Some((world_from_object, size_m)) = from_corners(&label.required("world_8_points")?)? else {
+            return Ok(None);
+        };
+        Ok(Some(Object {
+            id: Block::Cooperative.id(number),
+            class: class(label)?,
+            world_from_object,
+            size_m,
+            speed_mps: None,
+        }))
+    })
+}
+
+/// Labels in the LiDAR frame of a side: all of V2X-Seq, and those of one side of DAIR-V2X. Ids are track ids where there
+/// are any.
+pub(super) fn in_frame(path: &Path, world_from_lidar: &Isometry3<f64>, block: Block) -> Result<Objects, ReadError> {
+    read(path, |number, label| {
+        let Some(size_m) = size_m(&label.required("3d_dimensions")?)? else { return Ok(None) };
+        let location = label.required("3d_location")?;
+        let axis = |key| location.required(key)?.number();
+        let center = Translation3::new(axis("x")?, axis("y")?, axis("z")?);
+        let yaw = UnitQuaternion::from_axis_angle(&Vector3::z_axis(), label.required("rotation")?.number()?);
+        let world_from_object: Pose = (world_from_lidar * Isometry3::from_parts(center, yaw)).into();
+        world_from_object.validate().map_err(|error| location.error(error.to_string()))?;
+        let track = label.optional("track_id")?.and_then(|track| track.count().ok());
+        let number = track.and_then(|track| i64::try_from(track).ok()).filter(|track| *track < BLOCK).unwrap_or(number);
+        Ok(Some(Object { id: block.id(number), class: class(label)?, world_from_object, size_m, speed_mps: None }))
+    })
+}
+
+fn read(
+    path: &Path,
+    object: impl Fn(i64, &Field<'_>) -> Result<Option<Object>, ReadError>,
+) -> Result<Objects, ReadError> {
+    let value = json::read(path)?;
+    let labels = Field::root(path, &value);
+    let labels = labels.items()?;
+    if labels.len() > MAX_BOXES {
+        return Err(ReadError::malformed(path, format!("{} boxes, expected at most {MAX_BOXES}", labels.len())));
+    }
+    let (mut objects, mut problems) = (Vec::with_capacity(labels.len()), Vec::new());
+    for (number, label) in (0..).zip(labels) {
+        match object(number, &label) {
+            Ok(Some(object)) => {
+                problems.extend(unknown_class(path, &label));
+                objects.push(object);
+            }
+            Ok(None) => {}
+            Err(error) => problems.push(Problem::from(&error.with_consequence("the object is left out"))),
+        }
+    }
+    Ok((objects, problems))
+}
+
+/// A type that is not known is no vehicle.
+fn class(label: &Field<'_>) -> Result<ObjectClass, ReadError> {
+    Ok(classes::of_name(label.required("type")?.text()?).unwrap_or(ObjectClass::Other))
+}
+
+fn unknown_class(path: &Path, label: &Field<'_>) -> Option<Problem> {
+    let kind = label.required("type").ok()?.text().ok().filter(|kind| classes::of_name(kind).is_none())?;
+    let shown: String = kind.chars().take(40).collect();
+    Some(classes::unknown(path.parent().unwrap_or(path), "type", &format!("{shown:?}")))
+}
+
+/// Length, width, height; nothing where one is 0: such labels have a box in the image alone.
+fn size_m(dimensions: &Field<'_>) -> Result<Option<[f64; 3]>, ReadError> {
+    let edge = |key| dimensions.required(key)?.number();
+    let size_m = [edge("l")?, edge("w")?, edge("h")?];
+    if size_m.contains(&0.0) {
+        return Ok(None);
+    }
+    check_size(dimensions, size_m).map(Some)
+}
+
+fn check_size(field: &Field<'_>, size_m: [f64; 3]) -> Result<[f64; 3], ReadError> {
+    if size_m.iter().all(|size| *size > 0.0 && *size <= MAX_SIZE_M) {
+        return Ok(size_m);
+    }
+    Err(field.error(format!("{size_m:?} are no sizes in metres, expected up to {MAX_SIZE_M}")))
+}
+
+/// Pose and size of a box from its corners: four of the bottom, in order around it from the front, then those above them.
+/// The edge from the third and fourth corner to the second and first points ahead; the first may be on either side.
+fn from_corners(field: &Field<'_>) -> Result<Option<(Pose, [f64; 3])>, ReadError> {
+    let numbers = field.numbers::<24>()?;
+    let (corners, _) = numbers.as_chunks::<3>();
+    let corner = |index: usize| Vector3::from(corners[index]);
+    let mean = |pairs: [(usize, usize); 4]| {
+        pairs.iter().map(|&(to, from)| corner(to) - corner(from)).sum::<Vector3<f64>>() / 4.0
+    };
+    let ahead = mean([(0, 3), (1, 2), (4, 7), (5, 6)]);
+    let aside = mean([(0, 1), (3, 2), (4, 5), (7, 6)]);
+    let above = mean([(4, 0), (5, 1), (6, 2), (7, 3)]);
+    let size_m = [ahead.norm(), aside.norm(), above.norm()];
+    if size_m.contains(&0.0) {
+        return Ok(None);
+    }
+    let size_m = check_size(field, size_m)?;
+    let skew = [(ahead, aside), (aside, above), (above, ahead)].map(|(a, b)| (a.normalize().dot(&b.normalize())).abs());
+    if !skew.iter().all(|cosine| *cosine <= MAX_SKEW) {
+        return Err(field.error(format!("no box: cosines {skew:.2?} between its edges, expected at most {MAX_SKEW}")));
+    }
+    let x = ahead.normalize();
+    let y = above.cross(&x).normalize();
+    let rotation = Rotation3::from_matrix_unchecked(Matrix3::from_columns(&[x, y, x.cross(&y)]));
+    let center = (0..8).map(corner).sum::<Vector3<f64>>() / 8.0;
+    let pose: Pose = Isometry3::from_parts(center.into(), UnitQuaternion::from_rotation_matrix(&rotation)).into();
+    pose.validate().map_err(|error| field.error(error.to_string()))?;
+    Ok(Some((pose, size_m)))
+}
+
+/// Gives objects of one side the ids of the other side's that they overlap, so that objects of both merge by id.
+///
+/// The two sides are labelled independently. Of several candidates the one that overlaps most is taken; each id is given
+/// once.
+pub(super) fn share_ids(objects: &mut [Object], others: &[Object], lidar_from_world: &Isometry3<f64>) {
+    let footprint = |object: &Object| {
+        let corners = upright_box(object, lidar_from_world).corners();
+        Polygon::new(std::array::from_fn(|corner| [corners[corner][0], corners[corner][1]]))
+    };
+    let own: Vec<Polygon> = objects.iter().map(footprint).collect();
+    let theirs: Vec<Polygon> = others.iter().map(footprint).collect();
+    let mut overlaps = Vec::new();
+    for (index, footprint) in own.iter().enumerate() {
+        for (other, their) in theirs.iter().enumerate() {
+            if footprint.overlaps_more_than(their, SAME_OBJECT_IOU) {
+                overlaps.push((footprint.iou(their), index, other));
+            }
+        }
+    }
+    overlaps.sort_by(|(a, ..), (b, ..)| b.total_cmp(a));
+    let (mut is_named, mut is_given) = (vec![false; own.len()], vec![false; theirs.len()]);
+    for (_, index, other) in overlaps {
+        if !is_named[index] && !is_given[other] {
+            objects[index].id = others[other].id;
+            (is_named[index], is_given[other]) = (true, true);
+        }
+    }
+}

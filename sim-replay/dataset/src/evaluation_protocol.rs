@@ -1,0 +1,123 @@
+//! Evaluation protocols: whose annotations count, where, of which classes, and how average precision is ordered.
+//!
+//! Every benchmark has a protocol of its own, and numbers of two protocols cannot be compared. [`EvaluationProtocol::preset`]
+//! has those of the data sets that are read here; [`ProtocolConfig`] is the same as options, with single changes on top.
+
+mod config;
+mod preset;
+
+use std::fmt;
+
+use serde::{Deserialize, Serialize};
+
+pub use config::ProtocolConfig;
+pub use preset::{PRESETS, preset_of_layout};
+
+use crate::Scenario;
+use crate::ground_truth::GroundTruthRule;
+
+/// How a method is judged on a data set.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct EvaluationProtocol {
+    /// Name of the preset that it starts from.
+    pub name: String,
+    /// Which objects count, and the communication range.
+    pub ground_truth: GroundTruthRule,
+    /// Whether the ground-truth range holds as it is. Otherwise it ends where the area of the network ends.
+    pub exact_range: bool,
+    /// Which agents take part.
+    pub agents: AgentKinds,
+    /// Which of them is the ego.
+    pub ego: EgoKind,
+    /// How many agents take part at most, the ego included.
+    pub max_agents: usize,
+    /// Order of detections in the average precision that the benchmark reports.
+    pub ap_order: ApOrder,
+}
+
+/// Which agents of a scenario take part.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, clap::ValueEnum)]
+#[serde(rename_all = "snake_case")]
+pub enum AgentKinds {
+    /// Vehicles and roadside units.
+    #[default]
+    All,
+    /// Vehicles only.
+    Vehicles,
+    /// Roadside units only.
+    Units,
+}
+
+/// Which agent of a scenario is the ego.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, clap::ValueEnum)]
+#[serde(rename_all = "snake_case")]
+pub enum EgoKind {
+    /// The first vehicle; the first roadside unit where there is no vehicle.
+    #[default]
+    Vehicle,
+    /// The first roadside unit; the first vehicle where there is none.
+    Unit,
+}
+
+/// Order of detections when precision and recall are summed up.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, clap::ValueEnum)]
+#[serde(rename_all = "snake_case")]
+pub enum ApOrder {
+    /// By score over all frames.
+    #[default]
+    Global,
+    /// Frame by frame, by score within a frame, as OpenCOOD's default does.
+    Frame,
+}
+
+impl EvaluationProtocol {
+    /// The preset of that name.
+    #[must_use]
+    pub fn preset(name: &str) -> Option<Self> {
+        preset::preset(name)
+    }
+
+    /// The rule for a network that sees `area_m`: x, y, z low, then x, y, z high, metres in the ego's LiDAR frame. No
+    /// network finds what lies outside of its area, so the ground-truth range ends there, unless `exact_range` is set.
+    #[must_use]
+    pub fn rule_within(&self, area_m: [f64; 6]) -> GroundTruthRule {
+        if self.exact_range {
+            return self.ground_truth;
+        }
+        let within = |[low, high]: [f64; 2], axis: usize| [low.max(area_m[axis]), high.min(area_m[axis + 3])];
+        let GroundTruthRule { x_m, y_m, z_m, .. } = self.ground_truth;
+        GroundTruthRule { x_m: within(x_m, 0), y_m: within(y_m, 1), z_m: within(z_m, 2), ..self.ground_truth }
+    }
+
+    /// The scenario with the agents that take part, the ego first; none where no agent is of the kind asked for.
+    #[must_use]
+    pub fn arrange(&self, scenario: &Scenario) -> Option<Scenario> {
+        let is_unit = |index: &usize| scenario.roadside_units.contains(&scenario.agents[*index]);
+        let (units, vehicles): (Vec<usize>, Vec<usize>) = (0..scenario.agents.len()).partition(is_unit);
+        let mut order = match (self.agents, self.ego) {
+            (AgentKinds::Vehicles, _) => vehicles,
+            (AgentKinds::Units, _) => units,
+            (AgentKinds::All, EgoKind::Vehicle) => [vehicles, units].concat(),
+            (AgentKinds::All, EgoKind::Unit) => [units, vehicles].concat(),
+        };
+        order.truncate(self.max_agents);
+        if order.is_empty() { None } else { Some(scenario.arranged(&order)) }
+    }
+}
+
+impl fmt::Display for EvaluationProtocol {
+    /// One line for reports.
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        let GroundTruthRule { x_m: [x0, x1], y_m: [y0, y1], z_m: [z0, z1], comm_range_m, min_corners, classes } =
+            self.ground_truth;
+        write!(
+            f,
+            "protocol {}: {classes} with {min_corners} of 8 corners in x {x0} to {x1}, y {y0} to {y1}, z {z0} to {z1} m of \
+             the ego's LiDAR; at most {} agents within {comm_range_m} m",
+            self.name, self.max_agents
+        )
+    }
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,104 @@
+//! Options of an evaluation protocol: a preset, and single changes over it.
+
+use serde::{Deserialize, Serialize};
+
+use super::{AgentKinds, ApOrder, EgoKind, EvaluationProtocol, PRESETS, preset_of_layout};
+use crate::Layout;
+use crate::class_set::ClassSet;
+
+/// A protocol as command lines and files ask for it. What is absent is as in the preset.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, clap::Args)]
+#[serde(default, deny_unknown_fields)]
+#[command(next_help_heading = "Evaluation protocol")]
+pub struct ProtocolConfig {
+    /// Protocol of a benchmark: opv2v, v2xset, v2vdet, v2xr, v2v4real, dair, v2xseq, v2xreal, v2xreal-v2v, v2xreal-i2i,
+    /// v2xsim, v2xradar, rcooper or mars [default: the one of the data set's layout].
+    #[arg(long = "protocol", value_name = "NAME")]
+    #[serde(rename = "preset")]
+    pub preset: Option<String>,
+    /// Agents farther from the ego than this do not take part, metres in the plane.
+    #[arg(long = "comm-range", value_name = "M")]
+    pub comm_range_m: Option<f64>,
+    /// Where objects count, in the ego's LiDAR frame: x, y, z low, then x, y, z high, metres. Without this the range of the
+    /// protocol ends where the area of the network ends.
+    #[arg(
+        long = "ground-truth-range",
+        value_name = "M,M,M,M,M,M",
+        value_delimiter = ',',
+        num_args = 6,
+        allow_negative_numbers = true
+    )]
+    pub ground_truth_range_m: Option<Vec<f64>>,
+    /// Corners of a box, of 8, that must lie within that range.
+    #[arg(long = "min-corners", value_name = "N")]
+    pub min_corners: Option<usize>,
+    /// Classes that count: vehicle, car, van, truck, bus, two_wheeler, pedestrian, other; several with commas.
+    #[arg(long, value_name = "CLASSES")]
+    pub classes: Option<ClassSet>,
+    /// Agents that take part at most, the ego included.
+    #[arg(long, value_name = "N")]
+    pub max_agents: Option<usize>,
+    /// Agents that take part.
+    #[arg(long, value_enum)]
+    pub agents: Option<AgentKinds>,
+    /// The ego: the first vehicle or the first roadside unit.
+    #[arg(long, value_enum)]
+    pub ego: Option<EgoKind>,
+    /// Order of detections in the average precision that is reported first.
+    #[arg(long, value_enum)]
+    pub ap_order: Option<ApOrder>,
+}
+
+impl ProtocolConfig {
+    /// The protocol for a data set of `layout`.
+    ///
+    /// # Errors
+    /// A sentence that names the option and both values.
+    pub fn resolve(&self, layout: Layout) -> Result<EvaluationProtocol, String> {
+        let name = self.preset.as_deref().unwrap_or(preset_of_layout(layout));
+        let mut protocol = EvaluationProtocol::preset(name).ok_or_else(|| {
+            let known: Vec<&str> = PRESETS.iter().map(|(name, _)| *name).collect();
+            format!("protocol {name:?} is not known; there are {}", known.join(", "))
+        })?;
+        let rule = &mut protocol.ground_truth;
+        rule.comm_range_m = checked("comm_range_m", self.comm_range_m, 0.0..=1e5)?.unwrap_or(rule.comm_range_m);
+        rule.min_corners = counted("min_corners", self.min_corners, 1..=8)?.unwrap_or(rule.min_corners);
+        rule.classes = self.classes.unwrap_or(rule.classes);
+        if let Some(range) = &self.ground_truth_range_m {
+            [rule.x_m, rule.y_m, rule.z_m] = intervals(range)?;
+            protocol.exact_range = true;
+        }
+        protocol.max_agents = counted("max_agents", self.max_agents, 1..=1000)?.unwrap_or(protocol.max_agents);
+        protocol.agents = self.agents.unwrap_or(protocol.agents);
+        protocol.ego = self.ego.unwrap_or(protocol.ego);
+        protocol.ap_order = self.ap_order.unwrap_or(protocol.ap_order);
+        Ok(protocol)
+    }
+}
+
+fn checked(name: &str, value: Option<f64>, range: std::ops::RangeInclusive<f64>) -> Result<Option<f64>, String> {
+    match value.filter(|value| !range.contains(value)) {
+        Some(value) => Err(format!("{name}: {value}, expected {} to {}", range.start(), range.end())),
+        None => Ok(value),
+    }
+}
+
+fn counted(name: &str, value: Option<usize>, range: std::ops::RangeInclusive<usize>) -> Result<Option<usize>, String> {
+    match value.filter(|value| !range.contains(value)) {
+        Some(value) => Err(format!("{name}: {value}, expected {} to {}", range.start(), range.end())),
+        None => Ok(value),
+    }
+}
+
+/// Low and high of x, y and z.
+fn intervals(range: &[f64]) -> Result<[[f64; 2]; 3], String> {
+    let &[x_low, y_low, z_low, x_high, y_high, z_high] = range else {
+        return Err(format!("ground_truth_range_m: {} numbers, expected 6", range.len()));
+    };
+    let intervals = [[x_low, x_high], [y_low, y_high], [z_low, z_high]];
+    let is_wrong = |[low, high]: &[f64; 2]| !(low.is_finite() && high.is_finite() && low < high);
+    match intervals.iter().find(|interval| is_wrong(interval)) {
+        Some([low, high]) => Err(format!("ground_truth_range_m: from {low} to {high} is no range")),
+        None => Ok(intervals),
+    }
+}

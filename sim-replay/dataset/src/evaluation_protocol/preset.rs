@@ -1,0 +1,99 @@
+//! Presets: the protocols of the data sets that are read here, with their sources.
+
+use super::{AgentKinds, ApOrder, EgoKind, EvaluationProtocol};
+use crate::Layout;
+use crate::class_set::ClassSet;
+use crate::ground_truth::GroundTruthRule;
+
+/// Names of all presets, with the data set of each.
+pub const PRESETS: [(&str, &str); 14] = [
+    ("opv2v", "OPV2V, and generated scenes"),
+    ("v2xset", "V2XSet"),
+    ("v2vdet", "V2VDet of V2VLoc"),
+    ("v2xr", "V2X-R"),
+    ("v2v4real", "V2V4Real"),
+    ("dair", "DAIR-V2X-C"),
+    ("v2xseq", "V2X-Seq (SPD)"),
+    ("v2xreal", "V2X-Real and V2XPnP, vehicles and roadside units"),
+    ("v2xreal-v2v", "V2X-Real, vehicles only"),
+    ("v2xreal-i2i", "V2X-Real, roadside units only"),
+    ("v2xsim", "V2X-Sim 2.0"),
+    ("v2xradar", "V2X-Radar-C"),
+    ("rcooper", "RCooper, in the layouts of its public converters"),
+    ("mars", "Open MARS, multi-agent subset"),
+];
+
+/// The preset of a layout: what holds unless another is asked for.
+#[must_use]
+pub fn preset_of_layout(layout: Layout) -> &'static str {
+    match layout {
+        Layout::V2v4Real => "v2v4real",
+        Layout::V2xReal => "v2xreal",
+        Layout::Dair => "dair",
+        Layout::V2xSeq => "v2xseq",
+        Layout::V2xSim => "v2xsim",
+        Layout::Mars => "mars",
+        _ => "opv2v",
+    }
+}
+
+/// The preset of that name.
+pub(super) fn preset(name: &str) -> Option<EvaluationProtocol> {
+    let known = PRESETS.iter().any(|(known, _)| *known == name);
+    known.then(|| {
+        let (agents, ego) = match name {
+            "v2xreal-v2v" | "v2xsim" => (AgentKinds::Vehicles, EgoKind::Vehicle),
+            "v2xreal-i2i" | "rcooper" => (AgentKinds::Units, EgoKind::Unit),
+            _ => (AgentKinds::All, EgoKind::Vehicle),
+        };
+        EvaluationProtocol {
+            name: name.to_owned(),
+            ground_truth: rule(name),
+            exact_range: false,
+            agents,
+            ego,
+            max_agents: max_agents(name),
+            ap_order: if name == "v2v4real" { ApOrder::Frame } else { ApOrder::Global },
+        }
+    })
+}
+
+fn rule(name: &str) -> GroundTruthRule {
+    let range = |x: f64, y: f64, z_m: [f64; 2], comm_range_m: f64| GroundTruthRule {
+        x_m: [-x, x],
+        y_m: [-y, y],
+        z_m,
+        comm_range_m,
+        min_corners: 8,
+        classes: ClassSet::VEHICLES,
+    };
+    match name {
+        "v2v4real" => GroundTruthRule::V2V4REAL,
+        // V2X-R: opencood/hypes_yaml/V2X-R, ground truth as wide as the points.
+        "v2xr" => range(140.8, 40.0, [-3.0, 1.0], 70.0),
+        // HEAL, dairv2x configurations: the range of the points, z widened by 1 m where labels are filtered. V2X-Seq's own code
+        // takes every pair, however far apart.
+        "dair" | "v2xseq" => range(102.4, 51.2, [-4.5, 2.5], 100.0),
+        // V2X-Real: opencood/data_utils/datasets/__init__.py.
+        "v2xreal" | "v2xreal-v2v" | "v2xreal-i2i" => range(100.0, 40.0, [-15.0, 15.0], 50.0),
+        // HEAL, v2xsim2 configurations, vehicles only. CoAlign has z -3..2 m and 50 m.
+        "v2xsim" => range(32.0, 32.0, [-3.0, 1.0], 70.0),
+        // V2X-Radar: communication range of its configurations.
+        "v2xradar" => range(140.8, 40.0, [-3.0, 1.0], 300.0),
+        // RCooper: roadside units up to 200 m apart.
+        "rcooper" => range(200.0, 40.0, [-20.0, 0.0], 200.0),
+        // Open MARS has no annotations and so no protocol: a choice of ours.
+        "mars" => range(51.2, 51.2, [-5.0, 3.0], 70.0),
+        // OPV2V, V2XSet, V2VDet.
+        _ => GroundTruthRule::OPV2V,
+    }
+}
+
+fn max_agents(name: &str) -> usize {
+    match name {
+        "v2v4real" | "dair" | "v2xseq" => 2,
+        "v2xreal" | "v2xreal-v2v" | "v2xreal-i2i" => 4,
+        "v2xr" | "v2xsim" => 5,
+        _ => 7,
+    }
+}

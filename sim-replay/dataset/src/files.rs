@@ -1,0 +1,149 @@
+//! Folders and files, with the path in every error.
+
+use std::path::{Path, PathBuf};
+use std::{fs, io};
+
+use super::ReadError;
+use support::bounded_file;
+
+/// A folder's entries that are not hidden, in text order.
+#[derive(Debug, Default)]
+pub(super) struct Listing {
+    /// Names of folders.
+    pub(super) folders: Vec<String>,
+    /// Names of files.
+    pub(super) files: Vec<String>,
+}
+
+/// Lists a folder. Names that are not UTF-8 are none of ours and are left out; so are links to nothing, which are files
+/// that are not there.
+pub(super) fn list(dir: &Path) -> Result<Listing, ReadError> {
+    let mut listing = Listing::default();
+    for entry in fs::read_dir(dir).map_err(|error| ReadError::io(dir, error))? {
+        let entry = entry.map_err(|error| ReadError::io(dir, error))?;
+        let Some(name) = entry.file_name().to_str().filter(|name| !name.starts_with('.')).map(str::to_owned) else {
+            continue;
+        };
+        // Data often lies behind symbolic links, so these are followed.
+        let kind = entry.file_type().ok().filter(|kind| !kind.is_symlink());
+        match kind.or_else(|| fs::metadata(entry.path()).ok().map(|metadata| metadata.file_type())) {
+            Some(kind) if kind.is_dir() => listing.folders.push(name),
+            Some(_) => listing.files.push(name),
+            None => {}
+        }
+    }
+    listing.folders.sort_unstable();
+    listing.files.sort_unstable();
+    Ok(listing)
+}
+
+/// The folders below one with their contents; one that cannot be listed is left out.
+pub(super) fn list_below(dir: &Path, listing: &Listing, problems: &mut Vec<ReadError>) -> Vec<(PathBuf, Listing)> {
+    let mut below = Vec::with_capacity(listing.folders.len());
+    for path in listing.folders.iter().map(|folder| dir.join(folder)) {
+        match list(&path) {
+            Ok(listing) => below.push((path, listing)),
+            Err(error) => problems.push(error),
+        }
+    }
+    below
+}
+
+/// Reads a file of at most `max_bytes`.
+pub(super) fn read_limited(path: &Path, max_bytes: u64) -> Result<Vec<u8>, ReadError> {
+    bounded_file::read(path, max_bytes).map_err(|error| match error.kind() {
+        io::ErrorKind::FileTooLarge => ReadError::malformed(path, error.to_string()),
+        _ => ReadError::io(path, error),
+    })
+}
+
+/// Reads a text file of at most `max_bytes`. Bytes that are no UTF-8 become marks that no number has.
+pub(super) fn read_text(path: &Path, max_bytes: u64) -> Result<String, ReadError> {
+    let bytes = read_limited(path, max_bytes)?;
+    Ok(String::from_utf8(bytes).unwrap_or_else(|error| String::from_utf8_lossy(error.as_bytes()).into_owned()))
+}
+
+/// True where a folder has a file whose name ends in `suffix`.
+pub(super) fn holds(dir: &Path, suffix: &str) -> bool {
+    list(dir).is_ok_and(|listing| listing.files.iter().any(|name| name.ends_with(suffix)))
+}
+
+/// The stems of the files that end in `suffix`, in the order given.
+pub(super) fn stems<'a>(files: &'a [String], suffix: &str) -> Vec<&'a str> {
+    files.iter().filter_map(|name| name.strip_suffix(suffix)).collect()
+}
+
+/// The names by which a folder can be found from outside: as it is given, from the root on, and where it really lies. In
+/// `.` or `00` there is little of what lies above it; behind a symbolic link other things may be.
+pub(super) fn names_of(dir: &Path) -> impl Iterator<Item = PathBuf> {
+    let others = [std::path::absolute(dir), dir.canonicalize()].into_iter().flatten();
+    std::iter::once(dir.to_owned()).chain(others).filter(|name| name.file_name().is_some())
+}
+
+/// The folders that lie above one, by its [`names_of`].
+pub(super) fn above(dir: &Path) -> impl Iterator<Item = PathBuf> {
+    names_of(dir).filter_map(|name| name.parent().map(Path::to_owned))
+}
+
+/// The name of a path below `root`, or the folder's own name where they are the same.
+pub(super) fn name_below(root: &Path, dir: &Path) -> String {
+    let below = dir.strip_prefix(root).ok().filter(|below| !below.as_os_str().is_empty());
+    let own_name = || dir.canonicalize().ok().and_then(|dir| dir.file_name().map(PathBuf::from)).unwrap_or_default();
+    below.map_or_else(own_name, Path::to_owned).to_string_lossy().replace('\\', "/")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn listings_are_sorted_and_leave_hidden_entries_out() {
+        let dir = tempfile::tempdir().unwrap();
+        for name in ["b.yaml", "a.yaml", ".hidden"] {
+            fs::write(dir.path().join(name), "").unwrap();
+        }
+        fs::create_dir(dir.path().join("4279")).unwrap();
+        let listing = list(dir.path()).unwrap();
+        assert_eq!((listing.files, listing.folders), (vec!["a.yaml".into(), "b.yaml".into()], vec!["4279".into()]));
+    }
+
+    #[test]
+    fn links_are_followed_and_those_to_nothing_are_not_there() {
+        let dir = tempfile::tempdir().unwrap();
+        let link = |target: &Path, name: &str| std::os::unix::fs::symlink(target, dir.path().join(name)).unwrap();
+        fs::create_dir(dir.path().join("4279")).unwrap();
+        fs::write(dir.path().join("a.yaml"), "").unwrap();
+        link(&dir.path().join("4279"), "4288");
+        link(&dir.path().join("a.yaml"), "b.yaml");
+        link(Path::new("/nowhere.png"), "a_camera0.png");
+        link(Path::new("loop"), "loop");
+        let listing = list(dir.path()).unwrap();
+        assert_eq!(
+            (listing.files, listing.folders),
+            (vec!["a.yaml".into(), "b.yaml".into()], vec!["4279".into(), "4288".into()])
+        );
+    }
+
+    #[test]
+    fn a_file_that_is_too_large_is_named() {
+        let dir = tempfile::tempdir().unwrap();
+        let path = dir.path().join("a");
+        fs::write(&path, [0; 11]).unwrap();
+        assert_eq!(read_limited(&path, 11).unwrap().len(), 11);
+        assert!(
+            read_limited(&path, 10)
+                .unwrap_err()
+                .to_string()
+                .ends_with("a: larger than 10 bytes, the most that is read")
+        );
+        assert!(matches!(read_limited(&dir.path().join("b"), 10), Err(ReadError::Io { .. })));
+    }
+
+    #[test]
+    fn a_scenario_is_named_by_its_path_below_the_root() {
+        assert_eq!(name_below(Path::new("/data"), Path::new("/data/test/one")), "test/one");
+        let dir = tempfile::tempdir().unwrap();
+        let own = dir.path().file_name().unwrap().to_string_lossy();
+        assert_eq!(name_below(dir.path(), dir.path()), own);
+    }
+}

@@ -1,0 +1,244 @@
+//! KITTI object detection: single frames with boxes, `{training,testing}/{velodyne,calib,label_2}`.
+//!
+//! The frames have nothing to do with each other, and no pose: each is its own world, with the LiDAR at its origin.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use nalgebra::{Isometry3, Matrix3, Point3, Rotation3, UnitQuaternion};
+use protocol::{CavId, Handedness, Pose};
+
+use super::frame_files::{named_once, usual_stems};
+use super::kitti_text::{self, Calibration};
+use super::points::{SweepStorage, Sweeps};
+use super::{FrameSource, Layout, OpenOptions, Problem, ReadError, Scenario, Tick, classes, files, single_vehicle};
+use crate::frame::{Frame, Object, ObjectClass};
+use crate::pcd::PcdCloud;
+
+/// Numbers behind the type in a line of labels; detections have a score as well.
+const LABEL_NUMBERS: usize = 14;
+/// Largest size of an object, metres.
+const MAX_SIZE_M: f64 = 100.0;
+
+/// A split.
+#[derive(Debug)]
+struct Split {
+    dir: PathBuf,
+    has_labels: bool,
+    sweeps: Sweeps,
+}
+
+/// True for a folder with sweeps and a folder of calibrations. DAIR-V2X has the same folders, with PCD files.
+pub(super) fn is_split(dir: &Path) -> bool {
+    dir.join("calib").is_dir() && files::holds(&dir.join("velodyne"), ".bin")
+}
+
+/// Opens a split.
+pub(super) fn open(
+    root: &Path,
+    dir: &Path,
+    options: &OpenOptions,
+    problems: &mut Vec<ReadError>,
+) -> Result<Scenario, ReadError> {
+    let velodyne = dir.join("velodyne");
+    let listing = files::list(&velodyne)?;
+    let (stems, strays) = usual_stems(files::stems(&listing.files, ".bin").into_iter().collect());
+    let strays: Vec<String> = strays.into_iter().map(|stem| format!("{stem}.bin")).collect();
+    problems.extend(named_once(&velodyne, &strays));
+    let times = (0u64..).map(|index| options.period_nanos.saturating_mul(index));
+    let tick = |(stem, capture_nanos): (&str, u64)| Tick { stem: stem.to_owned(), capture_nanos };
+    let ticks: Vec<Tick> = stems.into_iter().zip(times).map(tick).collect();
+    let files = ticks.iter().map(|tick| velodyne.join(format!("{}.bin", tick.stem)));
+    let sweeps = Sweeps::of_single_vehicle(SweepStorage::ByName, files, options);
+    let source = Split { dir: dir.to_owned(), has_labels: dir.join("label_2").is_dir(), sweeps };
+    Ok(single_vehicle(files::name_below(root, dir), Layout::KittiObject, ticks, Arc::new(source)))
+}
+
+impl FrameSource for Split {
+    fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame, ReadError> {
+        let mut frame = Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Right);
+        frame.world_from_lidar = Some(Pose::IDENTITY);
+        if self.has_labels {
+            let calibration = Calibration::read(&self.dir.join("calib").join(format!("{}.txt", tick.stem)))?;
+            let rectified = calibration.rotation("R0_rect")?.isometry();
+            let camera_from_lidar = rectified * calibration.transform("Tr_velo_to_cam")?.isometry();
+            (frame.objects, frame.problems) = objects(&self.labels(tick), &camera_from_lidar.inverse())?;
+        }
+        Ok(frame)
+    }
+
+    fn points(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> Result<PcdCloud, ReadError> {
+        self.sweeps.read(agent, &self.points_path(agent, tick, variant))
+    }
+
+    fn annotation_path(&self, _agent: &CavId, tick: &Tick) -> Option<PathBuf> {
+        self.has_labels.then(|| self.labels(tick))
+    }
+
+    fn points_path(&self, _agent: &CavId, tick: &Tick, _variant: Option<&str>) -> PathBuf {
+        self.dir.join("velodyne").join(format!("{}.bin", tick.stem))
+    }
+}
+
+impl Split {
+    fn labels(&self, tick: &Tick) -> PathBuf {
+        self.dir.join("label_2").join(format!("{}.txt", tick.stem))
+    }
+}
+
+/// The labelled objects in the LiDAR frame, and what was left out. `DontCare` regions have no box and are not counted.
+fn objects(path: &Path, lidar_from_camera: &Isometry3<f64>) -> Result<(Vec<Object>, Vec<Problem>), ReadError> {
+    let (mut objects, mut problems) = (Vec::new(), Vec::new());
+    for (line, text) in kitti_text::lines(path)? {
+        let (kind, numbers) = text.trim().split_once(' ').unwrap_or((text.trim(), ""));
+        if kind == "DontCare" {
+            continue;
+        }
+        match object((path, line), kind, numbers, objects.len() as i64, lidar_from_camera) {
+            Ok(object) => {
+                if classes::of_name(kind).is_none() {
+                    let dir = path.parent().unwrap_or(path);
+                    let name: String = kind.chars().take(40).collect();
+                    problems.push(classes::unknown(dir, "type", &format!("{name:?}")));
+                }
+                objects.push(object);
+            }
+            Err(error) => problems.push(Problem::from(&error.with_consequence("the object is left out"))),
+        }
+    }
+    Ok((objects, problems))
+}
+
+fn object(
+    (path, line): (&Path, u64),
+    kind: &str,
+    numbers: &str,
+    id: i64,
+    lidar_from_camera: &Isometry3<f64>,
+) -> Result<Object, ReadError> {
+    // Not every file's first word is short.
+    let field: String = kind.chars().take(40).collect();
+    let malformed = |reason: String| kitti_text::malformed(path, line, Some(&field), reason);
+    let count = numbers.split_ascii_whitespace().count();
+    // A score may follow.
+    let has_score = count == LABEL_NUMBERS + 1;
+    let numbers = numbers.trim().rsplit_once(' ').filter(|_| has_score).map_or(numbers, |(numbers, _)| numbers);
+    let values: [f64; LABEL_NUMBERS] = kitti_text::numbers(path, line, Some(&field), numbers)?;
+    let [.., height, width, length, x, y, z, rotation_y] = values;
+    let size_m = [length, width, height];
+    if size_m.iter().any(|&size| size <= 0.0 || size > MAX_SIZE_M) {
+        return Err(malformed(format!("{size_m:?} m, expected sizes above 0 and up to {MAX_SIZE_M} m")));
+    }
+    let class = classes::of_name(kind).unwrap_or(ObjectClass::Other);
+    let camera_from_object = camera_from_object([x, y, z], height, rotation_y);
+    let world_from_object: Pose = (lidar_from_camera * camera_from_object).into();
+    world_from_object.validate().map_err(|error| malformed(error.to_string()))?;
+    Ok(Object { id, class, world_from_object, size_m, speed_mps: None })
+}
+
+/// The label's place is the middle of the bottom face in the camera frame (x right, y down, z forward); `rotation_y`
+/// turns the length from x towards -z.
+fn camera_from_object(bottom: [f64; 3], height: f64, rotation_y: f64) -> Isometry3<f64> {
+    let (sin, cos) = rotation_y.sin_cos();
+    // Columns: where the object's length, left side and top point.
+    let rotation = Matrix3::new(cos, sin, 0.0, 0.0, 0.0, -1.0, -sin, cos, 0.0);
+    let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(rotation));
+    let [x, y, z] = bottom;
+    Isometry3::from_parts(Point3::new(x, y - height / 2.0, z).coords.into(), rotation)
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use super::*;
+    use crate::LoadOptions;
+
+    fn build(label: &str) -> tempfile::TempDir {
+        let dir = tempfile::tempdir().unwrap();
+        for (name, text) in [
+            ("training/velodyne/000000.bin", ""),
+            (
+                "training/calib/000000.txt",
+                "R0_rect: 1 0 0 0 1 0 0 0 1\nTr_velo_to_cam: 0 -1 0 0 0 0 -1 -0.1 1 0 0 -0.3\n",
+            ),
+            ("training/label_2/000000.txt", label),
+        ] {
+            let path = dir.path().join(name);
+            fs::create_dir_all(path.parent().unwrap()).unwrap();
+            fs::write(path, text).unwrap();
+        }
+        dir
+    }
+
+    #[test]
+    fn labels_become_boxes_in_the_lidar_frame() {
+        let line = "Car 0.00 0 -1.57 0 0 0 0 1.5 1.6 4.0 2.0 1.7 9.7 -1.5707963267948966";
+        let dir = build(&format!("{line}\nDontCare -1 -1 -10 0 0 0 0 -1 -1 -1 -1000 -1000 -1000 -10\n{line} 0.9\n"));
+        let dataset = crate::open(dir.path()).unwrap();
+        assert_eq!((dataset.layout, dataset.scenarios[0].name.as_str()), (Layout::KittiObject, "training"));
+        let frame = dataset.scenarios[0].load(0, 0, &LoadOptions::default()).unwrap();
+        assert_eq!(frame.objects.len(), 2);
+        let car = &frame.objects[0];
+        let [x, y, z] = car.world_from_object.translation_m;
+        // 10 m ahead, 2 m to the right, its middle 0.85 m below the LiDAR.
+        assert!((x - 10.0).abs() < 1e-9 && (y + 2.0).abs() < 1e-9 && (z + 1.05).abs() < 1e-9, "{x} {y} {z}");
+        assert_eq!(car.size_m, [4.0, 1.6, 1.5]);
+        // A quarter turn from the camera's x towards -z... of the camera points along the LiDAR's x.
+        assert!(car.world_from_object.yaw_rad().abs() < 1e-9);
+        let up = car.world_from_object.isometry() * nalgebra::Vector3::z();
+        assert!((up.z - 1.0).abs() < 1e-9);
+    }
+
+    #[test]
+    fn a_bad_label_loses_its_object_alone_and_names_line_and_field() {
+        let sound = "Car 0 0 0 0 0 0 0 1.5 1.6 4.0 2.0 1.7 9.7 0\n";
+        for (bad, field, expected) in [
+            ("Van 0 0 0", "Van", "3 numbers, expected 14: the object is left out"),
+            (
+                "Car 0 0 0 0 0 0 0 1.5 nan 4.0 2.0 1.7 9.7 0",
+                "Car",
+                "\"nan\" is no finite number: the object is left out",
+            ),
+            (
+                "Car 0 0 0 0 0 0 0 1.5 0 4.0 2.0 1.7 9.7 0",
+                "Car",
+                "expected sizes above 0 and up to 100 m: the object is left out",
+            ),
+            ("Car 0 0 0 0 0 0 0 1.5 1.6 4.0 2.0 1e9 9.7 0", "Car", "within 1e7: the object is left out"),
+            ("\u{fffd}\u{1}", "\u{fffd}\u{1}", "0 numbers, expected 14: the object is left out"),
+        ] {
+            let dir = build(&format!("{sound}{bad}\n{sound}"));
+            let frame = crate::open(dir.path()).unwrap().scenarios[0].load(0, 0, &LoadOptions::default()).unwrap();
+            assert_eq!((frame.objects.len(), frame.problems.len()), (2, 1), "{bad}");
+            let problem = &frame.problems[0];
+            assert_eq!((problem.line, problem.field.as_deref()), (Some(2), Some(field)));
+            assert!(problem.message.ends_with(expected), "{problem:?}");
+        }
+    }
+
+    #[test]
+    fn an_unknown_type_is_named_and_counts_as_other() {
+        let dir = build("Ufo 0 0 0 0 0 0 0 1.5 1.6 4.0 2.0 1.7 9.7 0\n");
+        let frame = crate::open(dir.path()).unwrap().scenarios[0].load(0, 0, &LoadOptions::default()).unwrap();
+        assert_eq!(frame.objects[0].class, ObjectClass::Other);
+        assert!(frame.problems[0].message.contains("type: \"Ufo\" is no known type of object"), "{:?}", frame.problems);
+    }
+
+    #[test]
+    fn copies_are_no_sweeps() {
+        let dir = build("");
+        fs::write(dir.path().join("training/velodyne/000000 (1).bin"), "").unwrap();
+        let dataset = crate::open(dir.path()).unwrap();
+        assert_eq!((dataset.scenarios[0].ticks.len(), dataset.problems.len()), (1, 1));
+        assert!(dataset.problems[0].to_string().ends_with("first: 000000 (1).bin"), "{:?}", dataset.problems);
+    }
+
+    #[test]
+    fn a_folder_without_sweeps_is_no_split() {
+        let dir = build("");
+        fs::rename(dir.path().join("training/velodyne/000000.bin"), dir.path().join("training/velodyne/000000.pcd"))
+            .unwrap();
+        assert!(crate::open(dir.path()).unwrap_err().to_string().contains("no known layout"));
+    }
+}

@@ -1,0 +1,285 @@
+//! KITTI odometry: sequences of scans with poses of the left camera.
+//!
+//! A sequence is a folder with `velodyne/<scan>.bin` and `calib.txt`; its poses are in `poses.txt` or
+//! `poses_cam0.txt` beside these, or in the release's `poses/<sequence>.txt`. The line of the poses is the scan's
+//! number. The pose of the LiDAR is `inverse(Tr) * P * Tr`, in the frame of the first scan's LiDAR.
+
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use protocol::{CavId, Handedness, Pose};
+
+use super::faults::Faults;
+use super::kitti_text::{self, Calibration};
+use super::points::{SweepStorage, Sweeps};
+use super::{FrameSource, Layout, OpenOptions, ReadError, Scenario, Tick, files, single_vehicle};
+use crate::frame::Frame;
+use crate::pcd::PcdCloud;
+
+/// A sequence.
+#[derive(Debug)]
+struct Sequence {
+    dir: PathBuf,
+    /// Poses of the LiDAR by scan number, where the sequence has poses and the scan a sound one.
+    world_from_lidar: Option<Vec<Option<Pose>>>,
+    sweeps: Sweeps,
+}
+
+/// True for a folder with scans and a calibration file.
+pub(super) fn is_sequence(dir: &Path) -> bool {
+    dir.join("calib.txt").is_file() && files::holds(&dir.join("velodyne"), ".bin")
+}
+
+/// Opens a sequence. Scans without time or pose are left out where others have them, and named with their number.
+pub(super) fn open(
+    root: &Path,
+    dir: &Path,
+    options: &OpenOptions,
+    problems: &mut Vec<ReadError>,
+) -> Result<Scenario, ReadError> {
+    let velodyne = dir.join("velodyne");
+    let mut scans = scans(&velodyne, problems)?;
+    let times = or_without("times", times(dir, &scans, problems), problems);
+    let poses = or_without("poses", poses(dir, problems), problems);
+    keep_those_with(&mut scans, &dir.join("times.txt"), times.as_deref(), problems);
+    keep_those_with(&mut scans, &poses_path(dir).unwrap_or_default(), poses.as_deref(), problems);
+    let capture_nanos = |scan: usize| match &times {
+        Some(times) => times.get(scan).copied().flatten().unwrap_or_default(),
+        None => options.period_nanos.saturating_mul(scan as u64),
+    };
+    let tick = |(scan, stem): (usize, String)| Tick { stem, capture_nanos: capture_nanos(scan) };
+    let mut ticks: Vec<Tick> = scans.into_iter().map(tick).collect();
+    ticks.sort_by_key(|tick| tick.capture_nanos);
+    let files = ticks.iter().map(|tick| velodyne.join(format!("{}.bin", tick.stem)));
+    let sweeps = Sweeps::of_single_vehicle(SweepStorage::ByName, files, options);
+    let source = Sequence { dir: dir.to_owned(), world_from_lidar: poses, sweeps };
+    Ok(single_vehicle(files::name_below(root, dir), Layout::KittiOdometry, ticks, Arc::new(source)))
+}
+
+/// Number and stem of the scans. Files of other names are left out.
+fn scans(velodyne: &Path, problems: &mut Vec<ReadError>) -> Result<Vec<(usize, String)>, ReadError> {
+    let mut strays = Faults::default();
+    let listing = files::list(velodyne)?;
+    let stems = files::stems(&listing.files, ".bin").into_iter();
+    let scans = stems.filter_map(|stem| Some((strays.take(scan_number(velodyne, stem))?, stem.to_owned()))).collect();
+    strays.report("file", problems);
+    Ok(scans)
+}
+
+/// What a file says of all scans, or a problem and nothing.
+fn or_without<T>(what: &str, read: Result<Option<T>, ReadError>, problems: &mut Vec<ReadError>) -> Option<T> {
+    read.unwrap_or_else(|error| {
+        problems.push(error.with_consequence(&format!("the sequence is read without {what}")));
+        None
+    })
+}
+
+/// Leaves out the scans that the rows of `path` end before, or whose row could not be read, which is known already.
+fn keep_those_with<T>(
+    scans: &mut Vec<(usize, String)>,
+    path: &Path,
+    rows: Option<&[Option<T>]>,
+    problems: &mut Vec<ReadError>,
+) {
+    let Some(rows) = rows else { return };
+    let mut faults = Faults::default();
+    scans.retain(|(scan, _)| match rows.get(*scan) {
+        Some(row) => row.is_some(),
+        None => {
+            faults.push(ReadError::malformed(path, format!("no line for scan {scan}: there are {}", rows.len())));
+            false
+        }
+    });
+    faults.report("scan", problems);
+}
+
+impl FrameSource for Sequence {
+    fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame, ReadError> {
+        let mut frame = Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Right);
+        if let Some(poses) = &self.world_from_lidar {
+            let scan = scan_number(&self.dir.join("velodyne"), &tick.stem)?;
+            frame.world_from_lidar = poses.get(scan).copied().flatten();
+        }
+        Ok(frame)
+    }
+
+    fn points(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> Result<PcdCloud, ReadError> {
+        self.sweeps.read(agent, &self.points_path(agent, tick, variant))
+    }
+
+    fn points_path(&self, _agent: &CavId, tick: &Tick, _variant: Option<&str>) -> PathBuf {
+        self.dir.join("velodyne").join(format!("{}.bin", tick.stem))
+    }
+}
+
+fn scan_number(velodyne: &Path, stem: &str) -> Result<usize, ReadError> {
+    let path = velodyne.join(format!("{stem}.bin"));
+    stem.parse().map_err(|_| ReadError::malformed(&path, format!("{stem:?} is no scan number")))
+}
+
+/// Where the sequence's poses are: beside the scans, or in the release's common folder.
+fn poses_path(dir: &Path) -> Option<PathBuf> {
+    let beside = ["poses.txt", "poses_cam0.txt"].map(|name| dir.join(name)).into_iter().find(|path| path.is_file());
+    let common = |dir: PathBuf| {
+        let name = dir.file_name()?.to_str()?;
+        Some(dir.parent()?.parent()?.join("poses").join(format!("{name}.txt"))).filter(|path| path.is_file())
+    };
+    beside.or_else(|| files::names_of(dir).find_map(common))
+}
+
+fn poses(dir: &Path, problems: &mut Vec<ReadError>) -> Result<Option<Vec<Option<Pose>>>, ReadError> {
+    let Some(path) = poses_path(dir) else { return Ok(None) };
+    let camera_from_lidar = Calibration::read(&dir.join("calib.txt"))?.transform("Tr")?.isometry();
+    let lidar_from_camera = camera_from_lidar.inverse();
+    let mut faults = Faults::default();
+    let poses = kitti_text::rows(&path, &mut faults, |line, text| {
+        let rows = kitti_text::numbers::<12>(&path, line, None, text)?;
+        let world_from_camera = kitti_text::rigid(&path, line, None, &rows)?.isometry();
+        Ok((lidar_from_camera * world_from_camera * camera_from_lidar).into())
+    });
+    faults.report("scan", problems);
+    poses.map(Some)
+}
+
+/// `times.txt`, seconds from the first scan, one per line, in nanoseconds.
+fn times(
+    dir: &Path,
+    scans: &[(usize, String)],
+    problems: &mut Vec<ReadError>,
+) -> Result<Option<Vec<Option<u64>>>, ReadError> {
+    let path = dir.join("times.txt");
+    if !path.is_file() {
+        return Ok(None);
+    }
+    let mut faults = Faults::default();
+    let times = kitti_text::rows(&path, &mut faults, |line, text| {
+        let [seconds] = kitti_text::numbers(&path, line, None, text)?;
+        if !(0.0..=1e9).contains(&seconds) {
+            return Err(kitti_text::malformed(&path, line, None, format!("{seconds} s, expected 0 to 1e9")));
+        }
+        Ok((seconds * 1e9).round() as u64)
+    })?;
+    faults.report("scan", problems);
+    let needed = scans.iter().map(|(scan, _)| scan + 1).max().unwrap_or(0);
+    if times.len() > needed {
+        let reason = format!("{} lines for {needed} scans: those beyond the last scan are not used", times.len());
+        problems.push(ReadError::malformed(&path, reason));
+    }
+    Ok(Some(times))
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use super::*;
+    use crate::{Dataset, LoadOptions};
+
+    /// The camera looks along x of the LiDAR: x right, y down, z forward.
+    const TR: &str = "Tr: 0 -1 0 0 0 0 -1 0 1 0 0 0\n";
+
+    fn build(root: &Path, name: &str, poses_at: &str, poses: &str) {
+        let dir = root.join(name);
+        fs::create_dir_all(dir.join("velodyne")).unwrap();
+        fs::write(dir.join("calib.txt"), TR).unwrap();
+        for scan in 0..2u8 {
+            let point: Vec<u8> =
+                [f32::from(scan), 2.0, 3.0, 0.5].iter().flat_map(|value| value.to_le_bytes()).collect();
+            fs::write(dir.join(format!("velodyne/{scan:06}.bin")), point).unwrap();
+        }
+        let poses_at = root.join(poses_at);
+        fs::create_dir_all(poses_at.parent().unwrap()).unwrap();
+        fs::write(poses_at, poses).unwrap();
+    }
+
+    #[test]
+    fn camera_poses_become_lidar_poses() {
+        let dir = tempfile::tempdir().unwrap();
+        // The second pose: 2 m ahead (camera z) and 1 m to the right (camera x).
+        let poses = "1 0 0 0 0 1 0 0 0 0 1 0\n1 0 0 1 0 1 0 0 0 0 1 2\n";
+        build(dir.path(), "sequences/07", "poses/07.txt", poses);
+        let dataset = crate::open(dir.path()).unwrap();
+        let scenario = &dataset.scenarios[0];
+        assert_eq!((dataset.layout, scenario.name.as_str()), (Layout::KittiOdometry, "sequences/07"));
+        let frame = scenario.load(0, 1, &LoadOptions::default()).unwrap();
+        let moved = frame.world_from_lidar.unwrap().translation_m;
+        assert!((moved[0] - 2.0).abs() < 1e-9 && (moved[1] + 1.0).abs() < 1e-9 && moved[2].abs() < 1e-9, "{moved:?}");
+        assert_eq!((frame.points.xyzi, frame.capture_nanos), (vec![[1.0, 2.0, 3.0, 0.5]], 100_000_000));
+    }
+
+    #[test]
+    fn poses_above_are_found_by_whatever_name_the_folder_has() {
+        let dir = tempfile::tempdir().unwrap();
+        build(dir.path(), "sequences/07", "poses/07.txt", &"1 0 0 0 0 1 0 0 0 0 1 0\n".repeat(2));
+        let sequence = dir.path().join("sequences/07");
+        for name in [sequence.clone(), sequence.join("velodyne/..")] {
+            let dataset = crate::open(&name).unwrap();
+            assert_eq!(dataset.scenarios[0].name, "07");
+            let frame = dataset.scenarios[0].load(0, 0, &LoadOptions::default()).unwrap();
+            assert!(frame.world_from_lidar.is_some(), "{}", name.display());
+        }
+    }
+
+    #[test]
+    fn times_and_missing_lines() {
+        let dir = tempfile::tempdir().unwrap();
+        build(dir.path(), ".", "poses.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n");
+        fs::write(dir.path().join("times.txt"), "0.0\n1.036e-01\n").unwrap();
+        let problems = |dataset: &Dataset| {
+            let root = dir.path().to_string_lossy();
+            dataset.problems.iter().map(|problem| problem.to_string().replace(&*root, "")).collect::<Vec<_>>()
+        };
+        let dataset = crate::open(dir.path()).unwrap();
+        assert_eq!(stems(&dataset), ["000000"]);
+        assert_eq!(problems(&dataset), ["/poses.txt: no line for scan 1: there are 1: the scan is left out"]);
+        fs::write(dir.path().join("poses.txt"), "1 0 0 0 0 1 0 0 0 0 1 0\n".repeat(2)).unwrap();
+        let dataset = crate::open(dir.path()).unwrap();
+        assert_eq!((dataset.scenarios[0].ticks[1].capture_nanos, dataset.problems.len()), (103_600_000, 0));
+        for (times, kept, expected) in [
+            ("0.0\n", 1, "/times.txt: no line for scan 1: there are 1: the scan is left out"),
+            ("0\nsoon\n", 1, "/times.txt:2: \"soon\" is no finite number: the scan is left out"),
+            ("0\n0.1\n0.2\n", 2, "/times.txt: 3 lines for 2 scans: those beyond the last scan are not used"),
+        ] {
+            fs::write(dir.path().join("times.txt"), times).unwrap();
+            let dataset = crate::open(dir.path()).unwrap();
+            assert_eq!((stems(&dataset).len(), problems(&dataset)), (kept, vec![expected.to_owned()]));
+        }
+    }
+
+    #[test]
+    fn a_bad_pose_loses_its_scan_alone() {
+        let dir = tempfile::tempdir().unwrap();
+        build(dir.path(), ".", "poses.txt", "1 0 0 0 0 1 0 0 0 0 -1 0\n1 0 0 0 0 1 0 0 0 0 1 0\n");
+        fs::write(dir.path().join("velodyne/000001 (1).bin"), [0; 16]).unwrap();
+        let dataset = crate::open(dir.path()).unwrap();
+        assert_eq!(stems(&dataset), ["000001"]);
+        assert!(dataset.scenarios[0].load(0, 0, &LoadOptions::default()).unwrap().world_from_lidar.is_some());
+        let problems: Vec<String> = dataset.problems.iter().map(ToString::to_string).collect();
+        assert_eq!((problems.len(), dataset.problems[1].line()), (2, Some(1)));
+        assert!(problems[0].ends_with("\"000001 (1)\" is no scan number: the file is left out"), "{problems:?}");
+        assert!(problems[1].ends_with("the scan is left out"), "{problems:?}");
+    }
+
+    #[test]
+    fn without_calibration_there_are_no_poses() {
+        let dir = tempfile::tempdir().unwrap();
+        build(dir.path(), ".", "poses.txt", "1 0 0 0 0 1 0 0 0 0 1 0\n");
+        fs::write(dir.path().join("calib.txt"), "Tr: 1 2 3\n").unwrap();
+        let dataset = crate::open(dir.path()).unwrap();
+        assert_eq!((stems(&dataset).len(), dataset.problems.len()), (2, 1));
+        assert!(dataset.problems[0].to_string().ends_with("expected 12: the sequence is read without poses"));
+    }
+
+    #[test]
+    fn a_folder_without_scans_is_no_sequence() {
+        let dir = tempfile::tempdir().unwrap();
+        fs::create_dir(dir.path().join("velodyne")).unwrap();
+        fs::write(dir.path().join("velodyne/000000.pcd"), "").unwrap();
+        fs::write(dir.path().join("calib.txt"), TR).unwrap();
+        assert!(crate::open(dir.path()).unwrap_err().to_string().contains("no known layout"));
+    }
+
+    fn stems(dataset: &Dataset) -> Vec<&str> {
+        dataset.scenarios[0].ticks.iter().map(|tick| tick.stem.as_str()).collect()
+    }
+}

@@ -1,0 +1,273 @@
+//! Datasets on disk, whatever their layout, as scenarios of agents and ticks.
+//!
+//! ```no_run
+//! # fn main() -> Result<(), dataset::ReadError> {
+//! use dataset::{self, LoadOptions};
+//!
+//! let dataset = dataset::open("v2xset/validate".as_ref())?;
+//! let scenario = &dataset.scenarios[0];
+//! let ego_frame = scenario.load(0, 0, &LoadOptions::default())?;
+//! println!("{} points", ego_frame.points.len());
+//! # Ok(())
+//! # }
+//! ```
+
+mod agent_folders;
+mod annotations;
+pub mod carla_pose;
+pub mod class_set;
+mod classes;
+mod dair;
+mod error;
+pub mod evaluation_protocol;
+mod faults;
+mod files;
+pub mod frame;
+mod frame_files;
+pub mod ground_truth;
+pub mod hdf5_file;
+mod hdf5_poses;
+mod json;
+mod json_table;
+mod kitti_object;
+mod kitti_odometry;
+mod kitti_text;
+mod layouts;
+mod left_out;
+mod listing;
+mod localization;
+mod nclt_ground_truth;
+mod numpy_tags;
+mod nuscenes;
+mod open;
+mod opv2v;
+pub mod pcd;
+mod points;
+mod poses;
+mod presence;
+mod problem;
+mod recorded;
+mod roots;
+mod unfinished;
+mod v2v4real;
+mod written_pose;
+mod yaml;
+
+use std::path::PathBuf;
+use std::sync::Arc;
+
+use protocol::{CavId, Handedness};
+use serde::Serialize;
+
+pub use error::ReadError;
+pub use layouts::{LAYOUTS, Layout, LayoutDescription, layouts_text};
+pub use left_out::LeftOut;
+pub use listing::{content_sha256, listing_sha256};
+pub use open::{OpenOptions, open, open_with};
+pub use points::{IntensityScale, IntensityScaleError, Plausibility};
+pub use presence::LoadedTick;
+pub use problem::Problem;
+pub use unfinished::UNFINISHED;
+
+use crate::frame::Frame;
+use crate::pcd::PcdCloud;
+use presence::Absences;
+
+/// A dataset, or the part of one that was opened.
+#[derive(Debug)]
+pub struct Dataset {
+    /// Its layout.
+    pub layout: Layout,
+    /// Its scenarios, in text order of their names.
+    pub scenarios: Vec<Scenario>,
+    /// What is wrong with it and could be left out: missing files, folders that are not understood.
+    pub problems: Vec<ReadError>,
+}
+
+/// One moment of a scenario.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct Tick {
+    /// The name of the moment's files, without suffix: a tick counter or a time stamp, by layout.
+    pub stem: String,
+    /// Capture time on the scene's clock, nanoseconds.
+    pub capture_nanos: u64,
+}
+
+/// A frame that one agent lacks.
+#[derive(Debug, Clone, PartialEq, Eq, Serialize)]
+pub struct MissingFrame {
+    /// Who lacks it.
+    pub agent: CavId,
+    /// Its stem.
+    pub stem: String,
+}
+
+/// Some vehicles on the way together.
+#[derive(Debug, Clone)]
+pub struct Scenario {
+    /// Name: its path below the folder that was opened, or that folder's own name.
+    pub name: String,
+    /// The agents, ego first: in text order, a roadside unit that would come first last.
+    pub agents: Vec<CavId>,
+    /// The ego's moments, in order. Other agents take part where they have a frame, see [`Self::is_present`].
+    pub ticks: Vec<Tick>,
+    /// Frames that some agents have and others lack. Where the ego lacks one there is no tick.
+    pub missing: Vec<MissingFrame>,
+    /// Those of `agents` that stand beside the road.
+    pub roadside_units: Vec<CavId>,
+    /// Variants of the LiDAR sweep beside the plain one, for example `fog_0.060`.
+    pub lidar_variants: Vec<String>,
+    /// Whether there are 4D radar points.
+    pub has_radar: bool,
+    /// Layout of this scenario's files.
+    pub layout: Layout,
+    /// Which way the axes of the recording turned.
+    pub source_handedness: Handedness,
+    absences: Absences,
+    source: Arc<dyn FrameSource>,
+}
+
+/// What to read of a frame.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct LoadOptions {
+    /// A variant of [`Scenario::lidar_variants`] in place of the plain sweep.
+    pub lidar_variant: Option<String>,
+    /// Whether to read the LiDAR's points. Off, only poses and objects are read.
+    pub points: bool,
+    /// Whether to read the radar's points.
+    pub radar: bool,
+}
+
+impl Default for LoadOptions {
+    fn default() -> Self {
+        Self { lidar_variant: None, points: true, radar: false }
+    }
+}
+
+/// How a layout finds and reads its frames, in our conventions.
+trait FrameSource: std::fmt::Debug + Send + Sync {
+    /// Reads all of a frame but its points.
+    fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame, ReadError>;
+
+    /// Reads the LiDAR's points, the plain sweep or a variant.
+    fn points(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> Result<PcdCloud, ReadError>;
+
+    /// Reads the radar's points. Asked only of scenarios that have them.
+    fn radar(&self, agent: &CavId, tick: &Tick) -> Result<PcdCloud, ReadError> {
+        let path = self.points_path(agent, tick, None);
+        Err(ReadError::malformed(&path, "there are no radar points beside it"))
+    }
+
+    /// The file that tells the pose and objects of this frame alone, in layouts that have one.
+    fn annotation_path(&self, _agent: &CavId, _tick: &Tick) -> Option<PathBuf> {
+        None
+    }
+
+    /// The file that the LiDAR's points come from.
+    fn points_path(&self, agent: &CavId, tick: &Tick, variant: Option<&str>) -> PathBuf;
+}
+
+impl Scenario {
+    /// Reads the frame of an agent at a tick, by their indices in [`Self::agents`] and [`Self::ticks`].
+    ///
+    /// # Errors
+    /// [`ReadError`] when there is no such agent, tick or variant, and when a file is missing or malformed.
+    pub fn load(&self, agent_index: usize, tick_index: usize, options: &LoadOptions) -> Result<Frame, ReadError> {
+        let (agent, tick) = self.frame_of(agent_index, tick_index)?;
+        let mut frame = self.source.frame(agent, tick)?;
+        if options.points {
+            let cloud = self.load_points(agent_index, tick_index, options.lidar_variant.as_deref())?;
+            (frame.points, frame.dropped_points) = (cloud.points, cloud.dropped);
+        }
+        if options.radar && self.has_radar {
+            frame.radar = Some(self.load_radar(agent_index, tick_index)?.points);
+        }
+        Ok(frame)
+    }
+
+    /// Reads the radar's points alone.
+    ///
+    /// # Errors
+    /// As [`Self::load`].
+    pub fn load_radar(&self, agent_index: usize, tick_index: usize) -> Result<PcdCloud, ReadError> {
+        let (agent, tick) = self.frame_of(agent_index, tick_index)?;
+        self.source.radar(agent, tick)
+    }
+
+    /// Reads the LiDAR's points alone: the plain sweep, or a variant of [`Self::lidar_variants`].
+    ///
+    /// # Errors
+    /// As [`Self::load`].
+    pub fn load_points(
+        &self,
+        agent_index: usize,
+        tick_index: usize,
+        variant: Option<&str>,
+    ) -> Result<PcdCloud, ReadError> {
+        let (agent, tick) = self.frame_of(agent_index, tick_index)?;
+        if let Some(asked) = variant.filter(|asked| !self.lidar_variants.iter().any(|known| known == asked)) {
+            return Err(ReadError::NoSuch {
+                scenario: self.name.clone(),
+                what: "LiDAR variant",
+                asked: asked.to_owned(),
+                available: format!("there are {:?}", self.lidar_variants),
+            });
+        }
+        self.source.points(agent, tick, variant)
+    }
+
+    /// The file that a frame's LiDAR points come from.
+    ///
+    /// # Errors
+    /// [`ReadError::NoSuch`] when there is no such agent or tick.
+    pub fn points_path(
+        &self,
+        agent_index: usize,
+        tick_index: usize,
+        variant: Option<&str>,
+    ) -> Result<PathBuf, ReadError> {
+        let (agent, tick) = self.frame_of(agent_index, tick_index)?;
+        Ok(self.source.points_path(agent, tick, variant))
+    }
+
+    fn frame_of(&self, agent_index: usize, tick_index: usize) -> Result<(&CavId, &Tick), ReadError> {
+        let agent =
+            self.agents.get(agent_index).ok_or_else(|| self.no_such("agent", agent_index, self.agents.len()))?;
+        let tick = self.ticks.get(tick_index).ok_or_else(|| self.no_such("tick", tick_index, self.ticks.len()))?;
+        if !self.is_present(agent_index, tick_index) {
+            return Err(ReadError::Absent {
+                scenario: self.name.clone(),
+                agent: agent.to_string(),
+                tick: tick.stem.clone(),
+            });
+        }
+        Ok((agent, tick))
+    }
+
+    fn no_such(&self, what: &'static str, index: usize, count: usize) -> ReadError {
+        let available = format!("there are {count}, counted from 0");
+        ReadError::NoSuch { scenario: self.name.clone(), what, asked: index.to_string(), available }
+    }
+}
+
+/// The vehicle of a layout that does not name it.
+fn single_vehicle_id() -> CavId {
+    CavId::new("0").expect("a digit is an identifier")
+}
+
+/// A scenario of a layout that knows one vehicle and does not name it.
+fn single_vehicle(name: String, layout: Layout, ticks: Vec<Tick>, source: Arc<dyn FrameSource>) -> Scenario {
+    Scenario {
+        name,
+        agents: vec![single_vehicle_id()],
+        ticks,
+        missing: Vec::new(),
+        roadside_units: Vec::new(),
+        lidar_variants: Vec::new(),
+        has_radar: false,
+        layout,
+        source_handedness: Handedness::Right,
+        absences: Absences::default(),
+        source,
+    }
+}

@@ -1,0 +1,144 @@
+//! Annotated objects of nuScenes tables, and which of them a LiDAR sees.
+
+use std::collections::HashMap;
+use std::path::Path;
+
+use nalgebra::{Isometry3, Point3};
+use protocol::{PointCloud, Pose};
+
+use super::tables::{read_rows, referred, transform};
+use crate::frame::{Object, ObjectClass};
+use crate::json::Field;
+use crate::{ReadError, classes};
+
+/// Largest edge of a box, metres.
+const MAX_SIZE_M: f64 = 200.0;
+/// How far outside a box a point may lie to count as a hit, metres: the margin of the public converter of V2X-Sim.
+const HIT_MARGIN_M: f64 = 0.2;
+/// Categories that are named where they are not known.
+const MAX_UNKNOWN: usize = 20;
+/// Highest mount of a LiDAR above the roof, metres. Units beside the road hang higher.
+const MAX_MOUNT_M: f64 = 1.5;
+
+/// Objects by sample. What cannot be read is left out, with a problem; without `sample_annotation.json` there are none.
+pub(super) fn read(
+    version: &Path,
+    samples: &HashMap<String, usize>,
+    problems: &mut Vec<ReadError>,
+) -> Vec<Vec<Object>> {
+    let mut objects = vec![Vec::new(); samples.len()];
+    if !version.join("sample_annotation.json").is_file() {
+        return objects;
+    }
+    let read = read_instances(version, problems).and_then(|instances| {
+        read_rows(
+            version,
+            "sample_annotation.json",
+            problems,
+            |_| true,
+            |row| {
+                let sample = referred(row, "sample_token", samples)?;
+                let object = object(row, &instances)?;
+                if let Some(objects) = objects.get_mut(sample) {
+                    objects.push(object);
+                }
+                Ok(())
+            },
+        )
+    });
+    problems.extend(read.err());
+    objects
+}
+
+/// A physical object over time.
+struct Instance {
+    id: i64,
+    class: ObjectClass,
+}
+
+fn read_instances(version: &Path, problems: &mut Vec<ReadError>) -> Result<HashMap<String, Instance>, ReadError> {
+    let (mut names, mut unknown) = (HashMap::new(), Vec::new());
+    read_rows(
+        version,
+        "category.json",
+        problems,
+        |_| true,
+        |row| {
+            let name = row.required("name")?;
+            if classes::of_name(name.text()?).is_none() && unknown.len() < MAX_UNKNOWN {
+                unknown.push(unknown_type(&name));
+            }
+            names.insert(row.required("token")?.id()?, name.text()?.to_owned());
+            Ok(())
+        },
+    )?;
+    problems.append(&mut unknown);
+    let mut instances = HashMap::new();
+    read_rows(
+        version,
+        "instance.json",
+        problems,
+        |_| true,
+        |row| {
+            let category = row.required("category_token")?;
+            let name =
+                names.get(&category.id()?).ok_or_else(|| category.error("no row of category.json has this token"))?;
+            let class = classes::of_name(name).unwrap_or(ObjectClass::Other);
+            let id = instances.len() as i64;
+            instances.insert(row.required("token")?.id()?, Instance { id, class });
+            Ok(())
+        },
+    )?;
+    Ok(instances)
+}
+
+fn unknown_type(name: &Field<'_>) -> ReadError {
+    let shown: String = name.text().unwrap_or_default().chars().take(40).collect();
+    name.error(format!("{shown:?} is no known type of object: it counts as other, not as a vehicle"))
+}
+
+fn object(row: &Field<'_>, instances: &HashMap<String, Instance>) -> Result<Object, ReadError> {
+    let token = row.required("instance_token")?;
+    let Instance { id, class } =
+        instances.get(&token.id()?).ok_or_else(|| token.error("no row of instance.json has this token"))?;
+    let size = row.required("size")?;
+    let [width, length, height] = size.numbers::<3>()?;
+    if ![width, length, height].iter().all(|edge| *edge > 0.0 && *edge <= MAX_SIZE_M) {
+        let reason = format!("{:?} are no sizes in metres, expected up to {MAX_SIZE_M}", [width, length, height]);
+        return Err(size.error(reason));
+    }
+    let world_from_object: Pose = transform(row)?.into();
+    Ok(Object { id: *id, class: *class, world_from_object, size_m: [length, width, height], speed_mps: None })
+}
+
+/// The objects that a sweep hits with at least one point. An object with the LiDAR inside or on its roof is the vehicle that
+/// carries it: a vehicle does not list itself.
+pub(super) fn seen<'a>(
+    objects: &'a [Object],
+    points: &PointCloud,
+    world_from_lidar: &Isometry3<f64>,
+) -> impl Iterator<Item = &'a Object> {
+    let (points, world_from_lidar) = (points.xyzi.as_slice(), *world_from_lidar);
+    objects.iter().filter(move |object| {
+        let object_from_lidar = object.world_from_object.isometry().inv_mul(&world_from_lidar);
+        let lidar = object_from_lidar.translation.vector;
+        let half_m = object.size_m.map(|size| size / 2.0);
+        let roof_m = [0.0, 0.0, MAX_MOUNT_M];
+        let carries_lidar = (0..3).all(|axis| lidar[axis].abs() <= half_m[axis] + roof_m[axis]);
+        !carries_lidar && is_hit(points, &object_from_lidar, half_m.map(|half| half + HIT_MARGIN_M))
+    })
+}
+
+fn is_hit(points: &[[f32; 4]], object_from_lidar: &Isometry3<f64>, half_m: [f64; 3]) -> bool {
+    let center = object_from_lidar.inverse().translation.vector;
+    let reach_m2 = half_m.iter().map(|half| half * half).sum::<f64>();
+    points.iter().any(|&[x, y, z, _]| {
+        let point = Point3::new(f64::from(x), f64::from(y), f64::from(z));
+        // Most points are far from any one box.
+        if (point.coords - center).norm_squared() > reach_m2 {
+            return false;
+        }
+        let local = object_from_lidar * point;
+        (0..3).all(|axis| local[axis].abs() <= half_m[axis])
+    })
+}

@@ -1,0 +1,251 @@
+//! Tables of nuScenes: JSON lists whose rows refer to each other by tokens. They are read in an order in which each tells
+//! which rows of the next are needed: a table may have gigabytes, most of it about cameras.
+
+use std::collections::HashMap;
+use std::path::{Component, Path};
+
+use nalgebra::Isometry3;
+use protocol::Pose;
+
+use super::annotations;
+use crate::ReadError;
+use crate::frame::Object;
+use crate::json::Field;
+use crate::json_table::{self, Keys};
+
+/// Largest table that is read, bytes. `sample_data.json` of nuScenes' `v1.0-trainval` has about 1.2 GB.
+const MAX_BYTES: u64 = 4 << 30;
+/// How far a published quaternion's length may be off 1; it is normalized.
+const QUATERNION_TOLERANCE: f64 = 0.01;
+
+/// A drive.
+#[derive(Debug)]
+pub(super) struct Scene {
+    pub(super) name: String,
+    /// Vehicles in the order of the data set, where it names them (Open MARS).
+    pub(super) vehicles: Vec<String>,
+}
+
+/// A moment of a drive, with the sweeps of all LiDARs.
+#[derive(Debug)]
+pub(super) struct Sample {
+    /// Index of the scene.
+    pub(super) scene: usize,
+    pub(super) micros: u64,
+    /// By channel, for example `LIDAR_TOP`.
+    pub(super) sweeps: HashMap<String, Sweep>,
+}
+
+/// Where a sweep lies, and where its LiDAR was.
+#[derive(Debug, Clone)]
+pub(super) struct Sweep {
+    /// Path below the root of the data set.
+    pub(super) file: String,
+    pub(super) world_from_vehicle: Isometry3<f64>,
+    pub(super) vehicle_from_lidar: Isometry3<f64>,
+}
+
+/// What readers need of the tables.
+#[derive(Debug, Default)]
+pub(super) struct Tables {
+    pub(super) scenes: Vec<Scene>,
+    pub(super) samples: Vec<Sample>,
+    /// Annotated objects by sample.
+    pub(super) objects: Vec<Vec<Object>>,
+}
+
+/// A LiDAR on a vehicle.
+#[derive(Debug, Clone)]
+struct Mount {
+    channel: String,
+    vehicle_from_lidar: Isometry3<f64>,
+}
+
+/// A sweep before the pose of its vehicle is known.
+struct SweepRow {
+    sample: usize,
+    file: String,
+    mount: Mount,
+}
+
+/// Reads the tables in the folder `version`. Rows that cannot be used are left out, with a problem each.
+///
+/// # Errors
+/// Where a table is missing or broken before its first row. Annotations may be missing.
+pub(super) fn read(version: &Path, problems: &mut Vec<ReadError>) -> Result<Tables, ReadError> {
+    let mounts = read_mounts(version, problems)?;
+    let (scenes, scene_indices) = read_scenes(version, problems)?;
+    let (mut samples, sample_indices) = read_samples(version, &scene_indices, problems)?;
+    let rows = read_sweeps(version, &mounts, &sample_indices, problems)?;
+    place(version, rows, &mut samples, problems)?;
+    let objects = annotations::read(version, &sample_indices, problems);
+    Ok(Tables { scenes, samples, objects })
+}
+
+/// Reads the rows of a table that are needed.
+pub(super) fn read_rows(
+    version: &Path,
+    name: &str,
+    problems: &mut Vec<ReadError>,
+    is_needed: impl Fn(&Keys<'_>) -> bool,
+    row: impl FnMut(&Field<'_>) -> Result<(), ReadError>,
+) -> Result<usize, ReadError> {
+    json_table::read(&version.join(name), MAX_BYTES, problems, is_needed, row)
+}
+
+/// LiDARs by the token of their calibration.
+fn read_mounts(version: &Path, problems: &mut Vec<ReadError>) -> Result<HashMap<String, Mount>, ReadError> {
+    let mut channels = HashMap::new();
+    read_rows(
+        version,
+        "sensor.json",
+        problems,
+        |_| true,
+        |row| {
+            let channel = row.required("channel")?.text()?;
+            let modality = row.optional("modality")?.map(|modality| modality.text()).transpose()?;
+            if modality.map_or_else(|| channel.starts_with("LIDAR"), |modality| modality.eq_ignore_ascii_case("lidar"))
+            {
+                channels.insert(row.required("token")?.id()?, channel.to_owned());
+            }
+            Ok(())
+        },
+    )?;
+    let mut mounts = HashMap::new();
+    read_rows(
+        version,
+        "calibrated_sensor.json",
+        problems,
+        |_| true,
+        |row| {
+            if let Some(channel) = channels.get(&row.required("sensor_token")?.id()?) {
+                let mount = Mount { channel: channel.clone(), vehicle_from_lidar: transform(row)? };
+                mounts.insert(row.required("token")?.id()?, mount);
+            }
+            Ok(())
+        },
+    )?;
+    Ok(mounts)
+}
+
+type Indices = HashMap<String, usize>;
+
+fn read_scenes(version: &Path, problems: &mut Vec<ReadError>) -> Result<(Vec<Scene>, Indices), ReadError> {
+    let (mut scenes, mut indices) = (Vec::new(), Indices::new());
+    read_rows(
+        version,
+        "scene.json",
+        problems,
+        |_| true,
+        |row| {
+            let vehicles = match row.optional("vehicle_list")? {
+                Some(list) => list.items()?.map(|vehicle| vehicle.id()).collect::<Result<_, _>>()?,
+                None => Vec::new(),
+            };
+            let name = row.required("name")?.id()?;
+            indices.insert(row.required("token")?.id()?, scenes.len());
+            scenes.push(Scene { name, vehicles });
+            Ok(())
+        },
+    )?;
+    Ok((scenes, indices))
+}
+
+fn read_samples(
+    version: &Path,
+    scenes: &Indices,
+    problems: &mut Vec<ReadError>,
+) -> Result<(Vec<Sample>, Indices), ReadError> {
+    let (mut samples, mut indices) = (Vec::new(), Indices::new());
+    read_rows(
+        version,
+        "sample.json",
+        problems,
+        |_| true,
+        |row| {
+            let scene = referred(row, "scene_token", scenes)?;
+            let micros = row.required("timestamp")?.count()?;
+            indices.insert(row.required("token")?.id()?, samples.len());
+            samples.push(Sample { scene, micros, sweeps: HashMap::new() });
+            Ok(())
+        },
+    )?;
+    Ok((samples, indices))
+}
+
+/// Sweeps of key frames by the token of their vehicle's pose.
+fn read_sweeps(
+    version: &Path,
+    mounts: &HashMap<String, Mount>,
+    samples: &Indices,
+    problems: &mut Vec<ReadError>,
+) -> Result<HashMap<String, Vec<SweepRow>>, ReadError> {
+    let mut sweeps: HashMap<String, Vec<SweepRow>> = HashMap::new();
+    let is_needed =
+        |keys: &Keys<'_>| keys.is_key_frame != Some(false) && mounts.contains_key(&*keys.calibrated_sensor_token);
+    read_rows(version, "sample_data.json", problems, is_needed, |row| {
+        let token = row.required("calibrated_sensor_token")?;
+        let mount = mounts.get(&token.id()?).ok_or_else(|| token.error("no row of calibrated_sensor.json has it"))?;
+        let file = row.required("filename")?;
+        let is_below = Path::new(file.text()?).components().all(|part| matches!(part, Component::Normal(_)));
+        if !is_below {
+            return Err(file.error(format!("{:?}, expected a path below the data set", file.text()?)));
+        }
+        let sample = referred(row, "sample_token", samples)?;
+        let sweep = SweepRow { sample, file: file.text()?.to_owned(), mount: mount.clone() };
+        sweeps.entry(row.required("ego_pose_token")?.id()?).or_default().push(sweep);
+        Ok(())
+    })?;
+    Ok(sweeps)
+}
+
+/// Gives the samples their sweeps, with the poses of the vehicles.
+fn place(
+    version: &Path,
+    mut rows: HashMap<String, Vec<SweepRow>>,
+    samples: &mut [Sample],
+    problems: &mut Vec<ReadError>,
+) -> Result<(), ReadError> {
+    let tokens: std::collections::HashSet<String> = rows.keys().cloned().collect();
+    let is_needed = |keys: &Keys<'_>| tokens.contains(&*keys.token);
+    read_rows(version, "ego_pose.json", problems, is_needed, |row| {
+        let world_from_vehicle = transform(row)?;
+        for SweepRow { sample, file, mount } in rows.remove(&row.required("token")?.id()?).unwrap_or_default() {
+            let sweep = Sweep { file, world_from_vehicle, vehicle_from_lidar: mount.vehicle_from_lidar };
+            if let Some(sample) = samples.get_mut(sample) {
+                sample.sweeps.insert(mount.channel, sweep);
+            }
+        }
+        Ok(())
+    })?;
+    let mut without_pose: Vec<&str> = rows.values().flatten().map(|row| row.file.as_str()).collect();
+    without_pose.sort_unstable();
+    if let Some(first) = without_pose.first() {
+        let reason = format!("no pose for {} sweeps, the first {first}: left out", without_pose.len());
+        problems.push(ReadError::malformed(&version.join("ego_pose.json"), reason));
+    }
+    Ok(())
+}
+
+/// The index of the row that a token refers to.
+pub(super) fn referred(row: &Field<'_>, key: &str, indices: &Indices) -> Result<usize, ReadError> {
+    let token = row.required(key)?;
+    let text = token.id()?;
+    let unknown = || token.error(format!("no row has the token {:?}", text.chars().take(40).collect::<String>()));
+    indices.get(&text).copied().ok_or_else(unknown)
+}
+
+/// `translation` in metres and `rotation` as quaternion w, x, y, z.
+pub(super) fn transform(row: &Field<'_>) -> Result<Isometry3<f64>, ReadError> {
+    let translation_m = row.required("translation")?.numbers::<3>()?;
+    let rotation = row.required("rotation")?;
+    let rotation_wxyz = rotation.numbers::<4>()?;
+    let length = rotation_wxyz.iter().map(|part| part * part).sum::<f64>().sqrt();
+    let is_unit = (length - 1.0).abs() <= QUATERNION_TOLERANCE;
+    if !is_unit {
+        return Err(rotation.error(format!("a quaternion of length {length}, expected 1")));
+    }
+    let pose = Pose { translation_m, rotation_wxyz: rotation_wxyz.map(|part| part / length) };
+    pose.validate().map_err(|error| row.error(error.to_string()))?;
+    Ok(pose.isometry())
+}

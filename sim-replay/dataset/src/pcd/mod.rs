@@ -1,0 +1,169 @@
+//! PCD point files: ASCII, binary and LZF-compressed, as PCL, Open3D and the OPV2V family write them.
+//!
+//! Intensity comes from the field `intensity`, else from the red byte of `rgb`: OPV2V stores R / 255 there, in a word
+//! `0x00RRGGBB` whose bits are printed as a float. Every red below 128 is a subnormal number then, so the text is
+//! parsed exactly and only the bits are looked at.
+//!
+//! Points stay in the frame and handedness of the file; mirroring is the business of the datasets' readers.
+//!
+//! ```
+//! use protocol::PointCloud;
+//! use dataset::pcd::{self, Encoding, IntensityField};
+//!
+//! let cloud = PointCloud { xyzi: vec![[1.0, 2.0, 3.0, 0.5]] };
+//! let bytes = pcd::encode(&cloud, Encoding::Binary, IntensityField::Intensity);
+//! assert_eq!(pcd::decode(&bytes).unwrap().points, cloud);
+//! ```
+
+mod ascii;
+mod binary;
+mod encode;
+mod header;
+mod lzf;
+mod number;
+
+use protocol::PointCloud;
+use serde::Serialize;
+
+pub use encode::{Encoding, IntensityField, encode};
+
+use header::{Data, Header};
+
+/// Red of full intensity.
+const RED_SCALE: f32 = 255.0;
+
+/// What a PCD file holds.
+#[derive(Debug, Clone, PartialEq, Default)]
+pub struct PcdCloud {
+    /// The points whose coordinates and intensity are finite, in the order of the file.
+    pub points: PointCloud,
+    /// The green byte of `rgb` for each of `points`, where one is not zero: V2X-R labels weather clutter with it.
+    pub labels: Option<Vec<u8>>,
+    /// How many points were left out because a number is NaN or infinite.
+    pub dropped: usize,
+    /// Where the first of these stands.
+    pub first_dropped: Option<Place>,
+    /// Where the intensities come from; `None` where the file has none, and 0 stands for all.
+    pub intensity: Option<IntensityOrigin>,
+    /// Form of the file, for example `PCD` or `5 floats per point: x y z intensity ring`; empty where it is not known.
+    pub form: &'static str,
+}
+
+/// Where the intensities of a sweep come from.
+#[derive(Debug, Clone, PartialEq, Serialize)]
+pub struct IntensityOrigin {
+    /// Name of the field.
+    pub field: String,
+    /// Number that the field stores, which tells its scale or leaves it open.
+    pub kind: IntensityKind,
+    /// Divisor that made the stored numbers what [`PcdCloud::points`] holds.
+    pub divisor: f32,
+}
+
+/// Number that stores an intensity.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum IntensityKind {
+    /// The red byte of a packed colour, 0..255.
+    RedByte,
+    /// A byte, 0..255.
+    Byte,
+    /// A wider number, whose scale its type does not tell.
+    Number,
+}
+
+/// Where in a file.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Place {
+    /// A line, from 1.
+    Line(u64),
+    /// A point, from 0.
+    Point(u64),
+}
+
+/// Why bytes are no PCD file that can be read.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+#[error("{}{}{reason}", line.map(|line| format!("line {line}: ")).unwrap_or_default(), field.as_ref().map(|field| format!("{field}: ")).unwrap_or_default())]
+pub struct PcdError {
+    /// The line at fault, from 1, where the fault is in text.
+    pub line: Option<u64>,
+    /// The header key or the field of a point.
+    pub field: Option<String>,
+    /// What was found and what was expected.
+    pub reason: String,
+}
+
+impl PcdError {
+    fn at(line: u64, field: impl Into<String>, reason: impl Into<String>) -> Self {
+        Self { line: Some(line), field: Some(field.into()), reason: reason.into() }
+    }
+
+    fn of(field: impl Into<String>, reason: impl Into<String>) -> Self {
+        Self { line: None, field: Some(field.into()), reason: reason.into() }
+    }
+}
+
+/// Reads a PCD file that is in memory. Intensities are as the file stores them; the red byte of a colour is 0 to 1.
+///
+/// # Errors
+/// [`PcdError`] names line, field and both values of what does not fit. Nothing is allocated on the word of the header
+/// alone.
+pub fn decode(bytes: &[u8]) -> Result<PcdCloud, PcdError> {
+    let mut cloud = decode_stored(bytes)?;
+    if let Some(origin) = cloud.intensity.as_mut().filter(|origin| origin.kind == IntensityKind::RedByte) {
+        origin.divisor = RED_SCALE;
+        cloud.points.xyzi.iter_mut().for_each(|point| point[3] /= RED_SCALE);
+    }
+    Ok(cloud)
+}
+
+/// [`decode`] with the red byte of a colour as it is stored too: 0 to 255.
+///
+/// # Errors
+/// As [`decode`].
+pub fn decode_stored(bytes: &[u8]) -> Result<PcdCloud, PcdError> {
+    let (header, body) = Header::parse(bytes)?;
+    let cloud = match header.data {
+        Data::Ascii => ascii::decode(&header, body),
+        Data::Binary => binary::decode(&header, body),
+        Data::BinaryCompressed => binary::decode_compressed(&header, body),
+    }?;
+    let intensity = header.intensity_origin().map(|(field, kind)| IntensityOrigin::stored(field, kind));
+    Ok(PcdCloud { intensity, form: header.data.name(), ..cloud })
+}
+
+impl IntensityOrigin {
+    /// A field whose numbers stand as they are stored.
+    pub(crate) fn stored(field: &str, kind: IntensityKind) -> Self {
+        Self { field: field.to_owned(), kind, divisor: 1.0 }
+    }
+}
+
+impl PcdCloud {
+    /// Points without those that are not finite. `labels`: one for each point, or none.
+    pub(crate) fn of_finite(mut points: Vec<[f32; 4]>, mut labels: Vec<u8>) -> Self {
+        let is_finite = |point: &[f32; 4]| point.iter().all(|value| value.is_finite());
+        let (all, first) = (points.len(), points.iter().position(|point| !is_finite(point)));
+        if first.is_some() {
+            let mut kept = points.iter().map(is_finite);
+            labels.retain(|_| kept.next().unwrap_or(false));
+            points.retain(is_finite);
+        }
+        Self {
+            dropped: all - points.len(),
+            first_dropped: first.map(|point| Place::Point(point as u64)),
+            points: PointCloud { xyzi: points },
+            labels: labels.iter().any(|&label| label != 0).then_some(labels),
+            ..Self::default()
+        }
+    }
+}
+
+/// Red and green of a packed `0x00RRGGBB`: intensity and label.
+fn unpack_rgb(bits: u32) -> (f32, u8) {
+    let [_, red, green, _] = bits.to_be_bytes();
+    (f32::from(red), green)
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,224 @@
+//! Sweeps of all layouts: the one door to point files, with intensities from 0 to 1.
+//!
+//! Numbers that do not tell their own form (how many floats a point has, how far intensities reach) are decided by the
+//! first sweeps of each agent, once, so that every frame is read alike.
+
+mod floats;
+mod intensity;
+mod plausibility;
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::OnceLock;
+
+use protocol::{CavId, PointCloud};
+
+pub use intensity::{IntensityScale, IntensityScaleError};
+pub use plausibility::Plausibility;
+
+use floats::FloatForm;
+
+use super::{OpenOptions, ReadError, files};
+use crate::pcd::{self, IntensityKind, IntensityOrigin, PcdCloud};
+
+/// Largest point file that is read, bytes: a sweep of a 128-channel LiDAR has some 10 MB.
+const MAX_BYTES: u64 = 1 << 30;
+/// Sweeps of an agent that decide what its files do not tell.
+const SAMPLES: usize = 3;
+
+/// How the points of a file are stored.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub(super) enum SweepStorage {
+    /// By its name: `.pcd` is PCD, all else (`.bin`, `.pcd.bin`) little-endian `f32`, 4 or 5 per point.
+    #[default]
+    ByName,
+    /// Little-endian `f32`, 5 per point: x, y, z, intensity, ring (nuScenes).
+    FiveFloats,
+    /// Little-endian `f32`, component by component: all x, all y, all z, all intensities (Oxford).
+    Planar,
+    /// NCLT's own: `u16` x, y, z in steps of 5 mm from -100 m, `u8` intensity, `u8` laser.
+    NcltRaw,
+}
+
+/// The sweeps of a scenario, by agent.
+#[derive(Debug, Default)]
+pub(super) struct Sweeps {
+    storage: SweepStorage,
+    scale: IntensityScale,
+    agents: BTreeMap<CavId, AgentSweeps>,
+}
+
+/// What the first sweeps of an agent tell about the others.
+#[derive(Debug, Default)]
+struct AgentSweeps {
+    files: Vec<PathBuf>,
+    form: OnceLock<Result<FloatForm, String>>,
+    divisor: OnceLock<f32>,
+    /// Whether it is told that there are no intensities.
+    is_told: OnceLock<()>,
+}
+
+impl Sweeps {
+    /// Files of an agent that are looked at to find samples.
+    pub(super) const MOST_TRIED: usize = 30;
+
+    /// Sweeps of files that are stored so.
+    pub(super) fn new(storage: SweepStorage, options: &OpenOptions) -> Self {
+        Self { storage, scale: options.intensity_scale, agents: BTreeMap::new() }
+    }
+
+    /// Adds an agent with the files of its plain sweeps, in order. The first that can be read and hold points decide what
+    /// files do not tell of themselves; nothing is read before the first [`Self::read`].
+    pub(super) fn with_agent(mut self, agent: CavId, files: impl IntoIterator<Item = PathBuf>) -> Self {
+        let files = files.into_iter().take(Self::MOST_TRIED).collect();
+        self.agents.insert(agent, AgentSweeps { files, ..AgentSweeps::default() });
+        self
+    }
+
+    /// Sweeps of a layout that knows one vehicle.
+    pub(super) fn of_single_vehicle(
+        storage: SweepStorage,
+        files: impl IntoIterator<Item = PathBuf>,
+        options: &OpenOptions,
+    ) -> Self {
+        Self::new(storage, options).with_agent(super::single_vehicle_id(), files)
+    }
+
+    /// Reads a sweep of an agent: plain or a variant, in the frame and handedness of the file, intensities 0 to 1.
+    ///
+    /// # Errors
+    /// [`ReadError`] for a file that cannot be read or is malformed, and for every file of an agent whose numbers are
+    /// neither four nor five to a point.
+    pub(super) fn read(&self, agent: &CavId, path: &Path) -> Result<PcdCloud, ReadError> {
+        let unknown = AgentSweeps::default();
+        let agent = self.agents.get(agent).unwrap_or(&unknown);
+        let mut cloud = agent.read_stored(self.storage, path)?;
+        if cloud.intensity.is_none() {
+            agent.is_told.get_or_init(|| {
+                tracing::warn!("{}: no field of intensity, as in others maybe: it is 0", path.display())
+            });
+        }
+        self.scale.apply(&mut cloud, || agent.divisor(self.storage));
+        Ok(cloud)
+    }
+}
+
+impl AgentSweeps {
+    /// Divisor of intensities whose type does not tell their scale.
+    fn divisor(&self, storage: SweepStorage) -> f32 {
+        *self.divisor.get_or_init(|| {
+            let clouds = self.files.iter().filter_map(|path| self.read_stored(storage, path).ok());
+            let clouds = clouds.filter(|cloud| !cloud.points.is_empty()).take(SAMPLES);
+            let largest = clouds.flat_map(|cloud| cloud.points.xyzi).map(|point| point[3]).fold(0.0, f32::max);
+            let divisor = intensity::divisor_of_range(largest);
+            if divisor > intensity::BYTE {
+                let file = self.files.first().map(|path| path.display().to_string()).unwrap_or_default();
+                tracing::warn!(
+                    "{file} and those after it: intensities reach {largest}, neither 0 to 1 nor 0 to 255: divided by \
+                     {divisor}; --intensity-scale states another number"
+                );
+            }
+            divisor
+        })
+    }
+
+    /// How many floats a point has.
+    fn form(&self, path: &Path) -> Result<FloatForm, ReadError> {
+        let form = self.form.get_or_init(|| {
+            let files = self.files.iter().filter(|path| !is_pcd(path));
+            let samples = files.filter_map(|path| files::read_limited(path, MAX_BYTES).ok());
+            FloatForm::of(&samples.filter(|bytes| !bytes.is_empty()).take(SAMPLES).collect::<Vec<_>>())
+        });
+        form.clone().map_err(|reason| ReadError::malformed(path, reason))
+    }
+
+    /// Reads a sweep with the intensities that are stored.
+    fn read_stored(&self, storage: SweepStorage, path: &Path) -> Result<PcdCloud, ReadError> {
+        match storage {
+            SweepStorage::ByName if is_pcd(path) => read_pcd_stored(path),
+            SweepStorage::ByName => read_floats(path, self.form(path)?),
+            SweepStorage::FiveFloats => read_floats(path, FloatForm::Five),
+            SweepStorage::Planar => read_planar(path),
+            SweepStorage::NcltRaw => read_nclt_raw(path),
+        }
+    }
+}
+
+fn read_floats(path: &Path, form: FloatForm) -> Result<PcdCloud, ReadError> {
+    let bytes = files::read_limited(path, MAX_BYTES)?;
+    check_whole_points(path, bytes.len(), 4 * form.numbers())?;
+    Ok(form.points(&bytes))
+}
+
+fn is_pcd(path: &Path) -> bool {
+    path.extension().is_some_and(|kind| kind.eq_ignore_ascii_case("pcd"))
+}
+
+/// Reads a PCD file that is no sweep of a LiDAR: the fourth value is as stored, or the red byte of a colour from 0 to 1.
+pub(super) fn read_pcd(path: &Path) -> Result<PcdCloud, ReadError> {
+    read_with(path, pcd::decode)
+}
+
+fn read_pcd_stored(path: &Path) -> Result<PcdCloud, ReadError> {
+    read_with(path, pcd::decode_stored)
+}
+
+fn read_with(path: &Path, decode: fn(&[u8]) -> Result<PcdCloud, pcd::PcdError>) -> Result<PcdCloud, ReadError> {
+    let bytes = files::read_limited(path, MAX_BYTES)?;
+    decode(&bytes).map_err(|error| ReadError::Malformed {
+        path: path.to_owned(),
+        line: error.line,
+        field: error.field,
+        reason: error.reason,
+    })
+}
+
+fn read_planar(path: &Path) -> Result<PcdCloud, ReadError> {
+    let bytes = files::read_limited(path, MAX_BYTES)?;
+    check_whole_points(path, bytes.len(), 16)?;
+    let (numbers, _) = bytes.as_chunks::<4>();
+    let count = numbers.len() / 4;
+    let points = (0..count).map(|point| [0, 1, 2, 3].map(|c| f32::from_le_bytes(numbers[c * count + point])));
+    let intensity = Some(IntensityOrigin::stored("4th block of floats", IntensityKind::Number));
+    Ok(PcdCloud {
+        intensity,
+        form: "floats by component: x, y, z, intensity",
+        ..PcdCloud::of_finite(points.collect(), Vec::new())
+    })
+}
+
+fn read_nclt_raw(path: &Path) -> Result<PcdCloud, ReadError> {
+    const STEP_M: f64 = 0.005;
+    const OFFSET_M: f64 = -100.0;
+    let bytes = files::read_limited(path, MAX_BYTES)?;
+    check_whole_points(path, bytes.len(), 8)?;
+    let (points, _) = bytes.as_chunks::<8>();
+    let points = points.iter().map(|&[x0, x1, y0, y1, z0, z1, intensity, _laser]| {
+        let metres = |bytes| (f64::from(u16::from_le_bytes(bytes)) * STEP_M + OFFSET_M) as f32;
+        [metres([x0, x1]), metres([y0, y1]), metres([z0, z1]), f32::from(intensity)]
+    });
+    let intensity = Some(IntensityOrigin::stored("7th byte", IntensityKind::Byte));
+    Ok(PcdCloud {
+        intensity,
+        form: "8 bytes per point, as NCLT records them",
+        ..PcdCloud::of_finite(points.collect(), Vec::new())
+    })
+}
+
+/// Turns y round: left-handed points become right-handed ones.
+pub(super) fn mirror_y(cloud: &mut PointCloud) {
+    for [_, y, ..] in &mut cloud.xyzi {
+        *y = -*y;
+    }
+}
+
+fn check_whole_points(path: &Path, len: usize, point: usize) -> Result<(), ReadError> {
+    if len.is_multiple_of(point) {
+        return Ok(());
+    }
+    let reason = format!("{len} bytes are not a whole number of points of {point} bytes: the file is cut off");
+    Err(ReadError::malformed(path, reason))
+}
+
+#[cfg(test)]
+mod tests;

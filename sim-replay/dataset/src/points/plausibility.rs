@@ -1,0 +1,95 @@
+//! Plausibility of a sweep: figures that real sweeps keep within limits, and what is read wrongly does not.
+
+use protocol::PointCloud;
+
+/// Range within which nearly all points lie, metres.
+const RANGE_M: f32 = 300.0;
+/// Least share of the points within that range.
+const WITHIN_RANGE: f64 = 0.95;
+/// Largest share of the points exactly at the origin; sensors write rays that met nothing so.
+const AT_ORIGIN: f64 = 0.5;
+/// Magnitude below which only zero itself is a coordinate: integers read as floats lie there.
+pub(super) const TINY: f32 = 1e-30;
+/// Largest share of coordinates that are tiny.
+pub(super) const TINY_SHARE: f64 = 0.01;
+
+/// Counts over the points of some sweeps.
+#[derive(Debug, Clone, Copy, Default, PartialEq, Eq)]
+pub struct Plausibility {
+    points: usize,
+    beyond_range: usize,
+    at_origin: usize,
+    tiny: usize,
+}
+
+impl Plausibility {
+    /// Counts the points of a sweep, which are finite.
+    pub fn add(&mut self, cloud: &PointCloud) {
+        for &[x, y, z, _] in &cloud.xyzi {
+            // Infinite where the square is too large for a float.
+            self.beyond_range += usize::from(x * x + y * y + z * z > RANGE_M * RANGE_M);
+            self.at_origin += usize::from([x, y, z] == [0.0; 3]);
+            self.tiny += [x, y, z].into_iter().filter(|&value| value != 0.0 && value.abs() < TINY).count();
+        }
+        self.points += cloud.len();
+    }
+
+    /// Adds what was counted elsewhere.
+    pub fn join(&mut self, other: &Self) {
+        self.points += other.points;
+        self.beyond_range += other.beyond_range;
+        self.at_origin += other.at_origin;
+        self.tiny += other.tiny;
+    }
+
+    /// The first figure that no sweep has, and the usual one.
+    pub fn fault(&self) -> Option<String> {
+        let of = |count: usize, all: usize| count as f64 / all.max(1) as f64;
+        let percent = |share: f64| format!("{:.1} %", 100.0 * share);
+        let tiny = of(self.tiny, 3 * self.points);
+        if tiny > TINY_SHARE {
+            return Some(format!(
+                "{} of the coordinates are tiny (below {TINY:e} m, not zero), usual is none: are these floats?",
+                percent(tiny)
+            ));
+        }
+        let within = 1.0 - of(self.beyond_range, self.points);
+        if within < WITHIN_RANGE {
+            return Some(format!(
+                "{} of the points lie within {RANGE_M} m, usual are {} or more",
+                percent(within),
+                percent(WITHIN_RANGE)
+            ));
+        }
+        let at_origin = of(self.at_origin, self.points);
+        let fault = || format!("{} of the points lie exactly at the origin, usual is none", percent(at_origin));
+        (at_origin > AT_ORIGIN).then(fault)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn fault(points: &[[f32; 4]]) -> Option<String> {
+        let mut counted = Plausibility::default();
+        counted.add(&PointCloud { xyzi: points.to_vec() });
+        counted.fault()
+    }
+
+    #[test]
+    fn the_figure_and_the_usual_one_are_named() {
+        let sound: Vec<[f32; 4]> = (0..100).map(|i| [i as f32, -3.0, 0.0, 0.5]).collect();
+        assert_eq!(fault(&sound), None);
+        assert_eq!(fault(&[]), None);
+        let mut far = sound.clone();
+        far[..6].fill([0.0, 301.0, 0.0, 0.5]);
+        assert_eq!(fault(&far).unwrap(), "94.0 % of the points lie within 300 m, usual are 95.0 % or more");
+        let mut origin = sound.clone();
+        origin[..51].fill([0.0, 0.0, 0.0, 0.5]);
+        assert_eq!(fault(&origin).unwrap(), "51.0 % of the points lie exactly at the origin, usual is none");
+        let mut tiny = sound;
+        tiny[..6].fill([f32::from_bits(7), 1.0, 1.0, 0.5]);
+        assert!(fault(&tiny).unwrap().starts_with("2.0 % of the coordinates are tiny (below 1e-30 m, not zero)"));
+    }
+}

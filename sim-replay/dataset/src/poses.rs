@@ -1,0 +1,58 @@
+//! Whether a scenario has the poses that some uses of it need.
+
+use super::{LoadOptions, Scenario};
+
+/// Frames that are looked at: the first of them may be damaged.
+const FRAMES_TO_TRY: usize = 10;
+
+impl Scenario {
+    /// Whether the recording says where an agent's LiDAR is, judged by the first of its frames from `tick` on that can be
+    /// read.
+    #[must_use]
+    pub fn has_poses(&self, agent: usize, tick: usize) -> bool {
+        let blind = LoadOptions { points: false, ..LoadOptions::default() };
+        let ticks = (tick..self.ticks.len()).take(FRAMES_TO_TRY);
+        let mut frames = ticks.filter_map(|tick| self.load(agent, tick, &blind).ok());
+        // Where nothing can be read, that is what is wrong.
+        frames.next().is_none_or(|frame| frame.world_from_lidar.is_some())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::fs;
+
+    use protocol::PointCloud;
+
+    use crate::LoadOptions;
+    use crate::pcd::{Encoding, IntensityField, encode};
+
+    /// A scenario of one frame, whose agent 1 has a YAML file of this text, if any.
+    fn scenario(yaml: Option<&str>) -> (tempfile::TempDir, crate::Scenario) {
+        let dir = tempfile::tempdir().unwrap();
+        let folder = dir.path().join("1");
+        fs::create_dir(&folder).unwrap();
+        let cloud = PointCloud { xyzi: vec![[1.0, 2.0, 3.0, 0.5]] };
+        fs::write(folder.join("000070.pcd"), encode(&cloud, Encoding::Binary, IntensityField::Intensity)).unwrap();
+        if let Some(yaml) = yaml {
+            fs::write(folder.join("000070.yaml"), yaml).unwrap();
+        }
+        let mut dataset = crate::open(dir.path()).unwrap();
+        assert!(dataset.problems.is_empty(), "{:?}", dataset.problems);
+        (dir, dataset.scenarios.swap_remove(0))
+    }
+
+    #[test]
+    fn sweeps_without_poses_are_frames() {
+        for yaml in [None, Some("ego_speed: 36\n"), Some("lidar_pose: null\nvehicles: null\nego_speed: 36\n")] {
+            let (_dir, scenario) = scenario(yaml);
+            assert!(!scenario.has_poses(0, 0), "{yaml:?}");
+            let frame = scenario.load(0, 0, &LoadOptions::default()).unwrap();
+            assert_eq!(frame.points.xyzi, [[1.0, -2.0, 3.0, 0.5]], "the files of the family are left-handed");
+            assert!(frame.objects.is_empty() && frame.world_from_lidar.is_none());
+            assert_eq!(frame.speed_mps, yaml.map(|_| 10.0));
+        }
+        let (_dir, scenario) = scenario(Some("lidar_pose: [1, 2, 3, 0, 0, 0]\n"));
+        assert!(scenario.has_poses(0, 0));
+    }
+}

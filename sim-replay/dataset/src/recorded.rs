@@ -1,0 +1,198 @@
+//! Recordings of live runs ([`recording`]) as scenes: what sensors measured, and the truth, come out as they went in.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+use protocol::{CavId, Gnss, Handedness, Lidar, Limits, Payload, Radar, Stamp, Stream, Topic, Truth, wire};
+
+use super::presence::Absences;
+use super::{Dataset, FrameSource, Layout, MissingFrame, ReadError, Scenario, Tick};
+use crate::frame::{Frame, Object, ObjectClass};
+use crate::pcd::{IntensityKind, IntensityOrigin, PcdCloud};
+use recording::{Entry, Recording, RecordingError};
+
+/// Name of the recording in a run folder.
+const IN_RUN_FOLDER: &str = "recording.mcap";
+
+/// The recording that `path` names: the file itself, or that of a run folder.
+pub(super) fn file_of(path: &Path) -> Option<PathBuf> {
+    let is_recording = |file: &Path| file.is_file() && file.extension().is_some_and(|kind| kind == "mcap");
+    [path.to_path_buf(), path.join(IN_RUN_FOLDER)].into_iter().find(|file| is_recording(file))
+}
+
+/// Opens a recording as a dataset of one scenario. What was cut off its end stands in [`Dataset::problems`].
+pub(super) fn open(file: &Path) -> Result<Dataset, ReadError> {
+    let recording = Recording::open(file).map_err(as_read_error)?;
+    let mut problems = Vec::new();
+    for damage in recording.damage() {
+        problems.push(ReadError::malformed(file, damage.to_string()));
+    }
+    let name = file.file_stem().map_or("recording".into(), |stem| stem.to_string_lossy().into_owned());
+    let source = Recorded::new(recording, &mut problems)?;
+    let agents = source.agents.clone();
+    let (ticks, missing) = source.ticks();
+    let scenario = Scenario {
+        name,
+        absences: Absences::new(&agents, &ticks, &missing),
+        roadside_units: agents.iter().filter(|id| id.as_str().starts_with('-')).cloned().collect(),
+        has_radar: source.sensors.keys().any(|(_, _, stream)| *stream == Stream::Radar),
+        agents,
+        ticks,
+        missing,
+        lidar_variants: Vec::new(),
+        layout: Layout::Recording,
+        source_handedness: Handedness::Right,
+        source: Arc::new(source),
+    };
+    Ok(Dataset { layout: Layout::Recording, scenarios: vec![scenario], problems })
+}
+
+/// The sensors and the truth of a recording, by capture time.
+#[derive(Debug)]
+struct Recorded {
+    recording: Recording,
+    agents: Vec<CavId>,
+    sensors: BTreeMap<(u64, CavId, Stream), Entry>,
+    truth: BTreeMap<u64, Truth>,
+}
+
+impl Recorded {
+    /// A truth that cannot be read is a problem of its moment, and not of the scene. Of two replays of one moment the
+    /// first is taken, sweeps and truth alike.
+    fn new(recording: Recording, problems: &mut Vec<ReadError>) -> Result<Self, ReadError> {
+        let mut sensors = BTreeMap::new();
+        let (mut truth, mut first_epochs, mut told_twice) = (BTreeMap::new(), BTreeMap::new(), 0);
+        for entry in recording.entries() {
+            let Stamp { capture_nanos, epoch, .. } = entry.header.stamp;
+            match &entry.key.topic {
+                Topic::Stream { cav, stream: stream @ (Stream::Lidar | Stream::Gnss | Stream::Radar) } => {
+                    sensors.entry((capture_nanos, cav.clone(), *stream)).or_insert_with(|| entry.clone());
+                }
+                Topic::Truth => match first_epochs.get(&capture_nanos) {
+                    Some(first) => told_twice += u64::from(*first != epoch),
+                    None => {
+                        first_epochs.insert(capture_nanos, epoch);
+                        match message::<Truth>(&recording, entry) {
+                            Ok(told) => drop(truth.insert(capture_nanos, told)),
+                            Err(problem) => problems.push(problem),
+                        }
+                    }
+                },
+                _ => {}
+            }
+        }
+        if told_twice > 0 {
+            let reason = format!("more than one replay tells the truth of {told_twice} moments: the first is taken");
+            problems.push(ReadError::malformed(recording.path(), reason));
+        }
+        let mut recorded = Self { recording, agents: Vec::new(), sensors, truth };
+        recorded.agents = recorded.in_order();
+        if recorded.agents.is_empty() {
+            let reason = "no sweep of any vehicle in it: recorded --without lidar?";
+            return Err(ReadError::malformed(recorded.recording.path(), reason));
+        }
+        Ok(recorded)
+    }
+
+    /// Everyone with sweeps, in the order of the scene, which the truth keeps: the ego comes first.
+    fn in_order(&self) -> Vec<CavId> {
+        let has_sweeps =
+            |cav: &CavId| self.sensors.keys().any(|(_, known, stream)| known == cav && *stream == Stream::Lidar);
+        let told = self.truth.values().flat_map(|truth| truth.agents.iter().map(|agent| &agent.cav));
+        let untold = self.sensors.keys().map(|(_, cav, _)| cav);
+        let mut agents: Vec<CavId> = Vec::new();
+        for cav in told.chain(untold) {
+            if !agents.contains(cav) && has_sweeps(cav) {
+                agents.push(cav.clone());
+            }
+        }
+        agents
+    }
+
+    /// The moments of which the ego's sweep was recorded, and the sweeps that are missing at any moment.
+    fn ticks(&self) -> (Vec<Tick>, Vec<MissingFrame>) {
+        let mut captures: Vec<u64> =
+            self.sensors.keys().filter(|(_, _, stream)| *stream == Stream::Lidar).map(|(at, _, _)| *at).collect();
+        captures.dedup();
+        let (mut ticks, mut missing) = (Vec::new(), Vec::new());
+        for capture_nanos in captures {
+            let stem = capture_nanos.to_string();
+            let lacks = |cav: &&CavId| !self.sensors.contains_key(&(capture_nanos, (*cav).clone(), Stream::Lidar));
+            let lacking: Vec<&CavId> = self.agents.iter().filter(lacks).collect();
+            let frame = |cav: &&CavId| MissingFrame { agent: (*cav).clone(), stem: stem.clone() };
+            missing.extend(lacking.iter().map(frame));
+            if lacking.first() != self.agents.first().as_ref() {
+                ticks.push(Tick { stem, capture_nanos });
+            }
+        }
+        (ticks, missing)
+    }
+
+    fn sensor<M: Payload>(&self, agent: &CavId, tick: &Tick, stream: Stream) -> Result<M, ReadError> {
+        let key = (tick.capture_nanos, agent.clone(), stream);
+        let lacks = || ReadError::malformed(self.recording.path(), format!("no {agent}/{stream} at {}", tick.stem));
+        message(&self.recording, self.sensors.get(&key).ok_or_else(lacks)?)
+    }
+}
+
+impl FrameSource for Recorded {
+    fn frame(&self, agent: &CavId, tick: &Tick) -> Result<Frame, ReadError> {
+        let mut frame = Frame::empty(agent.clone(), tick.capture_nanos, Handedness::Right);
+        let truth = self.truth.get(&tick.capture_nanos);
+        if let Some(truth) = truth.and_then(|truth| truth.agents.iter().find(|known| known.cav == *agent)) {
+            frame.world_from_lidar = Some(truth.world_from_lidar);
+            frame.objects = truth.objects.iter().map(object).collect();
+        }
+        if self.sensors.contains_key(&(tick.capture_nanos, agent.clone(), Stream::Gnss)) {
+            let gnss: Gnss = self.sensor(agent, tick, Stream::Gnss)?;
+            frame.world_from_lidar = Some(gnss.world_from_lidar);
+        }
+        Ok(frame)
+    }
+
+    fn points(&self, agent: &CavId, tick: &Tick, _: Option<&str>) -> Result<PcdCloud, ReadError> {
+        let Lidar { points } = self.sensor(agent, tick, Stream::Lidar)?;
+        let intensity = Some(IntensityOrigin::stored("intensity", IntensityKind::Number));
+        Ok(PcdCloud { points, intensity, form: "recorded message", ..PcdCloud::default() })
+    }
+
+    fn radar(&self, agent: &CavId, tick: &Tick) -> Result<PcdCloud, ReadError> {
+        let Radar { points } = self.sensor(agent, tick, Stream::Radar)?;
+        Ok(PcdCloud { points, ..PcdCloud::default() })
+    }
+
+    fn points_path(&self, _: &CavId, _: &Tick, _: Option<&str>) -> PathBuf {
+        self.recording.path().into()
+    }
+}
+
+fn object(object: &protocol::TrueObject) -> Object {
+    Object {
+        id: object.id,
+        class: serde_json::from_value(object.class.as_str().into()).unwrap_or(ObjectClass::Other),
+        world_from_object: object.world_from_object,
+        size_m: object.size_m,
+        speed_mps: object.speed_mps,
+    }
+}
+
+fn message<M: Payload>(recording: &Recording, entry: &Entry) -> Result<M, ReadError> {
+    let bytes = recording.read(entry).map_err(as_read_error)?;
+    let decoded = wire::decode([bytes.as_slice()], &Limits::DEFAULT);
+    decoded
+        .map(|(_, message)| message)
+        .map_err(|error| ReadError::malformed(recording.path(), format!("{}: {error}", entry.key)))
+}
+
+fn as_read_error(error: RecordingError) -> ReadError {
+    match error {
+        RecordingError::Io { path, source } => ReadError::Io { path, source },
+        RecordingError::NotOurs { path, reason } | RecordingError::Ended { path, reason } => {
+            ReadError::Layout { path, reason }
+        }
+        RecordingError::Malformed { path, offset, reason } => {
+            ReadError::malformed(&path, format!("byte {offset}: {reason}"))
+        }
+    }
+}

@@ -1,0 +1,187 @@
+//! A node together with its place: typed access for readers, with errors that name file, line and field.
+
+use std::path::Path;
+
+use super::{Node, Value};
+use crate::ReadError;
+use crate::numpy_tags::{self, NumpyArray};
+
+/// A node together with where it was found: what readers take values from.
+///
+/// Wherever numbers stand, NumPy's pickled arrays and scalars are read as well ([`numpy_tags`]).
+#[derive(Debug, Clone)]
+pub(crate) struct Field<'a> {
+    path: &'a Path,
+    /// Dotted names from the root, for example `vehicles.4335.extent`.
+    name: String,
+    node: &'a Node,
+}
+
+impl<'a> Field<'a> {
+    /// The whole document.
+    pub(crate) fn root(path: &'a Path, node: &'a Node) -> Self {
+        Self { path, name: String::new(), node }
+    }
+
+    pub(crate) fn node(&self) -> &'a Node {
+        self.node
+    }
+
+    /// The file it stands in.
+    pub(crate) fn path(&self) -> &'a Path {
+        self.path
+    }
+
+    /// Kind and content in few words, for messages.
+    pub(crate) fn found(&self) -> String {
+        self.node.value.kind()
+    }
+
+    /// An error about this field.
+    pub(crate) fn error(&self, reason: impl Into<String>) -> ReadError {
+        ReadError::Malformed {
+            path: self.path.to_owned(),
+            line: Some(self.node.line),
+            field: (!self.name.is_empty()).then(|| self.name.clone()),
+            reason: reason.into(),
+        }
+    }
+
+    /// An error that names what was found and what was expected.
+    pub(crate) fn expected(&self, what: &str) -> ReadError {
+        self.error(format!("{}, expected {what}", self.found()))
+    }
+
+    fn child(&self, key: &str, node: &'a Node) -> Self {
+        let name = if self.name.is_empty() { key.to_owned() } else { format!("{}.{key}", self.name) };
+        Self { path: self.path, name, node }
+    }
+
+    /// The entries of a map.
+    pub(crate) fn entries(&self) -> Result<Vec<(&'a str, Self)>, ReadError> {
+        match &self.node.value {
+            Value::Map(entries) => {
+                Ok(entries.iter().map(|(key, node)| (key.as_str(), self.child(key, node))).collect())
+            }
+            _ => Err(self.expected("a map")),
+        }
+    }
+
+    /// The items of a list.
+    pub(crate) fn items(&self) -> Result<Vec<Self>, ReadError> {
+        match &self.node.value {
+            Value::List(items) => {
+                Ok(items.iter().enumerate().map(|(index, node)| self.child(&index.to_string(), node)).collect())
+            }
+            _ => Err(self.expected("a list")),
+        }
+    }
+
+    /// True where a map has the key, whatever its value.
+    pub(crate) fn has(&self, key: &str) -> bool {
+        matches!(&self.node.value, Value::Map(entries) if entries.iter().any(|(found, _)| found == key))
+    }
+
+    /// An entry that may be missing or null. Of equal keys the last counts, as in Python.
+    pub(crate) fn optional(&self, key: &str) -> Result<Option<Self>, ReadError> {
+        let Value::Map(entries) = &self.node.value else { return Err(self.expected("a map")) };
+        let found = entries.iter().rfind(|(found, node)| found == key && node.value != Value::Null);
+        Ok(found.map(|(_, node)| self.child(key, node)))
+    }
+
+    /// An entry that must be there.
+    pub(crate) fn required(&self, key: &str) -> Result<Self, ReadError> {
+        self.optional(key)?.ok_or_else(|| self.child(key, self.node).error("missing"))
+    }
+
+    /// A finite number, written in whatever way.
+    pub(crate) fn number(&self) -> Result<f64, ReadError> {
+        if numpy_tags::is_python(self.node) && !matches!(self.node.value, Value::Text(_)) {
+            return numpy_tags::scalar(self);
+        }
+        plain_number(self.node).filter(|number| number.is_finite()).ok_or_else(|| self.expected("a finite number"))
+    }
+
+    /// An integer, or a float without fraction: ids are written as `-1.0` where they went through an array of floats.
+    pub(crate) fn integer(&self) -> Result<i64, ReadError> {
+        if let Value::Integer(value) = self.node.value {
+            return Ok(value);
+        }
+        let number = self.number().ok().filter(|number| number.fract() == 0.0 && number.abs() < 1e15);
+        number.map(|number| number as i64).ok_or_else(|| self.expected("an integer"))
+    }
+
+    pub(crate) fn text(&self) -> Result<&'a str, ReadError> {
+        match &self.node.value {
+            Value::Text(text) => Ok(text),
+            _ => Err(self.expected("a text")),
+        }
+    }
+
+    /// Exactly `N` finite numbers, as a list or an array with one row or column.
+    pub(crate) fn numbers<const N: usize>(&self) -> Result<[f64; N], ReadError> {
+        let mut numbers = [0.0; N];
+        match &self.node.value {
+            Value::List(items) if !numpy_tags::is_call(self.node) => {
+                if items.len() != N {
+                    return Err(self.expected(&format!("{N} numbers")));
+                }
+                for (index, (number, item)) in numbers.iter_mut().zip(items).enumerate() {
+                    *number = match item.value {
+                        Value::Float(value) if value.is_finite() => value,
+                        _ => self.child(&index.to_string(), item).number()?,
+                    };
+                }
+            }
+            _ if numpy_tags::is_python(self.node) => {
+                let NumpyArray { shape, values } = numpy_tags::array(self)?;
+                let is_row = shape.iter().filter(|&&size| size != 1).count() <= 1;
+                let found = values.as_slice().try_into().ok().filter(|_| is_row);
+                numbers = found.ok_or_else(|| self.error(format!("an array of shape {shape:?}, expected [{N}]")))?;
+                if let Some(number) = numbers.iter().find(|number| !number.is_finite()) {
+                    return Err(self.error(format!("{number}, expected {N} finite numbers")));
+                }
+            }
+            _ => return Err(self.expected(&format!("a list of {N} numbers"))),
+        }
+        Ok(numbers)
+    }
+
+    /// Numbers of whatever shape: a list, a list of equally long rows, or an array.
+    pub(crate) fn array(&self) -> Result<NumpyArray, ReadError> {
+        let items = match &self.node.value {
+            Value::List(items) if !numpy_tags::is_call(self.node) => items,
+            _ if numpy_tags::is_python(self.node) => return numpy_tags::array(self),
+            _ => return Err(self.expected("numbers")),
+        };
+        let rows: Vec<NumpyArray> = self.items()?.iter().map(Self::row).collect::<Result<_, _>>()?;
+        let inner = rows.first().map(|row| row.shape.clone()).unwrap_or_default();
+        if rows.iter().any(|row| row.shape != inner) {
+            return Err(self.error("rows of different lengths"));
+        }
+        let shape = [vec![items.len()], inner].concat();
+        Ok(NumpyArray { shape, values: rows.into_iter().flat_map(|row| row.values).collect() })
+    }
+
+    /// An item of a list: a number, or a row of numbers.
+    fn row(&self) -> Result<NumpyArray, ReadError> {
+        match &self.node.value {
+            Value::List(items) if !numpy_tags::is_call(self.node) => {
+                let values = self.items()?.iter().map(Self::number).collect::<Result<_, _>>()?;
+                Ok(NumpyArray { shape: vec![items.len()], values })
+            }
+            Value::Map(_) | Value::List(_) if numpy_tags::is_python(self.node) => numpy_tags::array(self),
+            _ => Ok(NumpyArray { shape: vec![], values: vec![self.number()?] }),
+        }
+    }
+}
+
+fn plain_number(node: &Node) -> Option<f64> {
+    match &node.value {
+        Value::Integer(value) => Some(*value as f64),
+        Value::Float(value) => Some(*value),
+        // Numbers may be quoted.
+        Value::Text(text) => text.parse().ok(),
+        _ => None,
+    }
+}

@@ -1,0 +1,187 @@
+//! Builds the tree of a document from the events of a YAML parser, within limits.
+
+use std::collections::{HashMap, HashSet};
+
+use granit_parser::{Event, Parser, ScalarStyle, Span, StrInput, Tag};
+
+use super::{Node, Value, scalar};
+use crate::numpy_tags;
+
+/// Deepest nesting.
+const MAX_DEPTH: usize = 64;
+/// Most nodes of a document without those that aliases repeat. A frame has about a thousand.
+const MAX_NODES: usize = 500_000;
+/// How many nodes all aliases of a document together may stand for.
+const MAX_ALIASED_NODES: usize = 200_000;
+/// YAML's own prefix of tags, written `!!`.
+const TAG_PREFIX: &str = "tag:yaml.org,2002:";
+
+/// A fault of a document.
+#[derive(Debug)]
+pub(super) struct Unsound {
+    /// The line, from 1.
+    pub(super) line: u64,
+    pub(super) reason: String,
+}
+
+/// Builds the tree of a text with at most one document.
+pub(super) fn build(text: &str) -> Result<Node, Unsound> {
+    let mut options = granit_parser::options! {
+        flow_nesting_limit: MAX_DEPTH,
+        block_nesting_limit: MAX_DEPTH,
+    };
+    options.set_emit_comments(false);
+    let parser = Parser::new_from_str_with_options(text, options);
+    Builder { parser, line: 1, anchors: HashMap::new(), nodes: 0, aliased: 0 }.document()
+}
+
+struct Builder<'t> {
+    parser: Parser<'t, StrInput<'t>>,
+    /// The line of the last event, from 1.
+    line: u64,
+    /// What aliases stand for, with its number of nodes.
+    anchors: HashMap<usize, (Node, usize)>,
+    nodes: usize,
+    aliased: usize,
+}
+
+impl<'t> Builder<'t> {
+    fn document(mut self) -> Result<Node, Unsound> {
+        let mut root = None;
+        loop {
+            match self.next()? {
+                Event::StreamEnd => break,
+                Event::DocumentStart(..) if root.is_some() => {
+                    return Err(self.unsound("a second document begins here, expected one"));
+                }
+                Event::StreamStart | Event::DocumentStart(..) | Event::DocumentEnd => {}
+                event => root = Some(self.node(event, 0)?),
+            }
+        }
+        Ok(root.unwrap_or(Node { line: 1, tag: None, value: Value::Null }))
+    }
+
+    fn next(&mut self) -> Result<Event<'t>, Unsound> {
+        match self.parser.next_event() {
+            Some(Ok((event, span))) => {
+                self.line = line(&span);
+                Ok(event)
+            }
+            Some(Err(error)) => Err(Unsound { line: error.marker().line().max(1) as u64, reason: error.info() }),
+            None => Ok(Event::StreamEnd),
+        }
+    }
+
+    fn unsound(&self, reason: impl Into<String>) -> Unsound {
+        Unsound { line: self.line, reason: reason.into() }
+    }
+
+    /// The node that begins with an event.
+    fn node(&mut self, event: Event<'t>, depth: usize) -> Result<Node, Unsound> {
+        self.nodes += 1;
+        if self.nodes > MAX_NODES {
+            return Err(self.unsound(format!("more than {MAX_NODES} nodes")));
+        }
+        if depth > MAX_DEPTH {
+            return Err(self.unsound(format!("nested deeper than {MAX_DEPTH}")));
+        }
+        let line = self.line;
+        let (anchor, tag, value) = match event {
+            Event::Scalar(text, style, anchor, tag) => {
+                let tag = tag.as_deref().map(tag_text);
+                let is_resolved = match tag.as_deref() {
+                    None => style == ScalarStyle::Plain,
+                    Some(tag) => matches!(tag, "int" | "float" | "bool" | "null" | "python/int" | "python/float"),
+                };
+                let value = if is_resolved { scalar::plain(&text) } else { Value::Text(text.into_owned()) };
+                (anchor, tag, value)
+            }
+            Event::SequenceStart(_, anchor, tag) => (anchor, tag.as_deref().map(tag_text), self.list(depth)?),
+            Event::MappingStart(_, anchor, tag) => (anchor, tag.as_deref().map(tag_text), self.map(depth)?),
+            Event::Alias(anchor) => return self.alias(anchor, line),
+            _ => return Err(self.unsound("expected a scalar, a list or a map")),
+        };
+        let node = Node { line, tag, value };
+        if anchor > 0 {
+            let size = size(&node);
+            self.count_aliased(size)?;
+            self.anchors.insert(anchor, (node.clone(), size));
+        }
+        Ok(node)
+    }
+
+    fn list(&mut self, depth: usize) -> Result<Value, Unsound> {
+        let mut items = Vec::new();
+        loop {
+            match self.next()? {
+                Event::SequenceEnd => return Ok(Value::List(items)),
+                event => items.push(self.node(event, depth + 1)?),
+            }
+        }
+    }
+
+    fn map(&mut self, depth: usize) -> Result<Value, Unsound> {
+        let mut entries = Vec::new();
+        let mut merged = Vec::new();
+        loop {
+            let key = match self.next()? {
+                Event::MappingEnd => break,
+                Event::Scalar(text, ..) => text.into_owned(),
+                event => {
+                    let node = self.node(event, depth + 1)?;
+                    numpy_tags::key_text(&node).unwrap_or_else(|| node.value.kind())
+                }
+            };
+            let event = self.next()?;
+            let node = self.node(event, depth + 1)?;
+            match node.value {
+                Value::Map(base) if key == "<<" => merged.extend(base),
+                _ => entries.push((key, node)),
+            }
+        }
+        if !merged.is_empty() {
+            let mut known: HashSet<String> = entries.iter().map(|(key, _)| key.clone()).collect();
+            merged.retain(|(key, _)| known.insert(key.clone()));
+            entries.append(&mut merged);
+        }
+        Ok(Value::Map(entries))
+    }
+
+    fn alias(&mut self, anchor: usize, line: u64) -> Result<Node, Unsound> {
+        let size = self.anchors.get(&anchor).map(|(_, size)| *size);
+        self.count_aliased(size.unwrap_or(0))?;
+        match self.anchors.get(&anchor) {
+            Some((node, _)) => Ok(Node { line, ..node.clone() }),
+            None => Err(self.unsound("an alias within what it stands for")),
+        }
+    }
+
+    fn count_aliased(&mut self, size: usize) -> Result<(), Unsound> {
+        self.aliased += size;
+        if self.aliased > MAX_ALIASED_NODES {
+            return Err(self.unsound(format!("aliases repeat more than {MAX_ALIASED_NODES} nodes")));
+        }
+        Ok(())
+    }
+}
+
+fn line(span: &Span) -> u64 {
+    span.start.line().max(1) as u64
+}
+
+/// Without YAML's own prefix.
+fn tag_text(tag: &Tag) -> Box<str> {
+    let (handle, suffix) = tag.parts();
+    match handle.strip_prefix(TAG_PREFIX) {
+        Some(rest) => format!("{rest}{suffix}").into(),
+        None => format!("{handle}{suffix}").into(),
+    }
+}
+
+fn size(node: &Node) -> usize {
+    match &node.value {
+        Value::List(items) => 1 + items.iter().map(size).sum::<usize>(),
+        Value::Map(entries) => 1 + entries.iter().map(|(_, node)| size(node)).sum::<usize>(),
+        _ => 1,
+    }
+}

@@ -1,0 +1,32 @@
+//! Chance that only depends on what it decides about, never on what was decided before.
+
+use protocol::CavId;
+
+use support::random::{SplitMix64, derive_seed};
+
+/// What is decided.
+#[derive(Debug, Clone, Copy)]
+pub(super) enum Purpose {
+    Delay = 1,
+    Loss = 2,
+    Reorder = 3,
+    Duplicate = 4,
+}
+
+/// The chances of one direction of one link.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct Chance {
+    seed: u64,
+}
+
+impl Chance {
+    pub(super) fn new(seed: u64, from: &CavId, to: &CavId) -> Self {
+        let letters = |cav: &CavId| derive_seed(0, &cav.as_str().bytes().map(u64::from).collect::<Vec<_>>());
+        Self { seed: derive_seed(seed, &[letters(from), letters(to)]) }
+    }
+
+    /// The numbers that decide one thing about one message.
+    pub(super) fn of(self, purpose: Purpose, stream: u64, sequence: u64) -> SplitMix64 {
+        SplitMix64::derived(self.seed, &[purpose as u64, stream, sequence])
+    }
+}

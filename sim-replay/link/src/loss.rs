@@ -1,0 +1,121 @@
+//! What gets lost.
+
+use super::config::{FRAGMENT_BYTES, LossLaw, LossUnit};
+use super::trace::Trace;
+use support::random::SplitMix64;
+
+/// The state of loss on one direction of one link.
+#[derive(Debug, Clone, Copy, Default)]
+pub(super) struct LossState {
+    is_bad: bool,
+}
+
+/// A message that has been sent.
+#[derive(Debug, Clone, Copy)]
+pub(super) struct SentMessage {
+    pub(super) bytes: u64,
+    pub(super) distance_m: f64,
+    pub(super) sent_nanos: u64,
+}
+
+impl LossState {
+    /// Whether a message is lost. Messages of a link are asked about in the order they are sent in.
+    pub(super) fn loses(
+        &mut self,
+        law: &LossLaw,
+        unit: LossUnit,
+        message: &SentMessage,
+        trace: Option<&Trace>,
+        random: &mut SplitMix64,
+    ) -> bool {
+        let units = match unit {
+            LossUnit::Message => 1,
+            LossUnit::Fragment => message.bytes.div_ceil(FRAGMENT_BYTES).max(1),
+        };
+        // Independent losses of all units at once.
+        let mut any = |share: f64| {
+            let survives = (1.0 - share).powi(i32::try_from(units).unwrap_or(i32::MAX));
+            random.unit() >= survives
+        };
+        match law {
+            LossLaw::None => false,
+            LossLaw::Bernoulli(share) => any(*share),
+            LossLaw::Distance(points) => any(interpolate(points, message.distance_m)),
+            LossLaw::Trace => any(trace.and_then(|trace| trace.at(message.sent_nanos)).map_or(0.0, |step| step.loss)),
+            LossLaw::GilbertElliott { to_bad, to_good, loss_good, loss_bad } => {
+                let mut is_lost = false;
+                for _ in 0..units {
+                    let leaves = if self.is_bad { *to_good } else { *to_bad };
+                    self.is_bad ^= random.chance(leaves);
+                    is_lost |= random.chance(if self.is_bad { *loss_bad } else { *loss_good });
+                }
+                is_lost
+            }
+        }
+    }
+}
+
+/// The value at `x` of the line through `points`, level beyond both ends; 0 without points.
+fn interpolate(points: &[[f64; 2]], x: f64) -> f64 {
+    let after = points.partition_point(|point| point[0] <= x);
+    match (after.checked_sub(1).map(|before| points[before]), points.get(after)) {
+        (None, None) => 0.0,
+        (None, Some(&[_, y])) | (Some([_, y]), None) => y,
+        (Some([x0, y0]), Some(&[x1, y1])) => y0 + (y1 - y0) * (x - x0) / (x1 - x0),
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const COUNT: u64 = 100_000;
+
+    fn losses(law: &LossLaw, unit: LossUnit, bytes: u64, distance_m: f64) -> f64 {
+        let mut state = LossState::default();
+        let message = SentMessage { bytes, distance_m, sent_nanos: 0 };
+        let lost = (0..COUNT).filter(|&k| state.loses(law, unit, &message, None, &mut SplitMix64::derived(7, &[k])));
+        lost.count() as f64 / COUNT as f64
+    }
+
+    fn three_sigma(share: f64) -> f64 {
+        3.0 * (share * (1.0 - share) / COUNT as f64).sqrt()
+    }
+
+    #[test]
+    fn a_message_survives_with_all_its_fragments() {
+        for (bytes, fragments) in [(0, 1), (1, 1), (1400, 1), (1401, 2), (70_000, 50)] {
+            let expected = 1.0 - 0.99f64.powi(fragments);
+            let found = losses(&LossLaw::Bernoulli(0.01), LossUnit::Fragment, bytes, 0.0);
+            assert!((found - expected).abs() < three_sigma(expected), "{bytes}: {found}, not {expected}");
+            let found = losses(&LossLaw::Bernoulli(0.01), LossUnit::Message, bytes, 0.0);
+            assert!((found - 0.01).abs() < three_sigma(0.01), "{found}");
+        }
+    }
+
+    #[test]
+    fn the_chain_has_its_stationary_loss() {
+        let (to_bad, to_good, loss_good, loss_bad) = (0.02, 0.1, 0.001, 0.7);
+        let law = LossLaw::GilbertElliott { to_bad, to_good, loss_good, loss_bad };
+        let bad = to_bad / (to_bad + to_good);
+        let expected = bad * loss_bad + (1.0 - bad) * loss_good;
+        // Neighbours are correlated: the variance of the mean grows by (1 + r) / (1 - r) for the part that the state explains.
+        let r = 1.0 - to_bad - to_good;
+        let between = bad * (1.0 - bad) * (loss_bad - loss_good) * (loss_bad - loss_good);
+        let within = expected * (1.0 - expected) - between;
+        let sigma = ((between * (1.0 + r) / (1.0 - r) + within) / COUNT as f64).sqrt();
+        let found = losses(&law, LossUnit::Message, 1000, 0.0);
+        assert!((found - expected).abs() < 3.0 * sigma, "{found}, not {expected} +- {sigma}");
+    }
+
+    #[test]
+    fn distance_is_interpolated() {
+        let law = LossLaw::Distance(vec![[50.0, 0.0], [150.0, 0.5]]);
+        for (distance_m, expected) in [(0.0, 0.0), (50.0, 0.0), (100.0, 0.25), (150.0, 0.5), (900.0, 0.5)] {
+            let found = losses(&law, LossUnit::Message, 10, distance_m);
+            assert!((found - expected).abs() <= three_sigma(expected), "{distance_m}: {found}, not {expected}");
+        }
+        assert_eq!(losses(&LossLaw::Distance(Vec::new()), LossUnit::Message, 10, 5.0), 0.0);
+        assert_eq!(losses(&LossLaw::Bernoulli(1.0), LossUnit::Message, 10, 5.0), 1.0);
+    }
+}

@@ -1,0 +1,232 @@
+//! Links that somebody has measured.
+
+use std::io;
+use std::path::{Path, PathBuf};
+
+use support::bounded_file;
+
+/// First line of a CSV trace.
+const HEADER: &str = "time_s,rate_mbps,delay_ms,loss";
+/// Bytes of a mahimahi delivery opportunity.
+pub(super) const OPPORTUNITY_BYTES: u64 = 1500;
+/// Longer files are no traces, bytes.
+const MAX_FILE_BYTES: u64 = 256 << 20;
+
+/// Why a trace cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum TraceError {
+    /// The file is missing or not readable.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// What the system said.
+        source: io::Error,
+    },
+    /// A line is not what it must be.
+    #[error("{}:{line}: {found:?} must be {must}", path.display())]
+    Line {
+        /// The file.
+        path: PathBuf,
+        /// Line number, from 1.
+        line: usize,
+        /// What stood there.
+        found: String,
+        /// What would be right.
+        must: &'static str,
+    },
+    /// It ends before the link is to begin.
+    #[error("{}: offset_s is {offset_s}, behind the last line", path.display())]
+    Past {
+        /// The file.
+        path: PathBuf,
+        /// Where the link is to begin, seconds.
+        offset_s: f64,
+    },
+    /// There is nothing in it.
+    #[error("{}: no line with numbers", path.display())]
+    Empty {
+        /// The file.
+        path: PathBuf,
+    },
+}
+
+/// The state of a link from one moment on.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct Step {
+    /// From here on, nanoseconds since the beginning.
+    pub from_nanos: u64,
+    /// Rate, bit/s.
+    pub bits_per_s: u64,
+    /// Propagation delay, milliseconds.
+    pub delay_ms: f64,
+    /// Probability of loss.
+    pub loss: f64,
+}
+
+/// A link over time.
+#[derive(Debug, Clone, PartialEq)]
+pub enum Trace {
+    /// Rates, delays and losses; the last step lasts for ever.
+    Steps(Vec<Step>),
+    /// Moments at which 1,500 bytes may cross, nanoseconds, in order; repeated from the last one on.
+    Opportunities(Vec<u64>),
+}
+
+impl Trace {
+    /// Reads `time_s,rate_mbps,delay_ms,loss`: one line for every change, times rising, the first at `offset_nanos` or
+    /// before. There the link begins.
+    ///
+    /// # Errors
+    /// [`TraceError`] names the file and the line.
+    pub fn read_csv(path: &Path, offset_nanos: u64) -> Result<Self, TraceError> {
+        let text = read(path)?;
+        let mut lines = text.lines().enumerate();
+        let header = lines.next().map_or("", |(_, line)| line.trim());
+        if header != HEADER {
+            return Err(wrong(path, 0, header, "the header time_s,rate_mbps,delay_ms,loss"));
+        }
+        let mut steps: Vec<Step> = Vec::new();
+        for (index, line) in lines.filter(|(_, line)| !line.trim().is_empty()) {
+            let numbers: Option<Vec<f64>> = line.split(',').map(|field| field.trim().parse().ok()).collect();
+            let numbers = numbers.and_then(|numbers| <[f64; 4]>::try_from(numbers).ok());
+            let Some([time_s, rate_mbps, delay_ms, loss]) = numbers else {
+                return Err(wrong(path, index, line, "four numbers"));
+            };
+            let sound = (0.0..=1e9).contains(&time_s)
+                && (0.0..=1e6).contains(&rate_mbps)
+                && (0.0..=600_000.0).contains(&delay_ms)
+                && (0.0..=1.0).contains(&loss);
+            if !sound {
+                return Err(wrong(
+                    path,
+                    index,
+                    line,
+                    "a time, a rate up to 1e6, a delay up to 600,000, a loss up to 1",
+                ));
+            }
+            let from_nanos = (time_s * 1e9).round() as u64;
+            let rises = steps.last().map_or(from_nanos <= offset_nanos, |last| from_nanos > last.from_nanos);
+            if !rises {
+                return Err(wrong(
+                    path,
+                    index,
+                    line,
+                    "later than the line before, the first at offset_s (0) or before",
+                ));
+            }
+            steps.push(Step { from_nanos, bits_per_s: (rate_mbps * 1e6).round() as u64, delay_ms, loss });
+        }
+        let is_past = steps.last().is_some_and(|last| last.from_nanos < offset_nanos);
+        if is_past {
+            return Err(TraceError::Past { path: path.to_owned(), offset_s: offset_nanos as f64 * 1e-9 });
+        }
+        let begin = steps.partition_point(|step| step.from_nanos <= offset_nanos).saturating_sub(1);
+        let shifted = |step: &Step| Step { from_nanos: step.from_nanos.saturating_sub(offset_nanos), ..*step };
+        match steps.get(begin..) {
+            Some(left @ [_, ..]) => Ok(Self::Steps(left.iter().map(shifted).collect())),
+            _ => Err(TraceError::Empty { path: path.to_owned() }),
+        }
+    }
+
+    /// Reads delivery opportunities as mahimahi writes them: one line a packet, whole milliseconds that never fall.
+    ///
+    /// # Errors
+    /// [`TraceError`] names the file and the line.
+    pub fn read_mahimahi(path: &Path) -> Result<Self, TraceError> {
+        let mut times = Vec::new();
+        for (index, line) in read(path)?.lines().enumerate().filter(|(_, line)| !line.trim().is_empty()) {
+            let time = line.trim().parse::<u64>().ok().and_then(|ms| ms.checked_mul(1_000_000));
+            match time {
+                Some(time) if times.last().is_none_or(|&last| time >= last) => times.push(time),
+                _ => return Err(wrong(path, index, line, "whole milliseconds, not before the line above")),
+            }
+        }
+        match times.last() {
+            None => Err(TraceError::Empty { path: path.to_owned() }),
+            // A trace lasts as long as its last line says: one that ends at 0 would deliver everything at once.
+            Some(0) => Err(wrong(path, times.len() - 1, "0", "a last line above 0")),
+            Some(_) => Ok(Self::Opportunities(times)),
+        }
+    }
+
+    /// The step at a time; none for opportunities.
+    pub(super) fn at(&self, nanos: u64) -> Option<&Step> {
+        match self {
+            Self::Steps(steps) => steps.get(steps.partition_point(|step| step.from_nanos <= nanos).saturating_sub(1)),
+            Self::Opportunities(_) => None,
+        }
+    }
+}
+
+fn read(path: &Path) -> Result<String, TraceError> {
+    bounded_file::read_text(path, MAX_FILE_BYTES).map_err(|source| TraceError::Io { path: path.to_owned(), source })
+}
+
+fn wrong(path: &Path, index: usize, found: &str, must: &'static str) -> TraceError {
+    TraceError::Line { path: path.to_owned(), line: index + 1, found: found.chars().take(80).collect(), must }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn file(text: &str) -> (tempfile::TempDir, PathBuf) {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("trace.txt");
+        std::fs::write(&path, text).unwrap();
+        (folder, path)
+    }
+
+    #[test]
+    fn steps_hold_until_the_next() {
+        let (_folder, path) = file("time_s,rate_mbps,delay_ms,loss\n0,27,10,0\n2.5,1.5,40,0.1\n\n");
+        let trace = Trace::read_csv(&path, 0).unwrap();
+        let rate = |seconds: f64| trace.at((seconds * 1e9) as u64).unwrap().bits_per_s;
+        assert_eq!([rate(0.0), rate(2.499), rate(2.5), rate(900.0)], [27_000_000, 27_000_000, 1_500_000, 1_500_000]);
+    }
+
+    #[test]
+    fn a_link_begins_at_any_moment_of_its_trace() {
+        let text = "time_s,rate_mbps,delay_ms,loss\n10,27,10,0\n12.5,1.5,40,0.1\n20,6,5,0\n";
+        let (_folder, path) = file(text);
+        let steps = |offset_s: f64| match Trace::read_csv(&path, (offset_s * 1e9) as u64) {
+            Ok(Trace::Steps(steps)) => {
+                Ok(steps.iter().map(|step| (step.from_nanos as f64 * 1e-9, step.bits_per_s)).collect::<Vec<_>>())
+            }
+            other => Err(other.unwrap_err().to_string()),
+        };
+        assert_eq!(steps(10.0).unwrap(), [(0.0, 27_000_000), (2.5, 1_500_000), (10.0, 6_000_000)]);
+        assert_eq!(steps(13.0).unwrap(), [(0.0, 1_500_000), (7.0, 6_000_000)]);
+        assert_eq!(steps(20.0).unwrap(), [(0.0, 6_000_000)]);
+        assert!(steps(9.0).unwrap_err().contains("trace.txt:2:"), "it has not begun");
+        assert!(steps(20.5).unwrap_err().contains("offset_s is 20.5, behind the last line"));
+    }
+
+    #[test]
+    fn what_is_wrong_is_named_with_its_line() {
+        let header = "time_s,rate_mbps,delay_ms,loss\n";
+        for (text, line) in [
+            ("1,2,3,0\n", 2),
+            ("0,2,3,0\n0,2,3,0\n", 3),
+            ("0,2,3,0\n5,2,3,0\n4.9,2,3,0\n", 4),
+            ("0,2,3\n", 2),
+            ("0,-1,0,0\n", 2),
+            ("0,1,0,nan\n", 2),
+        ] {
+            let (_folder, path) = file(&format!("{header}{text}"));
+            let message = Trace::read_csv(&path, 0).unwrap_err().to_string();
+            assert!(message.contains(&format!("trace.txt:{line}:")), "{message}");
+        }
+        assert!(matches!(Trace::read_csv(Path::new("no/such/trace.csv"), 0), Err(TraceError::Io { .. })));
+        let (_folder, path) = file("time,rate\n");
+        assert!(Trace::read_csv(&path, 0).unwrap_err().to_string().contains("header"));
+        let (_folder, path) = file("2\n5\n3\n");
+        let message = Trace::read_mahimahi(&path).unwrap_err().to_string();
+        assert!(message.contains("trace.txt:3: \"3\"") && message.contains("not before the line above"), "{message}");
+        for text in ["x\n", "-1\n", "0\n0\n", ""] {
+            let (_folder, path) = file(text);
+            assert!(Trace::read_mahimahi(&path).is_err(), "{text:?}");
+        }
+    }
+}

@@ -1,0 +1,342 @@
+//! Recordings written, read back, cut and filled up.
+
+mod damaged;
+mod public_reader;
+
+use std::io::{self, Write};
+use std::path::{Path, PathBuf};
+use std::sync::{Arc, Mutex};
+
+use protocol::message::AgentTruth;
+use protocol::{
+    CavId, DetectionsReport, Gnss, GnssSource, Key, Lidar, PointCloud, Pose, RunId, Stamp, Stream, TrueObject, Truth,
+    wire,
+};
+
+use super::*;
+use dataset::{self, LoadOptions};
+
+const AGENTS: [&str; 2] = ["4279", "4288"];
+
+fn stamp(cav: &str, tick: u64) -> Stamp {
+    let cav = CavId::new(cav).unwrap();
+    Stamp { cav, epoch: 1, sequence: tick, capture_nanos: 100_000_000 * (tick + 1), publish_nanos: 7 }
+}
+
+fn cloud(tick: u64, points: usize) -> PointCloud {
+    PointCloud { xyzi: (0..points).map(|k| [k as f32, tick as f32, 0.5, 0.25]).collect() }
+}
+
+fn pose(tick: u64) -> Pose {
+    Pose::from_xyz_yaw([tick as f64 + 0.1, -2.0, 1.9], 0.3)
+}
+
+fn truth(tick: u64) -> Truth {
+    let object = TrueObject {
+        id: 7,
+        class: "truck".into(),
+        world_from_object: Pose::from_xyz_yaw([20.0, 3.0, 0.8], 0.1),
+        size_m: [4.0, 1.8, 1.6],
+        speed_mps: Some(3.5),
+    };
+    let agent = |cav: &str| AgentTruth {
+        cav: CavId::new(cav).unwrap(),
+        world_from_lidar: pose(tick),
+        objects: vec![object.clone()],
+    };
+    Truth { tick, agents: AGENTS.map(agent).into() }
+}
+
+/// The messages of one tick, as they come from the network.
+fn tick_messages(tick: u64, points: usize) -> Vec<(Key, Vec<u8>)> {
+    let run = RunId::new("test").unwrap();
+    let mut messages = Vec::new();
+    for cav in AGENTS {
+        let key = |stream| Key::stream(&run, &CavId::new(cav).unwrap(), stream);
+        let gnss = Gnss {
+            world_from_lidar: pose(tick),
+            position_std_m: 0.0,
+            heading_std_rad: 0.0,
+            source: GnssSource::Recorded,
+        };
+        messages.push((key(Stream::Gnss), wire::encode(&stamp(cav, tick), gnss).unwrap().to_vec()));
+        let lidar = Lidar { points: cloud(tick, points) };
+        messages.push((key(Stream::Lidar), wire::encode(&stamp(cav, tick), lidar).unwrap().to_vec()));
+    }
+    messages.push((Key::truth(&run), wire::encode(&stamp("replay", tick), truth(tick)).unwrap().to_vec()));
+    messages
+}
+
+/// Memory that is full at some point.
+#[derive(Clone)]
+struct Disk {
+    bytes: Arc<Mutex<Vec<u8>>>,
+    capacity: usize,
+}
+
+impl Disk {
+    fn new(capacity: usize) -> Self {
+        Self { bytes: Arc::default(), capacity }
+    }
+
+    fn bytes(&self) -> Vec<u8> {
+        self.bytes.lock().unwrap().clone()
+    }
+}
+
+impl Write for Disk {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        let mut held = self.bytes.lock().unwrap();
+        let take = bytes.len().min(self.capacity - held.len());
+        if take == 0 && !bytes.is_empty() {
+            return Err(io::ErrorKind::StorageFull.into());
+        }
+        held.extend(&bytes[..take]);
+        Ok(take)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        Ok(())
+    }
+}
+
+impl Store for Disk {
+    fn cut(&mut self, len: u64) -> io::Result<()> {
+        self.bytes.lock().unwrap().truncate(len as usize);
+        Ok(())
+    }
+}
+
+/// A recording of `ticks` ticks, a chunk each.
+fn recorded(ticks: u64, points: usize, options: RecordingOptions) -> Vec<u8> {
+    let disk = Disk::new(usize::MAX);
+    let mut writer = RecordingWriter::over(disk.clone(), Path::new("test.mcap"), options).unwrap();
+    for tick in 0..ticks {
+        for (key, payload) in tick_messages(tick, points) {
+            writer.write(&key, 1_000 + tick, &payload).unwrap();
+        }
+        writer.flush().unwrap();
+    }
+    writer.finish().unwrap();
+    disk.bytes()
+}
+
+/// Every message of every channel: topic, encoding, data.
+fn messages_of(recording: &Recording) -> Vec<(String, String, Vec<u8>)> {
+    let mut messages = Vec::new();
+    for held in recording.all() {
+        for message in held.unwrap().iter() {
+            let channel = &message.channel;
+            messages.push((channel.topic.clone(), channel.message_encoding.clone(), message.data.to_vec()));
+        }
+    }
+    messages
+}
+
+fn has_index(path: &Path) -> bool {
+    std::fs::read(path).unwrap().ends_with(mcap::MAGIC)
+}
+
+fn write(folder: &Path, bytes: &[u8]) -> PathBuf {
+    let path = folder.join("recording.mcap");
+    std::fs::write(&path, bytes).unwrap();
+    path
+}
+
+#[test]
+fn what_is_read_is_what_was_written() {
+    for zstd_level in [None, Some(1)] {
+        let folder = tempfile::tempdir().unwrap();
+        let options = RecordingOptions { zstd_level, with_ros: true };
+        let path = write(folder.path(), &recorded(3, 100, options));
+        let recording = Recording::open(&path).unwrap();
+        assert_eq!(recording.damage(), []);
+        let expected: Vec<_> = (0..3).flat_map(|tick| tick_messages(tick, 100)).collect();
+        assert_eq!(recording.entries().len(), expected.len());
+        for (entry, (key, payload)) in recording.entries().iter().zip(&expected) {
+            assert_eq!((&entry.key, &recording.read(entry).unwrap()), (key, payload));
+            assert_eq!(entry.arrived_nanos, 1_000 + entry.header.stamp.sequence);
+        }
+        let names: Vec<_> = AGENTS.map(|cav| format!("/{cav}/points")).into();
+        let topics: Vec<String> = messages_of(&recording).into_iter().map(|(topic, _, _)| topic).collect();
+        assert!(names.iter().all(|name| topics.contains(name)), "{topics:?}");
+        assert!(has_index(&path));
+    }
+}
+
+#[test]
+fn sweeps_in_coordinates_of_a_map_are_told_to_ros_tools_too() {
+    let disk = Disk::new(usize::MAX);
+    let mut writer = RecordingWriter::over(disk.clone(), Path::new("t"), RecordingOptions::default()).unwrap();
+    // UTM: east, north, height.
+    let far = PointCloud { xyzi: vec![[458_000.0, 5_428_000.0, 115.0, 0.5]] };
+    let key = Key::stream(&RunId::new("test").unwrap(), &CavId::new("4279").unwrap(), Stream::Lidar);
+    for points in [far, PointCloud { xyzi: vec![[f32::NAN; 4]] }] {
+        let payload = wire::encode(&stamp("4279", 0), Lidar { points }).unwrap().to_vec();
+        writer.write(&key, 5, &payload).unwrap();
+    }
+    writer.finish().unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let recording = Recording::open(&write(folder.path(), &disk.bytes())).unwrap();
+    let messages = messages_of(&recording);
+    let told: Vec<_> = messages.iter().filter(|(topic, ..)| topic == "/4279/points").collect();
+    assert_eq!((messages.len(), told.len()), (3, 1), "what is no number is recorded as it came");
+    let north = 5_428_000.0_f32.to_le_bytes();
+    assert!(told[0].2.windows(4).any(|bytes| bytes == north));
+}
+
+#[test]
+fn a_recording_is_a_scene() {
+    let folder = tempfile::tempdir().unwrap();
+    write(folder.path(), &recorded(3, 50, RecordingOptions::default()));
+    // The run folder names it as well as the file does.
+    let scenario = dataset::open(folder.path()).unwrap().scenarios.remove(0);
+    assert_eq!(scenario.agents, AGENTS.map(|cav| CavId::new(cav).unwrap()));
+    let captures: Vec<u64> = scenario.ticks.iter().map(|tick| tick.capture_nanos).collect();
+    assert_eq!(captures, [100_000_000, 200_000_000, 300_000_000]);
+    let frame = scenario.load(1, 2, &LoadOptions::default()).unwrap();
+    assert_eq!((frame.points, frame.world_from_lidar), (cloud(2, 50), Some(pose(2))));
+    let object = &frame.objects[0];
+    assert_eq!((object.id, object.class, object.speed_mps), (7, dataset::frame::ObjectClass::Truck, Some(3.5)));
+}
+
+#[test]
+fn a_truth_that_cannot_be_read_is_a_problem_and_no_end() {
+    let folder = tempfile::tempdir().unwrap();
+    let disk = Disk::new(usize::MAX);
+    let mut writer = RecordingWriter::over(disk.clone(), Path::new("t"), RecordingOptions::default()).unwrap();
+    for tick in 0..2 {
+        for (key, mut payload) in tick_messages(tick, 10) {
+            if tick == 1 && key.topic == protocol::Topic::Truth {
+                // Behind the header, which stays sound.
+                payload.truncate(payload.len() - 1);
+            }
+            writer.write(&key, tick, &payload).unwrap();
+        }
+    }
+    writer.finish().unwrap();
+    write(folder.path(), &disk.bytes());
+    let mut dataset = dataset::open(folder.path()).unwrap();
+    assert_eq!(dataset.problems.len(), 1, "{:?}", dataset.problems);
+    let scenario = dataset.scenarios.remove(0);
+    assert_eq!(scenario.ticks.len(), 2);
+    let frame = scenario.load(0, 1, &LoadOptions::default()).unwrap();
+    assert_eq!((frame.points, frame.objects.len()), (cloud(1, 10), 0));
+}
+
+#[test]
+fn a_recovered_recording_has_an_index_and_the_same_messages() {
+    let folder = tempfile::tempdir().unwrap();
+    let whole = recorded(4, 100, RecordingOptions::default());
+    let path = write(folder.path(), &whole[..whole.len() / 2]);
+    let to = folder.path().join("whole.mcap");
+    let report = recover(&path, &to, RecordingOptions::default()).unwrap();
+    assert_eq!(report.damage.len(), 1);
+    let (cut, recovered) = (Recording::open(&path).unwrap(), Recording::open(&to).unwrap());
+    assert_eq!(recovered.damage(), []);
+    assert_eq!(report.messages as usize, cut.entries().len());
+    assert!(has_index(&to) && !has_index(&path));
+    for (left, right) in cut.entries().iter().zip(recovered.entries()) {
+        assert_eq!(cut.read(left).unwrap(), recovered.read(right).unwrap());
+        assert_eq!(left.arrived_nanos, right.arrived_nanos);
+    }
+    assert_eq!(cut.entries().len(), recovered.entries().len());
+}
+
+#[test]
+fn json_stands_beside_our_own_messages() {
+    let disk = Disk::new(usize::MAX);
+    let mut writer = RecordingWriter::over(disk.clone(), Path::new("t"), RecordingOptions::default()).unwrap();
+    let key: Key = "v2v/test/4279/detections/json".parse().unwrap();
+    let text = br#"{"tick": 0}"#;
+    assert!(serde_json::from_slice::<DetectionsReport>(text).is_err(), "any JSON will do");
+    writer.write(&key, 5, text).unwrap();
+    for (key, payload) in tick_messages(0, 1) {
+        writer.write(&key, 6, &payload).unwrap();
+    }
+    writer.finish().unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let recording = Recording::open(&write(folder.path(), &disk.bytes())).unwrap();
+    assert_eq!(recording.entries().len(), 5, "JSON is no message of ours");
+    assert_eq!(messages_of(&recording)[0], (key.to_string(), "json".to_owned(), text.to_vec()));
+}
+
+#[test]
+fn a_first_message_that_is_none_spoils_none_after_it() {
+    let disk = Disk::new(usize::MAX);
+    let mut writer = RecordingWriter::over(disk.clone(), Path::new("t"), RecordingOptions::default()).unwrap();
+    let messages = tick_messages(0, 1);
+    messages.iter().for_each(|(key, _)| writer.write(key, 5, b"garbage").unwrap());
+    messages.iter().for_each(|(key, payload)| writer.write(key, 6, payload).unwrap());
+    writer.finish().unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let recording = Recording::open(&write(folder.path(), &disk.bytes())).unwrap();
+    let keys: Vec<&Key> = recording.entries().iter().map(|entry| &entry.key).collect();
+    assert_eq!(keys, messages.iter().map(|(key, _)| key).collect::<Vec<_>>());
+}
+
+#[test]
+fn the_first_of_two_replays_of_one_moment_is_taken_with_its_own_truth() {
+    let disk = Disk::new(usize::MAX);
+    let mut writer = RecordingWriter::over(disk.clone(), Path::new("t"), RecordingOptions::default()).unwrap();
+    for (key, payload) in tick_messages(0, 1) {
+        writer.write(&key, 5, &payload).unwrap();
+        if key.topic == protocol::Topic::Truth {
+            let second = Stamp { epoch: 2, ..stamp("replay", 0) };
+            let nothing = Truth { tick: 0, agents: Vec::new() };
+            // The same once more is no news.
+            for stamp in [stamp("replay", 0), second] {
+                writer.write(&key, 6, &wire::encode(&stamp, nothing.clone()).unwrap().to_vec()).unwrap();
+            }
+        }
+    }
+    writer.finish().unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let mut dataset = dataset::open(&write(folder.path(), &disk.bytes())).unwrap();
+    assert_eq!(dataset.problems.len(), 1, "{:?}", dataset.problems);
+    assert!(dataset.problems[0].to_string().contains("1 moments"), "{}", dataset.problems[0]);
+    let frame = dataset.scenarios.remove(0).load(0, 0, &LoadOptions::default()).unwrap();
+    assert_eq!(frame.objects.len(), 1);
+}
+
+#[test]
+fn a_full_disk_leaves_what_is_whole() {
+    let folder = tempfile::tempdir().unwrap();
+    let one = recorded(1, 2_000, RecordingOptions::default()).len();
+    let disk = Disk::new(5 * one / 2);
+    let mut writer = RecordingWriter::over(disk.clone(), Path::new("full.mcap"), RecordingOptions::default()).unwrap();
+    let mut failures = Vec::new();
+    for tick in 0..6 {
+        for (key, payload) in tick_messages(tick, 2_000) {
+            failures.extend(writer.write(&key, tick, &payload).err());
+        }
+        failures.extend(writer.flush().err());
+    }
+    let said: Vec<String> = failures.iter().map(ToString::to_string).collect();
+    assert!(matches!(failures[0], RecordingError::Io { .. }), "{said:?}");
+    assert!(said[0].contains("full.mcap") && said[0].contains("storage"), "{said:?}");
+    assert!(failures[1..].iter().all(|error| matches!(error, RecordingError::Ended { .. })), "{said:?}");
+    assert!(writer.finish().is_err());
+    assert_eq!(writer.whole_messages(), 2 * 5, "two ticks were whole");
+    drop(writer);
+    let recording = Recording::open(&write(folder.path(), &disk.bytes())).unwrap();
+    assert_eq!(recording.entries().len(), 2 * 5);
+    let [damage] = recording.damage() else { panic!("{:?}", recording.damage()) };
+    assert_eq!((damage.lost_bytes, damage.to_s), (0, None), "only the index is missing");
+}
+
+#[test]
+fn what_is_no_recording_is_refused_with_a_reason() {
+    let folder = tempfile::tempdir().unwrap();
+    for bytes in
+        [b"".as_slice(), b"\x89MCAP", b"hello, hello, hello", &recorded(1, 1, RecordingOptions::default())[..8]]
+    {
+        let error = Recording::open(&write(folder.path(), bytes)).unwrap_err();
+        assert!(matches!(error, RecordingError::NotOurs { .. }), "{error}");
+    }
+    // A file of someone else: whole, but without a channel of ours.
+    let disk = Disk::new(usize::MAX);
+    RecordingWriter::over(disk.clone(), Path::new("t"), RecordingOptions::default()).unwrap().finish().unwrap();
+    let error = Recording::open(&write(folder.path(), &disk.bytes())).unwrap_err();
+    assert!(error.to_string().contains("no channel of encoding"), "{error}");
+}

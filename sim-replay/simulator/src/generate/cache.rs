@@ -1,0 +1,159 @@
+//! Generated scenes that are kept and used again: whole or not at all, and only where they are what is asked for.
+
+use std::path::Path;
+use std::{fs, io};
+
+use serde::Deserialize;
+
+use super::data_protocol::FILE_NAME;
+use super::error::SynthError;
+use super::layout::SceneLayout;
+use super::options::SynthOptions;
+use super::scenes::{Summary, generate, sources};
+use crate::map::TownSource;
+use support::bounded_file;
+
+/// A longer file does not come from here, bytes.
+const MAX_FILE_BYTES: u64 = 1 << 20;
+
+/// What [`FILE_NAME`] says of how a scenario was made.
+#[derive(Debug, Deserialize)]
+struct MadeWith {
+    generator: Generator,
+}
+
+#[derive(Debug, Deserialize)]
+struct Generator {
+    subset: String,
+    seed: u64,
+    town: String,
+    town_seed: u64,
+    agents: usize,
+    frames: usize,
+    period_seconds: f64,
+    weather: String,
+    #[serde(default = "default_layout")]
+    layout: String,
+}
+
+fn default_layout() -> String {
+    SceneLayout::Opv2v.name().to_owned()
+}
+
+/// Whether scenes of these options lie in their folder already.
+///
+/// # Errors
+/// [`SynthError::Kept`] where something else lies there, with the first setting in which it differs;
+/// [`SynthError::Read`] where that cannot be told.
+pub fn are_kept(options: &SynthOptions) -> Result<bool, SynthError> {
+    let folder = options.out.as_path();
+    if !folder.exists() {
+        return Ok(false);
+    }
+    let scenarios = read(folder)?;
+    let differs = |setting, found: String, wanted: String| {
+        let folder = folder.to_owned();
+        Err(SynthError::Kept { folder, setting, found, wanted })
+    };
+    let towns: Vec<String> = sources(options).iter().map(TownSource::name).collect();
+    for made in &scenarios {
+        let Generator { subset, seed, town, town_seed, agents, frames, period_seconds, weather, layout } = made;
+        let settings = [
+            ("subset", subset.clone(), options.subset.name().to_owned()),
+            ("seed", seed.to_string(), options.seed.to_string()),
+            ("frames", frames.to_string(), options.frames.to_string()),
+            ("period_seconds", period_seconds.to_string(), options.period_s.to_string()),
+            ("weather", weather.clone(), options.weather.name().to_owned()),
+            ("town_seed", town_seed.to_string(), options.town_seed.to_string()),
+            ("layout", layout.clone(), options.layout.name().to_owned()),
+        ];
+        if let Some((setting, found, wanted)) = settings.into_iter().find(|(_, found, wanted)| found != wanted) {
+            return differs(setting, found, wanted);
+        }
+        if !towns.contains(town) {
+            return differs("town", town.clone(), towns.join(" or "));
+        }
+        if !options.agents.contains(agents) {
+            let wanted = format!("{} to {}", options.agents.start(), options.agents.end());
+            return differs("agents", agents.to_string(), wanted);
+        }
+    }
+    if scenarios.len() != options.scenarios() {
+        return differs("scenarios", scenarios.len().to_string(), options.scenarios().to_string());
+    }
+    Ok(true)
+}
+
+/// [`generate`], but the folder has its name only when all is in it: a run that is cut off leaves no half of a data set to
+/// the next one, which begins anew.
+///
+/// # Errors
+/// As [`generate`].
+pub fn generate_whole(options: &SynthOptions, progress: &(dyn Fn(u64) + Sync)) -> Result<Summary, SynthError> {
+    let unfinished = options.out.with_added_extension("unfinished");
+    let write = |path: &Path, source| SynthError::Write { path: path.to_owned(), source };
+    match fs::remove_dir_all(&unfinished) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(write(&unfinished, error)),
+        Ok(()) | Err(_) => {}
+    }
+    let summary = generate(&SynthOptions { out: unfinished.clone(), ..options.clone() }, progress)?;
+    fs::rename(&unfinished, &options.out).map_err(|source| write(&options.out, source))?;
+    Ok(summary)
+}
+
+/// How the scenarios in a folder were made. Without a file that says so they were not made here.
+fn read(folder: &Path) -> Result<Vec<Generator>, SynthError> {
+    let at = |path: &Path, problem: String| SynthError::Read { path: path.to_owned(), problem };
+    let entries = fs::read_dir(folder).map_err(|error| at(folder, error.to_string()))?;
+    let mut generators = Vec::new();
+    for entry in entries {
+        let scenario = entry.map_err(|error| at(folder, error.to_string()))?.path();
+        if !scenario.is_dir() {
+            continue;
+        }
+        let file = scenario.join(FILE_NAME);
+        let text = bounded_file::read_text(&file, MAX_FILE_BYTES).map_err(|error| at(&file, error.to_string()))?;
+        let made: MadeWith = serde_saphyr::from_str(&text).map_err(|error| {
+            at(&file, error.without_snippet().to_string().lines().next().unwrap_or_default().into())
+        })?;
+        generators.push(made.generator);
+    }
+    Ok(generators)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::{Subset, Weather};
+    use super::*;
+
+    #[test]
+    fn kept_scenes_are_taken_only_for_what_they_are() {
+        let folder = tempfile::tempdir().unwrap();
+        let out = folder.path().join("scenes");
+        let options =
+            SynthOptions { scenes: 2, frames: 2, agents: 2..=2, ..SynthOptions::new(Subset::V2vdet, 7, out.clone()) };
+        assert!(!are_kept(&options).unwrap());
+        // Of a run with another seed that was cut off.
+        fs::create_dir_all(folder.path().join("scenes.unfinished/v2vdet_town1_s8_0000")).unwrap();
+        generate_whole(&options, &|_| {}).unwrap();
+        assert!(are_kept(&options).unwrap());
+        assert!(are_kept(&SynthOptions { agents: 1..=3, threads: 2, ..options.clone() }).unwrap());
+        for (asked, words) in [
+            (SynthOptions { seed: 8, ..options.clone() }, "seed 7, not 8"),
+            (SynthOptions { frames: 3, ..options.clone() }, "frames 2, not 3"),
+            (SynthOptions { agents: 3..=4, ..options.clone() }, "agents 2, not 3 to 4"),
+            (SynthOptions { scenes: 3, ..options.clone() }, "scenarios 2, not 3"),
+            (SynthOptions { weather: Weather::Fog, ..options.clone() }, "weather sunny, not fog"),
+            (SynthOptions { town: Some(TownSource::Town1), ..options.clone() }, "town town4, not town1"),
+        ] {
+            let problem = are_kept(&asked).unwrap_err().to_string();
+            assert!(problem.contains(words) && problem.contains(&*out.to_string_lossy()), "{problem}");
+        }
+        fs::create_dir(out.join("other")).unwrap();
+        let problem = are_kept(&options).unwrap_err().to_string();
+        assert!(problem.contains("other/data_protocol.yaml"), "{problem}");
+        fs::write(out.join("other/data_protocol.yaml"), vec![b' '; MAX_FILE_BYTES as usize + 1]).unwrap();
+        let problem = are_kept(&options).unwrap_err().to_string();
+        assert!(problem.contains("larger than"), "{problem}");
+    }
+}

@@ -1,0 +1,150 @@
+//! Conversion: a data set that was opened, written in another layout.
+
+use std::collections::BTreeMap;
+use std::path::PathBuf;
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use protocol::CavId;
+use rayon::prelude::*;
+
+use super::data_protocol::converted_yaml;
+use super::error::SynthError;
+use super::layout::{
+    AgentFrame, Moment, Omissions, SceneAgent, SceneHeader, SceneLayout, SceneWriter, SweepVariant, Unfinished, locked,
+};
+use super::scenes::check_folder;
+use dataset::{Dataset, LeftOut, LoadOptions, LoadedTick, Problem, ReadError, Scenario};
+
+/// Lengths of a tick that are tried, nanoseconds: a simulator's step, and what clocks of sensors are read to.
+const TICKS_NANOS: [u64; 4] = [50_000_000, 10_000_000, 1_000_000, 1_000];
+
+/// What to write, and where.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct ConvertOptions {
+    /// Where the scenarios go.
+    pub out: PathBuf,
+    /// Layout of the files.
+    pub layout: SceneLayout,
+    /// Whether to write into a folder that holds something already.
+    pub force: bool,
+}
+
+/// What was converted.
+#[derive(Debug, Default)]
+pub struct Converted {
+    /// Scenarios.
+    pub scenarios: usize,
+    /// Frames of all agents together.
+    pub agent_frames: usize,
+    /// What the layout has no place for, and how often it was left out.
+    pub omitted: BTreeMap<&'static str, u64>,
+    /// What could not be read.
+    pub left_out: LeftOut,
+}
+
+/// Writes all scenarios of a data set in a layout. `progress` is called with the number of moments
+/// that are done and their total, from any thread.
+///
+/// # Errors
+/// [`SynthError`] where the layout cannot hold a scene or a file cannot be written. A frame that cannot be read is left out
+/// and stands in [`Converted::left_out`].
+pub fn convert(
+    dataset: &Dataset,
+    options: &ConvertOptions,
+    progress: &(dyn Fn(usize, usize) + Sync),
+) -> Result<Converted, SynthError> {
+    check_folder(&options.out, options.force)?;
+    let unfinished = Unfinished::mark(&options.out)?;
+    let mut writer = options.layout.writer(&options.out);
+    let (omitted, left_out) = (Omissions::default(), Mutex::new(LeftOut::default()));
+    locked(&left_out).add_files(&dataset.problems);
+    let mut converted = Converted::default();
+    let total = dataset.scenarios.iter().map(|scenario| scenario.ticks.len()).sum();
+    let done = AtomicUsize::new(0);
+    for scenario in &dataset.scenarios {
+        writer.begin(&header(scenario, dataset)?)?;
+        let frames = write_moments(scenario, writer.as_ref(), (&omitted, &left_out), &|| {
+            progress(done.fetch_add(1, Ordering::Relaxed) + 1, total);
+        })?;
+        writer.end()?;
+        converted.scenarios += 1;
+        converted.agent_frames += frames;
+    }
+    writer.finish()?;
+    unfinished.clear()?;
+    converted.omitted = omitted.into_counts();
+    converted.left_out = std::mem::take(&mut *locked(&left_out));
+    Ok(converted)
+}
+
+fn header(scenario: &Scenario, dataset: &Dataset) -> Result<SceneHeader, SynthError> {
+    let capture_nanos: Vec<u64> = scenario.ticks.iter().map(|tick| tick.capture_nanos).collect();
+    let divides = |tick: &u64| capture_nanos.iter().all(|nanos| nanos % tick == 0);
+    let tick_nanos = TICKS_NANOS.into_iter().find(divides).unwrap_or(TICKS_NANOS[TICKS_NANOS.len() - 1]);
+    if let Some(pair) = capture_nanos.windows(2).find(|pair| pair[0] / tick_nanos >= pair[1] / tick_nanos) {
+        let reason =
+            format!("scenario {}: two moments at {} and {} ns: times do not rise", scenario.name, pair[0], pair[1]);
+        return Err(SynthError::Layout { layout: "of the input", reason });
+    }
+    let is_roadside = |id: &CavId| scenario.roadside_units.contains(id);
+    let agents = scenario.agents.iter().map(|id| SceneAgent { id: id.clone(), is_roadside: is_roadside(id) });
+    Ok(SceneHeader {
+        name: scenario.name.clone(),
+        agents: agents.collect(),
+        origin: converted_yaml(dataset.layout.name(), &scenario.name, tick_nanos),
+        capture_nanos,
+        tick_nanos,
+    })
+}
+
+/// Writes the moments at which the ego's frame can be read; returns how many frames.
+fn write_moments(
+    scenario: &Scenario,
+    writer: &dyn SceneWriter,
+    (omitted, left_out): (&Omissions, &Mutex<LeftOut>),
+    done: &(dyn Fn() + Sync),
+) -> Result<usize, SynthError> {
+    let moments = (0..scenario.ticks.len()).into_par_iter().map(|index| {
+        let loaded = read(scenario, index);
+        locked(left_out).add_tick(&loaded);
+        done();
+        if loaded.frames.first().is_none_or(|(agent, _)| *agent != 0) {
+            return Ok(0);
+        }
+        let frames = loaded.frames.into_iter().map(|(agent, frame)| {
+            let variants = variants(scenario, agent, index, left_out);
+            AgentFrame { agent, frame, variants, simulated: None }
+        });
+        let moment = Moment { index, frames: frames.collect() };
+        writer.write(&moment, omitted)?;
+        Ok(moment.frames.len())
+    });
+    moments.sum()
+}
+
+/// The frames of a moment. No layout has a place for sweeps of which nobody knows where they were taken.
+fn read(scenario: &Scenario, index: usize) -> LoadedTick {
+    let options = LoadOptions { lidar_variant: None, points: true, radar: true };
+    let mut loaded = scenario.load_tick(index, 0..scenario.agents.len(), &options);
+    for (agent, _) in loaded.frames.extract_if(.., |(_, frame)| frame.world_from_lidar.is_none()) {
+        let path = scenario.points_path(agent, index, None).unwrap_or_default();
+        let error = ReadError::malformed(&path, "there is no pose for this sweep");
+        loaded.unreadable.push((agent, Problem::from(&error)));
+    }
+    loaded
+}
+
+/// The copies of a sweep that can be read.
+fn variants(scenario: &Scenario, agent: usize, index: usize, left_out: &Mutex<LeftOut>) -> Vec<SweepVariant> {
+    let read = |name: &String| {
+        let cloud = scenario.load_points(agent, index, Some(name)).map_err(|error| {
+            // A copy is a part of its frame, not a frame.
+            locked(left_out).add_files([&error]);
+        });
+        let cloud = cloud.ok()?;
+        let labels = cloud.labels.unwrap_or_else(|| vec![0; cloud.points.len()]);
+        Some(SweepVariant { name: name.clone(), points: cloud.points.xyzi, labels })
+    };
+    scenario.lidar_variants.iter().filter_map(read).collect()
+}

@@ -1,0 +1,82 @@
+//! Layouts of the OPV2V family: a folder per agent, some files per frame.
+
+use std::path::{Path, PathBuf};
+
+use super::disk::{Unfinished, make_folder, make_fresh_folder, scene_path, write_file};
+use super::yaml_text::agent_folders;
+use super::{AgentFrame, Moment, Omissions, SceneHeader, SceneWriter};
+use crate::generate::data_protocol::FILE_NAME;
+use crate::generate::error::SynthError;
+
+/// The folders of a scene in the layouts of the OPV2V family.
+#[derive(Debug)]
+pub(super) struct AgentFolders {
+    agents: Vec<PathBuf>,
+    is_roadside: Vec<bool>,
+    /// Number of the moment's tick, by index.
+    ticks: Vec<u64>,
+    mark: Unfinished,
+}
+
+impl AgentFolders {
+    /// Makes the folders anew.
+    pub(super) fn make(root: &Path, scene: &SceneHeader) -> Result<Self, SynthError> {
+        let folder = scene_path(root, &scene.name);
+        make_fresh_folder(&folder)?;
+        let mark = Unfinished::mark(&folder)?;
+        write_file(&folder.join(FILE_NAME), &scene.origin)?;
+        let agents: Vec<PathBuf> = agent_folders(scene).iter().map(|name| folder.join(name)).collect();
+        agents.iter().try_for_each(|folder| make_folder(folder))?;
+        let ticks = scene.capture_nanos.iter().map(|nanos| nanos / scene.tick_nanos).collect();
+        let is_roadside = scene.agents.iter().map(|agent| agent.is_roadside).collect();
+        Ok(Self { agents, is_roadside, ticks, mark })
+    }
+
+    /// Whether an agent is a unit at the roadside.
+    pub(super) fn is_roadside(&self, frame: &AgentFrame) -> bool {
+        self.is_roadside[frame.agent]
+    }
+
+    /// A file of an agent's frame: `suffix` follows the number of the tick.
+    pub(super) fn file(&self, moment: &Moment, frame: &AgentFrame, suffix: &str) -> PathBuf {
+        self.agents[frame.agent].join(format!("{:06}{suffix}", self.ticks[moment.index]))
+    }
+
+    /// All is written.
+    pub(super) fn close(self) -> Result<(), SynthError> {
+        self.mark.clear()
+    }
+}
+
+/// Writes the files of one frame of one agent.
+type WriteFrame = fn(&AgentFolders, &Moment, &AgentFrame) -> Result<(), SynthError>;
+
+/// The writer of these layouts, which differ in the files of a frame.
+#[derive(Debug)]
+pub(super) struct AgentFolderWriter {
+    root: PathBuf,
+    folders: Option<AgentFolders>,
+    write_frame: WriteFrame,
+}
+
+impl AgentFolderWriter {
+    pub(super) fn new(root: &Path, write_frame: WriteFrame) -> Self {
+        Self { root: root.to_owned(), folders: None, write_frame }
+    }
+}
+
+impl SceneWriter for AgentFolderWriter {
+    fn begin(&mut self, scene: &SceneHeader) -> Result<(), SynthError> {
+        self.folders = Some(AgentFolders::make(&self.root, scene)?);
+        Ok(())
+    }
+
+    fn write(&self, moment: &Moment, _: &Omissions) -> Result<(), SynthError> {
+        let Some(folders) = &self.folders else { return Ok(()) };
+        moment.frames.iter().try_for_each(|frame| (self.write_frame)(folders, moment, frame))
+    }
+
+    fn end(&mut self) -> Result<(), SynthError> {
+        self.folders.take().map_or(Ok(()), AgentFolders::close)
+    }
+}

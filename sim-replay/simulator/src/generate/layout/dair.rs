@@ -1,0 +1,293 @@
+//! DAIR-V2X-C and V2X-Seq SPD: the ego as the vehicle, one other agent as the roadside unit, and labels of both together.
+//!
+//! All scenes of a data set lie in one root, each a batch (DAIR) or a sequence (SPD). Frames have numbers of six digits, and
+//! those of the unit are others than those of the vehicle. Intensities are 0 to 255. There are no images, though the paths
+//! of images stand in the lists, as loaders take numbers from them.
+
+use std::path::{Path, PathBuf};
+use std::sync::Mutex;
+
+use nalgebra::Isometry3;
+use protocol::{Box3d, Pose};
+use serde_json::{Value, json};
+
+use super::boxes::{upright_in, with_byte_intensities};
+use super::dair_json::{cooperative_type, side_type, transform, upright_label, world_label};
+use super::disk::{make_folder, make_fresh_folder, write_file, write_origin};
+use super::{AgentFrame, Moment, Omissions, SceneHeader, SceneWriter, locked};
+use crate::generate::error::SynthError;
+use dataset::frame::Object;
+use dataset::ground_truth::upright_box;
+use dataset::pcd::{self, Encoding, IntensityField};
+
+/// The first number of the unit's frames, and by how much at most the vehicle's count.
+const FIRST_UNIT_FRAME: usize = 500_000;
+/// Time stamps of a scene count from here on, microseconds, with a day between two scenes.
+const EPOCH_MICROS: u64 = 1_626_155_000_000_000;
+const DAY_MICROS: u64 = 86_400_000_000;
+
+/// Which of the two relatives.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(super) enum Edition {
+    /// Pairs by paths, cooperative labels in the world.
+    Dair,
+    /// Pairs by numbers of frames and sequences, cooperative labels in the frame of the vehicle's LiDAR, with track ids.
+    V2xSeq,
+}
+
+/// One of the two agents.
+struct Side {
+    folder: &'static str,
+    labels: &'static str,
+}
+
+const VEHICLE: Side = Side { folder: "vehicle-side", labels: "lidar" };
+const UNIT: Side = Side { folder: "infrastructure-side", labels: "virtuallidar" };
+
+/// The writer.
+#[derive(Debug)]
+pub(super) struct Dair {
+    root: PathBuf,
+    edition: Edition,
+    /// Scenes that were begun.
+    scenes: usize,
+    /// Number of the next scene's first frame.
+    next_frame: usize,
+    scene: Option<Batch>,
+    /// Rows of the three lists, by number of the vehicle's frame.
+    rows: Mutex<Vec<(usize, Rows)>>,
+}
+
+/// A scene.
+#[derive(Debug)]
+struct Batch {
+    number: usize,
+    first_frame: usize,
+    /// Which agent is the roadside unit.
+    unit: usize,
+    capture_nanos: Vec<u64>,
+}
+
+/// What the lists hold of a moment.
+#[derive(Debug)]
+struct Rows {
+    vehicle: Value,
+    unit: Value,
+    pair: Value,
+}
+
+impl Dair {
+    pub(super) fn new(root: &Path, edition: Edition) -> Self {
+        let rows = Mutex::new(Vec::new());
+        Self { root: root.to_owned(), edition, scenes: 0, next_frame: 0, scene: None, rows }
+    }
+
+    fn make_folders(&self) -> Result<(), SynthError> {
+        for name in [VEHICLE.folder, UNIT.folder, "cooperative"] {
+            make_fresh_folder(&self.root.join(name))?;
+        }
+        let cooperative = format!("cooperative/{}", self.cooperative_labels());
+        let folders = [
+            "vehicle-side/velodyne",
+            "vehicle-side/calib/lidar_to_novatel",
+            "vehicle-side/calib/novatel_to_world",
+            "vehicle-side/label/lidar",
+            "infrastructure-side/velodyne",
+            "infrastructure-side/calib/virtuallidar_to_world",
+            "infrastructure-side/label/virtuallidar",
+            &cooperative,
+        ];
+        folders.iter().try_for_each(|folder| make_folder(&self.root.join(folder)))
+    }
+
+    fn cooperative_labels(&self) -> &'static str {
+        match self.edition {
+            Edition::Dair => "label_world",
+            Edition::V2xSeq => "label",
+        }
+    }
+
+    fn layout(&self) -> &'static str {
+        match self.edition {
+            Edition::Dair => "dair",
+            Edition::V2xSeq => "v2xseq",
+        }
+    }
+
+    fn write_json(&self, path: &str, value: &Value) -> Result<(), SynthError> {
+        write_file(&self.root.join(path), value.to_string())
+    }
+
+    /// The sweep and the labels of one side.
+    fn write_side(&self, side: &Side, id: &str, frame: &AgentFrame, omitted: &Omissions) -> Result<(), SynthError> {
+        let points = with_byte_intensities(&frame.frame.points);
+        let cloud = pcd::encode(&points, Encoding::Binary, IntensityField::Intensity);
+        write_file(&self.root.join(format!("{}/velodyne/{id}.pcd", side.folder)), cloud)?;
+        let mut labels = Vec::new();
+        for object in &frame.frame.objects {
+            match side_type(object.class) {
+                Some(kind) => labels.push(upright_label(kind, object.id, &upright_in(frame, object))),
+                None => omitted.add("objects of a class without a name in the labels", 1),
+            }
+        }
+        self.write_json(&format!("{}/label/{}/{id}.json", side.folder, side.labels), &Value::Array(labels))
+    }
+
+    /// Where the vehicle's LiDAR is, in the two steps of the data set.
+    fn write_vehicle_pose(&self, id: &str, frame: &AgentFrame) -> Result<(), SynthError> {
+        let world_from_lidar = frame.world_from_lidar();
+        let world_from_novatel = frame.frame.world_from_vehicle.map_or(world_from_lidar, |vehicle| vehicle.isometry());
+        let novatel_from_lidar: Pose = world_from_novatel.inv_mul(&world_from_lidar).into();
+        let mount = json!({ "transform": transform(&novatel_from_lidar) });
+        self.write_json(&format!("vehicle-side/calib/lidar_to_novatel/{id}.json"), &mount)?;
+        let pose = transform(&world_from_novatel.into());
+        self.write_json(&format!("vehicle-side/calib/novatel_to_world/{id}.json"), &pose)
+    }
+
+    fn write_unit_pose(&self, id: &str, frame: &AgentFrame) -> Result<(), SynthError> {
+        let mut pose = transform(&frame.world_from_lidar().into());
+        pose["relative_error"] = json!({ "delta_x": 0.0, "delta_y": 0.0 });
+        self.write_json(&format!("infrastructure-side/calib/virtuallidar_to_world/{id}.json"), &pose)
+    }
+
+    /// The label of an object that either side lists.
+    fn cooperative_label(&self, kind: &str, object: &Object, vehicle: &AgentFrame) -> Value {
+        match self.edition {
+            Edition::Dair => {
+                let upright: Box3d = upright_box(object, &Isometry3::identity());
+                world_label(kind, object, &upright)
+            }
+            Edition::V2xSeq => upright_label(kind, object.id, &upright_in(vehicle, object)),
+        }
+    }
+}
+
+impl SceneWriter for Dair {
+    fn begin(&mut self, scene: &SceneHeader) -> Result<(), SynthError> {
+        let refused = |reason: String| Err(SynthError::Layout { layout: self.layout(), reason });
+        if scene.agents.len() < 2 {
+            return refused(format!("scene {} has one agent; a vehicle and a roadside unit are needed", scene.name));
+        }
+        let frames = scene.capture_nanos.len();
+        if self.next_frame + frames > FIRST_UNIT_FRAME {
+            return refused(format!("more than {FIRST_UNIT_FRAME} frames have no numbers of six digits"));
+        }
+        if self.scenes == 0 {
+            self.make_folders()?;
+        }
+        write_origin(&self.root, scene)?;
+        // A unit where there is one; the second agent takes its part elsewhere.
+        let unit = (1..scene.agents.len()).find(|&agent| scene.agents[agent].is_roadside).unwrap_or(1);
+        let (number, first_frame) = (self.scenes, self.next_frame);
+        self.scene = Some(Batch { number, first_frame, unit, capture_nanos: scene.capture_nanos.clone() });
+        self.scenes += 1;
+        self.next_frame += frames;
+        Ok(())
+    }
+
+    fn write(&self, moment: &Moment, omitted: &Omissions) -> Result<(), SynthError> {
+        let Some(batch) = &self.scene else { return Ok(()) };
+        let (Some(vehicle), Some(unit)) = (moment.of(0), moment.of(batch.unit)) else {
+            omitted.add("frames of moments without vehicle or roadside unit", moment.frames.len());
+            return Ok(());
+        };
+        omitted.add("frames of agents beyond one vehicle and one roadside unit", moment.frames.len() - 2);
+        let number = batch.first_frame + moment.index;
+        let [id, unit_id] = [number, FIRST_UNIT_FRAME + number].map(|number| format!("{number:06}"));
+        self.write_side(&VEHICLE, &id, vehicle, omitted)?;
+        self.write_side(&UNIT, &unit_id, unit, omitted)?;
+        self.write_vehicle_pose(&id, vehicle)?;
+        self.write_unit_pose(&unit_id, unit)?;
+        let mut labels = Vec::new();
+        for object in Moment::union([vehicle, unit]) {
+            match cooperative_type(object.class) {
+                Some(kind) => labels.push(self.cooperative_label(kind, object, vehicle)),
+                None => omitted.add("objects that are no vehicles, in the labels of both sides", 1),
+            }
+        }
+        let path = format!("cooperative/{}/{id}.json", self.cooperative_labels());
+        self.write_json(&path, &Value::Array(labels))?;
+        locked(&self.rows).push((number, self.rows_of(batch, moment, &id, &unit_id)));
+        Ok(())
+    }
+
+    fn end(&mut self) -> Result<(), SynthError> {
+        self.scene = None;
+        Ok(())
+    }
+
+    fn finish(&mut self) -> Result<(), SynthError> {
+        let mut rows = std::mem::take(&mut *locked(&self.rows));
+        rows.sort_by_key(|(number, _)| *number);
+        let list = |of: fn(&Rows) -> &Value| Value::Array(rows.iter().map(|(_, rows)| of(rows).clone()).collect());
+        self.write_json("vehicle-side/data_info.json", &list(|rows| &rows.vehicle))?;
+        self.write_json("infrastructure-side/data_info.json", &list(|rows| &rows.unit))?;
+        self.write_json("cooperative/data_info.json", &list(|rows| &rows.pair))
+    }
+}
+
+impl Dair {
+    /// The rows of a moment in the lists.
+    fn rows_of(&self, batch: &Batch, moment: &Moment, id: &str, unit_id: &str) -> Rows {
+        let micros = EPOCH_MICROS + batch.number as u64 * DAY_MICROS + batch.capture_nanos[moment.index] / 1000;
+        let last_frame = batch.first_frame + batch.capture_nanos.len() - 1;
+        let [first, last] = [batch.first_frame, last_frame];
+        let span = |offset: usize| [first, last].map(|number| format!("{:06}", offset + number));
+        let vehicle = self.side_row(&VEHICLE, id, micros, batch, span(0));
+        let unit = self.side_row(&UNIT, unit_id, micros, batch, span(FIRST_UNIT_FRAME));
+        let offset = json!({ "delta_x": 0.0, "delta_y": 0.0 });
+        let pair = match self.edition {
+            Edition::Dair => json!({
+                "infrastructure_image_path": format!("infrastructure-side/image/{unit_id}.jpg"),
+                "infrastructure_pointcloud_path": format!("infrastructure-side/velodyne/{unit_id}.pcd"),
+                "vehicle_image_path": format!("vehicle-side/image/{id}.jpg"),
+                "vehicle_pointcloud_path": format!("vehicle-side/velodyne/{id}.pcd"),
+                "cooperative_label_path": format!("cooperative/label_world/{id}.json"),
+                "system_error_offset": offset,
+            }),
+            Edition::V2xSeq => json!({
+                "vehicle_frame": id,
+                "infrastructure_frame": unit_id,
+                "vehicle_sequence": format!("{:04}", batch.number),
+                "infrastructure_sequence": format!("{:04}", batch.number),
+                "system_error_offset": offset,
+            }),
+        };
+        Rows { vehicle, unit, pair }
+    }
+
+    fn side_row(&self, side: &Side, id: &str, micros: u64, batch: &Batch, [first, last]: [String; 2]) -> Value {
+        let mut row = json!({
+            "image_path": format!("image/{id}.jpg"),
+            "image_timestamp": micros.to_string(),
+            "pointcloud_path": format!("velodyne/{id}.pcd"),
+            "pointcloud_timestamp": micros.to_string(),
+            "intersection_loc": "generated",
+        });
+        let labels = format!("label/{}/{id}.json", side.labels);
+        let calibrations: &[&str] = match side.folder {
+            "vehicle-side" => &["lidar_to_novatel", "novatel_to_world"],
+            _ => &["virtuallidar_to_world"],
+        };
+        for name in calibrations {
+            row[format!("calib_{name}_path")] = json!(format!("calib/{name}/{id}.json"));
+        }
+        match self.edition {
+            Edition::Dair => {
+                row["label_lidar_path"] = json!(labels);
+                row["batch_id"] = json!(batch.number.to_string());
+                row["batch_start_id"] = json!(first);
+                row["batch_end_id"] = json!(last);
+            }
+            Edition::V2xSeq => {
+                row["label_lidar_std_path"] = json!(labels);
+                row["frame_id"] = json!(id);
+                row["sequence_id"] = json!(format!("{:04}", batch.number));
+                row["num_frames"] = json!(batch.capture_nanos.len().to_string());
+                row["start_frame_id"] = json!(first);
+                row["end_frame_id"] = json!(last);
+            }
+        }
+        row
+    }
+}

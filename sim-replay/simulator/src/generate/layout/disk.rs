@@ -1,0 +1,98 @@
+//! Files and folders of scenes that are written, with the path in every error.
+
+use std::path::{Component, Path, PathBuf};
+use std::{fs, io};
+
+use super::SceneHeader;
+use crate::generate::error::SynthError;
+use dataset::UNFINISHED;
+
+fn failed(path: &Path, source: io::Error) -> SynthError {
+    SynthError::Write { path: path.to_owned(), source }
+}
+
+/// Writes text or bytes.
+pub(crate) fn write_file(path: &Path, bytes: impl AsRef<[u8]>) -> Result<(), SynthError> {
+    fs::write(path, bytes).map_err(|source| failed(path, source))
+}
+
+/// Makes a folder and those above it.
+pub(crate) fn make_folder(path: &Path) -> Result<(), SynthError> {
+    fs::create_dir_all(path).map_err(|source| failed(path, source))
+}
+
+/// Makes a folder; one that was there is removed with all that it holds.
+pub(super) fn make_fresh_folder(path: &Path) -> Result<(), SynthError> {
+    match fs::remove_dir_all(path) {
+        Err(error) if error.kind() != io::ErrorKind::NotFound => return Err(failed(path, error)),
+        Ok(()) | Err(_) => {}
+    }
+    make_folder(path)
+}
+
+/// The folder of a scene below `root`: its name can lead nowhere else.
+pub(crate) fn scene_path(root: &Path, name: &str) -> PathBuf {
+    let parts = Path::new(name).components().filter(|part| matches!(part, Component::Normal(_)));
+    root.join(parts.collect::<PathBuf>())
+}
+
+/// Writes how a scene came to be, in a file that no reader takes for a frame.
+pub(super) fn write_origin(folder: &Path, scene: &SceneHeader) -> Result<(), SynthError> {
+    write_file(&folder.join(format!("{}.origin.txt", flat_name(&scene.name))), &scene.origin)
+}
+
+/// The name of a scene as one part of a path.
+fn flat_name(name: &str) -> String {
+    let allowed = |letter: char| letter.is_alphanumeric() || matches!(letter, '.' | '-' | '_');
+    let text: String = name.chars().map(|letter| if allowed(letter) { letter } else { '_' }).collect();
+    text.trim_start_matches('.').to_owned()
+}
+
+/// The mark of a folder that is being written. It stays where the run does not come to its end, and the reader reports it.
+#[derive(Debug)]
+pub(crate) struct Unfinished(PathBuf);
+
+impl Unfinished {
+    /// Marks a folder, which exists.
+    pub(crate) fn mark(folder: &Path) -> Result<Self, SynthError> {
+        let mark = folder.join(UNFINISHED);
+        write_file(&mark, "This folder is being written, or the run that wrote it was interrupted.\n")?;
+        Ok(Self(mark))
+    }
+
+    /// Takes the mark away: all is written.
+    pub(crate) fn clear(self) -> Result<(), SynthError> {
+        fs::remove_file(&self.0).map_err(|source| failed(&self.0, source))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_scene_stays_below_the_root() {
+        assert_eq!(scene_path(Path::new("out"), "test/a"), Path::new("out/test/a"));
+        assert_eq!(scene_path(Path::new("out"), "/../x/./y"), Path::new("out/x/y"));
+        assert_eq!(flat_name("../test/a b"), "_test_a_b");
+    }
+
+    #[test]
+    fn a_fresh_folder_is_empty() {
+        let root = tempfile::tempdir().unwrap();
+        let folder = root.path().join("a/b");
+        for _ in 0..2 {
+            make_fresh_folder(&folder).unwrap();
+            assert_eq!(fs::read_dir(&folder).unwrap().count(), 0);
+            write_file(&folder.join("old"), "x").unwrap();
+        }
+    }
+
+    #[test]
+    fn an_error_names_the_path() {
+        let root = tempfile::tempdir().unwrap();
+        let path = root.path().join("missing/file");
+        let message = write_file(&path, "x").unwrap_err().to_string();
+        assert!(message.starts_with(&*path.to_string_lossy()) && message.contains("No such file"), "{message}");
+    }
+}

@@ -1,0 +1,129 @@
+//! KITTI object detection: `training/{velodyne,calib,label_2}`, each sweep of each agent a frame of its own.
+//!
+//! Boxes are upright in the frame of the LiDAR. There is no image: regions of images are zero.
+
+use std::fmt::Write as _;
+use std::path::{Path, PathBuf};
+
+use nalgebra::Point3;
+use protocol::Box3d;
+
+use super::boxes::{float_bytes, upright_in};
+use super::disk::{make_folder, make_fresh_folder, write_file, write_origin};
+use super::kitti_odometry::camera_from_lidar;
+use super::{AgentFrame, Moment, Omissions, SceneHeader, SceneWriter};
+use crate::generate::error::SynthError;
+use dataset::frame::ObjectClass;
+
+/// The folder of the frames.
+const SPLIT: &str = "training";
+/// The camera's axes (x right, y down, z forward) in those of the LiDAR, at the same place.
+const CALIBRATION: &str = "\
+P0: 7.215377e+02 0 6.095593e+02 0 0 7.215377e+02 1.728540e+02 0 0 0 1 0
+P1: 7.215377e+02 0 6.095593e+02 0 0 7.215377e+02 1.728540e+02 0 0 0 1 0
+P2: 7.215377e+02 0 6.095593e+02 0 0 7.215377e+02 1.728540e+02 0 0 0 1 0
+P3: 7.215377e+02 0 6.095593e+02 0 0 7.215377e+02 1.728540e+02 0 0 0 1 0
+R0_rect: 1 0 0 0 1 0 0 0 1
+Tr_velo_to_cam: 0 -1 0 0 0 0 -1 0 1 0 0 0
+Tr_imu_to_velo: 1 0 0 0 0 1 0 0 0 0 1 0
+";
+
+/// The writer.
+#[derive(Debug)]
+pub(super) struct KittiObject {
+    root: PathBuf,
+    /// Number of the next scene's first frame; `None` before the first scene.
+    next_frame: Option<usize>,
+    first_frame: usize,
+    moments: usize,
+}
+
+impl KittiObject {
+    pub(super) fn new(root: &Path) -> Self {
+        Self { root: root.to_owned(), next_frame: None, first_frame: 0, moments: 0 }
+    }
+
+    fn file(&self, folder: &str, number: usize, suffix: &str) -> PathBuf {
+        self.root.join(SPLIT).join(folder).join(format!("{number:06}{suffix}"))
+    }
+}
+
+impl SceneWriter for KittiObject {
+    fn begin(&mut self, scene: &SceneHeader) -> Result<(), SynthError> {
+        let split = self.root.join(SPLIT);
+        if self.next_frame.is_none() {
+            make_fresh_folder(&split)?;
+            ["velodyne", "calib", "label_2"].iter().try_for_each(|name| make_folder(&split.join(name)))?;
+        }
+        write_origin(&self.root, scene)?;
+        self.first_frame = self.next_frame.unwrap_or(0);
+        self.moments = scene.capture_nanos.len();
+        self.next_frame = Some(self.first_frame + self.moments * scene.agents.len());
+        Ok(())
+    }
+
+    fn write(&self, moment: &Moment, _: &Omissions) -> Result<(), SynthError> {
+        for frame in &moment.frames {
+            let number = self.first_frame + frame.agent * self.moments + moment.index;
+            let points = float_bytes(frame.frame.points.xyzi.iter().copied());
+            write_file(&self.file("velodyne", number, ".bin"), points)?;
+            write_file(&self.file("calib", number, ".txt"), CALIBRATION)?;
+            write_file(&self.file("label_2", number, ".txt"), labels(frame))?;
+        }
+        Ok(())
+    }
+}
+
+fn labels(frame: &AgentFrame) -> String {
+    let mut text = String::with_capacity(200 * frame.frame.objects.len());
+    for object in &frame.frame.objects {
+        let label = Label::of(&upright_in(frame, object));
+        let ([height, width, length], [x, y, z]) = (label.size_m, label.bottom_m);
+        // Writing to a String does not fail.
+        let _ = writeln!(
+            text,
+            "{} 0 0 {} 0 0 0 0 {height} {width} {length} {x} {y} {z} {}",
+            kind(object.class),
+            label.alpha_rad,
+            label.rotation_y_rad
+        );
+    }
+    text
+}
+
+/// A box in the terms of a label.
+#[derive(Debug, Clone, Copy)]
+struct Label {
+    /// Height, width, length.
+    size_m: [f64; 3],
+    /// The middle of the bottom face in the frame of the camera.
+    bottom_m: [f64; 3],
+    /// Turn of the length about y from x towards -z.
+    rotation_y_rad: f64,
+    /// The same seen along the ray to the box.
+    alpha_rad: f64,
+}
+
+impl Label {
+    fn of(upright: &Box3d) -> Self {
+        let ([length, width, height], [x, y, z]) = (upright.size_m, upright.center_m);
+        let bottom = camera_from_lidar() * Point3::new(x, y, z - height / 2.0);
+        // The camera's x points to the right of the LiDAR's x.
+        let rotation_y_rad = -upright.heading_rad - std::f64::consts::FRAC_PI_2;
+        let alpha_rad = rotation_y_rad - bottom.x.atan2(bottom.z);
+        Self { size_m: [height, width, length], bottom_m: bottom.into(), rotation_y_rad, alpha_rad }
+    }
+}
+
+fn kind(class: ObjectClass) -> &'static str {
+    match class {
+        ObjectClass::Car => "Car",
+        ObjectClass::Van => "Van",
+        ObjectClass::Truck => "Truck",
+        // KITTI has no buses.
+        ObjectClass::Bus => "Tram",
+        ObjectClass::TwoWheeler => "Cyclist",
+        ObjectClass::Pedestrian => "Pedestrian",
+        ObjectClass::Other => "Misc",
+    }
+}

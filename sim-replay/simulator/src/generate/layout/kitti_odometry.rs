@@ -1,0 +1,94 @@
+//! KITTI odometry: `sequences/<number>/{velodyne,calib.txt,times.txt}` and `poses/<number>.txt`.
+//!
+//! Poses are of the left camera, in the frame of the first scan's camera: where the sequence lies in the world is lost.
+
+use std::fmt::Write as _;
+use std::path::Path;
+
+use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion};
+
+use super::Omissions;
+use super::boxes::float_bytes;
+use super::disk::{make_folder, write_file};
+use super::sequences::{Sequence, Style};
+use crate::generate::error::SynthError;
+
+/// The camera's axes (x right, y down, z forward) in those of the LiDAR, at the same place.
+const CALIBRATION: &str = "\
+P0: 7.188560e+02 0 6.071928e+02 0 0 7.188560e+02 1.852157e+02 0 0 0 1 0
+P1: 7.188560e+02 0 6.071928e+02 0 0 7.188560e+02 1.852157e+02 0 0 0 1 0
+P2: 7.188560e+02 0 6.071928e+02 0 0 7.188560e+02 1.852157e+02 0 0 0 1 0
+P3: 7.188560e+02 0 6.071928e+02 0 0 7.188560e+02 1.852157e+02 0 0 0 1 0
+Tr: 0 -1 0 0 0 0 -1 0 1 0 0 0
+";
+
+/// The style.
+#[derive(Debug)]
+pub(super) struct KittiOdometry;
+
+/// `camera_from_lidar` of [`CALIBRATION`].
+pub(super) fn camera_from_lidar() -> Isometry3<f64> {
+    let axes = Matrix3::new(0.0, -1.0, 0.0, 0.0, 0.0, -1.0, 1.0, 0.0, 0.0);
+    let rotation = UnitQuaternion::from_rotation_matrix(&Rotation3::from_matrix_unchecked(axes));
+    Isometry3::from_parts(Translation3::identity(), rotation)
+}
+
+impl Style for KittiOdometry {
+    fn epoch_micros(&self) -> u64 {
+        0
+    }
+
+    fn folder(&self, sequence: usize) -> String {
+        format!("sequences/{sequence:02}")
+    }
+
+    fn sweeps_folder(&self) -> &'static str {
+        "velodyne"
+    }
+
+    fn file_name(&self, moment: usize, _: u64) -> String {
+        format!("{moment:06}.bin")
+    }
+
+    fn points(&self, points: &[[f32; 4]], _: &Omissions) -> Vec<u8> {
+        float_bytes(points.iter().copied())
+    }
+
+    fn write_poses(&self, root: &Path, sequence: &Sequence<'_>) -> Result<(), SynthError> {
+        let folder = root.join(&sequence.folder);
+        write_file(&folder.join("calib.txt"), CALIBRATION)?;
+        write_file(&folder.join("times.txt"), times(sequence.capture_nanos))?;
+        let poses = root.join("poses");
+        make_folder(&poses)?;
+        write_file(&poses.join(format!("{:02}.txt", sequence.number)), pose_lines(sequence))
+    }
+}
+
+/// Seconds from the first moment, one a line.
+fn times(capture_nanos: &[u64]) -> String {
+    let first = capture_nanos.first().copied().unwrap_or(0);
+    let mut text = String::with_capacity(16 * capture_nanos.len());
+    for nanos in capture_nanos {
+        // Writing to a String does not fail.
+        let _ = writeln!(text, "{:e}", (nanos - first) as f64 / 1e9);
+    }
+    text
+}
+
+/// A line for each moment, as the number of the line is that of the scan: where there is none, the pose before it.
+fn pose_lines(sequence: &Sequence<'_>) -> String {
+    let camera_from_lidar = camera_from_lidar();
+    let Some(first) = sequence.sweeps.first() else { return String::new() };
+    let first_from_world = first.world_from_lidar.isometry().inverse();
+    let mut text = String::with_capacity(280 * sequence.capture_nanos.len());
+    for moment in 0..sequence.capture_nanos.len() {
+        let next = sequence.sweeps.partition_point(|sweep| sweep.moment <= moment);
+        let sweep = &sequence.sweeps[next.saturating_sub(1)];
+        let first_from_lidar = first_from_world * sweep.world_from_lidar.isometry();
+        let pose = (camera_from_lidar * first_from_lidar * camera_from_lidar.inverse()).to_homogeneous();
+        let row = (0..12).map(|place| format!("{:e}", pose[(place / 4, place % 4)])).collect::<Vec<_>>().join(" ");
+        text.push_str(&row);
+        text.push('\n');
+    }
+    text
+}

@@ -1,0 +1,252 @@
+//! Layouts on disk that scenes are written in: one file per layout, one [`Frame`] for all.
+//!
+//! A [`SceneWriter`] receives the moments of one scene after another, in the convention of [`dataset::frame`]: the type that
+//! the readers produce. Axes, units and file formats of a layout stand in its writer alone. A new layout is one file
+//! beside this one, a line in [`SceneLayout`] and a line in [`SceneLayout::writer`].
+
+mod agent_folders;
+mod boxes;
+mod dair;
+mod dair_json;
+mod disk;
+mod kitti_object;
+mod kitti_odometry;
+mod mars;
+mod nclt;
+mod nuscenes;
+mod nuscenes_tables;
+mod opv2v;
+mod oxford;
+mod sequences;
+mod v2v4real;
+mod v2xreal;
+mod v2xsim;
+mod yaml_text;
+
+#[cfg(test)]
+mod tests;
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::Mutex;
+
+use clap::ValueEnum;
+use protocol::CavId;
+
+use super::error::SynthError;
+use super::positioning::Fix;
+use dataset::frame::{Frame, Object};
+
+pub(crate) use disk::{Unfinished, make_folder};
+
+/// The layouts that scenes are written in.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, ValueEnum)]
+#[value(rename_all = "kebab-case")]
+pub enum SceneLayout {
+    /// OPV2V, V2XSet: a folder per agent with PCD and YAML, left-handed. Alone holds radar, GNSS and copies in other weather.
+    #[default]
+    #[value(name = "opv2v")]
+    Opv2v,
+    /// V2V4Real: the same folders, right-handed, pose matrices pickled by NumPy, boxes in the frame of the LiDAR.
+    #[value(name = "v2v4real")]
+    V2v4real,
+    /// DAIR-V2X-C: the ego as the vehicle, the second agent as the roadside unit; others are left out.
+    Dair,
+    /// V2X-Seq SPD: the same two, in sequences with track ids.
+    #[value(name = "v2xseq")]
+    V2xseq,
+    /// V2X-Real, V2XPnP: folders as OPV2V, right-handed, `.bin` sweeps, types of objects.
+    #[value(name = "v2xreal")]
+    V2xreal,
+    /// V2X-Sim 2.0: tables of nuScenes, one sample for all agents, boxes in the world.
+    #[value(name = "v2xsim")]
+    V2xsim,
+    /// Open MARS: tables of nuScenes, a channel per vehicle. The released set has no boxes; scenes written here have.
+    Mars,
+    /// NCLT as recorded: velodyne_sync and ground truth per agent, steps of 5 mm within 100 m. No boxes.
+    Nclt,
+    /// Oxford as LightLoc converts it: velodyne_left and HDF5 poses per agent. No boxes.
+    Oxford,
+    /// KITTI odometry: a sequence per agent, poses from the first scan. No boxes.
+    KittiOdometry,
+    /// KITTI object detection: each sweep of each agent a frame of its own, without pose.
+    KittiObject,
+}
+
+impl SceneLayout {
+    /// The name on the command line.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Opv2v => "opv2v",
+            Self::V2v4real => "v2v4real",
+            Self::Dair => "dair",
+            Self::V2xseq => "v2xseq",
+            Self::V2xreal => "v2xreal",
+            Self::V2xsim => "v2xsim",
+            Self::Mars => "mars",
+            Self::Nclt => "nclt",
+            Self::Oxford => "oxford",
+            Self::KittiOdometry => "kitti-odometry",
+            Self::KittiObject => "kitti-object",
+        }
+    }
+
+    /// Whether scenes of one agent have no place in it.
+    pub(super) fn needs_two_agents(self) -> bool {
+        matches!(self, Self::Dair | Self::V2xseq)
+    }
+
+    /// A writer of data sets below `root`, which exists.
+    pub(crate) fn writer(self, root: &Path) -> Box<dyn SceneWriter> {
+        match self {
+            Self::Opv2v => Box::new(opv2v::writer(root)),
+            Self::V2v4real => Box::new(v2v4real::writer(root)),
+            Self::Dair => Box::new(dair::Dair::new(root, dair::Edition::Dair)),
+            Self::V2xseq => Box::new(dair::Dair::new(root, dair::Edition::V2xSeq)),
+            Self::V2xreal => Box::new(v2xreal::writer(root)),
+            Self::V2xsim => Box::new(nuscenes::NuScenes::new(root, &v2xsim::V2xSim)),
+            Self::Mars => Box::new(nuscenes::NuScenes::new(root, &mars::Mars)),
+            Self::Nclt => Box::new(sequences::Sequences::new(root, &nclt::Nclt)),
+            Self::Oxford => Box::new(sequences::Sequences::new(root, &oxford::Oxford)),
+            Self::KittiOdometry => Box::new(sequences::Sequences::new(root, &kitti_odometry::KittiOdometry)),
+            Self::KittiObject => Box::new(kitti_object::KittiObject::new(root)),
+        }
+    }
+}
+
+/// Writes scenes in one layout, one after another.
+pub(crate) trait SceneWriter: Send + Sync {
+    /// Begins a scene. What an earlier run left under its name is removed.
+    fn begin(&mut self, scene: &SceneHeader) -> Result<(), SynthError>;
+
+    /// Writes one moment of the scene: from any thread, in any order, each moment once. What the layout has no place for is
+    /// counted in `omitted`.
+    fn write(&self, moment: &Moment, omitted: &Omissions) -> Result<(), SynthError>;
+
+    /// Ends the scene: writes what several of its moments share.
+    fn end(&mut self) -> Result<(), SynthError> {
+        Ok(())
+    }
+
+    /// Ends the data set: writes what several of its scenes share.
+    fn finish(&mut self) -> Result<(), SynthError> {
+        Ok(())
+    }
+}
+
+/// A scene before its first moment.
+#[derive(Debug, Clone)]
+pub(crate) struct SceneHeader {
+    /// Its name, in parts by `/` where it lies in folders.
+    pub(crate) name: String,
+    /// Its agents, ego first.
+    pub(crate) agents: Vec<SceneAgent>,
+    /// Capture times of its moments, nanoseconds, rising.
+    pub(crate) capture_nanos: Vec<u64>,
+    /// Length of a tick of the clock that OPV2V's file names count, nanoseconds. Capture times are multiples of it.
+    pub(crate) tick_nanos: u64,
+    /// Text of `data_protocol.yaml`: how the scene came to be.
+    pub(crate) origin: String,
+}
+
+/// An agent of a scene.
+#[derive(Debug, Clone)]
+pub(crate) struct SceneAgent {
+    pub(crate) id: CavId,
+    /// A unit at the roadside rather than a vehicle.
+    pub(crate) is_roadside: bool,
+}
+
+/// The frames of the agents that are present at one capture time.
+#[derive(Debug)]
+pub(crate) struct Moment {
+    /// Place among the scene's capture times.
+    pub(crate) index: usize,
+    /// In the order of the scene's agents.
+    pub(crate) frames: Vec<AgentFrame>,
+}
+
+/// One agent's frame.
+#[derive(Debug)]
+pub(crate) struct AgentFrame {
+    /// Place among the scene's agents.
+    pub(crate) agent: usize,
+    /// The frame, with points.
+    pub(crate) frame: Frame,
+    /// Copies of the sweep in other weather.
+    pub(crate) variants: Vec<SweepVariant>,
+    /// What only generated scenes know.
+    pub(crate) simulated: Option<Simulated>,
+}
+
+/// A copy of a sweep, named as in [`dataset::Scenario::lidar_variants`].
+#[derive(Debug)]
+pub(crate) struct SweepVariant {
+    pub(crate) name: String,
+    /// x, y, z in metres and intensity, in the frame of the LiDAR.
+    pub(crate) points: Vec<[f32; 4]>,
+    /// For each point 1 where it is clutter in the air, else 0.
+    pub(crate) labels: Vec<u8>,
+}
+
+/// Facts of a simulated frame for which [`Frame`] has no place.
+#[derive(Debug)]
+pub(crate) struct Simulated {
+    /// What the receivers measured.
+    pub(crate) fix: Fix,
+    /// For each object the point on the ground under its middle, in the world, and the way from there to the centre of the
+    /// box, metres.
+    pub(crate) anchors: Vec<BoxAnchor>,
+}
+
+/// Where OPV2V puts an object: a point that is not the centre of its box.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct BoxAnchor {
+    pub(crate) location_m: [f64; 3],
+    pub(crate) center_offset_m: [f64; 3],
+}
+
+impl AgentFrame {
+    /// The pose of the LiDAR in the world. Frames without are not given to writers.
+    pub(crate) fn world_from_lidar(&self) -> nalgebra::Isometry3<f64> {
+        self.frame.world_from_lidar.unwrap_or(protocol::Pose::IDENTITY).isometry()
+    }
+}
+
+impl Moment {
+    /// The frame of an agent, if it is present.
+    fn of(&self, agent: usize) -> Option<&AgentFrame> {
+        self.frames.iter().find(|frame| frame.agent == agent)
+    }
+
+    /// Everything that any of these frames lists, each object once: as the first frame that lists it has it.
+    fn union<'a>(frames: impl IntoIterator<Item = &'a AgentFrame>) -> Vec<&'a Object> {
+        let mut seen = std::collections::HashSet::new();
+        let objects = frames.into_iter().flat_map(|frame| &frame.frame.objects);
+        objects.filter(|object| seen.insert(object.id)).collect()
+    }
+}
+
+/// What a layout had no place for: counts by what it is.
+#[derive(Debug, Default)]
+pub(crate) struct Omissions(Mutex<BTreeMap<&'static str, u64>>);
+
+impl Omissions {
+    /// Counts `count` more of `what`.
+    pub(crate) fn add(&self, what: &'static str, count: usize) {
+        if count > 0 {
+            *locked(&self.0).entry(what).or_default() += count as u64;
+        }
+    }
+
+    /// All counts.
+    pub(crate) fn into_counts(self) -> BTreeMap<&'static str, u64> {
+        self.0.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner)
+    }
+}
+
+/// The content of a lock: a thread that panicked while it held it ends the program anyway.
+pub(crate) fn locked<T>(mutex: &Mutex<T>) -> std::sync::MutexGuard<'_, T> {
+    mutex.lock().unwrap_or_else(std::sync::PoisonError::into_inner)
+}

@@ -1,0 +1,128 @@
+//! Data sets in the tables of nuScenes: sweeps of five floats (x, y, z, intensity, ring) and JSON tables beside them.
+//!
+//! A sample holds the sweeps of all agents at one capture time. Its annotations are what any agent lists, in the world.
+
+use std::fmt::Debug;
+use std::path::{Path, PathBuf};
+use std::sync::Mutex;
+
+use serde_json::{Map, Value};
+
+use super::boxes::{float_bytes, points_in, ring};
+use super::disk::{make_folder, make_fresh_folder, write_file, write_origin};
+use super::nuscenes_tables::{AnnotationRecord, Sample, SceneTables, SweepRecord, Tables};
+use super::{AgentFrame, Moment, Omissions, SceneHeader, SceneWriter, locked};
+use crate::generate::error::SynthError;
+
+/// Time stamps of a scene count from here on, microseconds, with a day between two scenes.
+const EPOCH_MICROS: u64 = 1_696_454_400_000_000;
+const DAY_MICROS: u64 = 86_400_000_000;
+/// The folder of the sweeps.
+const SWEEPS: &str = "sweeps";
+
+/// In what data sets with these tables differ.
+pub(super) trait Style: Debug + Send + Sync {
+    /// The folder of the tables.
+    fn version(&self) -> &'static str;
+
+    /// The channel of each agent's LiDAR.
+    fn channels(&self, scene: &SceneHeader) -> Vec<String>;
+
+    /// The file of a sweep in the folder of its channel, by number of scene and moment and time in microseconds.
+    fn file_name(&self, scene: usize, moment: usize, micros: u64) -> String;
+
+    /// The number that stands for an intensity of 0 to 1.
+    fn intensity(&self, intensity: f32) -> f32;
+
+    /// Fields of a row of scenes that only this data set has.
+    fn scene_fields(&self, scene: &SceneHeader) -> Map<String, Value>;
+}
+
+/// The writer.
+#[derive(Debug)]
+pub(super) struct NuScenes {
+    root: PathBuf,
+    style: &'static dyn Style,
+    scenes: usize,
+    scene: Option<Current>,
+    samples: Mutex<Vec<Sample>>,
+    tables: Tables,
+}
+
+/// The scene that is being written.
+#[derive(Debug)]
+struct Current {
+    number: usize,
+    header: SceneHeader,
+    channels: Vec<String>,
+}
+
+impl NuScenes {
+    pub(super) fn new(root: &Path, style: &'static dyn Style) -> Self {
+        let (samples, tables) = (Mutex::new(Vec::new()), Tables::default());
+        Self { root: root.to_owned(), style, scenes: 0, scene: None, samples, tables }
+    }
+
+    fn sweep_bytes(&self, frame: &AgentFrame) -> Vec<u8> {
+        let row = |&point: &[f32; 4]| {
+            let [x, y, z, intensity] = point;
+            [x, y, z, self.style.intensity(intensity), f32::from(ring(point))]
+        };
+        float_bytes(frame.frame.points.xyzi.iter().map(row))
+    }
+}
+
+impl SceneWriter for NuScenes {
+    fn begin(&mut self, scene: &SceneHeader) -> Result<(), SynthError> {
+        if self.scenes == 0 {
+            make_fresh_folder(&self.root.join(SWEEPS))?;
+            make_fresh_folder(&self.root.join(self.style.version()))?;
+        }
+        write_origin(&self.root, scene)?;
+        let channels = self.style.channels(scene);
+        channels.iter().try_for_each(|channel| make_folder(&self.root.join(SWEEPS).join(channel)))?;
+        self.scene = Some(Current { number: self.scenes, header: scene.clone(), channels });
+        self.scenes += 1;
+        Ok(())
+    }
+
+    fn write(&self, moment: &Moment, _: &Omissions) -> Result<(), SynthError> {
+        let Some(scene) = &self.scene else { return Ok(()) };
+        let offset = EPOCH_MICROS + scene.number as u64 * DAY_MICROS;
+        let micros = offset + scene.header.capture_nanos[moment.index] / 1000;
+        let name = self.style.file_name(scene.number, moment.index, micros);
+        let mut sweeps = Vec::with_capacity(moment.frames.len());
+        for frame in &moment.frames {
+            let file = format!("{SWEEPS}/{}/{name}", scene.channels[frame.agent]);
+            write_file(&self.root.join(&file), self.sweep_bytes(frame))?;
+            let (world_from_lidar, vehicle) = (frame.world_from_lidar(), frame.frame.world_from_vehicle);
+            sweeps.push(SweepRecord { agent: frame.agent, file, world_from_lidar, world_from_vehicle: vehicle });
+        }
+        let annotations = Moment::union(&moment.frames).into_iter().map(|object| {
+            let lidar_points = moment.frames.iter().map(|frame| points_in(frame, object)).sum();
+            AnnotationRecord { object: object.clone(), lidar_points }
+        });
+        let annotations = annotations.collect();
+        locked(&self.samples).push(Sample { moment: moment.index, micros, sweeps, annotations });
+        Ok(())
+    }
+
+    fn end(&mut self) -> Result<(), SynthError> {
+        let mut samples = std::mem::take(&mut *locked(&self.samples));
+        samples.sort_by_key(|sample| sample.moment);
+        if let Some(scene) = self.scene.take() {
+            let Current { number, header, channels } = &scene;
+            let fields = self.style.scene_fields(header);
+            self.tables.add(SceneTables { number: *number, name: &header.name, channels, fields, samples: &samples });
+        }
+        Ok(())
+    }
+
+    fn finish(&mut self) -> Result<(), SynthError> {
+        let folder = self.root.join(self.style.version());
+        let tables = std::mem::take(&mut self.tables).into_tables();
+        tables.into_iter().try_for_each(|(name, rows)| {
+            write_file(&folder.join(format!("{name}.json")), Value::Array(rows).to_string())
+        })
+    }
+}

@@ -1,0 +1,326 @@
+//! The tables of nuScenes: rows that refer to each other by tokens.
+//!
+//! Tokens are hashes of what the row is, so that the same scenes give the same files.
+
+use std::collections::BTreeMap;
+
+use nalgebra::Isometry3;
+use protocol::Pose;
+use serde_json::{Map, Value, json};
+use sha2::{Digest, Sha256};
+
+use dataset::frame::{Object, ObjectClass};
+
+/// Bytes of a token: 32 digits.
+const TOKEN_BYTES: usize = 16;
+/// Tables that readers want to exist, though nothing stands in them.
+const EMPTY_TABLES: [&str; 2] = ["attribute", "visibility"];
+
+/// A sweep that was written.
+#[derive(Debug)]
+pub(super) struct SweepRecord {
+    pub(super) agent: usize,
+    /// Path below the root.
+    pub(super) file: String,
+    pub(super) world_from_lidar: Isometry3<f64>,
+    pub(super) world_from_vehicle: Option<Pose>,
+}
+
+/// An object that any agent lists.
+#[derive(Debug)]
+pub(super) struct AnnotationRecord {
+    pub(super) object: Object,
+    /// Points of all agents in its box.
+    pub(super) lidar_points: usize,
+}
+
+/// A moment that was written.
+#[derive(Debug)]
+pub(super) struct Sample {
+    pub(super) moment: usize,
+    pub(super) micros: u64,
+    pub(super) sweeps: Vec<SweepRecord>,
+    pub(super) annotations: Vec<AnnotationRecord>,
+}
+
+/// A scene whose moments are written.
+#[derive(Debug)]
+pub(super) struct SceneTables<'a> {
+    pub(super) number: usize,
+    pub(super) name: &'a str,
+    /// Channel of each agent's LiDAR.
+    pub(super) channels: &'a [String],
+    /// Further fields of the row of scenes.
+    pub(super) fields: Map<String, Value>,
+    /// In order.
+    pub(super) samples: &'a [Sample],
+}
+
+/// All tables, by name.
+#[derive(Debug, Default)]
+pub(super) struct Tables(BTreeMap<&'static str, Vec<Value>>);
+
+/// Where a sensor sits on its vehicle, and the token of the row that holds it.
+struct Mount {
+    token: String,
+    vehicle_from_lidar: Isometry3<f64>,
+}
+
+impl Tables {
+    fn push(&mut self, table: &'static str, row: Value) {
+        self.0.entry(table).or_default().push(row);
+    }
+
+    /// All tables, with those that are empty.
+    pub(super) fn into_tables(mut self) -> BTreeMap<&'static str, Vec<Value>> {
+        for name in EMPTY_TABLES.into_iter().chain(["instance", "sample_annotation", "category", "map"]) {
+            self.0.entry(name).or_default();
+        }
+        self.0
+    }
+
+    /// Adds the rows of a scene.
+    pub(super) fn add(&mut self, scene: SceneTables<'_>) {
+        let samples = scene.samples.iter();
+        let tokens: Vec<String> =
+            samples.map(|sample| scene_token(&scene, "sample", &[&sample.moment.to_string()])).collect();
+        self.add_scene(&scene, &tokens);
+        let scene_token = scene_token(&scene, "scene", &[]);
+        for ((sample, token), (prev, next)) in scene.samples.iter().zip(&tokens).zip(neighbours(&tokens)) {
+            self.push(
+                "sample",
+                json!({
+                    "token": token, "timestamp": sample.micros, "prev": prev, "next": next, "scene_token": scene_token,
+                }),
+            );
+        }
+        self.add_sweeps(&scene, &tokens);
+        self.add_annotations(&scene, &tokens);
+    }
+
+    /// The scene, its log and its map.
+    fn add_scene(&mut self, scene: &SceneTables<'_>, sample_tokens: &[String]) {
+        let [log, map, token] = ["log", "map", "scene"].map(|kind| scene_token(scene, kind, &[]));
+        self.push(
+            "log",
+            json!({
+                "token": log, "logfile": "", "vehicle": "", "date_captured": "", "location": "",
+            }),
+        );
+        self.push("map", json!({ "token": map, "log_tokens": [log], "category": "semantic_prior", "filename": "" }));
+        let end = |token: Option<&String>| token.cloned().unwrap_or_default();
+        let mut row = json!({
+            "token": token,
+            "log_token": log,
+            "nbr_samples": scene.samples.len(),
+            "first_sample_token": end(sample_tokens.first()),
+            "last_sample_token": end(sample_tokens.last()),
+            "name": scene.name,
+        });
+        if let Some(row) = row.as_object_mut() {
+            row.extend(scene.fields.clone());
+        }
+        self.push("scene", row);
+    }
+
+    /// Sensors, their mounts, the sweeps and the poses of the vehicles: a chain of sweeps per channel.
+    fn add_sweeps(&mut self, scene: &SceneTables<'_>, sample_tokens: &[String]) {
+        for (agent, channel) in scene.channels.iter().enumerate() {
+            let chain: Vec<(&Sample, &SweepRecord, &String)> = scene
+                .samples
+                .iter()
+                .zip(sample_tokens)
+                .filter_map(|(sample, token)| {
+                    Some((sample, sample.sweeps.iter().find(|sweep| sweep.agent == agent)?, token))
+                })
+                .collect();
+            let Some((_, first, _)) = chain.first() else { continue };
+            let mount = self.add_mount(scene, channel, first);
+            let tokens: Vec<String> = chain
+                .iter()
+                .map(|(sample, ..)| scene_token(scene, "sample_data", &[channel, &sample.moment.to_string()]))
+                .collect();
+            for (((sample, sweep, sample_token), token), (prev, next)) in
+                chain.iter().zip(&tokens).zip(neighbours(&tokens))
+            {
+                // The mount is that of the first sweep, so that one row of it serves the scene.
+                let world_from_vehicle: Pose = (sweep.world_from_lidar * mount.vehicle_from_lidar.inverse()).into();
+                self.push(
+                    "ego_pose",
+                    json!({
+                        "token": token, "timestamp": sample.micros,
+                        "rotation": world_from_vehicle.rotation_wxyz, "translation": world_from_vehicle.translation_m,
+                    }),
+                );
+                self.push(
+                    "sample_data",
+                    json!({
+                        "token": token, "sample_token": sample_token, "ego_pose_token": token,
+                        "calibrated_sensor_token": mount.token, "timestamp": sample.micros, "fileformat": "bin",
+                        "is_key_frame": true, "height": 0, "width": 0, "filename": sweep.file, "prev": prev, "next": next,
+                    }),
+                );
+            }
+        }
+    }
+
+    fn add_mount(&mut self, scene: &SceneTables<'_>, channel: &str, first: &SweepRecord) -> Mount {
+        // A sensor is one row, though several scenes have it.
+        let sensor = token(&["sensor", channel]);
+        let known = self.0.get("sensor").is_some_and(|rows| rows.iter().any(|row| row["token"] == sensor.as_str()));
+        if !known {
+            self.push("sensor", json!({ "token": sensor, "channel": channel, "modality": "lidar" }));
+        }
+        let world_from_vehicle = first.world_from_vehicle.map_or(first.world_from_lidar, |pose| pose.isometry());
+        let vehicle_from_lidar = world_from_vehicle.inv_mul(&first.world_from_lidar);
+        let pose: Pose = vehicle_from_lidar.into();
+        let token = scene_token(scene, "calibrated_sensor", &[channel]);
+        self.push(
+            "calibrated_sensor",
+            json!({
+                "token": token, "sensor_token": sensor, "translation": pose.translation_m,
+                "rotation": pose.rotation_wxyz, "camera_intrinsic": [],
+            }),
+        );
+        Mount { token, vehicle_from_lidar }
+    }
+
+    /// Objects by id, and their boxes at each sample: a chain of boxes per object.
+    fn add_annotations(&mut self, scene: &SceneTables<'_>, sample_tokens: &[String]) {
+        let mut by_object: BTreeMap<i64, Vec<(&Sample, &String, &AnnotationRecord)>> = BTreeMap::new();
+        for (sample, token) in scene.samples.iter().zip(sample_tokens) {
+            for annotation in &sample.annotations {
+                by_object.entry(annotation.object.id).or_default().push((sample, token, annotation));
+            }
+        }
+        for (id, chain) in &by_object {
+            let id = id.to_string();
+            let instance = scene_token(scene, "instance", &[&id]);
+            let tokens: Vec<String> = chain
+                .iter()
+                .map(|(sample, ..)| scene_token(scene, "annotation", &[&id, &sample.moment.to_string()]))
+                .collect();
+            let category = self.category(chain[0].2.object.class);
+            self.push(
+                "instance",
+                json!({
+                    "token": instance, "category_token": category, "nbr_annotations": tokens.len(),
+                    "first_annotation_token": tokens.first(), "last_annotation_token": tokens.last(),
+                }),
+            );
+            for (((_, sample_token, annotation), token), (prev, next)) in
+                chain.iter().zip(&tokens).zip(neighbours(&tokens))
+            {
+                let Object { world_from_object, size_m: [length, width, height], .. } = &annotation.object;
+                self.push(
+                    "sample_annotation",
+                    json!({
+                        "token": token, "sample_token": sample_token, "instance_token": instance,
+                        "visibility_token": "", "attribute_tokens": [],
+                        "translation": world_from_object.translation_m, "size": [width, length, height],
+                        "rotation": world_from_object.rotation_wxyz, "prev": prev, "next": next,
+                        "num_lidar_pts": annotation.lidar_points, "num_radar_pts": 0,
+                    }),
+                );
+            }
+        }
+    }
+
+    /// The token of a category's row, which is added where it is missing.
+    fn category(&mut self, class: ObjectClass) -> String {
+        let name = category_name(class);
+        let token = token(&["category", name]);
+        let rows = self.0.entry("category").or_default();
+        if !rows.iter().any(|row| row["token"] == token.as_str()) {
+            rows.push(json!({ "token": token, "name": name, "description": "" }));
+        }
+        token
+    }
+}
+
+/// The tokens before and after each, empty at the ends.
+fn neighbours(tokens: &[String]) -> impl Iterator<Item = (&str, &str)> {
+    let at = |place: Option<usize>| place.and_then(|place| tokens.get(place)).map_or("", String::as_str);
+    (0..tokens.len()).map(move |place| (at(place.checked_sub(1)), at(place.checked_add(1))))
+}
+
+fn scene_token(scene: &SceneTables<'_>, kind: &str, parts: &[&str]) -> String {
+    let number = scene.number.to_string();
+    token(&[&[kind, &number, scene.name], parts].concat())
+}
+
+fn token(parts: &[&str]) -> String {
+    let digest = Sha256::digest(parts.join("/"));
+    digest.iter().take(TOKEN_BYTES).map(|byte| format!("{byte:02x}")).collect()
+}
+
+/// The name in the taxonomy of nuScenes, which counts vans as cars.
+fn category_name(class: ObjectClass) -> &'static str {
+    match class {
+        ObjectClass::Car | ObjectClass::Van => "vehicle.car",
+        ObjectClass::Truck => "vehicle.truck",
+        ObjectClass::Bus => "vehicle.bus.rigid",
+        ObjectClass::TwoWheeler => "vehicle.bicycle",
+        ObjectClass::Pedestrian => "human.pedestrian.adult",
+        ObjectClass::Other => "movable_object.debris",
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn object(id: i64, x: f64) -> Object {
+        Object {
+            id,
+            class: ObjectClass::Van,
+            world_from_object: Pose::from_xyz_yaw([x, 0.0, 1.0], 0.5),
+            size_m: [4.0, 2.0, 1.5],
+            speed_mps: None,
+        }
+    }
+
+    fn sample(moment: usize, objects: Vec<Object>) -> Sample {
+        let sweep = SweepRecord {
+            agent: 0,
+            file: format!("sweeps/TOP/{moment}.pcd.bin"),
+            world_from_lidar: Pose::from_xyz_yaw([moment as f64, 0.0, 2.0], 0.0).isometry(),
+            world_from_vehicle: Some(Pose::from_xyz_yaw([moment as f64 + 0.5, 0.0, 0.0], 0.0)),
+        };
+        let annotations = objects.into_iter().map(|object| AnnotationRecord { object, lidar_points: 3 }).collect();
+        Sample { moment, micros: 100_000 * moment as u64, sweeps: vec![sweep], annotations }
+    }
+
+    #[test]
+    fn rows_refer_to_each_other() {
+        let samples =
+            [sample(0, vec![object(7, 10.0)]), sample(1, vec![object(7, 11.0), object(8, 20.0)]), sample(2, vec![])];
+        let channels = ["TOP".to_owned(), "absent".to_owned()];
+        let mut tables = Tables::default();
+        tables.add(SceneTables { number: 0, name: "a", channels: &channels, fields: Map::new(), samples: &samples });
+        tables.add(SceneTables { number: 1, name: "b", channels: &channels, fields: Map::new(), samples: &samples });
+        let tables = tables.into_tables();
+        let count = |name: &str| tables[name].len();
+        assert_eq!((count("scene"), count("sample"), count("sample_data"), count("ego_pose")), (2, 6, 6, 6));
+        assert_eq!((count("sensor"), count("calibrated_sensor"), count("category")), (1, 2, 1));
+        assert_eq!((count("instance"), count("sample_annotation"), count("visibility")), (4, 6, 0));
+        let row = |name: &str, token: &Value| {
+            tables[name].iter().find(|row| row["token"] == *token).unwrap_or_else(|| panic!("{name} {token}")).clone()
+        };
+        // From the scene along its samples to the second box of the first object.
+        let first = row("sample", &tables["scene"][0]["first_sample_token"]);
+        assert_eq!(first["prev"], "");
+        let second = row("sample", &first["next"]);
+        assert_eq!((second["timestamp"].as_u64(), &second["prev"]), (Some(100_000), &first["token"]));
+        let instance = row("instance", &tables["sample_annotation"][0]["instance_token"]);
+        assert_eq!(instance["nbr_annotations"], 2);
+        let last = row("sample_annotation", &instance["last_annotation_token"]);
+        assert_eq!((&last["sample_token"], &last["size"]), (&second["token"], &json!([2.0, 4.0, 1.5])));
+        assert_eq!(row("category", &instance["category_token"])["name"], "vehicle.car");
+        // The LiDAR 0.5 m behind the vehicle's origin and 2 m above.
+        let sweep = &tables["sample_data"][1];
+        assert_eq!(row("ego_pose", &sweep["ego_pose_token"])["translation"], json!([1.5, 0.0, 0.0]));
+        let mount = row("calibrated_sensor", &sweep["calibrated_sensor_token"]);
+        assert_eq!(mount["translation"], json!([-0.5, 0.0, 2.0]));
+    }
+}

@@ -1,0 +1,120 @@
+//! OPV2V, V2XSet, V2X-R: a folder per agent, a YAML and a PCD per frame, with radar and copies of the sweep beside it.
+//!
+//! The world of the files is CARLA's: left-handed, degrees, half extents. This is the only writer that mirrors.
+
+use std::fmt::Write as _;
+use std::path::Path;
+
+use protocol::{PointCloud, Pose};
+
+use super::agent_folders::{AgentFolderWriter, AgentFolders};
+use super::disk::write_file;
+use super::yaml_text::{KMH_PER_MPS, ObjectEntry, anchors, write_list};
+use super::{AgentFrame, Moment, SweepVariant};
+use crate::generate::error::SynthError;
+use crate::generate::positioning::Fix;
+use dataset::carla_pose::{CarlaPose, mirrored_point};
+use dataset::frame::ObjectClass;
+use dataset::pcd::{self, Encoding, IntensityField};
+
+/// The writer.
+pub(super) fn writer(root: &Path) -> AgentFolderWriter {
+    AgentFolderWriter::new(root, write_files)
+}
+
+fn write_files(folders: &AgentFolders, moment: &Moment, frame: &AgentFrame) -> Result<(), SynthError> {
+    let points = pcd_of(&frame.frame.points.xyzi, IntensityField::Intensity);
+    write_file(&folders.file(moment, frame, ".pcd"), points)?;
+    for SweepVariant { name, points, labels } in &frame.variants {
+        let bytes = pcd_of(points, IntensityField::RedAndLabel(labels));
+        write_file(&folders.file(moment, frame, &format!("_{name}.pcd")), bytes)?;
+    }
+    if let Some(radar) = &frame.frame.radar {
+        write_file(&folders.file(moment, frame, "_radar.pcd"), pcd_of(&radar.xyzi, IntensityField::Red))?;
+    }
+    write_file(&folders.file(moment, frame, ".yaml"), frame_yaml(frame, folders.is_roadside(frame)))
+}
+
+fn pcd_of(points: &[[f32; 4]], intensity: IntensityField<'_>) -> Vec<u8> {
+    let xyzi = points.iter().map(|&[x, y, z, fourth]| [x, -y, z, fourth]).collect();
+    pcd::encode(&PointCloud { xyzi }, Encoding::Binary, intensity)
+}
+
+fn frame_yaml(frame: &AgentFrame, is_roadside: bool) -> String {
+    let mut yaml = String::with_capacity(512 + 400 * frame.frame.objects.len());
+    write_frame(&mut yaml, frame, is_roadside).expect("a String takes all that is written to it");
+    yaml
+}
+
+fn six(pose: &Pose) -> [f64; 6] {
+    CarlaPose::from_pose(pose).into()
+}
+
+fn write_frame(yaml: &mut String, agent: &AgentFrame, is_roadside: bool) -> std::fmt::Result {
+    let frame = &agent.frame;
+    writeln!(yaml, "RSU: {is_roadside}")?;
+    if let Some(speed_mps) = frame.speed_mps {
+        writeln!(yaml, "ego_speed: {}", KMH_PER_MPS * speed_mps)?;
+    }
+    if let Some(simulated) = &agent.simulated {
+        write_receivers(yaml, &simulated.fix)?;
+    }
+    let poses = [
+        ("lidar_pose", frame.world_from_lidar),
+        ("predicted_ego_pos", frame.gnss_world_from_vehicle),
+        ("true_ego_pos", frame.world_from_vehicle),
+    ];
+    for (key, pose) in poses.iter().filter_map(|(key, pose)| Some((key, pose.as_ref()?))) {
+        write_list(yaml, "", key, &six(pose))?;
+        if *key == "lidar_pose" {
+            writeln!(yaml, "plan_trajectory: []")?;
+        }
+    }
+    write_vehicles(yaml, agent)
+}
+
+fn write_receivers(yaml: &mut String, fix: &Fix) -> std::fmt::Result {
+    let [latitude, longitude, altitude] = fix.geodetic();
+    writeln!(yaml, "gnss:\n  altitude: {altitude}\n  latitude: {latitude}\n  longitude: {longitude}")?;
+    // Left-handed like everything in these files.
+    let (heading, rate) = (-fix.heading_rad.to_degrees(), -fix.yaw_rate_radps.to_degrees());
+    writeln!(yaml, "imu:\n  heading_deg: {heading}\n  speed_mps: {}\n  yaw_rate_degps: {rate}", fix.speed_mps)
+}
+
+fn write_vehicles(yaml: &mut String, agent: &AgentFrame) -> std::fmt::Result {
+    if agent.frame.objects.is_empty() {
+        return writeln!(yaml, "vehicles: {{}}");
+    }
+    writeln!(yaml, "vehicles:")?;
+    for (object, anchor) in agent.frame.objects.iter().zip(anchors(agent)) {
+        let mut more = vec![("class", class(object.class).to_owned())];
+        // What is no vehicle must not count as one.
+        if let ObjectClass::TwoWheeler | ObjectClass::Pedestrian | ObjectClass::Other = object.class {
+            more.push(("obj_type", super::boxes::real_type(object.class).to_owned()));
+        }
+        let entry = ObjectEntry {
+            id: object.id,
+            angle_deg: CarlaPose::from_pose(&object.world_from_object).roll_yaw_pitch_deg,
+            // Readers add the offset of the centre without turning it, so it is turned here.
+            location_m: mirrored_point(anchor.location_m),
+            center_m: mirrored_point(anchor.center_offset_m),
+            size_m: object.size_m,
+            speed_mps: object.speed_mps,
+            more: &more,
+        };
+        entry.write(yaml)?;
+    }
+    Ok(())
+}
+
+fn class(class: ObjectClass) -> &'static str {
+    match class {
+        ObjectClass::Car => "car",
+        ObjectClass::Van => "van",
+        ObjectClass::Truck => "truck",
+        ObjectClass::Bus => "bus",
+        ObjectClass::TwoWheeler => "two_wheeler",
+        ObjectClass::Pedestrian => "pedestrian",
+        ObjectClass::Other => "other",
+    }
+}

@@ -1,0 +1,66 @@
+//! Oxford as LightLoc converts it: `<day and time>/velodyne_left/<microseconds>.bin`, floats component by component, and
+//! poses in `velodyne_left_False.h5`; axes have z down.
+
+use std::path::Path;
+
+use super::Omissions;
+use super::boxes::of_255;
+use super::disk::write_file;
+use super::sequences::{Sequence, Style, SweepPose, date, pose_z_down, z_down};
+use crate::generate::error::SynthError;
+use dataset::hdf5_file::poses_file;
+
+/// Entries at either end of the poses that LightLoc leaves out.
+const TRIMMED: usize = 5;
+
+/// The style.
+#[derive(Debug)]
+pub(super) struct Oxford;
+
+impl Style for Oxford {
+    fn epoch_micros(&self) -> u64 {
+        1_547_120_000_000_000
+    }
+
+    fn folder(&self, sequence: usize) -> String {
+        let [year, month, day] = date(2019, sequence);
+        format!("{year}-{month:02}-{day:02}-12-00-00-radar-oxford-10k")
+    }
+
+    fn sweeps_folder(&self) -> &'static str {
+        "velodyne_left"
+    }
+
+    fn file_name(&self, _: usize, micros: u64) -> String {
+        format!("{micros}.bin")
+    }
+
+    fn points(&self, points: &[[f32; 4]], _: &Omissions) -> Vec<u8> {
+        let component = |index: usize| {
+            points.iter().map(move |&point| {
+                let [x, y, z, intensity] = z_down(point);
+                [x, y, z, of_255(intensity)][index]
+            })
+        };
+        (0..4).flat_map(component).flat_map(f32::to_le_bytes).collect()
+    }
+
+    fn write_poses(&self, root: &Path, sequence: &Sequence<'_>) -> Result<(), SynthError> {
+        let (Some(first), Some(last)) = (sequence.sweeps.first(), sequence.sweeps.last()) else { return Ok(()) };
+        let (stamps, rows) = padded(first, sequence.sweeps, last);
+        let file = root.join(&sequence.folder).join("velodyne_left_False.h5");
+        write_file(&file, poses_file(&stamps, &rows))
+    }
+}
+
+/// Time stamps and rows of 3x4 matrices. Those that are left out by readers are copies of the first and of the last pose.
+fn padded(first: &SweepPose, sweeps: &[SweepPose], last: &SweepPose) -> (Vec<i64>, Vec<[f64; 12]>) {
+    let before = (1..=TRIMMED as u64).rev().map(|step| SweepPose { micros: first.micros - step, ..*first });
+    let after = (1..=TRIMMED as u64).map(|step| SweepPose { micros: last.micros + step, ..*last });
+    before.chain(sweeps.iter().copied()).chain(after).map(|sweep| (sweep.micros as i64, row(&sweep))).unzip()
+}
+
+fn row(sweep: &SweepPose) -> [f64; 12] {
+    let matrix = pose_z_down(&sweep.world_from_lidar).isometry().to_homogeneous();
+    std::array::from_fn(|place| matrix[(place / 4, place % 4)])
+}

@@ -1,0 +1,137 @@
+//! YAML of the OPV2V family, as text.
+
+use std::fmt::{self, Write as _};
+
+use nalgebra::Vector3;
+use protocol::Pose;
+
+use super::{AgentFrame, BoxAnchor, SceneAgent, SceneHeader};
+use dataset::frame::Object;
+
+/// Kilometres per hour in a metre per second.
+pub(super) const KMH_PER_MPS: f64 = 3.6;
+/// The first number of vehicles that have to be named anew.
+const FIRST_VEHICLE: usize = 1001;
+
+/// A list of numbers below a key.
+pub(super) fn write_list(yaml: &mut String, indent: &str, key: &str, values: &[f64]) -> fmt::Result {
+    writeln!(yaml, "{indent}{key}:")?;
+    // Minus zero would be another text for the same number; `{:?}` keeps a point in whole numbers.
+    values.iter().try_for_each(|value| writeln!(yaml, "{indent}- {:?}", value + 0.0))
+}
+
+/// An object of the map of vehicles, in the numbers of the file.
+pub(super) struct ObjectEntry<'a> {
+    pub(super) id: i64,
+    /// Roll, yaw, pitch, degrees.
+    pub(super) angle_deg: [f64; 3],
+    pub(super) location_m: [f64; 3],
+    /// From the location to the centre of the box, added without being turned.
+    pub(super) center_m: [f64; 3],
+    pub(super) size_m: [f64; 3],
+    pub(super) speed_mps: Option<f64>,
+    /// Keys and values that only one layout has, in alphabetical order behind `angle`.
+    pub(super) more: &'a [(&'static str, String)],
+}
+
+impl ObjectEntry<'_> {
+    /// Writes the entry, with keys in alphabetical order.
+    pub(super) fn write(&self, yaml: &mut String) -> fmt::Result {
+        let more = |yaml: &mut String, after: &str, until: &str| {
+            let mut between = self.more.iter().filter(|(key, _)| after < *key && *key < until);
+            between.try_for_each(|(key, value)| writeln!(yaml, "    {key}: {value}"))
+        };
+        writeln!(yaml, "  {}:", self.id)?;
+        write_list(yaml, "    ", "angle", &self.angle_deg)?;
+        more(yaml, "angle", "center")?;
+        write_list(yaml, "    ", "center", &self.center_m)?;
+        more(yaml, "center", "extent")?;
+        write_list(yaml, "    ", "extent", &self.size_m.map(|size| size / 2.0))?;
+        more(yaml, "extent", "location")?;
+        write_list(yaml, "    ", "location", &self.location_m)?;
+        more(yaml, "location", "speed")?;
+        match self.speed_mps {
+            Some(speed_mps) => writeln!(yaml, "    speed: {}", KMH_PER_MPS * speed_mps),
+            None => Ok(()),
+        }
+    }
+}
+
+/// Where the objects of a frame stand: as the simulation knows it, else the middle of the box's bottom face.
+pub(super) fn anchors(frame: &AgentFrame) -> Vec<BoxAnchor> {
+    match &frame.simulated {
+        Some(simulated) => simulated.anchors.clone(),
+        None => frame.frame.objects.iter().map(bottom_anchor).collect(),
+    }
+}
+
+fn bottom_anchor(object: &Object) -> BoxAnchor {
+    let Pose { translation_m, .. } = object.world_from_object;
+    let up = object.world_from_object.isometry().rotation * Vector3::new(0.0, 0.0, object.size_m[2] / 2.0);
+    let center_offset_m: [f64; 3] = up.into();
+    BoxAnchor { location_m: std::array::from_fn(|axis| translation_m[axis] - center_offset_m[axis]), center_offset_m }
+}
+
+/// The folders of a scene's agents. Readers take them in text order, roadside units (negative numbers) last: where the
+/// agents' own names are not such numbers, they are numbered.
+pub(super) fn agent_folders(scene: &SceneHeader) -> Vec<String> {
+    let own: Vec<String> = scene.agents.iter().map(|agent| agent.id.as_str().to_owned()).collect();
+    let is_number =
+        |agent: &SceneAgent| agent.id.as_str().parse::<i64>().is_ok_and(|number| (number < 0) == agent.is_roadside);
+    let key = |name: &String| (name.starts_with('-'), name.clone());
+    if scene.agents.iter().all(is_number) && own.is_sorted_by_key(key) {
+        return own;
+    }
+    let (mut vehicles, mut units) = (FIRST_VEHICLE.., 1..);
+    let mut number = |agent: &SceneAgent| match agent.is_roadside {
+        true => format!("-{}", units.next().unwrap_or_default()),
+        false => vehicles.next().unwrap_or_default().to_string(),
+    };
+    scene.agents.iter().map(&mut number).collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use protocol::CavId;
+
+    use super::*;
+
+    fn folders(agents: &[(&str, bool)]) -> Vec<String> {
+        let agents =
+            agents.iter().map(|&(id, is_roadside)| SceneAgent { id: CavId::new(id).unwrap(), is_roadside }).collect();
+        agent_folders(&SceneHeader {
+            name: "a".into(),
+            agents,
+            capture_nanos: vec![],
+            tick_nanos: 1,
+            origin: String::new(),
+        })
+    }
+
+    #[test]
+    fn agents_keep_names_that_readers_take_in_the_same_order() {
+        assert_eq!(folders(&[("1045", false), ("650", false), ("-1", true)]), ["1045", "650", "-1"]);
+        assert_eq!(folders(&[("650", false), ("1045", false)]), ["1001", "1002"], "the ego would be another one");
+        assert_eq!(folders(&[("vehicle", false), ("unit", true)]), ["1001", "-1"]);
+        assert_eq!(folders(&[("2", false), ("3", true)]), ["1001", "-1"], "a unit has a negative number");
+    }
+
+    #[test]
+    fn keys_of_an_object_are_in_alphabetical_order() {
+        let more = [("ass_id", "7".to_owned()), ("obj_type", "Car".to_owned())];
+        let entry = ObjectEntry {
+            id: 7,
+            angle_deg: [0.0, 90.0, -0.0],
+            location_m: [1.0, 2.5, 0.0],
+            center_m: [0.0; 3],
+            size_m: [4.0, 2.0, 1.5],
+            speed_mps: Some(10.0),
+            more: &more,
+        };
+        let mut yaml = String::new();
+        entry.write(&mut yaml).unwrap();
+        let keys: Vec<&str> = yaml.lines().filter_map(|line| line.trim().split_once(':')).map(|(key, _)| key).collect();
+        assert_eq!(keys, ["7", "angle", "ass_id", "center", "extent", "location", "obj_type", "speed"]);
+        assert!(yaml.contains("    - 0.0\n    - 90.0\n    - 0.0\n") && yaml.ends_with("speed: 36\n"), "{yaml}");
+    }
+}

@@ -1,0 +1,225 @@
+//! The LiDAR of the vehicles: 64 channels from -25 to 2 degrees, 120 m, 20 turns a second, 1.3 million rays a second.
+
+use std::f32::consts::{PI, TAU};
+
+use super::raycast::{Body, Caster, GROUND, MISS, RayPattern, Surface, Sweep};
+use super::weather::{Echo, Weather};
+use support::random::SplitMix64;
+
+/// Where the LiDAR sits on its vehicle: x forward, y left, z up from the ground under the middle, metres.
+pub const LIDAR_MOUNT_M: [f64; 3] = [-0.5, 0.0, 1.95];
+
+/// Channels of the LiDAR.
+const CHANNELS: usize = 64;
+/// Columns of one turn: 1.3 million rays a second over 64 channels and 20 turns a second, rounded as CARLA does.
+const COLUMNS: usize = 1016;
+/// Elevations of the lowest and the highest channel, degrees.
+const ELEVATIONS_DEG: [f32; 2] = [-25.0, 2.0];
+/// Range, metres.
+const RANGE_M: f32 = 120.0;
+/// Deviation of the range noise, metres.
+const NOISE_M: f64 = 0.02;
+/// Share of rays that is lost whatever they meet.
+const DROP_ALWAYS: f64 = 0.1;
+/// Weaker returns than this may be lost as well.
+const DROP_BELOW_INTENSITY: f32 = 0.7;
+/// Share that is lost at intensity 0; falls to none at [`DROP_BELOW_INTENSITY`].
+const DROP_AT_ZERO: f32 = 0.15;
+/// Loss of light in clear air, per metre: CARLA's attenuation, and all that its intensity tells.
+const ATTENUATION_PER_M: f32 = 0.004;
+/// Share of light that the ground throws back.
+const GROUND_REFLECTIVITY: f32 = 0.25;
+
+/// The rays of one turn. The sensor turns clockwise seen from above and passes the rear when a sweep begins and ends.
+#[must_use]
+pub fn lidar_pattern() -> RayPattern {
+    let [low, high] = ELEVATIONS_DEG.map(f32::to_radians);
+    let azimuth_step_rad = -TAU / COLUMNS as f32;
+    RayPattern {
+        first_azimuth_rad: PI + azimuth_step_rad,
+        azimuth_step_rad,
+        columns: COLUMNS,
+        first_elevation_rad: low,
+        elevation_step_rad: (high - low) / (CHANNELS - 1) as f32,
+        channels: CHANNELS,
+        range_m: RANGE_M,
+        rolling: true,
+    }
+}
+
+/// A LiDAR that keeps its buffers from one sweep to the next.
+#[derive(Debug, Clone)]
+pub struct Lidar {
+    caster: Caster,
+    points: Vec<[f32; 4]>,
+    hits: Vec<u32>,
+    labels: Vec<u8>,
+}
+
+/// One sweep as the sensor reports it.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct LidarSweep<'a> {
+    /// x, y, z in metres and intensity, in the (right-handed) frame of the sensor at the end of the sweep.
+    pub points: &'a [[f32; 4]],
+    /// How many of the points lie on each body.
+    pub hits: &'a [u32],
+    /// For each point 0 where it lies on a surface, as in clear air, and 1 where it is clutter: fog or a flake.
+    pub labels: &'a [u8],
+}
+
+impl Default for Lidar {
+    fn default() -> Self {
+        Self { caster: Caster::new(lidar_pattern()), points: Vec::new(), hits: Vec::new(), labels: Vec::new() }
+    }
+}
+
+impl Lidar {
+    /// Takes one sweep; `sensor` is `world_from_lidar` over it.
+    ///
+    /// The same arguments give the same points, bit for bit.
+    pub fn sweep(
+        &mut self,
+        sensor: &Sweep,
+        ground: &dyn Surface,
+        bodies: &[Body<'_>],
+        weather: Weather,
+        seed: u64,
+    ) -> LidarSweep<'_> {
+        self.caster.cast(sensor, ground, bodies);
+        self.again(sensor, bodies, weather, seed)
+    }
+
+    /// The last sweep once more, in another weather or with other noise: `sensor` and `bodies` are those of
+    /// [`Self::sweep`].
+    pub fn again(&mut self, sensor: &Sweep, bodies: &[Body<'_>], weather: Weather, seed: u64) -> LidarSweep<'_> {
+        self.points.clear();
+        self.labels.clear();
+        self.hits.clear();
+        self.hits.resize(bodies.len(), 0);
+        let mut random = SplitMix64::new(seed);
+        let image = self.caster.image();
+        let rows = image.depths_m.chunks_exact(CHANNELS).zip(image.hits.chunks_exact(CHANNELS));
+        for (column, (depths, hits)) in self.caster.columns_at_end(sensor).zip(rows) {
+            for ((elevation, &depth), &hit) in self.caster.elevations().zip(depths).zip(hits) {
+                if hit == MISS && weather == Weather::Sunny {
+                    continue;
+                }
+                let Some((range_m, intensity, hit)) = measure(depth, hit, bodies, weather, &mut random) else {
+                    continue;
+                };
+                let [x, y, z] = column.point_m(elevation, range_m);
+                self.points.push([x, y, z, intensity]);
+                self.labels.push(u8::from(hit == MISS));
+                if let Some(count) = self.hits.get_mut(hit as usize) {
+                    *count += 1;
+                }
+            }
+        }
+        LidarSweep { points: &self.points, hits: &self.hits, labels: &self.labels }
+    }
+}
+
+/// What one ray reports: range with noise, intensity, and what was hit; nothing where the return is lost.
+#[inline]
+fn measure(
+    depth_m: f32,
+    hit: u32,
+    bodies: &[Body<'_>],
+    weather: Weather,
+    random: &mut SplitMix64,
+) -> Option<(f32, f32, u32)> {
+    let (range_m, intensity, hit) = match weather {
+        Weather::Sunny => (depth_m, (-ATTENUATION_PER_M * depth_m).exp(), hit),
+        _ => {
+            let reflectivity = match hit {
+                MISS | GROUND => GROUND_REFLECTIVITY,
+                body => bodies[body as usize].shape.reflectivity,
+            };
+            match weather.echo((hit != MISS).then_some(depth_m), reflectivity, random) {
+                Echo::Target(kept) => (depth_m, kept * (-ATTENUATION_PER_M * depth_m).exp(), hit),
+                Echo::Air(range_m, intensity) => (range_m, intensity, MISS),
+                Echo::Lost => return None,
+            }
+        }
+    };
+    // One draw decides both losses: they are independent, so their shares of what is left multiply.
+    let faint = (1.0 - intensity / DROP_BELOW_INTENSITY).max(0.0) * DROP_AT_ZERO;
+    let kept = (1.0 - DROP_ALWAYS) * (1.0 - f64::from(faint));
+    if random.unit() >= kept {
+        return None;
+    }
+    Some((range_m + (NOISE_M * random.normal()) as f32, intensity, hit))
+}
+
+/// The point of a pose at which a sweep is given, relative to the vehicle's own origin.
+#[must_use]
+pub fn lidar_motion(vehicle: &Sweep) -> Sweep {
+    vehicle.mounted(LIDAR_MOUNT_M)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::generate::raycast::{BodyShape, Bounds, Part, Placement, Plane};
+
+    #[test]
+    fn a_pole_stands_straight_while_the_sensor_drives_past() {
+        let pole =
+            BodyShape::new(vec![Part::Cylinder { center_m: [0.0, 0.0, 2.0], radius_m: 0.15, half_height_m: 2.0 }], 0.5);
+        let place = |x: f64, y: f64| Body { shape: &pole, motion: Sweep::still(Placement::level([x, y, 0.0], 0.0)) };
+        let bodies = [place(8.0, 6.0), place(-7.0, 5.0), place(3.0, -9.0)];
+        // 30 m/s and 60 degrees a second.
+        let vehicle = Sweep {
+            start: Placement::level([0.0, 0.0, 0.0], 0.0),
+            end: Placement::level([1.5, 0.0, 0.0], 3f64.to_radians()),
+        };
+        let sensor = lidar_motion(&vehicle);
+        let mut lidar = Lidar::default();
+        let sweep = lidar.sweep(&sensor, &Plane(0.0), &bodies, Weather::Sunny, 3);
+        let world_from_lidar = sensor.end.isometry();
+        for body in &bodies {
+            let center = body.motion.end.position_m;
+            let offsets: Vec<f64> = sweep
+                .points
+                .iter()
+                .map(|&[x, y, z, _]| world_from_lidar * nalgebra::Point3::new(x, y, z).cast::<f64>())
+                .filter(|point| point.z > 0.3 && (point.x - center.x).hypot(point.y - center.y) < 1.0)
+                .map(|point| (point.x - center.x).hypot(point.y - center.y))
+                .collect();
+            assert!(offsets.len() > 30, "{}", offsets.len());
+            // On the surface of the pole up to the noise of the range.
+            assert!(offsets.iter().all(|offset| (offset - 0.15).abs() < 0.12), "{offsets:?}");
+        }
+        assert!(sweep.hits.iter().all(|&hits| hits > 30));
+    }
+
+    #[test]
+    fn noise_and_losses_have_the_stated_shares() {
+        let shell = BodyShape::new(vec![Part::Box(Bounds::centered([0.0, 0.0, 0.0], [0.5, 200.0, 200.0]))], 0.5);
+        let wall = |x: f64| Body { shape: &shell, motion: Sweep::still(Placement::level([x, 0.0, 0.0], 0.0)) };
+        let sensor = Sweep::still(Placement::level([0.0; 3], 0.0));
+        let mut lidar = Lidar::default();
+        let near = [wall(20.5)];
+        let sweep = lidar.sweep(&sensor, &Plane(-500.0), &near, Weather::Sunny, 1);
+        let ahead: Vec<_> = sweep.points.iter().filter(|p| p[1].abs() < 8.0 && p[0] > 0.0).collect();
+        let ranges: Vec<f64> = ahead.iter().map(|p| f64::from(p[0] / (p[0].hypot(p[1]).hypot(p[2])))).collect();
+        let errors: Vec<f64> = ahead.iter().zip(&ranges).map(|(p, cos)| (f64::from(p[0]) - 20.0) / cos).collect();
+        let deviation = (errors.iter().map(|e| e * e).sum::<f64>() / errors.len() as f64).sqrt();
+        assert!((deviation - NOISE_M).abs() < 0.002, "{deviation}");
+        // Nearly everything in this fan is nearer than 89 m, where only the general loss is left.
+        let fan = 64 * (2.0 * (8.0f64 / 20.0).atan() / f64::from(TAU) * COLUMNS as f64) as usize;
+        let kept = ahead.len() as f64 / fan as f64;
+        assert!((kept - 0.9).abs() < 0.02, "{kept}");
+    }
+
+    #[test]
+    fn the_same_seed_gives_the_same_points() {
+        let mut lidar = Lidar::default();
+        let sensor = Sweep::still(Placement::level([0.0, 0.0, 1.95], 0.0));
+        let once = lidar.sweep(&sensor, &Plane(0.0), &[], Weather::Snow, 5).points.to_vec();
+        let twice = lidar.sweep(&sensor, &Plane(0.0), &[], Weather::Snow, 5).points.to_vec();
+        let other = lidar.sweep(&sensor, &Plane(0.0), &[], Weather::Snow, 6).points.to_vec();
+        assert_eq!(once, twice);
+        assert_ne!(once, other);
+    }
+}

@@ -1,0 +1,47 @@
+//! Scene generation: traffic in a town, and the sensors of the vehicles in it.
+//!
+//! [`generate`] writes scenes in a [`SceneLayout`], by default OPV2V's, and the readers of this crate read them back like
+//! any other dataset. [`convert`] writes a dataset that was opened in such a layout.
+//! The parts, in the order in which they work: a [`crate::map`] that stands still, parked vehicles, traffic that is
+//! recorded step by step, then for each agent and frame the [`lidar`], the [`radar`] and the receivers, all of them over
+//! one ray [`cast`]er, and the writer of the layout.
+//!
+//! ```no_run
+//! use simulator::generate::{Subset, SynthOptions, generate};
+//!
+//! # fn main() -> Result<(), simulator::generate::SynthError> {
+//! let options = SynthOptions { scenes: 2, ..SynthOptions::new(Subset::V2vdet, 7, "scenes".into()) };
+//! let summary = generate(&options, &|_| {})?;
+//! println!("{} frames", summary.agent_frames);
+//! # Ok(())
+//! # }
+//! ```
+
+mod cache;
+mod convert;
+mod data_protocol;
+mod error;
+pub(crate) mod layout;
+pub mod lidar;
+mod options;
+mod parking;
+mod positioning;
+pub mod radar;
+pub mod raycast;
+mod recording;
+mod scenes;
+mod sensing;
+mod terrain;
+mod traffic;
+pub mod vehicle;
+pub mod weather;
+mod world;
+
+pub use cache::{are_kept, generate_whole};
+pub use convert::{ConvertOptions, Converted, convert};
+pub use error::SynthError;
+pub use layout::SceneLayout;
+pub use options::{Subset, SynthOptions};
+pub use scenes::{Summary, generate};
+pub use weather::Weather;
+pub use world::ground_surface;

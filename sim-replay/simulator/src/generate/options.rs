@@ -1,0 +1,155 @@
+//! What to generate.
+
+use std::ops::RangeInclusive;
+use std::path::PathBuf;
+
+use clap::ValueEnum;
+
+use super::error::SynthError;
+use super::layout::SceneLayout;
+use super::traffic::STEP_S;
+use super::weather::Weather;
+use crate::map::TownSource;
+
+/// The three subsets of V2VLoc.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, ValueEnum)]
+pub enum Subset {
+    /// One agent drives through town 1, in several traversals.
+    Town1loc,
+    /// One agent drives through town 4, in several traversals.
+    Town4loc,
+    /// Two to four agents drive near each other in the same two towns.
+    V2vdet,
+}
+
+impl Subset {
+    /// The name in files and on the command line.
+    #[must_use]
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Town1loc => "town1loc",
+            Self::Town4loc => "town4loc",
+            Self::V2vdet => "v2vdet",
+        }
+    }
+}
+
+/// What to generate. The same options give the same files, byte for byte.
+///
+/// By convention seeds 0 to 999 are for training and validation, and 1000 and above for measuring only, so that no
+/// measured scene was ever trained on. The town seed is the same for all: it is the place one drives in.
+#[derive(Debug, Clone, PartialEq)]
+pub struct SynthOptions {
+    /// Which kind of scenes.
+    pub subset: Subset,
+    /// Fixes routes, lanes, speeds, traffic, parked vehicles and noise.
+    pub seed: u64,
+    /// Where the scenarios go.
+    pub out: PathBuf,
+    /// Layout of the files.
+    pub layout: SceneLayout,
+    /// The town; each subset has its own otherwise, V2VDet both in turn.
+    pub town: Option<TownSource>,
+    /// Fixes everything that stands still for good.
+    pub town_seed: u64,
+    /// Traversals of a localization subset: one scenario each.
+    pub traversals: usize,
+    /// Scenes of V2VDet: one scenario each.
+    pub scenes: usize,
+    /// How many agents a V2VDet scene may have.
+    pub agents: RangeInclusive<usize>,
+    /// The weather.
+    pub weather: Weather,
+    /// Weathers in which every sweep is written once more, beside the plain one ([`Weather::variant`]).
+    pub copies: Vec<Weather>,
+    /// Frames of each scenario.
+    pub frames: usize,
+    /// Simulated time from one stored frame to the next, seconds; a multiple of 0.05.
+    pub period_s: f64,
+    /// Whether to write into a folder that holds something already; scenarios of the same name are replaced.
+    pub force: bool,
+    /// Threads that cast and write; does not change the files.
+    pub threads: usize,
+}
+
+impl SynthOptions {
+    /// The defaults of a subset.
+    #[must_use]
+    pub fn new(subset: Subset, seed: u64, out: PathBuf) -> Self {
+        Self {
+            subset,
+            seed,
+            out,
+            layout: SceneLayout::Opv2v,
+            town: None,
+            town_seed: 0,
+            traversals: 1,
+            scenes: 1,
+            agents: 2..=4,
+            weather: Weather::Sunny,
+            copies: Vec::new(),
+            frames: Self::default_frames(subset),
+            period_s: 0.1,
+            force: false,
+            threads: 1,
+        }
+    }
+
+    /// Frames of a scenario when nothing else is asked for.
+    #[must_use]
+    pub fn default_frames(subset: Subset) -> usize {
+        if subset == Subset::V2vdet { 60 } else { 2000 }
+    }
+
+    /// Scenarios that will be written.
+    #[must_use]
+    pub fn scenarios(&self) -> usize {
+        if self.subset == Subset::V2vdet { self.scenes } else { self.traversals }
+    }
+
+    /// Steps of the simulation from one stored frame to the next.
+    #[must_use]
+    pub fn steps_per_frame(&self) -> usize {
+        (self.period_s / STEP_S).round() as usize
+    }
+
+    /// Checks the numbers.
+    ///
+    /// # Errors
+    /// [`SynthError::Option`] names the first that makes no sense.
+    pub fn validate(&self) -> Result<(), SynthError> {
+        let check = |is_good: bool, option: &'static str, value: String, expected: &'static str| {
+            if is_good { Ok(()) } else { Err(SynthError::Option { option, value, expected }) }
+        };
+        let steps = self.period_s / STEP_S;
+        let is_multiple = (1.0..=1e4).contains(&steps) && (steps - steps.round()).abs() < 1e-6;
+        check(is_multiple, "--period", self.period_s.to_string(), "expected a multiple of 0.05 s up to 500 s")?;
+        check((1..=100_000).contains(&self.frames), "--frames", self.frames.to_string(), "expected 1 to 100000")?;
+        check((1..=10_000).contains(&self.scenes), "--scenes", self.scenes.to_string(), "expected 1 to 10000")?;
+        check(
+            (1..=1000).contains(&self.traversals),
+            "--traversals",
+            self.traversals.to_string(),
+            "expected 1 to 1000",
+        )?;
+        let copies: Vec<&str> = self.copies.iter().map(|weather| weather.name()).collect();
+        let have_names = self.copies.iter().all(|weather| weather.variant().is_some());
+        check(have_names, "--copies", copies.join(","), "expected fog, snow or both")?;
+        let have_place = self.copies.is_empty() || self.layout == SceneLayout::Opv2v;
+        check(
+            have_place,
+            "--copies",
+            copies.join(","),
+            "expected none, as the layout opv2v alone has copies of sweeps",
+        )?;
+        let agents = format!("{}-{}", self.agents.start(), self.agents.end());
+        let is_range = *self.agents.start() >= 1 && self.agents.start() <= self.agents.end() && *self.agents.end() <= 7;
+        check(is_range, "--agents", agents.clone(), "expected a number or a range within 1-7")?;
+        if !self.layout.needs_two_agents() {
+            return Ok(());
+        }
+        let subset = self.subset.name().to_owned();
+        check(self.subset == Subset::V2vdet, "--subset", subset, "expected v2vdet, as the layout needs two agents")?;
+        check(*self.agents.start() >= 2, "--agents", agents, "expected 2 or more, as the layout needs two agents")
+    }
+}

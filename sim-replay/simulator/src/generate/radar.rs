@@ -1,0 +1,151 @@
+//! The 4D radar of the vehicles: 150 m, 120 by 30 degrees ahead, with the radial velocity of every return.
+
+use nalgebra::Vector3;
+
+use super::raycast::{Body, Caster, GROUND, MISS, RayPattern, Surface, Sweep};
+use support::random::SplitMix64;
+
+/// Radial velocities between plus and minus this fill the red channel, metres per second.
+///
+/// Red 0 is -64 m/s (approaching), 255 is +64 m/s, `v = (red / 255 - 0.5) * 128`; steps of half a metre per second.
+/// V2X-R stores its velocities in the red channel too and leaves the mapping open.
+pub const RADAR_VELOCITY_SPAN_MPS: f64 = 64.0;
+
+/// Height of the radar above the ground, metres; it sits at the front bumper.
+const HEIGHT_M: f64 = 0.7;
+/// Share of the returns of vehicles and of standing things that is lost, and of the ground, which mirrors most away.
+const LOST: f64 = 0.15;
+const LOST_GROUND: f64 = 0.96;
+/// Deviations of range (metres), direction (radians) and radial velocity (metres per second).
+const RANGE_NOISE_M: f64 = 0.1;
+const DIRECTION_NOISE_RAD: f64 = 0.004;
+const VELOCITY_NOISE_MPS: f64 = 0.1;
+
+/// A radar that keeps its buffers from one frame to the next.
+#[derive(Debug, Clone)]
+pub struct Radar {
+    caster: Caster,
+    points: Vec<[f32; 4]>,
+}
+
+impl Default for Radar {
+    fn default() -> Self {
+        let degrees = |angle: f32| angle.to_radians();
+        let pattern = RayPattern {
+            first_azimuth_rad: degrees(60.0),
+            azimuth_step_rad: degrees(-1.0),
+            columns: 121,
+            first_elevation_rad: degrees(-15.0),
+            elevation_step_rad: degrees(1.5),
+            channels: 21,
+            range_m: 150.0,
+            rolling: false,
+        };
+        Self { caster: Caster::new(pattern), points: Vec::new() }
+    }
+}
+
+impl Radar {
+    /// The returns at the end of `vehicle`'s motion: x, y, z in metres and radial velocity in metres per second (growing
+    /// distance is positive), in the (right-handed) frame of a sensor at `reference_m` on the same vehicle.
+    ///
+    /// `half_length_m` is the vehicle's; `sweep_s` the time that the motions take.
+    #[allow(clippy::too_many_arguments, reason = "two sensors' frames and one scene; a struct would hide none of it")]
+    pub fn returns(
+        &mut self,
+        vehicle: &Sweep,
+        half_length_m: f64,
+        reference_m: [f64; 3],
+        sweep_s: f64,
+        ground: &dyn Surface,
+        bodies: &[Body<'_>],
+        seed: u64,
+    ) -> &[[f32; 4]] {
+        let mount_m = [half_length_m + 0.05, 0.0, HEIGHT_M];
+        let moved = vehicle.mounted(mount_m);
+        let own_velocity = (moved.end.position_m - moved.start.position_m) / sweep_s;
+        let sensor = Sweep::still(moved.end);
+        self.caster.cast(&sensor, ground, bodies);
+        self.points.clear();
+        let mut random = SplitMix64::new(seed);
+        let shift: Vector3<f64> = Vector3::from(mount_m) - Vector3::from(reference_m);
+        let (image, channels) = (self.caster.image(), self.caster.pattern().channels);
+        let rotation = sensor.end.rotation();
+        for (index, column) in self.caster.columns_at_end(&sensor).enumerate() {
+            for (channel, elevation) in self.caster.elevations().enumerate() {
+                let ray = index * channels + channel;
+                let hit = image.hits[ray];
+                if hit == MISS || random.chance(if hit == GROUND { LOST_GROUND } else { LOST }) {
+                    continue;
+                }
+                let velocity = match hit {
+                    GROUND => Vector3::zeros(),
+                    body => velocity_mps(&bodies[body as usize].motion, sweep_s),
+                };
+                let exact = Vector3::from(column.point_m(elevation, image.depths_m[ray])).cast::<f64>();
+                let direction = exact / exact.norm();
+                let radial = (rotation.transpose() * (velocity - own_velocity)).dot(&direction);
+                let mut noise = |deviation: f64| deviation * random.normal();
+                let aside = Vector3::new(noise(1.0), noise(1.0), noise(1.0)) * DIRECTION_NOISE_RAD * exact.norm();
+                let point = exact + direction * noise(RANGE_NOISE_M) + aside + shift;
+                let radial = radial + noise(VELOCITY_NOISE_MPS);
+                self.points.push([point.x as f32, point.y as f32, point.z as f32, radial as f32]);
+            }
+        }
+        &self.points
+    }
+}
+
+fn velocity_mps(motion: &Sweep, sweep_s: f64) -> Vector3<f64> {
+    (motion.end.position_m - motion.start.position_m) / sweep_s
+}
+
+/// A radial velocity as the red channel holds it, 0..1; see [`RADAR_VELOCITY_SPAN_MPS`].
+#[must_use]
+pub fn velocity_to_red(velocity_mps: f32) -> f32 {
+    (velocity_mps / (2.0 * RADAR_VELOCITY_SPAN_MPS as f32) + 0.5).clamp(0.0, 1.0)
+}
+
+/// The way back: metres per second from the red channel, 0..1.
+#[must_use]
+pub fn red_to_velocity(red: f32) -> f32 {
+    (red - 0.5) * 2.0 * RADAR_VELOCITY_SPAN_MPS as f32
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::generate::raycast::{BodyShape, Bounds, Part, Placement, Plane};
+
+    #[test]
+    fn velocities_are_relative_and_along_the_ray() {
+        let block = BodyShape::new(vec![Part::Box(Bounds::centered([0.0, 0.0, 1.0], [1.0, 1.0, 1.0]))], 0.5);
+        let drive =
+            |from: [f64; 3], to: [f64; 3]| Sweep { start: Placement::level(from, 0.0), end: Placement::level(to, 0.0) };
+        let own = drive([-0.5, 0.0, 0.0], [0.0, 0.0, 0.0]);
+        // One comes towards us at 5 m/s, one stands beside the road.
+        let bodies = [
+            Body { shape: &block, motion: drive([40.25, 0.0, 0.0], [40.0, 0.0, 0.0]) },
+            Body { shape: &block, motion: Sweep::still(Placement::level([20.0, 20.0, 0.0], 0.0)) },
+        ];
+        let mut radar = Radar::default();
+        let points = radar.returns(&own, 2.2, [-0.5, 0.0, 1.95], 0.05, &Plane(-500.0), &bodies, 1);
+        assert!(points.len() > 8);
+        for point in points {
+            let expected = if point[1].abs() < 3.0 { -15.0 } else { -10.0 * 17.75 / 17.75f64.hypot(20.0) };
+            assert!((f64::from(point[3]) - expected).abs() < 0.8, "{point:?} {expected}");
+        }
+        let ahead = points.iter().find(|point| point[1].abs() < 3.0).unwrap();
+        // The face at 39 m, seen from a LiDAR half a metre behind the vehicle's origin.
+        assert!((ahead[0] - 39.5).abs() < 1.0, "{ahead:?}");
+    }
+
+    #[test]
+    fn velocities_survive_the_red_channel() {
+        assert_eq!((velocity_to_red(-80.0), velocity_to_red(80.0)), (0.0, 1.0));
+        for velocity in [-30.0f32, 0.0, 12.3] {
+            let byte = (velocity_to_red(velocity) * 255.0).round();
+            assert!((red_to_velocity(byte / 255.0) - velocity).abs() < 0.26);
+        }
+    }
+}

@@ -1,0 +1,218 @@
+//! One scene as it happens, before any sensor looks at it: who is where at each stored frame, and who the agents are.
+
+use super::error::SynthError;
+use super::parking::{ParkedVehicle, park};
+use super::raycast::{Placement, Sweep};
+use super::traffic::{Rectangle, STEP_S, Traffic, TrafficOptions};
+use super::vehicle::{Vehicle, VehicleKind};
+use super::world::World;
+use support::random::{SplitMix64, derive_seed};
+
+/// Agents farther than this from the ego do not hear it, metres.
+pub(crate) const COMM_RANGE_M: f64 = 70.0;
+/// Companions are chosen within this, so that few frames fall out of range, metres.
+const COMPANION_RANGE_M: f64 = 62.0;
+/// Share of frames that a companion should be in range.
+const TOGETHER: f64 = 0.9;
+/// Scenes that are tried until one has enough companions.
+const ATTEMPTS: u64 = 24;
+/// A drive during which the ego stands for longer is driven anew, seconds.
+const LONGEST_STAND_S: f64 = 60.0;
+/// Traffic around the focus, metres: what a companion at the edge of the communication range can see, and a bit.
+const TRAFFIC_RADIUS_M: f64 = 210.0;
+/// Tick of the first stored frame, after the habit of OpenCDA's recordings.
+const FIRST_TICK: u64 = 60;
+
+/// What to record.
+#[derive(Debug, Clone)]
+pub(crate) struct SceneSpec {
+    pub(crate) name: String,
+    pub(crate) seed: u64,
+    pub(crate) agents: usize,
+    pub(crate) frames: usize,
+    pub(crate) steps_per_frame: usize,
+    pub(crate) explores: bool,
+}
+
+/// One scene.
+#[derive(Debug)]
+pub(crate) struct Recording {
+    /// Vehicles that move, by index.
+    pub(crate) vehicles: Vec<Vehicle>,
+    pub(crate) parked: Vec<ParkedVehicle>,
+    pub(crate) frames: Vec<RecordedFrame>,
+    /// The agents, ego first, as indices of vehicles.
+    pub(crate) agents: Vec<usize>,
+}
+
+/// All moving vehicles over the sweep that ends at one capture time.
+#[derive(Debug)]
+pub(crate) struct RecordedFrame {
+    /// Steps of the simulation until the end of the sweep.
+    pub(crate) tick: u64,
+    /// Present vehicles, in the order of their indices.
+    pub(crate) moving: Vec<Moving>,
+}
+
+/// One vehicle over one sweep.
+#[derive(Debug, Clone, Copy)]
+pub(crate) struct Moving {
+    pub(crate) vehicle: usize,
+    pub(crate) id: i64,
+    pub(crate) motion: Sweep,
+    pub(crate) speed_mps: f64,
+}
+
+impl RecordedFrame {
+    /// The motion of a vehicle that is present.
+    pub(crate) fn of(&self, vehicle: usize) -> Option<&Moving> {
+        let place = self.moving.binary_search_by_key(&vehicle, |moving| moving.vehicle).ok()?;
+        Some(&self.moving[place])
+    }
+}
+
+/// Lets a scene happen; tries others of the same seed when too few vehicles stay near the ego.
+pub(crate) fn record(world: &World<'_>, spec: &SceneSpec) -> Result<Recording, SynthError> {
+    let parked = park(world.town, &world.lane_index, derive_seed(spec.seed, &[1]));
+    let mut best: Option<(f64, Recording)> = None;
+    for attempt in 0..ATTEMPTS {
+        let (vehicles, frames) = simulate(world, spec, &parked, derive_seed(spec.seed, &[2, attempt]))?;
+        let mut random = SplitMix64::derived(spec.seed, &[3, attempt]);
+        let (together, agents) = choose_agents(&vehicles, &frames, spec.agents, &mut random);
+        // A drive that ends in a jam for good shows one place again and again.
+        let standing_s = longest_stand_s(&frames);
+        let quality = if standing_s > LONGEST_STAND_S { together.min(0.0) - standing_s } else { together };
+        if best.as_ref().is_none_or(|(least, _)| quality > *least) {
+            best = Some((quality, Recording { vehicles, parked: Vec::new(), frames, agents }));
+        }
+        if quality >= TOGETHER {
+            break;
+        }
+    }
+    let (_, recording) = best.ok_or_else(|| SynthError::NoRoad(world.town.name.clone()))?;
+    if recording.agents.len() < spec.agents {
+        return Err(SynthError::Alone {
+            scenario: spec.name.clone(),
+            found: recording.agents.len() - 1,
+            wanted: spec.agents - 1,
+            range_m: COMM_RANGE_M,
+        });
+    }
+    Ok(Recording { parked, ..recording })
+}
+
+fn simulate(
+    world: &World<'_>,
+    spec: &SceneSpec,
+    parked: &[ParkedVehicle],
+    seed: u64,
+) -> Result<(Vec<Vehicle>, Vec<RecordedFrame>), SynthError> {
+    let mut random = SplitMix64::new(seed);
+    let spawns = &world.roads.spawns;
+    if spawns.is_empty() {
+        return Err(SynthError::NoRoad(world.town.name.clone()));
+    }
+    let footprints: Vec<Rectangle> =
+        parked.iter().map(|parked| Rectangle::new(&parked.placement, &parked.vehicle.size_m)).collect();
+    let options = TrafficOptions {
+        vehicles_per_km: random.between(7.0, 21.0),
+        radius_m: TRAFFIC_RADIUS_M,
+        focus_explores: spec.explores,
+    };
+    let start = spawns[random.below(spawns.len())];
+    let mut traffic = Traffic::new(&world.roads, &footprints, options, start, derive_seed(seed, &[1]));
+    // Until gaps and speeds are those of traffic rather than of the lottery.
+    let settling_steps = (random.between(6.0, 12.0) / STEP_S) as usize;
+    (0..settling_steps).for_each(|_| traffic.step());
+    let mut frames = Vec::with_capacity(spec.frames);
+    for frame in 0..spec.frames {
+        let steps = if frame == 0 { 1 } else { spec.steps_per_frame };
+        (0..steps).for_each(|_| traffic.step());
+        let tick = FIRST_TICK + (frame * spec.steps_per_frame) as u64;
+        let present = traffic.cars.iter().enumerate().filter(|(_, car)| car.is_present);
+        let moving =
+            present.map(|(vehicle, car)| Moving { vehicle, id: car.id, motion: car.motion, speed_mps: car.speed_mps });
+        frames.push(RecordedFrame { tick, moving: moving.collect() });
+    }
+    Ok((traffic.cars.into_iter().map(|car| car.vehicle).collect(), frames))
+}
+
+/// Chooses the ego's companions at random among those that stay near it. Also says how well they do: the smallest share
+/// of frames that one of them is in range.
+fn choose_agents(
+    vehicles: &[Vehicle],
+    frames: &[RecordedFrame],
+    count: usize,
+    random: &mut SplitMix64,
+) -> (f64, Vec<usize>) {
+    let carries_a_lidar = |vehicle: usize| {
+        matches!(vehicles[vehicle].kind, VehicleKind::Sedan | VehicleKind::Hatchback | VehicleKind::Suv)
+    };
+    let mut together: Vec<(f64, usize)> = (1..vehicles.len())
+        .filter(|&vehicle| carries_a_lidar(vehicle))
+        .map(|vehicle| (share_together(frames, vehicle), vehicle))
+        .filter(|(share, _)| *share > 0.0)
+        .collect();
+    random.shuffle(&mut together);
+    // All that stay near are as good as each other, so that following, opposite and crossing agents all occur.
+    together.sort_by(|a, b| b.0.min(TOGETHER).total_cmp(&a.0.min(TOGETHER)));
+    together.truncate(count - 1);
+    let quality = if together.len() + 1 < count {
+        -((count - 1 - together.len()) as f64)
+    } else {
+        together.iter().map(|(share, _)| *share).fold(1.0, f64::min)
+    };
+    let mut agents: Vec<usize> = std::iter::once(0).chain(together.into_iter().map(|(_, vehicle)| vehicle)).collect();
+    agents.sort_unstable();
+    (quality, agents)
+}
+
+/// Share of the frames that a vehicle is near the ego; 0 for one that was exchanged for another on the way.
+fn share_together(frames: &[RecordedFrame], vehicle: usize) -> f64 {
+    let id = frames.first().and_then(|frame| frame.of(vehicle)).map(|moving| moving.id);
+    let mut near = 0;
+    for frame in frames {
+        let (Some(ego), Some(other)) = (frame.of(0), frame.of(vehicle)) else { return 0.0 };
+        if Some(other.id) != id {
+            return 0.0;
+        }
+        near += usize::from(distance_m(&ego.motion.end, &other.motion.end) < COMPANION_RANGE_M);
+    }
+    near as f64 / frames.len() as f64
+}
+
+/// How long the ego stands at one place, at most, seconds.
+fn longest_stand_s(frames: &[RecordedFrame]) -> f64 {
+    let mut since: Option<(&Moving, u64)> = None;
+    let mut longest = 0;
+    for (frame, own) in frames.iter().filter_map(|frame| Some((frame, frame.of(0)?))) {
+        match since {
+            Some((before, tick)) if distance_m(&before.motion.end, &own.motion.end) < 0.1 => {
+                longest = longest.max(frame.tick - tick);
+            }
+            _ => since = Some((own, frame.tick)),
+        }
+    }
+    longest as f64 * STEP_S
+}
+
+fn distance_m(a: &Placement, b: &Placement) -> f64 {
+    (a.position_m - b.position_m).xy().norm()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_stand_is_as_long_as_the_place_is_the_same() {
+        let frame = |tick: u64, x_m: f64| {
+            let motion = Sweep::still(Placement::level([x_m, 0.0, 0.0], 0.0));
+            RecordedFrame { tick, moving: vec![Moving { vehicle: 0, id: 1000, motion, speed_mps: 0.0 }] }
+        };
+        let places = [0.0, 5.0, 5.0, 5.05, 5.0, 9.0, 9.0];
+        let frames: Vec<_> = places.iter().zip(0..).map(|(&x_m, k)| frame(60 + 20 * k, x_m)).collect();
+        assert!((longest_stand_s(&frames) - 3.0).abs() < 1e-9);
+        assert_eq!(longest_stand_s(&[]), 0.0);
+    }
+}

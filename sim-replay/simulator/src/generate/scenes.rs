@@ -1,0 +1,237 @@
+//! From options to folders: scenes one after another, the frames of each on several threads.
+
+use std::collections::BTreeMap;
+use std::fs;
+use std::sync::Mutex;
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+use protocol::CavId;
+
+use super::data_protocol::protocol_yaml;
+use super::error::SynthError;
+use super::layout::{Moment, Omissions, SceneAgent, SceneHeader, SceneLayout, SceneWriter, Unfinished, make_folder};
+use super::options::{Subset, SynthOptions};
+use super::positioning::{Fix, Positioning};
+use super::recording::{RecordedFrame, Recording, SceneSpec, record};
+use super::sensing::Bench;
+use super::traffic::STEP_S;
+use super::world::World;
+use crate::map::{self, Finding, Town, TownSource};
+use dataset::frame::Frame;
+use support::random::derive_seed;
+
+/// Length of a step of the simulation, nanoseconds.
+const STEP_NANOS: u64 = (STEP_S * 1e9) as u64;
+
+/// What was generated.
+#[derive(Debug, Clone, PartialEq, Eq, Default)]
+pub struct Summary {
+    /// Layout of the files.
+    pub layout: SceneLayout,
+    /// Scenarios.
+    pub scenarios: usize,
+    /// Frames of all agents together.
+    pub agent_frames: usize,
+    /// LiDAR points of all agent-frames.
+    pub points: usize,
+    /// Annotated vehicles of all agent-frames.
+    pub annotations: usize,
+    /// What the layout has no place for, and how often it was left out.
+    pub omitted: BTreeMap<&'static str, u64>,
+    /// Parts of the map that were not built as its file gives them.
+    pub findings: Vec<Finding>,
+}
+
+impl Summary {
+    fn add(&mut self, other: &Self) {
+        self.scenarios += other.scenarios;
+        self.agent_frames += other.agent_frames;
+        self.points += other.points;
+        self.annotations += other.annotations;
+    }
+}
+
+/// Generates everything that `options` ask for. `progress` hears how many scenarios of how many are done, in thousandths
+/// of one, from any thread.
+///
+/// # Errors
+/// [`SynthError`] where an option makes no sense, the town cannot be built or a file cannot be written.
+pub fn generate(options: &SynthOptions, progress: &(dyn Fn(u64) + Sync)) -> Result<Summary, SynthError> {
+    options.validate()?;
+    check_folder(&options.out, options.force)?;
+    let unfinished = Unfinished::mark(&options.out)?;
+    let mut writer = options.layout.writer(&options.out);
+    let omitted = Omissions::default();
+    let mut total = Summary { layout: options.layout, ..Summary::default() };
+    for (place, source) in sources(options).iter().enumerate() {
+        let town = map::build(source, options.town_seed)?;
+        total.findings.extend(town.findings.iter().cloned());
+        let world = World::new(&town);
+        let places = sources(options).len();
+        for number in (place..options.scenarios()).step_by(places) {
+            let before = total.scenarios as u64 * 1000;
+            let spec = spec(options, &town, number);
+            let scene = Scene { options, world: &world, spec };
+            let progress = |thousandths| progress(before + thousandths);
+            total.add(&scene.write(writer.as_mut(), &omitted, &progress)?);
+        }
+    }
+    writer.finish()?;
+    unfinished.clear()?;
+    total.omitted = omitted.into_counts();
+    Ok(total)
+}
+
+/// The towns of the scenarios, which take them in turn.
+pub(super) fn sources(options: &SynthOptions) -> Vec<TownSource> {
+    match (&options.town, options.subset) {
+        (Some(town), _) => vec![town.clone()],
+        (None, Subset::Town1loc) => vec![TownSource::Town1],
+        (None, Subset::Town4loc) => vec![TownSource::Town4],
+        (None, Subset::V2vdet) => vec![TownSource::Town1, TownSource::Town4],
+    }
+}
+
+fn spec(options: &SynthOptions, town: &Town, number: usize) -> SceneSpec {
+    // Every scene has a seed of its own, whatever the number of scenes and the number of agents before it.
+    let seed = derive_seed(options.seed, &[options.subset as u64, number as u64]);
+    let (low, high) = (*options.agents.start(), *options.agents.end());
+    let is_detection = options.subset == Subset::V2vdet;
+    let choice = (derive_seed(seed, &[0]) % (high - low + 1) as u64) as usize;
+    SceneSpec {
+        name: format!("{}_{}_s{}_{number:04}", options.subset.name(), town.name.to_lowercase(), options.seed),
+        seed,
+        agents: if is_detection { low + choice } else { 1 },
+        frames: options.frames,
+        steps_per_frame: options.steps_per_frame(),
+        explores: !is_detection,
+    }
+}
+
+/// Makes the folder of the output, or refuses one that holds something.
+pub(super) fn check_folder(out: &std::path::Path, force: bool) -> Result<(), SynthError> {
+    make_folder(out)?;
+    let entries = fs::read_dir(out);
+    let mut entries = entries.map_err(|source| SynthError::Write { path: out.to_owned(), source })?;
+    if entries.next().is_some() && !force {
+        return Err(SynthError::NotEmpty(out.to_owned()));
+    }
+    Ok(())
+}
+
+/// One scenario to be written.
+pub(super) struct Scene<'a, 't> {
+    pub(super) options: &'a SynthOptions,
+    pub(super) world: &'a World<'t>,
+    pub(super) spec: SceneSpec,
+}
+
+/// One agent over the whole scene.
+pub(super) struct Agent {
+    /// Index among the recording's vehicles.
+    pub(super) vehicle: usize,
+    pub(super) id: i64,
+    pub(super) cav: CavId,
+    /// One for each moment.
+    pub(super) fixes: Vec<Fix>,
+}
+
+impl Scene<'_, '_> {
+    fn write(
+        &self,
+        writer: &mut dyn SceneWriter,
+        omitted: &Omissions,
+        progress: &(dyn Fn(u64) + Sync),
+    ) -> Result<Summary, SynthError> {
+        let recording = record(self.world, &self.spec)?;
+        let agents = self.agents(&recording)?;
+        writer.begin(&self.header(&recording, &agents))?;
+        let mut summary = self.write_moments(&recording, &agents, (writer, omitted), progress)?;
+        writer.end()?;
+        summary.scenarios = 1;
+        Ok(summary)
+    }
+
+    fn header(&self, recording: &Recording, agents: &[Agent]) -> SceneHeader {
+        SceneHeader {
+            name: self.spec.name.clone(),
+            agents: agents.iter().map(|agent| SceneAgent { id: agent.cav.clone(), is_roadside: false }).collect(),
+            capture_nanos: recording.frames.iter().map(capture_nanos).collect(),
+            tick_nanos: STEP_NANOS,
+            origin: protocol_yaml(self.options, &self.spec, self.world.town),
+        }
+    }
+
+    fn agents(&self, recording: &Recording) -> Result<Vec<Agent>, SynthError> {
+        let mut agents = Vec::new();
+        for &vehicle in &recording.agents {
+            // Agents are chosen among those that are present from the first frame to the last.
+            let id = recording.frames[0].of(vehicle).map_or(0, |moving| moving.id);
+            let mut positioning = Positioning::new(derive_seed(self.spec.seed, &[4, id as u64]));
+            let moving = recording.frames.iter().filter_map(|frame| frame.of(vehicle));
+            let fixes =
+                moving.map(|moving| positioning.fix(&moving.motion.end, moving.speed_mps, self.options.period_s));
+            let cav = CavId::new(&id.to_string()).map_err(|error| SynthError::Layout {
+                layout: self.options.layout.name(),
+                reason: error.to_string(),
+            })?;
+            agents.push(Agent { vehicle, id, cav, fixes: fixes.collect() });
+        }
+        Ok(agents)
+    }
+
+    /// Writes every moment. Each frame is made from the recording and a seed of its own, so the number of threads and their
+    /// order change nothing.
+    fn write_moments(
+        &self,
+        recording: &Recording,
+        agents: &[Agent],
+        (writer, omitted): (&dyn SceneWriter, &Omissions),
+        progress: &(dyn Fn(u64) + Sync),
+    ) -> Result<Summary, SynthError> {
+        let moments = recording.frames.len();
+        let (next, done) = (AtomicUsize::new(0), AtomicUsize::new(0));
+        let total = Mutex::new(Ok(Summary::default()));
+        let work = || {
+            let mut bench = Bench::default();
+            loop {
+                let index = next.fetch_add(1, Ordering::Relaxed);
+                if index >= moments {
+                    return;
+                }
+                let moment = self.moment(recording, agents, index, &mut bench);
+                let result = writer.write(&moment, omitted).map(|()| counts(&moment));
+                let mut total = total.lock().unwrap_or_else(std::sync::PoisonError::into_inner);
+                match (&mut *total, result) {
+                    (Ok(total), Ok(summary)) => total.add(&summary),
+                    (Ok(_), Err(error)) => *total = Err(error),
+                    (Err(_), _) => return,
+                }
+                drop(total);
+                progress(1000 * (done.fetch_add(1, Ordering::Relaxed) + 1) as u64 / moments as u64);
+            }
+        };
+        std::thread::scope(|scope| {
+            for _ in 1..self.options.threads.min(moments) {
+                scope.spawn(work);
+            }
+            work();
+        });
+        total.into_inner().unwrap_or_else(std::sync::PoisonError::into_inner)
+    }
+}
+
+/// When the sweeps of a moment end, on the clock of the scene.
+pub(super) fn capture_nanos(frame: &RecordedFrame) -> u64 {
+    frame.tick * STEP_NANOS
+}
+
+fn counts(moment: &Moment) -> Summary {
+    let sum = |count: fn(&Frame) -> usize| moment.frames.iter().map(|agent| count(&agent.frame)).sum();
+    Summary {
+        agent_frames: moment.frames.len(),
+        points: sum(|frame| frame.points.len()),
+        annotations: sum(|frame| frame.objects.len()),
+        ..Summary::default()
+    }
+}

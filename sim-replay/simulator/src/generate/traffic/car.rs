@@ -1,0 +1,60 @@
+//! One vehicle in traffic.
+
+use super::driver::{Driver, Obstacle};
+use super::lane_change::LaneMood;
+use super::path::Path;
+use super::rectangle::Rectangle;
+use super::roads::Roads;
+use crate::generate::raycast::{Placement, Sweep};
+use crate::generate::vehicle::Vehicle;
+use crate::map::LaneId;
+
+/// One vehicle in traffic.
+#[derive(Debug, Clone)]
+pub(crate) struct Car {
+    /// Changes when the vehicle leaves the scene and another one takes its place.
+    pub(crate) id: i64,
+    pub(crate) vehicle: Vehicle,
+    pub(crate) driver: Driver,
+    pub(crate) path: Path,
+    /// How far left of the lane's middle it drives, metres.
+    pub(crate) aside_m: f64,
+    pub(crate) speed_mps: f64,
+    /// Who was ahead in the last step.
+    pub(crate) leader: Option<Obstacle>,
+    /// Whether it would rather be on another lane.
+    pub(crate) lane_mood: LaneMood,
+    /// The motion of the last step.
+    pub(crate) motion: Sweep,
+    /// Whether it is part of the scene.
+    pub(crate) is_present: bool,
+    /// How long it has been standing, seconds.
+    pub(crate) standing_s: f64,
+    /// Lanes of junctions that it may use.
+    pub(crate) held: Vec<LaneId>,
+}
+
+impl Car {
+    pub(crate) fn half_length_m(&self) -> f64 {
+        0.5 * self.vehicle.size_m[0]
+    }
+
+    pub(crate) fn wheelbase_m(&self) -> f64 {
+        0.6 * self.vehicle.size_m[0]
+    }
+
+    /// Where it stands after `drive_m` more metres of its way.
+    pub(crate) fn placement_after(&self, roads: &Roads<'_>, drive_m: f64) -> Placement {
+        self.path.placement(roads.graph, drive_m, self.wheelbase_m(), self.aside_m)
+    }
+
+    /// Its footprint now.
+    pub(crate) fn rectangle(&self) -> Rectangle {
+        Rectangle::new(&self.motion.end, &self.vehicle.size_m)
+    }
+
+    /// Its place in the plane now, metres.
+    pub(crate) fn point_m(&self) -> [f64; 2] {
+        self.motion.end.position_m.xy().into()
+    }
+}

@@ -1,0 +1,121 @@
+//! How a driver chooses speed: the Intelligent Driver Model (Treiber, Hennecke and Helbing 2000) and bends.
+
+use crate::map::Lane;
+use support::random::SplitMix64;
+
+/// Sideways acceleration that drivers accept in bends, metres per second squared.
+const SIDEWAYS_MPS2: f64 = 2.2;
+/// Slower than this nobody takes a bend, metres per second.
+const CRAWL_MPS: f64 = 2.5;
+/// Hardest braking, metres per second squared.
+const EMERGENCY_MPS2: f64 = 8.0;
+
+/// What tells one driver from another.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Driver {
+    /// Share of the speed limit driven on a free road.
+    pub(crate) pace: f64,
+    /// Time gap to the vehicle ahead, seconds.
+    headway_s: f64,
+    /// Gap when standing, metres.
+    jam_gap_m: f64,
+    /// Acceleration from standing, metres per second squared.
+    acceleration_mps2: f64,
+    /// Braking that is felt as comfortable, metres per second squared.
+    pub(crate) comfort_mps2: f64,
+}
+
+/// Something ahead that must not be reached.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct Obstacle {
+    /// Free distance from bumper to bumper (or line), metres.
+    pub(crate) gap_m: f64,
+    /// How fast it moves away, metres per second.
+    pub(crate) speed_mps: f64,
+}
+
+impl Driver {
+    /// Somebody.
+    pub(crate) fn random(random: &mut SplitMix64) -> Self {
+        Self {
+            pace: random.between(0.75, 1.1),
+            headway_s: random.between(0.9, 1.7),
+            jam_gap_m: random.between(1.4, 2.8),
+            acceleration_mps2: random.between(1.3, 2.3),
+            comfort_mps2: random.between(2.0, 2.8),
+        }
+    }
+
+    /// Acceleration at `speed_mps` when `wanted_mps` is wanted, metres per second squared.
+    pub(crate) fn acceleration_mps2(&self, speed_mps: f64, wanted_mps: f64, obstacles: &[Obstacle]) -> f64 {
+        let wanted = wanted_mps.max(0.1);
+        let free = if speed_mps <= wanted {
+            self.acceleration_mps2 * (1.0 - (speed_mps / wanted).powi(4))
+        } else {
+            // The model's own term brakes far harder than anybody before a mere bend.
+            -self.comfort_mps2 * (1.0 - wanted / speed_mps).max(0.0).sqrt() * 1.5
+        };
+        let most = obstacles.iter().map(|obstacle| self.interaction(speed_mps, obstacle)).fold(0.0, f64::max);
+        (free - self.acceleration_mps2 * most).max(-EMERGENCY_MPS2)
+    }
+
+    fn interaction(&self, speed_mps: f64, obstacle: &Obstacle) -> f64 {
+        let closing = speed_mps - obstacle.speed_mps;
+        let braking = 2.0 * (self.acceleration_mps2 * self.comfort_mps2).sqrt();
+        let wanted_gap = self.jam_gap_m + (speed_mps * self.headway_s + speed_mps * closing / braking).max(0.0);
+        (wanted_gap / obstacle.gap_m.max(0.1)).powi(2)
+    }
+}
+
+/// The fastest speed at each point of a lane's centre line: its limit, or less where it bends, metres per second.
+pub(crate) fn bend_speeds_mps(lane: &Lane) -> Vec<f32> {
+    // Over 3 m to either side, since the corner between two points of the line is no bend by itself.
+    const REACH: usize = 3;
+    let points = &lane.centerline;
+    (0..points.len())
+        .map(|index| {
+            let at = |index: usize| [points[index][0], points[index][1]];
+            let (a, b, c) = (at(index.saturating_sub(REACH)), at(index), at((index + REACH).min(points.len() - 1)));
+            let side = |p: [f64; 2], q: [f64; 2]| (q[0] - p[0]).hypot(q[1] - p[1]);
+            let doubled_area = ((b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0])).abs();
+            let product = side(a, b) * side(b, c) * side(a, c);
+            // Curvature of the circle through the three points.
+            let curvature = if product > 1e-6 { 2.0 * doubled_area / product } else { 0.0 };
+            let bend = (SIDEWAYS_MPS2 / curvature.max(1e-6)).sqrt().max(CRAWL_MPS);
+            lane.speed_limit_mps.min(bend) as f32
+        })
+        .collect()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::map::LaneId;
+
+    #[test]
+    fn a_driver_reaches_the_wanted_speed_and_keeps_a_gap() {
+        let driver = Driver::random(&mut SplitMix64::new(1));
+        let (mut speed, mut position) = (0.0, 0.0);
+        for _ in 0..4000 {
+            speed += 0.05 * driver.acceleration_mps2(speed, 12.0, &[]);
+        }
+        assert!((speed - 12.0).abs() < 0.3, "{speed}");
+        for _ in 0..4000 {
+            let obstacle = Obstacle { gap_m: 400.0 - position, speed_mps: 0.0 };
+            speed = f64::max(0.0, speed + 0.05 * driver.acceleration_mps2(speed, 12.0, &[obstacle]));
+            position += 0.05 * speed;
+        }
+        assert!(speed < 0.05 && position < 399.0 && position > 395.0, "{speed} {position}");
+    }
+
+    #[test]
+    fn bends_are_slow_and_straights_are_not() {
+        let circle = (0..60).map(|i| [20.0 * (f64::from(i) / 20.0).cos(), 20.0 * (f64::from(i) / 20.0).sin(), 0.0]);
+        let bend = Lane::new(LaneId(0), circle.collect(), 3.5, 20.0);
+        let speeds = bend_speeds_mps(&bend);
+        let expected = (SIDEWAYS_MPS2 * 20.0).sqrt() as f32;
+        assert!(speeds[5..55].iter().all(|speed| (speed - expected).abs() < 0.1), "{speeds:?}");
+        let straight = Lane::new(LaneId(0), (0..60).map(|i| [f64::from(i), 0.0, 0.0]).collect(), 3.5, 20.0);
+        assert!(bend_speeds_mps(&straight).iter().all(|&speed| speed == 20.0));
+    }
+}

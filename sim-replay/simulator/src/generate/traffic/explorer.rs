@@ -1,0 +1,126 @@
+//! A focus that wants to know the whole town: always towards the nearest road where it has been least often.
+
+use std::cmp::Reverse;
+use std::collections::BinaryHeap;
+
+use super::lane_change::Side;
+use super::roads::Roads;
+use crate::map::LaneId;
+
+/// What a change of lanes counts for on the way somewhere, metres.
+const CHANGE_M: u64 = 100;
+/// Shorter lanes are no roads to look for, metres.
+const SHORTEST_M: f64 = 5.0;
+
+/// How often each lane was chosen, and how far the least known ones are from everywhere.
+#[derive(Debug)]
+pub(super) struct Explorer {
+    /// Lanes from which one comes onto a lane, each with what that costs, metres.
+    onto: Vec<Vec<(LaneId, u64)>>,
+    /// Whether a lane is worth looking for.
+    is_road: Vec<bool>,
+    visits: Vec<u32>,
+    /// From the beginning of each lane to the nearest least known one, metres; none where none can be reached.
+    unknown_m: Vec<Option<u64>>,
+}
+
+impl Explorer {
+    /// Nothing is known but the lane it starts on.
+    pub(super) fn new(roads: &Roads<'_>, start: LaneId) -> Self {
+        let lanes = &roads.graph.lanes;
+        let mut onto = vec![Vec::new(); lanes.len()];
+        for lane in lanes {
+            let length_m = lane.length_m.ceil() as u64;
+            for next in roads.onward(lane.id) {
+                onto[next.0 as usize].push((lane.id, length_m));
+            }
+            for beside in [Side::Left, Side::Right].into_iter().filter_map(|side| side.of(lane)) {
+                onto[beside.0 as usize].push((lane.id, CHANGE_M));
+            }
+        }
+        let is_road =
+            lanes.iter().map(|lane| !lane.in_junction && lane.length_m >= SHORTEST_M && roads.is_endless(lane.id));
+        let mut explorer =
+            Self { onto, is_road: is_road.collect(), visits: vec![0; lanes.len()], unknown_m: Vec::new() };
+        explorer.choose(start);
+        explorer
+    }
+
+    /// A lane was chosen.
+    pub(super) fn choose(&mut self, lane: LaneId) {
+        self.visits[lane.0 as usize] += 1;
+        self.unknown_m.clear();
+    }
+
+    /// A lane that was chosen will not be driven.
+    pub(super) fn give_up(&mut self, lane: LaneId) {
+        let visits = &mut self.visits[lane.0 as usize];
+        *visits = visits.saturating_sub(1);
+        self.unknown_m.clear();
+    }
+
+    /// Keeps the lanes that lead to the unknown soonest.
+    pub(super) fn keep_best(&mut self, lanes: &mut Vec<LaneId>) {
+        let distances: Vec<Option<u64>> = lanes.iter().map(|&lane| self.unknown_m(lane)).collect();
+        let Some(least) = distances.iter().flatten().min() else { return };
+        let mut distances = distances.iter();
+        lanes.retain(|_| distances.next().is_some_and(|distance| distance.as_ref() == Some(least)));
+    }
+
+    /// Whether the lane `beside` is worth the change from `own`.
+    pub(super) fn prefers(&mut self, beside: LaneId, own: LaneId) -> bool {
+        match (self.unknown_m(beside), self.unknown_m(own)) {
+            (Some(beside), Some(own)) => beside + CHANGE_M <= own,
+            (beside, own) => beside.is_some() && own.is_none(),
+        }
+    }
+
+    fn unknown_m(&mut self, lane: LaneId) -> Option<u64> {
+        if self.unknown_m.is_empty() {
+            self.unknown_m = self.look_around();
+        }
+        self.unknown_m[lane.0 as usize]
+    }
+
+    /// Dijkstra's algorithm, backwards from all lanes that are least known.
+    fn look_around(&self) -> Vec<Option<u64>> {
+        let roads = || (0..self.visits.len()).filter(|&lane| self.is_road[lane]);
+        let fewest = roads().map(|lane| self.visits[lane]).min();
+        let mut unknown_m = vec![None; self.visits.len()];
+        let mut open: BinaryHeap<_> =
+            roads().filter(|&lane| Some(self.visits[lane]) == fewest).map(|lane| Reverse((0, lane))).collect();
+        while let Some(Reverse((distance_m, lane))) = open.pop() {
+            if unknown_m[lane].is_some() {
+                continue;
+            }
+            unknown_m[lane] = Some(distance_m);
+            open.extend(self.onto[lane].iter().map(|&(from, cost_m)| Reverse((distance_m + cost_m, from.0 as usize))));
+        }
+        unknown_m
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::map::{TownSource, build};
+
+    #[test]
+    fn a_town_is_known_after_a_tour() {
+        let town = build(&TownSource::Town4, 0).unwrap();
+        let roads = Roads::new(&town.lanes);
+        let mut lane = roads.spawns[0].lane;
+        let mut explorer = Explorer::new(&roads, lane);
+        let count = explorer.is_road.iter().filter(|&&is_road| is_road).count();
+        for _ in 0..4 * count {
+            let mut onward = roads.onward(lane);
+            explorer.keep_best(&mut onward);
+            // Whoever drives changes lanes where it pays.
+            let beside = [Side::Left, Side::Right].into_iter().filter_map(|side| side.of(town.lanes.lane(lane)));
+            lane = beside.into_iter().find(|&beside| explorer.prefers(beside, lane)).unwrap_or(onward[0]);
+            explorer.choose(lane);
+        }
+        let known = (0..explorer.visits.len()).filter(|&lane| explorer.is_road[lane] && explorer.visits[lane] > 0);
+        assert!(known.count() * 100 >= count * 98, "{count} roads");
+    }
+}

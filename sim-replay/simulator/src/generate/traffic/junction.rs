@@ -1,0 +1,52 @@
+//! Who may enter a junction: a lane is taken by those who use it, and closed while a lane that conflicts is taken.
+
+use super::car::Car;
+use super::roads::Roads;
+use crate::map::LaneId;
+
+/// Which vehicles hold which lanes of junctions.
+#[derive(Debug, Default)]
+pub(crate) struct RightOfWay {
+    holders: Vec<Vec<u32>>,
+}
+
+impl RightOfWay {
+    pub(crate) fn new(lanes: usize) -> Self {
+        Self { holders: vec![Vec::new(); lanes] }
+    }
+
+    /// Takes a lane for a vehicle, unless another one holds a lane that conflicts with it.
+    pub(crate) fn take(&mut self, index: u32, car: &mut Car, lane: LaneId, roads: &Roads<'_>) -> bool {
+        if car.held.contains(&lane) {
+            return true;
+        }
+        let taken = |other: &LaneId| self.holders[other.0 as usize].iter().any(|&holder| holder != index);
+        if roads.graph.lane(lane).conflicts.iter().any(taken) {
+            return false;
+        }
+        self.holders[lane.0 as usize].push(index);
+        car.held.push(lane);
+        true
+    }
+
+    /// Gives back the lanes that a vehicle has left with its tail.
+    pub(crate) fn release_behind(&mut self, index: u32, car: &mut Car, roads: &Roads<'_>) {
+        if car.held.is_empty() {
+            return;
+        }
+        let needed: Vec<LaneId> = if car.is_present {
+            let under = car.path.lanes_under(roads.graph, car.half_length_m() + 0.5);
+            under.chain(car.path.ahead(roads.graph).map(|(lane, _)| lane)).collect()
+        } else {
+            Vec::new()
+        };
+        let holders = &mut self.holders;
+        car.held.retain(|lane| {
+            let is_needed = needed.contains(lane);
+            if !is_needed {
+                holders[lane.0 as usize].retain(|&holder| holder != index);
+            }
+            is_needed
+        });
+    }
+}

@@ -1,0 +1,317 @@
+//! Who changes lanes, and when: the wish, the gain and the safety rule of MOBIL (Kesting, Treiber and Helbing 2007).
+
+use super::car::Car;
+use super::driver::Obstacle;
+use super::path::{Beside, Path};
+use super::rectangle::Rectangle;
+use super::roads::Roads;
+use super::{STEP_S, Traffic};
+use crate::map::{Lane, LaneId};
+use support::random::SplitMix64;
+
+/// Duration of a change at an even speed, seconds.
+const CHANGE_S: f64 = 4.5;
+/// Shortest way in which a change is driven, metres.
+const CHANGE_LEAST_M: f64 = 22.0;
+/// Slower than this nobody begins a change, metres per second.
+const LEAST_SPEED_MPS: f64 = 2.5;
+/// Who has been behind somebody slower for this long wants to get past, seconds.
+const PATIENCE_S: f64 = 3.0;
+/// After a change the patience begins this much below zero, seconds.
+const REST_S: f64 = 8.0;
+/// Somebody slower: less than this share of the speed that the driver would like.
+const SLOW_SHARE: f64 = 0.8;
+/// A change must win at least this much acceleration, metres per second squared.
+const GAIN_MPS2: f64 = 0.3;
+/// Nobody is made to brake harder than this by a change, metres per second squared.
+const SAFE_MPS2: f64 = 2.0;
+/// Least gap before and behind on the new lane, metres.
+const SAFE_GAP_M: f64 = 2.5;
+/// Followers on the new lane are looked for this far behind, metres.
+const BEHIND_M: f64 = 60.0;
+/// How long a wish without need is kept, seconds.
+const WHIM_S: f64 = 8.0;
+/// An exploring focus changes this often where nothing speaks for either lane.
+const WHIM_SHARE: f64 = 0.25;
+/// Neighbours whose lengths differ by more than this share lie in a bend too tight for a change.
+const LENGTH_SHARE: f64 = 0.04;
+/// Narrower lanes are not changed to, metres.
+const LEAST_WIDTH_M: f64 = 2.6;
+
+/// A side, seen in driving direction.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) enum Side {
+    Left,
+    Right,
+}
+
+impl Side {
+    pub(super) fn of(self, lane: &Lane) -> Option<LaneId> {
+        match self {
+            Self::Left => lane.left,
+            Self::Right => lane.right,
+        }
+    }
+
+    fn opposite(self) -> Self {
+        match self {
+            Self::Left => Self::Right,
+            Self::Right => Self::Left,
+        }
+    }
+}
+
+/// What makes a driver think of another lane.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub(crate) struct LaneMood {
+    /// How long there has been somebody slower ahead, seconds.
+    held_up_s: f64,
+    /// The side wanted without need.
+    whim: Option<Side>,
+    /// Time until the whim passes, or until there may be the next one, seconds.
+    whim_turns_in_s: f64,
+}
+
+impl LaneMood {
+    pub(crate) fn random(random: &mut SplitMix64) -> Self {
+        Self { held_up_s: 0.0, whim: None, whim_turns_in_s: random.between(0.0, 50.0) }
+    }
+}
+
+/// Why a driver changes.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+enum Reason {
+    /// The lane ends and the other one goes on.
+    LaneEnds,
+    /// Somebody slower is ahead.
+    HeldUp,
+    /// Habit, or curiosity.
+    Whim,
+}
+
+impl Traffic<'_> {
+    /// Begins the changes that are wanted, possible and safe. Needs the list of occupants, and keeps it true.
+    pub(super) fn change_lanes(&mut self, near: &mut Vec<u32>) {
+        for index in 0..self.cars.len() {
+            if !self.cars[index].is_present {
+                continue;
+            }
+            self.turn_mood(index);
+            if let Some(path) = self.wanted_change(index, near) {
+                self.begin_change(index, path);
+            }
+        }
+    }
+
+    fn turn_mood(&mut self, index: usize) {
+        let car = &mut self.cars[index];
+        let is_held_up = is_held_up(car, self.roads);
+        let mood = &mut car.lane_mood;
+        // The rest after a change passes in any case.
+        let is_rising = is_held_up || mood.held_up_s < 0.0;
+        mood.held_up_s = if is_rising { mood.held_up_s + STEP_S } else { (mood.held_up_s - STEP_S).max(0.0) };
+        mood.whim_turns_in_s -= STEP_S;
+        if mood.whim_turns_in_s > 0.0 {
+            return;
+        }
+        // A whim passes; after the pause there may be another one.
+        let whim = if mood.whim.is_some() { None } else { self.whim(index) };
+        let turns_in_s = if whim.is_some() { WHIM_S } else { self.time_to_whim_s(index) };
+        let mood = &mut self.cars[index].lane_mood;
+        (mood.whim, mood.whim_turns_in_s) = (whim, turns_in_s);
+    }
+
+    fn time_to_whim_s(&mut self, index: usize) -> f64 {
+        let [low, high] = if self.explores(index) { [4.0, 16.0] } else { [20.0, 80.0] };
+        self.random.between(low, high)
+    }
+
+    fn explores(&self, index: usize) -> bool {
+        index == 0 && self.options.focus_explores
+    }
+
+    /// A side to change to without need; for an exploring focus, where that leads to the unknown.
+    fn whim(&mut self, index: usize) -> Option<Side> {
+        let own = self.cars[index].path.lane();
+        let sides = [Side::Left, Side::Right];
+        let lane = self.roads.graph.lane(own);
+        let sides = sides.into_iter().filter_map(|side| Some((side, side.of(lane)?)));
+        let mut sides: Vec<(Side, LaneId)> = sides.collect();
+        if let Some(explorer) = self.explorer.as_mut().filter(|_| index == 0) {
+            let wanted = |&(_, lane): &(Side, LaneId)| explorer.prefers(lane, own);
+            let better: Vec<_> = sides.iter().copied().filter(wanted).collect();
+            if better.is_empty() && !self.random.chance(WHIM_SHARE) {
+                return None;
+            }
+            if !better.is_empty() {
+                sides = better;
+            }
+        }
+        Some(sides.get(self.random.below(sides.len()))?.0)
+    }
+
+    /// The way after a change that may begin now.
+    fn wanted_change(&self, index: usize, near: &mut Vec<u32>) -> Option<Path> {
+        let car = &self.cars[index];
+        if car.path.is_changing() || car.speed_mps < LEAST_SPEED_MPS {
+            return None;
+        }
+        [Side::Left, Side::Right].into_iter().find_map(|side| {
+            let reason = self.reason(car, side)?;
+            let path = path_beside(car, side, self.roads)?;
+            let gains = reason != Reason::HeldUp || self.gain_mps2(index, &path) > GAIN_MPS2;
+            (gains && self.is_safe(index, &path, near)).then_some(path)
+        })
+    }
+
+    fn reason(&self, car: &Car, side: Side) -> Option<Reason> {
+        let own = car.path.lane();
+        let other = side.of(self.roads.graph.lane(own))?;
+        if !self.roads.is_endless(own) && self.roads.is_endless(other) {
+            return Some(Reason::LaneEnds);
+        }
+        if car.lane_mood.held_up_s > PATIENCE_S {
+            return Some(Reason::HeldUp);
+        }
+        (car.lane_mood.whim == Some(side)).then_some(Reason::Whim)
+    }
+
+    /// How much harder a driver could accelerate on another way, metres per second squared.
+    fn gain_mps2(&self, index: usize, path: &Path) -> f64 {
+        let car = &self.cars[index];
+        let wanted_mps = free_speed_mps(car, self.roads);
+        let with =
+            |leader: Option<Obstacle>| car.driver.acceleration_mps2(car.speed_mps, wanted_mps, leader.as_slice());
+        with(self.leader_on(index, path)) - with(car.leader)
+    }
+
+    /// Whether a change disturbs nobody: the driver's own way past who is ahead now, and the gaps on the new lane.
+    fn is_safe(&self, index: usize, path: &Path, near: &mut Vec<u32>) -> bool {
+        let car = &self.cars[index];
+        let is_clear_of = |leader: Obstacle| {
+            // Halfway the vehicle is past the one ahead, which moves on in the meantime.
+            let closing_share = (1.0 - leader.speed_mps / car.speed_mps).max(0.0);
+            leader.gap_m > 0.55 * change_m(car) * closing_share + SAFE_GAP_M
+        };
+        if !car.leader.is_none_or(is_clear_of) {
+            return false;
+        }
+        let brakes_softly = |car: &Car, ahead: Obstacle| {
+            let braking = -car.driver.acceleration_mps2(car.speed_mps, car.speed_mps, &[ahead]);
+            ahead.gap_m > SAFE_GAP_M && braking < SAFE_MPS2
+        };
+        if !self.leader_on(index, path).is_none_or(|leader| brakes_softly(car, leader)) {
+            return false;
+        }
+        let follower = self.follower_on(index, path.lane(), path.s_m());
+        let is_let_in = |(follower, apart_m): (usize, f64)| {
+            let follower = &self.cars[follower];
+            let gap_m = apart_m - car.half_length_m() - follower.half_length_m();
+            brakes_softly(follower, Obstacle { gap_m, speed_mps: car.speed_mps })
+        };
+        if !follower.is_none_or(is_let_in) {
+            return false;
+        }
+        // Those that are on no list of the lane: who crosses it, or has all but left it.
+        let beside =
+            Path::new(path.lane(), path.s_m()).placement(self.roads.graph, 0.0, car.wheelbase_m(), car.aside_m);
+        let mut room = Rectangle::new(&beside, &car.vehicle.size_m).grown(0.3);
+        room.half_m[0] += SAFE_GAP_M;
+        self.is_free(index, &room, near)
+    }
+
+    /// Who comes next behind a place on a lane, and how far from middle to middle, metres.
+    fn follower_on(&self, index: usize, lane: LaneId, s_m: f64) -> Option<(usize, f64)> {
+        let mut nearest: Option<(usize, f64)> = None;
+        // Lanes yet to be looked at, and how far behind the place their ends are.
+        let mut open = vec![(lane, s_m - self.roads.graph.lane(lane).length_m)];
+        while let Some((lane, end_m)) = open.pop() {
+            let start_m = end_m + self.roads.graph.lane(lane).length_m;
+            let behind = self.occupants[lane.0 as usize]
+                .iter()
+                .map(|&(other_m, other)| (other as usize, start_m - other_m))
+                .filter(|&(other, apart_m)| other != index && apart_m >= 0.0)
+                .min_by(|a, b| a.1.total_cmp(&b.1));
+            match behind {
+                Some(found) if nearest.is_none_or(|(_, least_m)| found.1 < least_m) => nearest = Some(found),
+                Some(_) => {}
+                None if start_m < BEHIND_M => {
+                    open.extend(self.roads.graph.lane(lane).predecessors.iter().map(|&before| (before, start_m)));
+                }
+                None => {}
+            }
+        }
+        nearest
+    }
+
+    fn begin_change(&mut self, index: usize, path: Path) {
+        let pause_s = self.time_to_whim_s(index);
+        let car = &mut self.cars[index];
+        car.lane_mood = LaneMood { held_up_s: -REST_S, whim: None, whim_turns_in_s: pause_s };
+        if let Some(explorer) = self.explorer.as_mut().filter(|_| index == 0) {
+            // Lanes that were decided but will not be driven do not count.
+            car.path.ahead(self.roads.graph).skip(1).for_each(|(lane, _)| explorer.give_up(lane));
+            path.ahead(self.roads.graph).for_each(|(lane, _)| explorer.choose(lane));
+        }
+        let entry = (path.s_m(), index as u32);
+        let occupants = &mut self.occupants[path.lane().0 as usize];
+        let place = occupants.partition_point(|other| *other < entry);
+        occupants.insert(place, entry);
+        car.path = path;
+    }
+}
+
+/// The speed that a driver would like here without anybody ahead, metres per second.
+fn free_speed_mps(car: &Car, roads: &Roads<'_>) -> f64 {
+    car.driver.pace * roads.speed_mps(car.path.lane(), car.path.s_m())
+}
+
+fn is_held_up(car: &Car, roads: &Roads<'_>) -> bool {
+    let slow_mps = SLOW_SHARE * free_speed_mps(car, roads);
+    let is_slow = |leader: &Obstacle| leader.speed_mps < slow_mps && leader.gap_m < 8.0 + 2.5 * car.speed_mps;
+    car.leader.as_ref().is_some_and(is_slow) && car.speed_mps < slow_mps
+}
+
+/// Length of a change, metres.
+fn change_m(car: &Car) -> f64 {
+    (CHANGE_S * car.speed_mps).max(CHANGE_LEAST_M)
+}
+
+/// The way that goes on beside the present one, when the two lie side by side for as long as the change takes.
+fn path_beside(car: &Car, side: Side, roads: &Roads<'_>) -> Option<Path> {
+    let graph = roads.graph;
+    let is_in_junction = |lane: LaneId| graph.lane(lane).in_junction;
+    if car.path.lanes_under(graph, car.half_length_m()).any(is_in_junction) {
+        return None;
+    }
+    let mut left = car.path.lane();
+    let mut lane = side.of(graph.lane(left))?;
+    let s_m = car.path.s_m() / graph.lane(left).length_m * graph.lane(lane).length_m;
+    let needed_m = change_m(car) + 0.5 * car.wheelbase_m() + car.half_length_m();
+    let (mut beside, mut reach_m) = (Vec::new(), -s_m);
+    loop {
+        if !lies_beside(lane, left, roads) {
+            return None;
+        }
+        beside.push(Beside { lane, left });
+        reach_m += graph.lane(lane).length_m;
+        if reach_m >= needed_m {
+            let mut path = car.path.clone();
+            path.change(beside, s_m, change_m(car), car.wheelbase_m());
+            return Some(path);
+        }
+        (lane, left) = roads.onward(lane).into_iter().find_map(|next| {
+            let next_left = side.opposite().of(graph.lane(next))?;
+            graph.lane(left).successors.contains(&next_left).then_some((next, next_left))
+        })?;
+    }
+}
+
+/// Whether a vehicle may drive from one neighbour to the other anywhere along them.
+fn lies_beside(lane: LaneId, left: LaneId, roads: &Roads<'_>) -> bool {
+    let (to, from) = (roads.graph.lane(lane), roads.graph.lane(left));
+    let leads_on = roads.is_endless(lane) || !roads.is_endless(left);
+    let is_even = (to.length_m / from.length_m - 1.0).abs() < LENGTH_SHARE;
+    let is_wide = to.widths_m.iter().all(|&width_m| width_m > LEAST_WIDTH_M);
+    !to.in_junction && !from.in_junction && leads_on && is_even && is_wide
+}

@@ -1,0 +1,167 @@
+//! What a driver sees on the way ahead, and how hard that makes them brake.
+
+use super::Traffic;
+use super::driver::Obstacle;
+use super::path::Path;
+use crate::generate::raycast::wrapped;
+use crate::map::LaneId;
+
+/// Vehicles that stand longer than this stop waiting for those beside them, seconds.
+const PATIENCE_S: f64 = 6.0;
+/// Free room beside the swept way in which nobody may be, metres.
+const SIDE_ROOM_M: f64 = 0.25;
+/// Distance between the looks along the swept way, metres.
+const SWEEP_STEP_M: f64 = 1.5;
+/// Where a vehicle stops before a junction, metres before its first lane.
+const STOP_LINE_M: f64 = 0.8;
+/// After the junction there must be this much more than the vehicle's length, metres.
+const EXIT_ROOM_M: f64 = 3.0;
+/// Who leaves the room behind a junction faster than this need not have left it, metres per second.
+const MOVING_ON_MPS: f64 = 3.0;
+
+impl Traffic<'_> {
+    /// How a driver accelerates now, metres per second squared.
+    pub(super) fn acceleration_mps2(&mut self, index: usize, near: &mut Vec<u32>) -> f64 {
+        let mut obstacles = Vec::with_capacity(4);
+        let leader = self.leader_on(index, &self.cars[index].path);
+        self.cars[index].leader = leader;
+        obstacles.extend(leader);
+        obstacles.extend(self.stop_line(index));
+        obstacles.extend(self.on_the_swept_way(index, near));
+        obstacles.extend(self.end_of_the_way(index));
+        let wanted = self.wanted_speed_mps(index);
+        let car = &self.cars[index];
+        car.driver.acceleration_mps2(car.speed_mps, wanted, &obstacles)
+    }
+
+    /// The speed that limits and bends ahead allow, metres per second.
+    fn wanted_speed_mps(&self, index: usize) -> f64 {
+        let car = &self.cars[index];
+        let braking = 0.7 * car.driver.comfort_mps2;
+        let horizon_m = car.speed_mps * car.speed_mps / (2.0 * braking) + 6.0;
+        let mut wanted = f64::MAX;
+        for (lane, start_m) in car.path.ahead(self.roads.graph) {
+            if start_m > horizon_m {
+                break;
+            }
+            let end_m = (start_m + self.roads.graph.lane(lane).length_m).min(horizon_m);
+            let mut at_m = start_m.max(0.0);
+            while at_m <= end_m {
+                let bend = car.driver.pace * self.roads.speed_mps(lane, at_m - start_m);
+                wanted = wanted.min((bend * bend + 2.0 * braking * at_m).sqrt());
+                at_m += 2.0;
+            }
+        }
+        wanted
+    }
+
+    /// The next vehicle on the lanes of a way from its present place on.
+    pub(super) fn leader_on(&self, index: usize, path: &Path) -> Option<Obstacle> {
+        let car = &self.cars[index];
+        let horizon_m = 30.0 + 3.0 * car.speed_mps;
+        for (lane, start_m) in path.ahead(self.roads.graph) {
+            if start_m > horizon_m {
+                return None;
+            }
+            // Those at the same place are parted by their index, as in the order of the list.
+            let is_ahead = |&&(s_m, other): &&(f64, u32)| {
+                other as usize != index && (start_m + s_m, other as usize) > (0.0, index)
+            };
+            if let Some(&(s_m, other)) = self.occupants[lane.0 as usize].iter().find(is_ahead) {
+                let leader = &self.cars[other as usize];
+                let gap_m = start_m + s_m - car.half_length_m() - leader.half_length_m();
+                return Some(Obstacle { gap_m, speed_mps: leader.speed_mps });
+            }
+        }
+        None
+    }
+
+    /// The line before the next junction lane that may not be entered.
+    fn stop_line(&mut self, index: usize) -> Option<Obstacle> {
+        let car = &self.cars[index];
+        let horizon_m = car.half_length_m() + car.speed_mps * car.speed_mps / (2.0 * 1.8) + 6.0;
+        let graph = self.roads.graph;
+        let ahead: Vec<(LaneId, f64)> = car.path.ahead(graph).collect();
+        for (place, &(lane, start_m)) in ahead.iter().enumerate() {
+            if start_m > horizon_m {
+                break;
+            }
+            if !graph.lane(lane).in_junction {
+                continue;
+            }
+            let exit = ahead.get(place + 1).map(|(next, _)| *next);
+            let is_inside = start_m < self.cars[index].half_length_m();
+            let has_room = is_inside || self.has_exit_room(index, exit);
+            let car = &mut self.cars[index];
+            if has_room && self.right_of_way.take(index as u32, car, lane, self.roads) {
+                continue;
+            }
+            if is_inside {
+                // Already across the line: wait in the lane for the others by the swept way alone.
+                continue;
+            }
+            return Some(Obstacle { gap_m: start_m - car.half_length_m() - STOP_LINE_M, speed_mps: 0.0 });
+        }
+        None
+    }
+
+    /// Whether the lane behind a junction takes one more vehicle.
+    fn has_exit_room(&self, index: usize, exit: Option<LaneId>) -> bool {
+        let Some(exit) = exit.filter(|exit| !self.roads.graph.lane(*exit).in_junction) else { return true };
+        let Some(&(s_m, last)) = self.occupants[exit.0 as usize].iter().find(|(_, other)| *other as usize != index)
+        else {
+            return true;
+        };
+        let last = &self.cars[last as usize];
+        let room_m = s_m - last.half_length_m();
+        last.speed_mps > MOVING_ON_MPS || room_m > 2.0 * self.cars[index].half_length_m() + EXIT_ROOM_M
+    }
+
+    /// Whoever stands or drives the same way in the strip that the vehicle will sweep: merging lanes, tails in bends.
+    fn on_the_swept_way(&self, index: usize, near: &mut Vec<u32>) -> Option<Obstacle> {
+        let car = &self.cars[index];
+        if car.standing_s > PATIENCE_S {
+            return None;
+        }
+        let reach_m = (6.0 + 2.5 * car.speed_mps).min(30.0);
+        let here = car.motion.end;
+        let (sin, cos) = here.yaw_rad.sin_cos();
+        self.index.near(car.point_m(), reach_m + car.half_length_m() + 6.0, near);
+        near.retain(|&other| {
+            let other_car = &self.cars[other as usize];
+            let offset = other_car.motion.end.position_m - here.position_m;
+            let turned = wrapped(other_car.motion.end.yaw_rad - here.yaw_rad).abs();
+            other as usize != index
+                && offset.z.abs() < 3.0
+                && offset.x * cos + offset.y * sin > 0.0
+                && turned < 1.75
+                // A vehicle that drives just ahead on the same lane is the leader already.
+                && (other_car.path.lane() != car.path.lane())
+        });
+        if near.is_empty() {
+            return None;
+        }
+        let half_width_m = (0.5 * car.vehicle.size_m[1] + SIDE_ROOM_M) * here.roll_rad.cos();
+        let mut ahead_m = car.half_length_m();
+        while ahead_m < car.half_length_m() + reach_m {
+            let [x, y, _] = car.path.point_m(self.roads.graph, ahead_m);
+            let hit =
+                near.iter().find(|&&other| self.cars[other as usize].rectangle().distance_m([x, y]) < half_width_m);
+            if let Some(&other) = hit {
+                let other = &self.cars[other as usize];
+                let turned = wrapped(other.motion.end.yaw_rad - here.yaw_rad);
+                let speed_mps = (other.speed_mps * turned.cos()).max(0.0);
+                return Some(Obstacle { gap_m: ahead_m - car.half_length_m(), speed_mps });
+            }
+            ahead_m += SWEEP_STEP_M;
+        }
+        None
+    }
+
+    /// The end of a road that leads nowhere.
+    fn end_of_the_way(&self, index: usize) -> Option<Obstacle> {
+        let car = &self.cars[index];
+        let left_m = car.path.remaining_m(self.roads.graph);
+        (left_m < super::DECIDED_M).then(|| Obstacle { gap_m: left_m - car.half_length_m(), speed_mps: 0.0 })
+    }
+}

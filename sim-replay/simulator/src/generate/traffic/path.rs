@@ -1,0 +1,280 @@
+//! The way of one vehicle: the lane it is on, the one it came from, those ahead.
+
+use std::collections::VecDeque;
+
+use crate::generate::raycast::Placement;
+use crate::map::{Lane, LaneGraph, LaneId};
+
+/// A place on a chain of lanes.
+#[derive(Debug, Clone, PartialEq)]
+pub(crate) struct Path {
+    /// Lanes in driving order, each a successor of the one before it.
+    lanes: VecDeque<LaneId>,
+    /// Which of them the vehicle's middle is on.
+    current: usize,
+    /// How far along it, metres.
+    s_m: f64,
+    /// The change of lanes under way.
+    change: Option<Change>,
+}
+
+/// A lane of the way, and its neighbour which the vehicle leaves for it. Equal shares of their lengths lie side by side.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub(crate) struct Beside {
+    pub(crate) lane: LaneId,
+    pub(crate) left: LaneId,
+}
+
+/// A change of lanes: a curve from one to the other, laid out along the way and not in time, so that a vehicle that
+/// has to stop stops across the lanes and does not slide sideways.
+#[derive(Debug, Clone, PartialEq)]
+struct Change {
+    beside: Vec<Beside>,
+    /// How far the vehicle's middle is past the beginning of the curve, metres.
+    done_m: f64,
+    length_m: f64,
+    wheelbase_m: f64,
+}
+
+impl Change {
+    /// How much of the way from the old lane to the new one is done `offset_m` ahead of the vehicle's middle, 0 to 1.
+    fn share(&self, offset_m: f64) -> f64 {
+        let t = ((self.done_m + offset_m) / self.length_m).clamp(0.0, 1.0);
+        // Place, heading and curvature begin and end with those of the lanes.
+        t * t * t * (10.0 + t * (6.0 * t - 15.0))
+    }
+
+    fn left_beside(&self, lane: LaneId) -> Option<LaneId> {
+        self.beside.iter().find(|pair| pair.lane == lane).map(|pair| pair.left)
+    }
+}
+
+/// A changing vehicle is counted on its old lane too until so much of the change is done.
+const LEFT_SHARE: f64 = 0.7;
+
+impl Path {
+    /// Starts on one lane.
+    pub(crate) fn new(lane: LaneId, s_m: f64) -> Self {
+        Self { lanes: VecDeque::from([lane]), current: 0, s_m, change: None }
+    }
+
+    /// The lane under the vehicle's middle.
+    pub(crate) fn lane(&self) -> LaneId {
+        self.lanes[self.current]
+    }
+
+    /// How far along that lane, metres.
+    pub(crate) fn s_m(&self) -> f64 {
+        self.s_m
+    }
+
+    /// The last lane that is decided.
+    pub(crate) fn last(&self) -> LaneId {
+        self.lanes[self.lanes.len() - 1]
+    }
+
+    /// Appends a successor of the last lane.
+    pub(crate) fn push(&mut self, lane: LaneId) {
+        self.lanes.push_back(lane);
+    }
+
+    /// Leaves the present lane for its neighbour over `length_m` metres: `beside` are the lanes of the new way from
+    /// there on, `s_m` is the vehicle's place on the first. The front axle is where the curve begins.
+    pub(crate) fn change(&mut self, beside: Vec<Beside>, s_m: f64, length_m: f64, wheelbase_m: f64) {
+        self.lanes.truncate(self.current);
+        self.lanes.extend(beside.iter().map(|pair| pair.lane));
+        self.s_m = s_m;
+        self.change = Some(Change { beside, done_m: -0.5 * wheelbase_m, length_m, wheelbase_m });
+    }
+
+    /// Whether the vehicle is between two lanes.
+    pub(crate) fn is_changing(&self) -> bool {
+        self.change.is_some()
+    }
+
+    /// The lane that the vehicle is leaving and its place there, metres, while it takes up room there.
+    pub(crate) fn leaving(&self, graph: &LaneGraph) -> Option<(LaneId, f64)> {
+        let change = self.change.as_ref().filter(|change| change.share(0.0) < LEFT_SHARE)?;
+        let left = change.left_beside(self.lane())?;
+        Some((left, self.s_m / graph.lane(self.lane()).length_m * graph.lane(left).length_m))
+    }
+
+    /// How far the decided way goes on, metres.
+    pub(crate) fn remaining_m(&self, graph: &LaneGraph) -> f64 {
+        self.ahead(graph).map(|(lane, start_m)| start_m + graph.lane(lane).length_m).last().unwrap_or(0.0)
+    }
+
+    /// The lane under the vehicle and those ahead, each with how far ahead it begins (negative for the first), metres.
+    pub(crate) fn ahead<'a>(&'a self, graph: &'a LaneGraph) -> impl Iterator<Item = (LaneId, f64)> + 'a {
+        let mut start_m = -self.s_m;
+        self.lanes.iter().skip(self.current).map(move |&lane| {
+            let entry = (lane, start_m);
+            start_m += graph.lane(lane).length_m;
+            entry
+        })
+    }
+
+    /// Drives on. Lanes farther back than the previous one are forgotten, unless a long vehicle still stands on them.
+    pub(crate) fn advance(&mut self, graph: &LaneGraph, distance_m: f64, keep_behind_m: f64) {
+        self.s_m += distance_m;
+        if let Some(change) = &mut self.change {
+            change.done_m += distance_m;
+        }
+        self.change.take_if(|change| change.done_m > change.length_m + 0.5 * change.wheelbase_m);
+        while self.s_m > graph.lane(self.lane()).length_m && self.current + 1 < self.lanes.len() {
+            self.s_m -= graph.lane(self.lane()).length_m;
+            self.current += 1;
+        }
+        let behind = |path: &Self| -> f64 {
+            path.lanes.iter().take(path.current).skip(1).map(|&lane| graph.lane(lane).length_m).sum::<f64>() + path.s_m
+        };
+        while self.current > 0 && behind(self) > keep_behind_m {
+            self.lanes.pop_front();
+            self.current -= 1;
+        }
+    }
+
+    /// Lanes which the stretch from `behind_m` behind to the vehicle's middle touches, the current one first.
+    pub(crate) fn lanes_under(&self, graph: &LaneGraph, behind_m: f64) -> impl Iterator<Item = LaneId> + '_ {
+        let mut left_m = behind_m - self.s_m;
+        let mut lanes = vec![self.lane()];
+        for &lane in self.lanes.iter().take(self.current).rev() {
+            if left_m <= 0.0 {
+                break;
+            }
+            lanes.push(lane);
+            left_m -= graph.lane(lane).length_m;
+        }
+        lanes.into_iter()
+    }
+
+    /// The point `offset_m` ahead of (or behind) the vehicle's middle, straight on where the way is not known.
+    pub(crate) fn point_m(&self, graph: &LaneGraph, offset_m: f64) -> [f64; 3] {
+        self.mixed(graph, offset_m, point_on, |from, to, share| {
+            std::array::from_fn(|axis| from[axis] + share * (to[axis] - from[axis]))
+        })
+    }
+
+    /// Slope across the way there, radians; positive where the left side is higher.
+    fn bank_rad(&self, graph: &LaneGraph, offset_m: f64) -> f64 {
+        self.mixed(graph, offset_m, Lane::bank_rad, |from, to, share| from + share * (to - from))
+    }
+
+    /// What a lane has `offset_m` ahead of the vehicle's middle; during a change, mixed from both lanes.
+    fn mixed<T>(
+        &self,
+        graph: &LaneGraph,
+        offset_m: f64,
+        on: impl Fn(&Lane, f64) -> T,
+        mix: impl Fn(T, T, f64) -> T,
+    ) -> T {
+        let (mut index, mut s_m) = (self.current, self.s_m + offset_m);
+        while s_m < 0.0 && index > 0 {
+            index -= 1;
+            s_m += graph.lane(self.lanes[index]).length_m;
+        }
+        while s_m > graph.lane(self.lanes[index]).length_m && index + 1 < self.lanes.len() {
+            s_m -= graph.lane(self.lanes[index]).length_m;
+            index += 1;
+        }
+        let lane = graph.lane(self.lanes[index]);
+        let own = on(lane, s_m);
+        let Some(change) = &self.change else { return own };
+        let share = change.share(offset_m);
+        match change.left_beside(lane.id) {
+            Some(left) if share < 1.0 => {
+                let left = graph.lane(left);
+                mix(on(left, s_m / lane.length_m * left.length_m), own, share)
+            }
+            // Lanes behind the change are those that the vehicle came from.
+            _ => own,
+        }
+    }
+
+    /// Where a vehicle of this wheelbase stands after `drive_m` more metres, both axles on the way, `aside_m` to the
+    /// left of it.
+    pub(crate) fn placement(&self, graph: &LaneGraph, drive_m: f64, wheelbase_m: f64, aside_m: f64) -> Placement {
+        let front = self.point_m(graph, drive_m + 0.5 * wheelbase_m);
+        let rear = self.point_m(graph, drive_m - 0.5 * wheelbase_m);
+        let (dx, dy, dz) = (front[0] - rear[0], front[1] - rear[1], front[2] - rear[2]);
+        let base = dx.hypot(dy).max(1e-6);
+        let middle: [f64; 3] = std::array::from_fn(|axis| 0.5 * (front[axis] + rear[axis]));
+        let roll_rad = self.bank_rad(graph, drive_m);
+        let (rise, flat) = roll_rad.sin_cos();
+        let aside_flat_m = aside_m * flat;
+        let position =
+            [middle[0] - aside_flat_m * dy / base, middle[1] + aside_flat_m * dx / base, middle[2] + aside_m * rise];
+        Placement { pitch_rad: dz.atan2(base), roll_rad, ..Placement::level(position, dy.atan2(dx)) }
+    }
+}
+
+/// A place on a lane, straight on before its start and behind its end.
+fn point_on(lane: &Lane, s_m: f64) -> [f64; 3] {
+    let (point, heading) = lane.at(s_m);
+    let beyond_m = s_m - s_m.clamp(0.0, lane.length_m);
+    let (sin, cos) = heading.sin_cos();
+    [point[0] + beyond_m * cos, point[1] + beyond_m * sin, point[2]]
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn two_lanes() -> LaneGraph {
+        let line = |from: i32, to: i32| (from..=to).map(|x| [f64::from(x), 0.0, 0.1 * f64::from(x)]).collect();
+        let mut first = Lane::new(LaneId(0), line(0, 20), 3.5, 10.0);
+        first.successors = vec![LaneId(1)];
+        LaneGraph::new(vec![first, Lane::new(LaneId(1), line(20, 50), 3.5, 10.0)])
+    }
+
+    #[test]
+    fn a_vehicle_between_two_lanes_stands_on_both() {
+        let graph = two_lanes();
+        let mut path = Path::new(LaneId(0), 18.0);
+        path.push(LaneId(1));
+        path.advance(&graph, 3.0, 6.0);
+        assert_eq!((path.lane(), path.s_m()), (LaneId(1), 1.0));
+        assert_eq!(path.lanes_under(&graph, 3.0).collect::<Vec<_>>(), [LaneId(1), LaneId(0)]);
+        let placement = path.placement(&graph, 0.0, 3.0, 0.5);
+        assert!((placement.position_m - nalgebra::Vector3::new(21.0, 0.5, 2.1)).norm() < 1e-9);
+        assert!((placement.pitch_rad - 0.1f64.atan()).abs() < 1e-9);
+        assert!((path.remaining_m(&graph) - 29.0).abs() < 1e-9);
+    }
+
+    #[test]
+    fn a_change_begins_and_ends_on_the_lanes_without_a_jump() {
+        let line = |y: f64| (0..=100).map(|x| [f64::from(x), y, 0.0]).collect();
+        let graph = LaneGraph::new(vec![
+            Lane::new(LaneId(0), line(0.0), 3.5, 10.0),
+            Lane::new(LaneId(1), line(3.5), 3.5, 10.0),
+        ]);
+        let mut path = Path::new(LaneId(0), 20.0);
+        let before = path.placement(&graph, 0.0, 3.0, 0.0);
+        path.change(vec![Beside { lane: LaneId(1), left: LaneId(0) }], 20.0, 40.0, 3.0);
+        assert_eq!(path.placement(&graph, 0.0, 3.0, 0.0), before);
+        assert_eq!((path.lane(), path.leaving(&graph)), (LaneId(1), Some((LaneId(0), 20.0))));
+        let mut last = before;
+        while path.is_changing() {
+            let next = path.placement(&graph, 0.5, 3.0, 0.0);
+            path.advance(&graph, 0.5, 5.0);
+            assert!((path.placement(&graph, 0.0, 3.0, 0.0).position_m - next.position_m).norm() < 1e-9);
+            let moved = next.position_m - last.position_m;
+            assert!(moved.y >= 0.0 && (moved.norm() - 0.5).abs() < 0.01, "{moved}");
+            // The nose points where the vehicle goes.
+            assert!((moved.y.atan2(moved.x) - next.yaw_rad).abs() < 0.02, "{moved} {}", next.yaw_rad);
+            last = next;
+        }
+        assert_eq!((last.position_m.y, last.yaw_rad), (3.5, 0.0));
+        assert!((last.position_m.x - 63.0).abs() < 0.6, "{last:?}");
+    }
+
+    #[test]
+    fn lanes_that_lie_behind_are_forgotten() {
+        let graph = two_lanes();
+        let mut path = Path::new(LaneId(0), 18.0);
+        path.push(LaneId(1));
+        path.advance(&graph, 20.0, 6.0);
+        assert_eq!(path.lanes.len(), 1);
+        assert_eq!(path.point_m(&graph, 20.0)[0], 58.0);
+    }
+}

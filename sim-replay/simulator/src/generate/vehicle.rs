@@ -1,0 +1,338 @@
+//! What vehicles look like: convex parts that a LiDAR can tell from a box.
+
+use std::f32::consts::PI;
+
+use super::raycast::{BodyShape, Bounds, Part};
+use support::random::SplitMix64;
+
+/// Kinds of vehicles on the roads of a town.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]
+pub enum VehicleKind {
+    /// Three boxes: bonnet, cabin, boot.
+    Sedan,
+    /// Short, with a steep tail.
+    Hatchback,
+    /// High, with a long cabin.
+    Suv,
+    /// A cabin and an open bed.
+    Pickup,
+    /// One volume with a short nose.
+    Van,
+    /// A cab and a cargo box.
+    Truck,
+    /// One long volume.
+    Bus,
+}
+
+/// One vehicle: its kind, its outer sizes and its form.
+///
+/// The frame of a vehicle has its origin on the ground under the middle of the box: x forward, y left, z up.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Vehicle {
+    /// Its kind.
+    pub kind: VehicleKind,
+    /// Full length, width and height of the tight outer box, metres.
+    pub size_m: [f64; 3],
+    /// Its form.
+    pub shape: BodyShape,
+}
+
+/// Mean sizes of a kind, how far an instance may differ from them (share), and how often it drives or parks.
+struct Stock {
+    kind: VehicleKind,
+    size_m: [f64; 3],
+    spread: [f64; 3],
+    driving: f64,
+    parked: f64,
+}
+
+/// Sizes after the vehicles of CARLA. All stay under 2.9 m, so that a box stands within -3..1 m of a LiDAR at 1.95 m.
+/// Trucks and buses are rare: the clean-up of detections in OpenCOOD's protocol drops boxes longer than 6 m.
+const STOCK: [Stock; 7] = [
+    Stock {
+        kind: VehicleKind::Sedan,
+        size_m: [4.65, 1.95, 1.48],
+        spread: [0.07, 0.05, 0.04],
+        driving: 0.36,
+        parked: 0.38,
+    },
+    Stock {
+        kind: VehicleKind::Hatchback,
+        size_m: [3.95, 1.85, 1.52],
+        spread: [0.08, 0.05, 0.04],
+        driving: 0.21,
+        parked: 0.26,
+    },
+    Stock {
+        kind: VehicleKind::Suv,
+        size_m: [4.65, 2.05, 1.75],
+        spread: [0.07, 0.04, 0.06],
+        driving: 0.25,
+        parked: 0.24,
+    },
+    Stock {
+        kind: VehicleKind::Pickup,
+        size_m: [5.30, 2.05, 1.88],
+        spread: [0.05, 0.04, 0.04],
+        driving: 0.05,
+        parked: 0.05,
+    },
+    Stock {
+        kind: VehicleKind::Van,
+        size_m: [5.15, 2.05, 2.15],
+        spread: [0.08, 0.04, 0.12],
+        driving: 0.085,
+        parked: 0.07,
+    },
+    Stock {
+        kind: VehicleKind::Truck,
+        size_m: [7.10, 2.40, 2.65],
+        spread: [0.12, 0.03, 0.05],
+        driving: 0.03,
+        parked: 0.0,
+    },
+    Stock {
+        kind: VehicleKind::Bus,
+        size_m: [10.2, 2.50, 2.82],
+        spread: [0.10, 0.02, 0.015],
+        driving: 0.015,
+        parked: 0.0,
+    },
+];
+
+impl Vehicle {
+    /// A vehicle as they drive around.
+    #[must_use]
+    pub fn random_driving(random: &mut SplitMix64) -> Self {
+        Self::random(random, |stock| stock.driving)
+    }
+
+    /// A vehicle as they stand at the kerb.
+    #[must_use]
+    pub fn random_parked(random: &mut SplitMix64) -> Self {
+        Self::random(random, |stock| stock.parked)
+    }
+
+    /// A vehicle that may carry the sensors: one low enough for a LiDAR on its roof.
+    #[must_use]
+    pub fn random_connected(random: &mut SplitMix64) -> Self {
+        let low = |kind| matches!(kind, VehicleKind::Sedan | VehicleKind::Hatchback | VehicleKind::Suv);
+        Self::random(random, |stock| if low(stock.kind) { stock.driving } else { 0.0 })
+    }
+
+    fn random(random: &mut SplitMix64, weight: impl Fn(&Stock) -> f64) -> Self {
+        let mut draw = random.unit() * STOCK.iter().map(&weight).sum::<f64>();
+        let chosen = STOCK.iter().find(|stock| {
+            draw -= weight(stock);
+            draw < 0.0
+        });
+        let stock = chosen.unwrap_or(&STOCK[0]);
+        let size_m =
+            std::array::from_fn(|axis| stock.size_m[axis] * (1.0 + stock.spread[axis] * random.between(-1.0, 1.0)));
+        Self::new(stock.kind, size_m, random)
+    }
+
+    /// A vehicle of given outer sizes; proportions vary from one to the next.
+    #[must_use]
+    pub fn new(kind: VehicleKind, size_m: [f64; 3], random: &mut SplitMix64) -> Self {
+        let [length, width, height] = size_m.map(|size| size as f32);
+        let mut vary = |value: f32, share: f32| value * (1.0 + share * random.between(-1.0, 1.0) as f32);
+        let form = Form { half: 0.5 * length, side: 0.5 * width, height };
+        let parts = match kind {
+            VehicleKind::Sedan => form.car(&Profile {
+                belt: vary(0.62, 0.04),
+                bonnet: vary(0.24, 0.1),
+                boot: vary(0.06, 0.2),
+                cabin: [vary(-0.42, 0.05), vary(0.19, 0.1)],
+                roof: [vary(-0.25, 0.1), vary(0.03, 0.3)],
+            }),
+            VehicleKind::Hatchback => form.car(&Profile {
+                belt: vary(0.61, 0.04),
+                bonnet: vary(0.2, 0.1),
+                boot: 0.02,
+                cabin: [-0.49, vary(0.25, 0.08)],
+                roof: [vary(-0.40, 0.06), vary(0.08, 0.2)],
+            }),
+            VehicleKind::Suv => form.car(&Profile {
+                belt: vary(0.60, 0.04),
+                bonnet: vary(0.18, 0.1),
+                boot: 0.02,
+                cabin: [-0.49, vary(0.22, 0.08)],
+                roof: [vary(-0.43, 0.04), vary(0.09, 0.2)],
+            }),
+            VehicleKind::Pickup => form.car(&Profile {
+                belt: vary(0.58, 0.04),
+                bonnet: vary(0.12, 0.2),
+                boot: 0.01,
+                cabin: [vary(-0.1, 0.2), vary(0.22, 0.06)],
+                roof: [vary(-0.06, 0.2), vary(0.13, 0.1)],
+            }),
+            VehicleKind::Van => form.car(&Profile {
+                belt: vary(0.52, 0.04),
+                bonnet: vary(0.1, 0.2),
+                boot: 0.01,
+                cabin: [-0.5, vary(0.38, 0.05)],
+                roof: [-0.48, vary(0.27, 0.06)],
+            }),
+            VehicleKind::Truck => form.truck(vary(0.24, 0.1), vary(0.84, 0.06)),
+            VehicleKind::Bus => form.bus(),
+        };
+        Self { kind, size_m, shape: BodyShape::new(parts, vary(0.5, 0.5)) }
+    }
+}
+
+/// The outer box that a vehicle fills, metres.
+struct Form {
+    half: f32,
+    side: f32,
+    height: f32,
+}
+
+/// The outline of a car from the side, in shares of its height (belt) and length (all others).
+struct Profile {
+    /// Height of the lower edge of the windows.
+    belt: f32,
+    /// How far the bonnet slopes down to the nose.
+    bonnet: f32,
+    /// How far the tail slopes.
+    boot: f32,
+    /// Rear and front of the cabin at the belt.
+    cabin: [f32; 2],
+    /// Rear and front of the roof.
+    roof: [f32; 2],
+}
+
+impl Form {
+    fn car(&self, profile: &Profile) -> Vec<Part> {
+        let (length, side, height) = (2.0 * self.half, self.side, self.height);
+        let (floor, bumper, belt) = (0.14 * height, 0.40 * height, profile.belt * height);
+        let mut parts = vec![
+            frustum(
+                [floor, bumper],
+                [[0.05 - self.half, self.half - 0.08, side - 0.07], [-self.half, self.half, side]],
+            ),
+            frustum(
+                [bumper, belt],
+                [
+                    [-self.half, self.half, side],
+                    [profile.boot * length - self.half, self.half - profile.bonnet * length, side - 0.05],
+                ],
+            ),
+            frustum(
+                [belt, height],
+                [
+                    [profile.cabin[0] * length, profile.cabin[1] * length, side - 0.07],
+                    [profile.roof[0] * length, profile.roof[1] * length, side - 0.26],
+                ],
+            ),
+        ];
+        parts.extend(self.wheels(0.33, 0.30 * length, -0.29 * length));
+        parts
+    }
+
+    /// `cab` is the share of the length before the cargo, `cab_height` of the height.
+    fn truck(&self, cab: f32, cab_height: f32) -> Vec<Part> {
+        let (length, side, height) = (2.0 * self.half, self.side, self.height);
+        let front = self.half - cab * length;
+        let mut parts = vec![
+            // Frame, cargo, cab, windscreen.
+            frustum([0.55, 0.95], [[-self.half, front, side * 0.5], [-self.half, front, side * 0.5]]),
+            frustum([0.95, height], [[-self.half, front - 0.15, side], [-self.half, front - 0.15, side]]),
+            frustum([0.35, 0.5 * height], [[front, self.half, side - 0.08], [front, self.half, side - 0.05]]),
+            frustum(
+                [0.5 * height, cab_height * height],
+                [[front, self.half, side - 0.05], [front, self.half - 0.45, side - 0.2]],
+            ),
+        ];
+        parts.extend(self.wheels(0.48, self.half - 0.55 * cab * length, -0.32 * length));
+        parts
+    }
+
+    fn bus(&self) -> Vec<Part> {
+        let (side, height) = (self.side, self.height);
+        let mut parts = vec![
+            frustum([0.30, 1.10], [[-self.half, self.half, side - 0.03], [-self.half, self.half, side]]),
+            frustum([1.10, height], [[-self.half, self.half, side], [0.1 - self.half, self.half - 0.25, side - 0.12]]),
+        ];
+        parts.extend(self.wheels(0.48, 0.30 * 2.0 * self.half, -0.26 * 2.0 * self.half));
+        parts
+    }
+
+    fn wheels(&self, radius: f32, front: f32, rear: f32) -> Vec<Part> {
+        let at = |x, side: f32| wheel([x, side * (self.side - 0.14), radius], radius, 0.12);
+        vec![at(front, 1.0), at(front, -1.0), at(rear, 1.0), at(rear, -1.0)]
+    }
+}
+
+/// A solid between two level rectangles: heights `[bottom, top]`, and for each `[rear x, front x, half width]`.
+fn frustum([bottom, top]: [f32; 2], [[rear0, front0, side0], [rear1, front1, side1]]: [[f32; 3]; 2]) -> Part {
+    let rise = top - bottom;
+    // A face through (at0, bottom) and (at1, top), with its normal towards growing `at`.
+    let slant = |at0: f32, at1: f32| {
+        let norm = rise.hypot(at0 - at1);
+        (rise / norm, (at0 - at1) / norm, (rise * at0 + (at0 - at1) * bottom) / norm)
+    };
+    let (front, rear, left) = (slant(front0, front1), slant(-rear0, -rear1), slant(side0, side1));
+    let planes = vec![
+        [front.0, 0.0, front.1, front.2],
+        [-rear.0, 0.0, rear.1, rear.2],
+        [0.0, left.0, left.1, left.2],
+        [0.0, -left.0, left.1, left.2],
+        [0.0, 0.0, 1.0, top],
+        [0.0, 0.0, -1.0, -bottom],
+    ];
+    let side = side0.max(side1);
+    let bounds = Bounds { min_m: [rear0.min(rear1), -side, bottom], max_m: [front0.max(front1), side, top] };
+    Part::Hull { planes, bounds }
+}
+
+/// An upright octagon that stands on the ground.
+fn wheel(center: [f32; 3], radius: f32, half_width: f32) -> Part {
+    let rim = (0..8).map(|face| {
+        let (sin, cos) = (face as f32 * PI / 4.0).sin_cos();
+        [cos, 0.0, sin, cos * center[0] + sin * center[2] + radius]
+    });
+    let sides = [[0.0, 1.0, 0.0, center[1] + half_width], [0.0, -1.0, 0.0, half_width - center[1]]];
+    Part::Hull { planes: rim.chain(sides).collect(), bounds: Bounds::centered(center, [radius, half_width, radius]) }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn fleet() -> Vec<Vehicle> {
+        let mut random = SplitMix64::new(5);
+        (0..2000).map(|_| Vehicle::random_driving(&mut random)).collect()
+    }
+
+    #[test]
+    fn every_kind_occurs_and_fills_its_box() {
+        let fleet = fleet();
+        for stock in &STOCK {
+            assert!(fleet.iter().any(|vehicle| vehicle.kind == stock.kind), "{:?}", stock.kind);
+        }
+        for vehicle in &fleet {
+            let bounds = vehicle.shape.bounds;
+            let [length, width, height] = vehicle.size_m;
+            let expected = [-length / 2.0, -width / 2.0, 0.0, length / 2.0, width / 2.0, height];
+            let actual = bounds.min_m.into_iter().chain(bounds.max_m);
+            for (expected, actual) in expected.into_iter().zip(actual) {
+                assert!((expected - f64::from(actual)).abs() < 1e-4, "{:?}: {expected} {actual}", vehicle.kind);
+            }
+            assert!(height < 2.9);
+        }
+    }
+
+    #[test]
+    fn a_frustum_is_bounded_by_its_rectangles() {
+        let Part::Hull { planes, .. } = frustum([0.5, 1.5], [[-2.0, 2.0, 1.0], [-1.0, 0.5, 0.7]]) else {
+            panic!("a frustum is a hull");
+        };
+        for corner in [[2.0, 1.0, 0.5], [-2.0, -1.0, 0.5], [0.5, 0.7, 1.5], [-1.0, -0.7, 1.5]] {
+            let slack: Vec<f32> =
+                planes.iter().map(|p| p[3] - (0..3).map(|axis| p[axis] * corner[axis]).sum::<f32>()).collect();
+            assert!(slack.iter().all(|&slack| slack > -1e-5), "{corner:?} lies outside");
+            assert_eq!(slack.iter().filter(|&&slack| slack.abs() < 1e-5).count(), 3, "{corner:?} is no corner");
+        }
+    }
+}

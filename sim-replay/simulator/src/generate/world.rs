@@ -1,0 +1,86 @@
+//! A town as the sensors see it.
+
+use super::raycast::{Body, BodyShape, Bounds, Part, Placement, Plane, Surface, Sweep};
+use super::terrain::{TerrainSurface, deck_shape};
+use super::traffic::Roads;
+use crate::map::{LaneIndex, Shape, Solid, Terrain, Town};
+
+/// A town made ready for casting and driving.
+pub(crate) struct World<'t> {
+    pub(crate) town: &'t Town,
+    pub(crate) roads: Roads<'t>,
+    pub(crate) lane_index: LaneIndex,
+    ground: Box<dyn Surface + Send + Sync>,
+    standing: Vec<Standing>,
+}
+
+/// Something that never moves.
+struct Standing {
+    shape: BodyShape,
+    placement: Placement,
+    /// Radius of the circle around it, seen from above, metres.
+    radius_m: f64,
+}
+
+impl<'t> World<'t> {
+    pub(crate) fn new(town: &'t Town) -> Self {
+        let decks = town.ground.decks.iter().filter_map(deck_shape).map(|(shape, center_m)| Standing {
+            radius_m: shape.bounds.radius_m(),
+            shape,
+            placement: Placement::level(center_m, 0.0),
+        });
+        Self {
+            town,
+            roads: Roads::new(&town.lanes),
+            lane_index: LaneIndex::new(&town.lanes),
+            ground: ground_surface(town),
+            standing: town.solids.iter().map(Standing::from).chain(decks).collect(),
+        }
+    }
+
+    pub(crate) fn ground(&self) -> &dyn Surface {
+        &*self.ground
+    }
+
+    /// Appends what stands within `radius_m` of a place.
+    pub(crate) fn standing_near<'a>(&'a self, x_m: f64, y_m: f64, radius_m: f64, bodies: &mut Vec<Body<'a>>) {
+        bodies.extend(self.standing.iter().filter_map(|standing| {
+            let position = standing.placement.position_m;
+            let (dx, dy, reach) = (position.x - x_m, position.y - y_m, radius_m + standing.radius_m);
+            let is_near = dx * dx + dy * dy < reach * reach;
+            is_near.then(|| Body { shape: &standing.shape, motion: Sweep::still(standing.placement) })
+        }));
+    }
+}
+
+/// The ground of a town, without its decks, as rays meet it.
+#[must_use]
+pub fn ground_surface(town: &Town) -> Box<dyn Surface + Send + Sync> {
+    match &town.ground.terrain {
+        Terrain::Plane { z_m } => Box::new(Plane(*z_m)),
+        Terrain::Grid(grid) => Box::new(TerrainSurface::new(grid)),
+    }
+}
+
+impl From<&Solid> for BodyShape {
+    fn from(solid: &Solid) -> Self {
+        let part = match solid.shape {
+            Shape::Box { half_m } => Part::Box(Bounds::centered([0.0; 3], half_m.map(|half| half as f32))),
+            Shape::Cylinder { radius_m, half_height_m } => {
+                Part::Cylinder { center_m: [0.0; 3], radius_m: radius_m as f32, half_height_m: half_height_m as f32 }
+            }
+            Shape::Ellipsoid { radii_m } => {
+                Part::Ellipsoid { center_m: [0.0; 3], radii_m: radii_m.map(|radius| radius as f32) }
+            }
+        };
+        Self::new(vec![part], solid.reflectivity)
+    }
+}
+
+impl From<&Solid> for Standing {
+    fn from(solid: &Solid) -> Self {
+        let shape = BodyShape::from(solid);
+        let placement = Placement::level(solid.center_m, solid.yaw_rad);
+        Self { radius_m: shape.bounds.radius_m(), shape, placement }
+    }
+}

@@ -1,0 +1,277 @@
+//! Everything that stands still: roads, ground, buildings and street furniture of a town.
+//!
+//! A [`Town`] is made from a source (one of two procedural kinds, or an OpenDRIVE map) and a seed, and is the same
+//! for the same two, byte for byte. Routes, traffic and parked cars come later and from another seed.
+//!
+//! # Frames and units
+//! World frame of the map: right-handed, x east, y north, z up, metres; yaw turns x towards y.
+
+mod clearance;
+mod clothoid;
+mod conflicts;
+mod convex;
+pub mod curve;
+mod finding;
+mod ground;
+mod lane;
+pub mod lane_builder;
+pub mod lane_links;
+mod lane_queries;
+pub mod lateral;
+mod layout;
+mod noise;
+pub mod opendrive;
+pub mod profile;
+pub mod road;
+mod roadside;
+mod solid;
+mod surface;
+mod terrain;
+
+use std::path::{Path, PathBuf};
+
+pub use clearance::LANE_HEADROOM_M;
+pub use finding::Finding;
+pub use ground::{Ground, HeightGrid, Terrain, Triangle};
+pub use lane::{JunctionId, Lane, LaneGraph, LaneId, Turn};
+pub use lane_queries::{LaneIndex, LanePosition};
+use layout::Layout;
+pub use opendrive::OpenDriveError;
+use road::RoadNetwork;
+pub use solid::{Shape, Solid, SolidKind};
+use surface::Surface;
+
+use support::bounded_file;
+
+/// Longest side of a town, metres.
+const MAX_EXTENT_M: f64 = 50_000.0;
+
+/// Everything that stands still.
+#[derive(Debug, Clone, PartialEq)]
+pub struct Town {
+    /// Kind or map the town was made from, such as `town1` or the stem of the map's file.
+    pub name: String,
+    /// Where vehicles drive.
+    pub lanes: LaneGraph,
+    /// Terrain and elevated road surfaces.
+    pub ground: Ground,
+    /// Buildings, trees, poles, walls, bridges.
+    pub solids: Vec<Solid>,
+    /// Where vehicles may stand.
+    pub parking: Vec<ParkingSpot>,
+    /// Parts of its map that were not built as the file gives them.
+    pub findings: Vec<Finding>,
+}
+
+/// What a town is made from.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub enum TownSource {
+    /// A small town with T-junctions and crossings.
+    Town1,
+    /// A motorway ring with ramps, an interchange, an under-pass, roundabouts and a small town.
+    Town4,
+    /// A map file in OpenDRIVE format.
+    OpenDrive(PathBuf),
+}
+
+impl TownSource {
+    /// The name of the town made from it: its kind, or the stem of the map's file in small letters.
+    #[must_use]
+    pub fn name(&self) -> String {
+        let stem = |path: &Path| path.file_stem().map(|stem| stem.to_string_lossy().to_lowercase());
+        match self {
+            Self::Town1 => "town1".into(),
+            Self::Town4 => "town4".into(),
+            Self::OpenDrive(path) => stem(path).unwrap_or_else(|| "map".into()),
+        }
+    }
+}
+
+/// A place for one parked vehicle.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct ParkingSpot {
+    /// Centre of the spot on the ground, metres in the world frame.
+    pub center_m: [f64; 3],
+    /// Direction a parked vehicle's bonnet points to, radians.
+    pub yaw_rad: f64,
+    /// Slope across the spot as an angle, radians; positive where the left side of a parked vehicle is higher.
+    pub roll_rad: f64,
+    /// Length along the heading, metres.
+    pub length_m: f64,
+    /// Width across the heading, metres.
+    pub width_m: f64,
+}
+
+/// Why a town could not be made.
+#[derive(Debug, thiserror::Error)]
+pub enum TownError {
+    /// The map's file could not be read.
+    #[error("{}: {source}", path.display())]
+    Read {
+        /// The map's file.
+        path: PathBuf,
+        /// What the system says.
+        source: std::io::Error,
+    },
+    /// The map's file is not a usable OpenDRIVE map.
+    #[error("{}: {source}", path.display())]
+    OpenDrive {
+        /// The map's file.
+        path: PathBuf,
+        /// What is wrong, and where.
+        source: OpenDriveError,
+    },
+    /// The map has no lane to drive on.
+    #[error("{}: none of its {roads} roads has a driving lane", path.display())]
+    NoLanes {
+        /// The map's file.
+        path: PathBuf,
+        /// Number of roads.
+        roads: usize,
+    },
+    /// The map is larger than a town.
+    #[error("{}: its lanes reach over {extent_m:.0} m, more than the limit of {limit_m} m", path.display())]
+    TooLarge {
+        /// The map's file.
+        path: PathBuf,
+        /// Longer side of the rectangle around its lanes, metres.
+        extent_m: f64,
+        /// Longest side of a town, metres.
+        limit_m: f64,
+    },
+}
+
+/// Builds the town of `source` and `town_seed`.
+///
+/// # Errors
+/// [`TownError`] when a map cannot be read or is no usable road network; procedural towns always build.
+pub fn build(source: &TownSource, town_seed: u64) -> Result<Town, TownError> {
+    let name = source.name();
+    match source {
+        TownSource::Town1 => Ok(furnish(name, &layout::town1(town_seed), town_seed)),
+        TownSource::Town4 => Ok(furnish(name, &layout::town4(town_seed), town_seed)),
+        TownSource::OpenDrive(path) => {
+            let Map { network, lanes } = read_map(path)?;
+            check_extent(path, &network, &lanes)?;
+            Ok(furnish(name, &Layout { network, islands: Vec::new() }, town_seed))
+        }
+    }
+}
+
+/// Refuses maps without driving lanes, and maps so large that the ground between their roads would not fit in memory.
+fn check_extent(path: &Path, network: &RoadNetwork, graph: &LaneGraph) -> Result<(), TownError> {
+    let points = || graph.lanes.iter().flat_map(|lane| &lane.centerline);
+    let extent = |axis: usize| {
+        let values = || points().map(|point| point[axis]);
+        values().fold(f64::NEG_INFINITY, f64::max) - values().fold(f64::INFINITY, f64::min)
+    };
+    if graph.lanes.is_empty() {
+        return Err(TownError::NoLanes { path: path.into(), roads: network.roads.len() });
+    }
+    let extent_m = extent(0).max(extent(1));
+    if extent_m > MAX_EXTENT_M {
+        return Err(TownError::TooLarge { path: path.into(), extent_m, limit_m: MAX_EXTENT_M });
+    }
+    Ok(())
+}
+
+/// A map as its file gives it.
+#[derive(Debug, Clone)]
+pub struct Map {
+    /// Its roads and junctions, with what was not built as the file gives it.
+    pub network: RoadNetwork,
+    /// Its driving lanes.
+    pub lanes: LaneGraph,
+}
+
+/// Reads the file of an OpenDRIVE map.
+///
+/// # Errors
+/// [`TownError::Read`] and [`TownError::OpenDrive`].
+pub fn read_map(path: &Path) -> Result<Map, TownError> {
+    let bytes = bounded_file::read(path, opendrive::MAX_BYTES as u64);
+    let bytes = bytes.map_err(|source| TownError::Read { path: path.into(), source })?;
+    let network = opendrive::read_bytes(&bytes);
+    let mut network = network.map_err(|source| TownError::OpenDrive { path: path.into(), source })?;
+    let (lanes, counts) = lane_builder::lane_graph(&network);
+    network.findings.extend(counts.findings);
+    Ok(Map { network, lanes })
+}
+
+fn furnish(name: String, layout: &Layout, town_seed: u64) -> Town {
+    let (lanes, _) = lane_builder::lane_graph(&layout.network);
+    let surface = Surface::new(&layout.network);
+    let ground = terrain::ground(&surface, town_seed);
+    let (solids, parking) = roadside::furnish(layout, &surface, &ground, town_seed);
+    Town { name, lanes, ground, solids, parking, findings: layout.network.findings.clone() }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn same_seed_same_town_on_any_thread() {
+        for source in [TownSource::Town1, TownSource::Town4] {
+            let elsewhere = {
+                let source = source.clone();
+                std::thread::spawn(move || build(&source, 11).unwrap())
+            };
+            let (here, other) = (build(&source, 11).unwrap(), build(&source, 12).unwrap());
+            let elsewhere = elsewhere.join().unwrap();
+            assert!(here == elsewhere, "{source:?} differs from itself");
+            assert!(here != other, "{source:?} does not depend on its seed");
+        }
+    }
+
+    /// Scenes of a seed are the same from one version to the next only in the same towns.
+    #[test]
+    fn our_own_towns_stay_what_they_are() {
+        for (source, counts, sums) in [
+            (TownSource::Town1, [168, 4221, 445, 0], [4735203.0653, 2410977.6519, 244239.8916]),
+            (TownSource::Town4, [172, 11365, 286, 192], [2554837.7919, 1465742.7106, 139175.4820]),
+        ] {
+            let town = build(&source, 0).unwrap();
+            let sum = |values: &mut dyn Iterator<Item = [f64; 3]>| -> f64 {
+                values.map(|[x, y, z]| x + 2.0 * y + 3.0 * z).sum()
+            };
+            let found = [
+                sum(&mut town.lanes.lanes.iter().flat_map(|lane| &lane.centerline).copied()),
+                sum(&mut town.solids.iter().map(|solid| solid.center_m)),
+                sum(&mut town.parking.iter().map(|spot| [spot.center_m[0], spot.center_m[1], spot.yaw_rad])),
+            ];
+            let counted = [town.lanes.lanes.len(), town.solids.len(), town.parking.len(), town.ground.decks.len()];
+            assert_eq!(counted, counts, "{source:?}");
+            assert!(found.iter().zip(sums).all(|(found, sum): (&f64, f64)| (found - sum).abs() < 0.01), "{found:?}");
+            assert!(town.findings.is_empty() && town.lanes.lanes.iter().all(|lane| lane.banks_rad.is_empty()));
+        }
+    }
+
+    #[test]
+    fn unusable_maps_are_refused_with_their_path() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("town.xodr");
+        let error = || build(&TownSource::OpenDrive(path.clone()), 0).unwrap_err().to_string();
+        assert!(error().starts_with(&path.display().to_string()), "{}", error());
+        std::fs::write(&path, "<OpenDRIVE><road id=\"1\" length=\"x\"/></OpenDRIVE>").unwrap();
+        assert!(error().ends_with("line 1: <road> has no <planView>"), "{}", error());
+        let road = |lanes: &str, length: u32| {
+            format!(
+                "<OpenDRIVE><road id=\"1\" length=\"{length}\"><planView><geometry s=\"0\" x=\"0\" y=\"0\" hdg=\"0\" \
+                 length=\"{length}\"><line/></geometry></planView><lanes><laneSection s=\"0\"><right>{lanes}</right>\
+                 </laneSection></lanes></road></OpenDRIVE>"
+            )
+        };
+        std::fs::File::create(&path).unwrap().set_len(opendrive::MAX_BYTES as u64 + 1).unwrap();
+        assert!(error().ends_with("larger than 67108864 bytes, the most that is read"), "{}", error());
+        std::fs::write(&path, road("", 10)).unwrap();
+        assert!(error().ends_with("none of its 1 roads has a driving lane"), "{}", error());
+        let lane = "<lane id=\"-1\" type=\"driving\"><width sOffset=\"0\" a=\"3\" b=\"0\" c=\"0\" d=\"0\"/></lane>";
+        std::fs::write(&path, road(lane, 60_000)).unwrap();
+        assert!(error().ends_with("its lanes reach over 60000 m, more than the limit of 50000 m"), "{}", error());
+        std::fs::write(&path, road(lane, 400)).unwrap();
+        let town = build(&TownSource::OpenDrive(path.clone()), 0).unwrap();
+        assert_eq!((town.name.as_str(), town.lanes.lanes.len()), ("town", 1));
+        assert!(town.obstructions().is_empty() && town.solids.len() > 50);
+    }
+}

@@ -1,0 +1,231 @@
+//! A process that writes a live run down.
+
+use std::path::PathBuf;
+use std::time::{Duration, Instant};
+
+use protocol::{Key, RunId, Selector, Stream, Topic, Verb};
+use serde::{Deserialize, Serialize};
+
+use bus::bounded_queue::Taken;
+use bus::shutdown::Stop;
+use bus::{Bus, BusError, Overheard, Tap};
+use recording::{RecordingError, RecordingOptions, RecordingWriter};
+
+/// Messages of one key that may wait for the disk.
+const PLACES: usize = 64;
+/// A chunk is closed after this long even if it is small: what a crash costs.
+const FLUSH_PERIOD: Duration = Duration::from_secs(1);
+/// How long a run whose replay has ended may still have something to say.
+const LAST_WORDS: Duration = Duration::from_secs(3);
+
+/// What to record.
+#[derive(Debug, Clone, PartialEq, Eq)]
+pub struct RecorderOptions {
+    /// The new file.
+    pub out: PathBuf,
+    /// How to write it.
+    pub recording: RecordingOptions,
+    /// Streams to leave out, before and behind the link: maps, for example, are most of the bytes.
+    pub without: Vec<Stream>,
+    /// Whether to go on when the replay has ended, for the next one.
+    pub keeps_running: bool,
+}
+
+/// How a recording went.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+pub struct RecordReport {
+    /// The file.
+    pub file: PathBuf,
+    /// Messages of the run that are in it.
+    pub messages: u64,
+    /// Its size.
+    pub bytes: u64,
+    /// From the first message to the last that is in it, seconds.
+    pub seconds: f64,
+    /// Messages that came faster than they could be written.
+    pub overwritten: u64,
+    /// Messages that came after writing had failed, or were in the chunk with which it did.
+    pub not_written: u64,
+    /// Why writing failed.
+    pub failure: Option<String>,
+}
+
+impl RecordReport {
+    /// Whether everything that came is in the file.
+    #[must_use]
+    pub fn is_complete(&self) -> bool {
+        self.overwritten == 0 && self.not_written == 0 && self.failure.is_none()
+    }
+
+    /// What is missing in the file, in words; `None` where nothing is.
+    #[must_use]
+    pub fn loss_in_words(&self) -> Option<String> {
+        let Self { file, messages, seconds, overwritten, not_written, failure, .. } = self;
+        let missing = overwritten + not_written;
+        match failure {
+            None if missing == 0 => None,
+            None => Some(format!("recording with gaps: the disk is too slow, {missing} messages missing")),
+            Some(why) if *messages == 0 => Some(format!("nothing is recorded: {why}, {missing} messages missing")),
+            Some(why) => Some(format!(
+                "recording cut at {seconds:.1} s: {why}, {missing} messages missing; sim-replay recover {} --out {}",
+                file.display(),
+                file.with_extension("whole.mcap").display()
+            )),
+        }
+    }
+}
+
+/// Why a recording could not begin.
+#[derive(Debug, thiserror::Error)]
+pub enum RecorderError {
+    /// The file cannot be written.
+    #[error(transparent)]
+    Recording(#[from] RecordingError),
+    /// The bus refuses.
+    #[error(transparent)]
+    Bus(#[from] BusError),
+}
+
+/// Records the run of `bus` until it is over or `stop` is requested. When the disk is full, or refuses for any other
+/// reason, `on_failure` is told once, the run goes on, and what would have been recorded is counted.
+///
+/// # Errors
+/// [`RecorderError`] when the recording cannot begin.
+pub fn record(
+    bus: &Bus,
+    options: &RecorderOptions,
+    stop: &Stop,
+    on_failure: &mut dyn FnMut(&RecordReport),
+) -> Result<RecordReport, RecorderError> {
+    let (writer, failure) = match RecordingWriter::create(&options.out, options.recording) {
+        Ok(writer) => (Some(writer), None),
+        // A run that waits for its recorder is not to wait in vain.
+        Err(error) if options.keeps_running => {
+            tracing::error!("nothing is recorded, the run goes on: {error}");
+            (None, Some(in_words(&error)))
+        }
+        Err(error) => return Err(error.into()),
+    };
+    let tap = bus.tap(&[Selector::run(&bus.identity().run)], PLACES)?;
+    stop.on_request(tap.closer());
+    let presence = bus.announce(protocol::Role::Recorder)?;
+    let mut recorder = Recorder {
+        writer,
+        without: &options.without,
+        run: &bus.identity().run,
+        over: None,
+        taken: 0,
+        span: None,
+        on_failure,
+        report: RecordReport {
+            file: options.out.clone(),
+            messages: 0,
+            bytes: 0,
+            seconds: 0.0,
+            overwritten: 0,
+            not_written: 0,
+            failure,
+        },
+    };
+    if recorder.report.failure.is_some() {
+        (recorder.on_failure)(&recorder.report);
+    }
+    recorder.listen(&tap, options.keeps_running);
+    let report = recorder.finish(tap.overwritten());
+    presence.withdraw()?;
+    Ok(report)
+}
+
+struct Recorder<'a> {
+    /// `None` once writing has failed.
+    writer: Option<RecordingWriter<std::fs::File>>,
+    without: &'a [Stream],
+    run: &'a RunId,
+    /// When the replay said that it was over.
+    over: Option<Instant>,
+    /// Messages that were to be written.
+    taken: u64,
+    /// When the first of them and the last one arrived, nanoseconds.
+    span: Option<(u64, u64)>,
+    on_failure: &'a mut dyn FnMut(&RecordReport),
+    report: RecordReport,
+}
+
+impl Recorder<'_> {
+    fn listen(&mut self, tap: &Tap, keeps_running: bool) {
+        let mut flush_at = Instant::now() + FLUSH_PERIOD;
+        loop {
+            match tap.take(Some(flush_at)) {
+                Taken::Item(topic, overheard) => {
+                    if topic == Topic::Control(Verb::End) {
+                        self.over = Some(Instant::now());
+                    }
+                    self.take(&overheard);
+                }
+                Taken::TimedOut => {}
+                Taken::Closed => return,
+            }
+            let now = Instant::now();
+            if now >= flush_at {
+                flush_at = now + FLUSH_PERIOD;
+                self.attempt(RecordingWriter::flush);
+                if !keeps_running && self.over.is_some_and(|over| over.elapsed() > LAST_WORDS) {
+                    return;
+                }
+            }
+        }
+    }
+
+    fn take(&mut self, overheard: &Overheard) {
+        let Key { run, topic } = &overheard.key;
+        let stream = match topic {
+            Topic::Stream { stream, .. } | Topic::Received { stream, .. } => Some(stream),
+            _ => None,
+        };
+        if run != self.run || stream.is_some_and(|stream| self.without.contains(stream)) {
+            return;
+        }
+        self.taken += 1;
+        self.span = Some((self.span.map_or(overheard.arrived_nanos, |(first, _)| first), overheard.arrived_nanos));
+        self.attempt(|writer| writer.write(&overheard.key, overheard.arrived_nanos, &overheard.bytes()));
+    }
+
+    fn attempt(&mut self, write: impl FnOnce(&mut RecordingWriter<std::fs::File>) -> Result<(), RecordingError>) {
+        let Some(writer) = &mut self.writer else { return };
+        let written = write(writer);
+        if writer.whole_messages() > self.report.messages {
+            self.report.messages = writer.whole_messages();
+            self.report.seconds = self.span.map_or(0.0, |(first, last)| last.saturating_sub(first) as f64 * 1e-9);
+        }
+        if let Err(error) = written {
+            tracing::error!("the recording ends here, the run goes on: {error}");
+            self.report.failure = Some(in_words(&error));
+            self.report.not_written = self.taken - self.report.messages;
+            self.writer = None;
+            (self.on_failure)(&self.report);
+        }
+    }
+
+    fn finish(mut self, overwritten: u64) -> RecordReport {
+        let has_file = self.writer.is_some() || self.report.messages > 0;
+        self.attempt(RecordingWriter::finish);
+        self.report.overwritten = overwritten;
+        self.report.not_written = self.taken - self.report.messages;
+        if has_file && let Ok(file) = std::fs::metadata(&self.report.file) {
+            self.report.bytes = file.len();
+        }
+        if self.report.overwritten > 0 {
+            tracing::error!(messages = self.report.overwritten, "the disk was too slow for the run");
+        }
+        self.report
+    }
+}
+
+/// Why writing failed, without the file, which stands in the report.
+fn in_words(error: &RecordingError) -> String {
+    match error {
+        RecordingError::Io { source, .. } if source.kind() == std::io::ErrorKind::StorageFull => "disk full".into(),
+        RecordingError::Io { source, .. } => source.to_string(),
+        other => other.to_string(),
+    }
+}

@@ -1,0 +1,168 @@
+//! What vehicles measure, late or lost: the emulated air between a replayed sensor and its vehicle's agent.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::time::{Duration, Instant};
+
+use protocol::{CavId, DropReason, HEADER_LEN, Stream};
+use serde::Serialize;
+
+use dataset::frame::Frame;
+use link::{Air, Fate, LinkConfig, LinkError, Outcome, Parcel};
+
+/// x, y, z and intensity of a point, bytes; for a radar's its velocity.
+const POINT_BYTES: u64 = 16;
+
+/// What became of replayed sensor frames on their way.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize)]
+pub struct AirReport {
+    /// Frames that were measured.
+    pub offered: u64,
+    /// Frames that reached their agent, copies counted.
+    pub arrived: u64,
+    /// Frames that did not, by reason.
+    pub dropped: BTreeMap<DropReason, u64>,
+}
+
+/// A frame on its way.
+#[derive(Debug, Clone)]
+pub(super) struct Held {
+    /// Place of the vehicle among those that take part.
+    pub(super) agent: usize,
+    pub(super) capture_nanos: u64,
+    pub(super) frame: Frame,
+}
+
+/// Frames on their way to the agents.
+pub(super) struct SensorAir {
+    air: Air,
+    held: BTreeMap<u64, Held>,
+    next_id: u64,
+    /// By vehicle, as its own messages are numbered: whether one is lost must not depend on who else is there.
+    next_sequences: BTreeMap<CavId, u64>,
+    began: Instant,
+    report: AirReport,
+}
+
+impl SensorAir {
+    /// # Errors
+    /// [`LinkError`] names the field that is wrong.
+    pub(super) fn new(link: &LinkConfig, seed: u64) -> Result<Self, LinkError> {
+        Ok(Self {
+            air: Air::new(link.clone(), Path::new("."), seed)?,
+            held: BTreeMap::new(),
+            next_id: 0,
+            next_sequences: BTreeMap::new(),
+            began: Instant::now(),
+            report: AirReport::default(),
+        })
+    }
+
+    /// Takes what the vehicle `cav` measured just now. What its sensors measured at a tick travels together.
+    pub(super) fn offer(&mut self, cav: &CavId, held: Held, now: Instant) {
+        let Frame { points, radar, .. } = &held.frame;
+        let points = points.len() + radar.as_ref().map_or(0, |radar| radar.len());
+        let bytes = HEADER_LEN as u64 + POINT_BYTES * points as u64;
+        let (id, offered_nanos) = (self.next_id, self.nanos(now));
+        self.next_id += 1;
+        let next_sequence = self.next_sequences.entry(cav.clone()).or_default();
+        let sequence = *next_sequence;
+        *next_sequence += 1;
+        self.report.offered += 1;
+        self.held.insert(id, held);
+        let (from, to, stream) = (cav.clone(), cav.clone(), Stream::Lidar);
+        self.air.offer(Parcel { id, from, to, stream, sequence, bytes, offered_nanos, distance_m: 0.0 });
+    }
+
+    /// When the next frame can arrive; none while none is under way.
+    pub(super) fn next(&self) -> Option<Instant> {
+        self.air.next_nanos().map(|nanos| self.began + Duration::from_nanos(nanos))
+    }
+
+    /// What has arrived by now.
+    pub(super) fn arrived(&mut self, now: Instant) -> Vec<Held> {
+        let mut arrived = Vec::new();
+        for Outcome { parcel, fate, .. } in self.air.advance(self.nanos(now)) {
+            match fate {
+                Fate::Dropped(reason) => {
+                    self.held.remove(&parcel.id);
+                    *self.report.dropped.entry(reason).or_default() += 1;
+                }
+                Fate::Arrived { is_repeated: true, .. } => arrived.extend(self.held.get(&parcel.id).cloned()),
+                Fate::Arrived { .. } => arrived.extend(self.held.remove(&parcel.id)),
+            }
+        }
+        self.report.arrived += arrived.len() as u64;
+        arrived
+    }
+
+    pub(super) fn report(&self) -> &AirReport {
+        &self.report
+    }
+
+    fn nanos(&self, at: Instant) -> u64 {
+        u64::try_from(at.saturating_duration_since(self.began).as_nanos()).unwrap_or(u64::MAX)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use protocol::{Handedness, PointCloud};
+
+    use super::*;
+    use link::{CapacityConfig, DelayLaw, LossLaw};
+
+    fn held(cav: &CavId, tick: u64) -> Held {
+        let points = PointCloud { xyzi: vec![[0.0; 4]; 1000] };
+        let frame = Frame { points, ..Frame::empty(cav.clone(), tick, Handedness::Right) };
+        Held { agent: 0, capture_nanos: tick, frame }
+    }
+
+    #[test]
+    fn what_a_vehicle_loses_does_not_depend_on_the_others() {
+        let [cav, other] = ["7", "8"].map(|cav| CavId::new(cav).unwrap());
+        let lossy = LinkConfig { loss: LossLaw::Bernoulli(0.5), ..LinkConfig::default() };
+        let arrived = |cavs: &[&CavId]| {
+            let mut air = SensorAir::new(&lossy, 1).unwrap();
+            let began = air.began;
+            for tick in 0..100 {
+                cavs.iter().for_each(|cav| air.offer(cav, held(cav, tick), began));
+            }
+            let arrived = air.arrived(began).into_iter().filter(|held| held.frame.cav == cav);
+            arrived.map(|held| held.capture_nanos).collect::<Vec<_>>()
+        };
+        assert_eq!(arrived(&[&other, &cav]), arrived(&[&cav]));
+    }
+
+    #[test]
+    fn frames_come_late_in_their_order_and_some_never() {
+        let cav = CavId::new("7").unwrap();
+        // 16 kB at 16 Mbit/s: 8 ms each, then 100 ms.
+        let link = LinkConfig {
+            capacity: CapacityConfig::TokenBucket { rate_mbps: 16.0, burst_bytes: 0 },
+            delay: DelayLaw::ConstantMs(100.0),
+            ..LinkConfig::default()
+        };
+        let mut air = SensorAir::new(&link, 1).unwrap();
+        let at = Duration::from_millis;
+        let began = air.began;
+        air.offer(&cav, held(&cav, 0), began);
+        air.offer(&cav, held(&cav, 1), began);
+        assert!(air.arrived(began + at(107)).is_empty());
+        let first = air.arrived(began + at(110));
+        assert_eq!(first.iter().map(|held| held.capture_nanos).collect::<Vec<_>>(), [0]);
+        assert!(air.next().is_some_and(|next| next > began + at(110)));
+        assert_eq!(air.arrived(began + at(120)).len(), 1);
+        assert_eq!(air.next(), None);
+
+        let mut lossy =
+            SensorAir::new(&LinkConfig { loss: LossLaw::Bernoulli(0.5), ..LinkConfig::default() }, 1).unwrap();
+        let began = lossy.began;
+        (0..200).for_each(|tick| lossy.offer(&cav, held(&cav, tick), began));
+        let arrived = lossy.arrived(began).len() as u64;
+        let report = lossy.report();
+        assert!((70..130).contains(&arrived), "{arrived}");
+        assert_eq!((report.offered, report.arrived), (200, arrived));
+        assert_eq!(report.dropped.get(&DropReason::LinkLoss), Some(&(200 - arrived)));
+    }
+}
