@@ -1,17 +1,15 @@
-//! Fixtures that lie outside the project: golden archives and sample data.
+//! Test fixtures: golden archives of the project and sample data outside it.
 //!
-//! They are looked for in `V2V_GOLDEN` and `V2V_DATA`, else in `../shared/golden` and `../shared/data` from the
-//! project's root. A test that does not find its fixture prints why and passes:
+//! Golden archives lie in `tests/golden`, or where `V2V_GOLDEN` points. Sample data may not be passed on: tests that need it
+//! are `#[ignore]`d, and look in `V2V_DATA`, else in `../shared/data` from the project's root. A missing fixture fails the
+//! test with its path. A missing tensor or an unexpected type fails with the names in the message.
 //!
 //! ```
-//! let Some(golden) = tests::fixtures::golden("c5_poses") else { return };
+//! let golden = tests::fixtures::golden("c5_poses");
 //! let (shape, poses) = golden.f64("in.poses");
 //! assert_eq!(shape[1], 6);
-//! # let _ = poses;
+//! assert_eq!(poses.len(), shape[0] * 6);
 //! ```
-//!
-//! What is found must be right: a missing tensor or an unexpected type panics with the names in the message, which is
-//! what a test wants.
 
 use std::path::{Path, PathBuf};
 
@@ -26,35 +24,38 @@ pub struct Golden {
     config: Value,
 }
 
-/// The golden archive `<name>.safetensors`, or `None` (with the reason on stderr) where there is none.
+/// The golden archive `<name>.safetensors`.
+///
+/// # Panics
+/// When it is missing or damaged, with its path.
 #[must_use]
-pub fn golden(name: &str) -> Option<Golden> {
-    let path = lookup("V2V_GOLDEN", "golden", &format!("{name}.safetensors"))?;
+pub fn golden(name: &str) -> Golden {
+    let path = fixture("V2V_GOLDEN", "golden", &format!("{name}.safetensors"));
     let bytes = std::fs::read(&path).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
     let (_, header) = SafeTensors::read_metadata(&bytes).unwrap_or_else(|error| panic!("{}: {error}", path.display()));
     let text = header.metadata().as_ref().and_then(|metadata| metadata.get("config"));
     let config = text.map_or(Value::Null, |text| {
         serde_json::from_str(text).unwrap_or_else(|error| panic!("{}: config: {error}", path.display()))
     });
-    Some(Golden { name: name.to_owned(), bytes, config })
+    Golden { name: name.to_owned(), bytes, config }
 }
 
-/// The sample folder or file `name`, for example `v2xset-scene`, or `None` (with the reason on stderr).
+/// The sample folder or file `name`, for example `v2xset-scene`.
+///
+/// # Panics
+/// When it is missing, with its path.
 #[must_use]
-pub fn data(name: &str) -> Option<PathBuf> {
-    lookup("V2V_DATA", "data", name)
+pub fn data(name: &str) -> PathBuf {
+    fixture("V2V_DATA", "../../shared/data", name)
 }
 
-fn lookup(variable: &str, folder: &str, name: &str) -> Option<PathBuf> {
-    let root = std::env::var_os(variable)
-        .map(PathBuf::from)
-        .unwrap_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared").join(folder));
+/// `name` in the folder of the environment variable, else in `default` from the manifest's folder.
+fn fixture(variable: &str, default: &str, name: &str) -> PathBuf {
+    let root =
+        std::env::var_os(variable).map_or_else(|| Path::new(env!("CARGO_MANIFEST_DIR")).join(default), PathBuf::from);
     let path = root.join(name);
-    if path.exists() {
-        return Some(path);
-    }
-    eprintln!("skipped: {} does not exist; {variable} can say where to look", path.display());
-    None
+    assert!(path.exists(), "{} does not exist; {variable} names another folder", path.display());
+    path
 }
 
 impl Golden {

@@ -5,8 +5,8 @@ use std::fs;
 use std::io::{BufRead, BufReader};
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, ExitStatus, Stdio};
+use std::sync::OnceLock;
 use std::sync::mpsc::{Receiver, channel};
-use std::sync::{Mutex, MutexGuard, OnceLock, PoisonError};
 use std::time::{Duration, Instant};
 
 use fusion::Method;
@@ -15,19 +15,33 @@ use perception::model_config::{DetectorConfig, ShrinkConfig};
 use perception::weights;
 use serde_json::Value;
 
+use crate::locks::random_generator_lock;
+
 /// Longer than anything takes here, under whatever load.
 pub const PATIENCE: Duration = Duration::from_secs(120);
+
+/// The folder of the profile that this test was built with, where cargo puts programs.
+///
+/// # Panics
+/// When the test has no file.
+#[must_use]
+pub fn programs_dir() -> &'static Path {
+    static FOLDER: OnceLock<PathBuf> = OnceLock::new();
+    FOLDER.get_or_init(|| {
+        // target/<profile>/deps/<this test>
+        let test = std::env::current_exe().expect("a test has a file");
+        test.ancestors().nth(2).expect("a folder of the profile").to_path_buf()
+    })
+}
 
 /// The folder of the programs under test, built if they are not.
 ///
 /// # Panics
 /// When they cannot be built.
 pub fn programs() -> &'static Path {
-    static PROGRAMS: OnceLock<PathBuf> = OnceLock::new();
-    PROGRAMS.get_or_init(|| {
-        // target/<profile>/deps/<this test>
-        let test = std::env::current_exe().expect("a test has a file");
-        let folder = test.ancestors().nth(2).expect("a folder of the profile").to_path_buf();
+    static BUILT: OnceLock<()> = OnceLock::new();
+    let folder = programs_dir();
+    BUILT.get_or_init(|| {
         // `cargo test` builds the programs of other packages only by chance: make sure they are there and fresh.
         if let Some(cargo) = std::env::var_os("CARGO") {
             let mut build = Command::new(cargo);
@@ -45,14 +59,8 @@ pub fn programs() -> &'static Path {
             }
             assert!(build.status().expect("cargo runs").success(), "the programs cannot be built");
         }
-        folder
-    })
-}
-
-/// Only one fleet at a time: on two cores several would time each other out.
-pub fn alone() -> MutexGuard<'static, ()> {
-    static ALONE: Mutex<()> = Mutex::new(());
-    ALONE.lock().unwrap_or_else(PoisonError::into_inner)
+    });
+    folder
 }
 
 /// Writes weights of a small detector with random parameters, the same every time.
@@ -75,8 +83,8 @@ pub fn write_sighted_weights(path: &Path) {
 }
 
 fn tiny() -> CooperativeModel {
+    let _generator = random_generator_lock();
     tch::manual_seed(7);
-    tch::set_num_threads(1);
     let config = DetectorConfig {
         name: "tiny".into(),
         lidar_range_m: [-25.6, -25.6, -3.0, 25.6, 25.6, 1.0],

@@ -1,4 +1,4 @@
-//! What the end-to-end and golden tests share.
+//! Helpers of the test programs: buses, fleets, fixtures, locks and small scenes.
 
 pub mod bus;
 pub mod faults;
@@ -7,6 +7,7 @@ pub mod fleet;
 pub mod hosts;
 pub mod keys;
 pub mod localizer;
+pub mod locks;
 pub mod machine;
 pub mod mutation;
 pub mod scene;

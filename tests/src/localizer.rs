@@ -10,6 +10,8 @@ use serde::Serialize;
 use tch::Device;
 use tch::nn::VarStore;
 
+use crate::locks::random_generator_lock;
+
 /// An encoder that a test has time to train.
 #[must_use]
 pub fn small_encoder() -> SceneEncoderConfig {
@@ -27,8 +29,8 @@ pub fn small_encoder() -> SceneEncoderConfig {
 /// # Panics
 /// When the disk refuses.
 pub fn write(folder: &Path, seed: i64) -> (PathBuf, PathBuf) {
+    let _generator = random_generator_lock();
     tch::manual_seed(seed);
-    tch::set_num_threads(1);
     let (encoder, head) = (folder.join("encoder.safetensors"), folder.join("head.safetensors"));
     let config = tiny();
     let network = VarStore::new(Device::Cpu);
@@ -59,8 +61,8 @@ pub fn write(folder: &Path, seed: i64) -> (PathBuf, PathBuf) {
 /// # Panics
 /// When the disk refuses.
 pub fn write_end_to_end(folder: &Path, regresses: EndToEndKind, seed: i64) -> PathBuf {
+    let _generator = random_generator_lock();
     tch::manual_seed(seed);
-    tch::set_num_threads(1);
     let config = EndToEndConfig { regresses, town: "nowhere".into(), origin_m: [0.0; 3], encoder: tiny() };
     let network = VarStore::new(Device::Cpu);
     EndToEnd::new(&network.root(), &config).expect("a configuration that fits");

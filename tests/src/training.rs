@@ -1,7 +1,6 @@
 //! Trainings that a test has time for.
 
 use std::path::Path;
-use std::sync::{Mutex, MutexGuard, PoisonError};
 
 use ::training::loss::LossConfig;
 use ::training::samples::{SampleConfig, SampleKind};
@@ -11,13 +10,6 @@ use dataset::evaluation_protocol::ProtocolConfig;
 use fusion::Method;
 use perception::model_config::DetectorConfig;
 use perception::train::{Length, RunConfig};
-
-/// libtorch has one generator of random numbers per process: who begins a training has it alone.
-pub fn alone() -> MutexGuard<'static, ()> {
-    static GENERATOR: Mutex<()> = Mutex::new(());
-    tch::set_num_threads(1);
-    GENERATOR.lock().unwrap_or_else(PoisonError::into_inner)
-}
 
 /// Hears what a training says.
 #[derive(Default)]

@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use bus::shutdown::Stop;
 use bus::web::WebServer;
 use bus::{Bus, BusOptions, Credentials, Endpoint, Identity, process_id};
-use deploy::view::{LiveRun, Onlooker, RecordedRun, ViewError, serve_live, serve_recorded};
+use deploy::view::{LiveRun, RecordedRun, ViewError, serve_live, serve_recorded};
 use protocol::{CavId, Role, RunId};
 use support::output;
 
@@ -35,10 +35,6 @@ pub(crate) struct Arguments {
     /// Folder with the viewer's keys, where the live run has security (`v2vloc keys` writes DIR/viewer).
     #[arg(long, value_name = "DIR")]
     keys: Option<PathBuf>,
-    /// Write moments for Rerun: to a file, or to its viewer (rerun+http://HOST:PORT/proxy). Of a recorded run all, and no page.
-    #[cfg(feature = "rerun")]
-    #[arg(long, value_name = "FILE.rrd|ADDRESS")]
-    rerun: Option<String>,
     /// Where to serve the page.
     #[arg(long, value_name = "HOST:PORT", default_value = "127.0.0.1:8088")]
     listen: SocketAddr,
@@ -56,11 +52,6 @@ impl Arguments {
                     ViewError::Recording(_) => anyhow::Error::from(error),
                 })?;
                 output::note(format_args!("{} moments of run {}", run.len(), run.name()));
-                #[cfg(feature = "rerun")]
-                if let Some(destination) = &self.rerun {
-                    deploy::view::write_for_rerun(&run, destination)?;
-                    return Ok(Outcome::Done);
-                }
                 serve_recorded(self.listen, Arc::new(run))
             }
             (None, Some(name), Some(router)) => {
@@ -75,7 +66,7 @@ impl Arguments {
                     options = options.with_credentials(credentials);
                 }
                 let bus = Bus::join(&options, identity)?;
-                serve_live(self.listen, Arc::new(LiveRun::start_for(bus, self.onlooker(name)?)?))
+                serve_live(self.listen, Arc::new(LiveRun::start(bus)?))
             }
             (None, _, _) => {
                 return Err(BadInput("name a run folder, or --live --name RUN --connect ROUTER".into()).into());
@@ -86,24 +77,6 @@ impl Arguments {
         while !stop.wait_until(Instant::now() + Duration::from_secs(3600)) {}
         say_dropped(&server);
         Ok(Outcome::Done)
-    }
-
-    #[cfg(not(feature = "rerun"))]
-    fn onlooker(&self, _: &RunId) -> anyhow::Result<Option<Onlooker>> {
-        Ok(None)
-    }
-
-    #[cfg(feature = "rerun")]
-    fn onlooker(&self, run: &RunId) -> anyhow::Result<Option<Onlooker>> {
-        let Some(destination) = &self.rerun else { return Ok(None) };
-        let log = deploy::view::RerunLog::open(run.as_str(), destination)?;
-        let mut log = Some(log);
-        Ok(Some(Box::new(move |frame| {
-            if let Some(Err(error)) = log.as_mut().map(|log| log.write(frame)) {
-                output::note(format_args!("{error}; nothing more is written for Rerun"));
-                log = None;
-            }
-        })))
     }
 }
 

@@ -13,7 +13,6 @@ use protocol::{Kind, RunId, Selector, Stream, wire};
 use tokio::sync::watch;
 use tokio::time::{sleep, timeout};
 
-use super::SceneFrame;
 use super::frame_assembler::{Assembly, Seen};
 
 /// Messages of one key that may wait to be looked at.
@@ -28,9 +27,6 @@ const HEARTBEAT: Duration = Duration::from_secs(1);
 const NOTHING_NEW: [u8; 4] = [0; 4];
 /// How often the thread looks whether somebody looks.
 const LOOK_ROUND: Duration = Duration::from_millis(100);
-
-/// Somebody to whom every moment is shown.
-pub type Onlooker = Box<dyn FnMut(&SceneFrame) + Send>;
 
 /// The newest moment of a run, for any number of pages. The run is listened to only while somebody looks: nobody pays for a
 /// page that is not open. Points are those of previews, which are sent only while somebody listens to them.
@@ -48,14 +44,6 @@ impl LiveRun {
     /// # Errors
     /// [`BusError`] when the system gives no thread.
     pub fn start(bus: Bus) -> Result<Self, BusError> {
-        Self::start_for(bus, None)
-    }
-
-    /// The same with somebody who looks at every moment, whether a page is open or not.
-    ///
-    /// # Errors
-    /// As [`Self::start`].
-    pub fn start_for(bus: Bus, onlooker: Option<Onlooker>) -> Result<Self, BusError> {
         let run = bus.identity().run.clone();
         let newest = Arc::new(watch::Sender::default());
         let ending = Arc::<AtomicBool>::default();
@@ -64,7 +52,6 @@ impl LiveRun {
             run: run.clone(),
             newest: Arc::clone(&newest),
             ending: Arc::clone(&ending),
-            onlooker,
             assembly: Assembly::default(),
         };
         let thread = thread::Builder::new()
@@ -124,7 +111,6 @@ struct Listener {
     run: RunId,
     newest: Arc<watch::Sender<Bytes>>,
     ending: Arc<AtomicBool>,
-    onlooker: Option<Onlooker>,
     assembly: Assembly,
 }
 
@@ -178,7 +164,7 @@ impl Listener {
     }
 
     fn is_watched(&self) -> bool {
-        self.onlooker.is_some() || self.newest.receiver_count() > 0
+        self.newest.receiver_count() > 0
     }
 
     fn take(&mut self, overheard: &Overheard) {
@@ -191,9 +177,6 @@ impl Listener {
         let (arrived_nanos, payload) = (overheard.arrived_nanos, Some(bytes.as_ref()));
         let seen = Seen { topic, header: &header, arrived_nanos, payload };
         if let Some(frame) = self.assembly.add(&seen).filter(|_| self.is_watched()) {
-            if let Some(onlooker) = &mut self.onlooker {
-                onlooker(&frame);
-            }
             let frame = frame.to_bytes();
             let len = (frame.len() as u32).to_le_bytes();
             self.newest.send_replace([len.as_slice(), &frame].concat().into());

@@ -2,24 +2,20 @@
 //!
 //! The page is part of this program and loads nothing from anywhere else. What it shows comes from a live run
 //! ([`LiveRun`]), over a tap that nobody's books know of, or from a recorded one ([`RecordedRun`]); both put their messages
-//! through the same [`Assembly`], and a [`SceneFrame`] is what comes out. With the feature `rerun` moments are written for Rerun, too.
+//! through the same [`Assembly`], and a [`SceneFrame`] is what comes out.
 
 pub mod demo;
 mod frame_assembler;
 mod live;
 pub mod picture;
 mod recorded;
-#[cfg(feature = "rerun")]
-mod rerun;
 mod scene_frame;
 mod server;
 #[cfg(test)]
 mod tests;
 
 pub use frame_assembler::{Assembly, Seen};
-pub use live::{LiveRun, Onlooker};
+pub use live::LiveRun;
 pub use recorded::{RecordedRun, ViewError};
-#[cfg(feature = "rerun")]
-pub use rerun::{RerunError, RerunLog, write_for_rerun};
 pub use scene_frame::SceneFrame;
 pub use server::{serve_live, serve_recorded};

@@ -172,56 +172,6 @@ fn a_recorded_run_is_shown_in_any_order() {
     shows_without_an_error(server.address(), "?at=4", "recorded");
 }
 
-#[cfg(feature = "rerun")]
-#[test]
-fn a_recorded_run_is_written_for_rerun_and_read_back() {
-    use re_sdk::log::{Chunk, LogMsg};
-    use re_sdk_types::archetypes::{Boxes3D, Points3D, Scalars};
-
-    let folder = tempfile::tempdir().unwrap();
-    let file = folder.path().join("run.rrd");
-    write_for_rerun(&record(folder.path()), file.to_str().unwrap()).unwrap();
-    let bytes = std::io::BufReader::new(std::fs::File::open(&file).unwrap());
-    let mut chunks: Vec<Chunk> = Vec::new();
-    for message in re_log_encoding::DecoderApp::decode_eager(bytes).unwrap() {
-        match message.unwrap() {
-            LogMsg::SetStoreInfo(store) => assert_eq!(store.info.application_id().as_str(), "v2vloc"),
-            LogMsg::ArrowMsg(_, message) => chunks.push(Chunk::from_arrow_msg(&message).unwrap()),
-            LogMsg::BlueprintActivationCommand(_) => panic!("none was sent"),
-        }
-    }
-    // How many values an entity has of a component at every moment, in order.
-    let counts = |entity: &str, component| {
-        let of_it = chunks.iter().filter(|chunk| chunk.entity_path().to_string() == entity && !chunk.is_static());
-        let rows = of_it.flat_map(|chunk| {
-            assert!(chunk.timelines().keys().any(|timeline| timeline.as_str() == "frame"));
-            chunk.iter_component_offsets(component).map(|span| span.len).collect::<Vec<_>>()
-        });
-        rows.collect::<Vec<_>>()
-    };
-    let each = |count: usize| vec![count; TICKS as usize];
-    for vehicle in [EGO, OTHER] {
-        let points = format!("/world/vehicles/{vehicle}/points");
-        assert_eq!(counts(&points, Points3D::descriptor_positions().component), each(10_000));
-        let confidence = format!("/vehicles/{vehicle}/confidence");
-        assert_eq!(counts(&confidence, Scalars::descriptor_scalars().component), each(1));
-    }
-    for layer in ["/world/truth", "/world/detections/fused"] {
-        assert_eq!(counts(layer, Boxes3D::descriptor_half_sizes().component), each(1), "{layer}");
-    }
-    let scalars = |entity: &str| {
-        let component = Scalars::descriptor_scalars().component;
-        let of_it = chunks.iter().filter(|chunk| chunk.entity_path().to_string() == entity);
-        let values =
-            of_it.flat_map(|chunk| chunk.iter_slices::<f64>(component).flat_map(<[f64]>::to_vec).collect::<Vec<_>>());
-        values.collect::<Vec<_>>()
-    };
-    assert_eq!(scalars("/latency_ms"), [50.0; TICKS as usize]);
-    assert_eq!(scalars("/stages/fuse/ms"), [8.0; TICKS as usize]);
-    let link = chunks.iter().map(|chunk| chunk.entity_path().to_string()).find(|path| path.ends_with("wire_bytes"));
-    assert_eq!(scalars(&link.unwrap()), [1_250.0; TICKS as usize]);
-}
-
 #[test]
 fn a_replay_that_begins_anew_is_shown_from_its_beginning() {
     let mut assembly = Assembly::default();

@@ -1,0 +1,6 @@
+//! Bus: publishers, subscribers, link emulation and replay through real zenoh sessions on loopback.
+
+mod flood;
+mod link;
+mod replay;
+mod sessions;

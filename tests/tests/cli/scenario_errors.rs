@@ -1,0 +1,118 @@
+//! What `v2vloc` says, and with which exit code, when something is missing or wrong.
+
+use std::fs;
+use std::net::TcpListener;
+use std::path::Path;
+use std::process::Command;
+
+use tests::fleet::{programs, write_scenario};
+use tests::locks::exclusive_lock;
+
+/// Runs `v2vloc up` and returns exit code and standard error.
+fn up(program: &Path, folder: &Path, scenario: &Path) -> (Option<i32>, String) {
+    let output = Command::new(program).arg("up").arg(scenario).arg("--runs").arg(folder.join("runs")).output().unwrap();
+    (output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned())
+}
+
+/// As [`up`], with the program under test.
+fn refused(folder: &Path, scenario: &Path) -> (Option<i32>, String) {
+    up(&programs().join("v2vloc"), folder, scenario)
+}
+
+#[test]
+fn a_misspelt_field_is_named_with_file_and_line() {
+    let folder = tempfile::tempdir().unwrap();
+    let scenario = write_scenario(folder.path(), 1, "", "ego:\n  dedline_ms: 5");
+    let (code, said) = refused(folder.path(), &scenario);
+    assert_eq!(code, Some(2), "{said}");
+    assert!(said.contains("scenario.yaml:6") && said.contains("dedline_ms"), "{said}");
+}
+
+#[test]
+fn missing_weights_are_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let scenario = write_scenario(folder.path(), 1, "", "");
+    fs::remove_file(folder.path().join("weights.safetensors")).unwrap();
+    let (code, said) = refused(folder.path(), &scenario);
+    assert_eq!(code, Some(2), "{said}");
+    assert!(said.contains("models.weights") && said.contains("weights.safetensors does not exist"), "{said}");
+}
+
+#[test]
+fn cut_off_weights_are_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let scenario = write_scenario(folder.path(), 1, "", "");
+    let weights = folder.path().join("weights.safetensors");
+    let whole = fs::read(&weights).unwrap();
+    fs::write(&weights, &whole[..whole.len() / 2]).unwrap();
+    let (code, said) = refused(folder.path(), &scenario);
+    assert_eq!(code, Some(2), "{said}");
+    assert!(said.contains("weights.safetensors: not a whole safetensors file"), "{said}");
+}
+
+#[test]
+fn a_scene_without_frames_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let scenario = write_scenario(folder.path(), 1, "", "");
+    for agent in ["4279", "4288"] {
+        for entry in fs::read_dir(folder.path().join("scene").join(agent)).unwrap() {
+            fs::remove_file(entry.unwrap().path()).unwrap();
+        }
+    }
+    let (code, said) = refused(folder.path(), &scenario);
+    assert_eq!(code, Some(2), "{said}");
+    assert!(said.contains(&folder.path().join("scene").display().to_string()), "{said}");
+}
+
+#[test]
+fn a_vehicle_that_is_not_there_is_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let scenario = write_scenario(folder.path(), 1, "agents: ['4279', '77']", "");
+    let (code, said) = refused(folder.path(), &scenario);
+    assert_eq!(code, Some(2), "{said}");
+    assert!(said.contains("scene.agents names vehicle 77") && said.contains("4288"), "{said}");
+}
+
+#[test]
+fn a_port_in_use_is_named() {
+    let taken = TcpListener::bind("127.0.0.1:0").unwrap();
+    let endpoint = format!("tcp/{}", taken.local_addr().unwrap());
+    let folder = tempfile::tempdir().unwrap();
+    let scenario = write_scenario(folder.path(), 1, "", &format!("network: {{listen: \"{endpoint}\"}}"));
+    let (code, said) = refused(folder.path(), &scenario);
+    assert_eq!(code, Some(1), "{said}");
+    assert!(said.contains(&endpoint) && said.contains("in use"), "{said}");
+    assert!(!folder.path().join("runs/test").exists(), "the name is free for the next attempt");
+}
+
+#[test]
+fn a_missing_program_is_named() {
+    let folder = tempfile::tempdir().unwrap();
+    let scenario = write_scenario(folder.path(), 1, "", "");
+    let lonely = folder.path().join("v2vloc");
+    fs::copy(programs().join("v2vloc"), &lonely).unwrap();
+    let (code, said) = up(&lonely, folder.path(), &scenario);
+    assert_eq!(code, Some(1), "{said}");
+    assert!(said.contains(&folder.path().join("agent").display().to_string()) && said.contains("is missing"), "{said}");
+}
+
+#[test]
+fn a_second_run_of_the_same_name_is_refused() {
+    let folder = tempfile::tempdir().unwrap();
+    let scenario = write_scenario(folder.path(), 1, "", "");
+    fs::create_dir_all(folder.path().join("runs/test")).unwrap();
+    let (code, said) = refused(folder.path(), &scenario);
+    assert_eq!(code, Some(2), "{said}");
+    assert!(said.contains("runs/test exists already"), "{said}");
+}
+
+#[test]
+fn an_agent_that_never_comes_is_named() {
+    let _exclusive = exclusive_lock();
+    let folder = tempfile::tempdir().unwrap();
+    let rest = "vehicles: {'4288': {launch: elsewhere}}\ntimeouts: {ready_s: 3}";
+    let scenario = write_scenario(folder.path(), 1, "", rest);
+    let (code, said) = refused(folder.path(), &scenario);
+    assert_eq!(code, Some(1), "{said}");
+    assert!(said.contains("not ready") && said.contains("agent-4288"), "{said}");
+}

@@ -1,0 +1,11 @@
+//! Faults: crashed processes, cut connections, full disks and damaged inputs. Every test holds the exclusive lock.
+
+mod damaged_inputs;
+mod failed_parts;
+mod processes;
+
+use peak_alloc::PeakAlloc;
+
+/// Counts memory for `damaged_inputs`; an allocator belongs to the whole program.
+#[global_allocator]
+static MEMORY: PeakAlloc = PeakAlloc;

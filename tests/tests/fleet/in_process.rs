@@ -1,0 +1,564 @@
+//! A fleet through real zenoh sessions: replay, agents and ego in one process, each on a session of its own.
+
+use std::collections::BTreeMap;
+use std::path::Path;
+use std::sync::Arc;
+use std::thread::{Scope, ScopedJoinHandle};
+use std::time::{Duration, Instant};
+
+use agent::agent::{Agent, AgentInput};
+use agent::node as agent_node;
+use agent::rate::RateConfig;
+use bus::bounded_queue::Taken;
+use bus::shutdown::Stop;
+use bus::{Bus, Event, Inbox, PublisherOptions, Route, Subscription, process_id};
+use dataset::{self, LoadOptions, Scenario};
+use ego_fuser::ego::{Content, Ego, View, own_content};
+use ego_fuser::node as ego_node;
+use ego_fuser::pairing::PairingConfig;
+use fusion::Exchange;
+use fusion::Method;
+use localization::pose_source::RecordedPose;
+use perception::detector::Detector;
+use perception::model_config::DetectorConfig;
+use perception::pillars::point_pillars::PointPillars;
+use protocol::message::{Descriptor, ModelHash};
+use protocol::{
+    Account, CavId, DecodedFeatures, Detection, Detections, DropReason, Ledger, Limits, RateReason, Stream, Topic,
+};
+use recording::{Recording, RecordingOptions};
+use sim_replay::recorder::{self, RecordReport, RecorderOptions};
+use sim_replay::stream::{Replay, StreamOptions};
+use tch::Device;
+use tch::nn::VarStore;
+use tests::bus::{PATIENCE, TestRouter, next_event};
+use tests::locks::random_generator_lock;
+use tests::scene;
+use zenoh::Wait;
+
+const AGENTS: [&str; 3] = ["10", "20", "30"];
+const TICKS: usize = 6;
+
+fn cav(text: &str) -> CavId {
+    CavId::new(text).unwrap()
+}
+
+fn topic(cav_id: &str, stream: Stream) -> Topic {
+    Topic::Stream { cav: cav(cav_id), stream }
+}
+
+/// What `build` makes, with the same random parameters every time.
+fn seeded<T>(build: impl FnOnce() -> T) -> T {
+    // The seed is that of the whole process: nobody else may draw between it and the last parameter.
+    let _generator = random_generator_lock();
+    tch::manual_seed(5);
+    build()
+}
+
+/// A network with a head that believes in vehicles everywhere.
+fn network() -> Detector {
+    let config = DetectorConfig { lidar_range_m: [-25.6, -12.8, -3.0, 25.6, 12.8, 1.0], ..DetectorConfig::lean() };
+    let network = VarStore::new(Device::Cpu);
+    let pillars = PointPillars::new(&network.root(), &config).unwrap();
+    let _ = tch::no_grad(|| network.variables()["cls_head.bias"].shallow_clone().fill_(0.3));
+    Detector::from_network(pillars)
+}
+
+fn detector() -> Detector {
+    seeded(network)
+}
+
+/// An ego around the same network, its fusion with the same random parameters every time.
+fn ego(method: Method) -> Ego {
+    seeded(|| Ego::new(network(), method).unwrap())
+}
+
+fn agent(cav_id: &str) -> Agent {
+    Agent::new(cav(cav_id), Box::new(RecordedPose), detector())
+}
+
+fn published(method: Method) -> Stream {
+    match own_content(method) {
+        Exchange::Boxes => Stream::Boxes,
+        Exchange::Points => Stream::Points,
+        Exchange::Features | Exchange::Nothing => Stream::Bev,
+    }
+}
+
+/// Runs an agent on a session of its own until `stop`; gives its books.
+fn run_agent<'scope>(
+    scope: &'scope Scope<'scope, '_>,
+    router: &'scope TestRouter,
+    cav_id: &'static str,
+    stream: Stream,
+    rate: RateConfig,
+    stop: &Stop,
+) -> ScopedJoinHandle<'scope, Ledger> {
+    let stop = stop.clone();
+    scope.spawn(move || {
+        let bus = router.join(&format!("agent-{cav_id}"), cav_id);
+        let options = agent_node::NodeOptions { publish: vec![stream], rate, ..agent_node::NodeOptions::default() };
+        let report = agent_node::run(&bus, agent(cav_id), &options, &stop).unwrap();
+        assert_eq!(report.failed, 0);
+        leave(bus)
+    })
+}
+
+fn leave(bus: Bus) -> Ledger {
+    let books = bus.books().clone();
+    bus.leave(PATIENCE).unwrap();
+    books.ledger()
+}
+
+/// Listens to an ego's detections until it ends.
+fn listen<'scope>(
+    scope: &'scope Scope<'scope, '_>,
+    router: &'scope TestRouter,
+    ego: &'static str,
+) -> ScopedJoinHandle<'scope, (Vec<(u64, Detections)>, Ledger)> {
+    let bus = router.join("scorer", "scorer");
+    let inbox = bus.inbox(1000, 2);
+    let subscription = bus.subscribe(topic(ego, Stream::Detections), &inbox).unwrap();
+    scope.spawn(move || {
+        let mut results = Vec::new();
+        loop {
+            match inbox.take(Some(Instant::now() + PATIENCE)) {
+                Taken::Item(_, Event::Message(arrival)) => {
+                    let result: Detections = inbox.decode(&arrival, &Limits::DEFAULT).unwrap();
+                    bus.books().received(&arrival.topic);
+                    results.push((arrival.header.stamp.capture_nanos, result));
+                }
+                Taken::Item(_, Event::End { .. }) => break,
+                other => panic!("{other:?}"),
+            }
+        }
+        drop(subscription);
+        (results, leave(bus))
+    })
+}
+
+/// Who has a part in a method: alone the ego needs nobody's maps but its own.
+fn taking_part(method: Method) -> &'static [&'static str] {
+    if method == Method::None { &AGENTS[..1] } else { &AGENTS }
+}
+
+/// Plays the scene in step with the ego, whose neighbours keep within `rate`; gives what the ego told and everyone's books
+/// added up.
+fn play_in_lockstep(dir: &Path, method: Method, rate: RateConfig) -> (Vec<(u64, Detections)>, Ledger) {
+    play_and_record(dir, method, rate, None)
+}
+
+/// Writes a run down until `stop`.
+fn record<'scope>(
+    scope: &'scope Scope<'scope, '_>,
+    router: &'scope TestRouter,
+    file: &Path,
+    stop: &Stop,
+) -> ScopedJoinHandle<'scope, RecordReport> {
+    let (out, stop) = (file.to_path_buf(), stop.clone());
+    scope.spawn(move || {
+        let bus = router.join("recorder", "recorder");
+        let recording = RecordingOptions::default();
+        let options = RecorderOptions { out, recording, without: Vec::new(), keeps_running: true };
+        let report = recorder::record(&bus, &options, &stop, &mut |_| {}).unwrap();
+        bus.leave(PATIENCE).unwrap();
+        report
+    })
+}
+
+/// [`play_in_lockstep`], with everything that is said written to a file.
+fn play_and_record(
+    dir: &Path,
+    method: Method,
+    rate: RateConfig,
+    file: Option<&Path>,
+) -> (Vec<(u64, Detections)>, Ledger) {
+    let scenario = dataset::open(dir).unwrap().scenarios.remove(0);
+    let (router, stop) = (TestRouter::open(), Stop::new());
+    let stream = published(method);
+    std::thread::scope(|scope| {
+        let listening = listen(scope, &router, "10");
+        let (recorded, ending) = (Stop::new(), Stop::new());
+        let recorder = file.map(|file| record(scope, &router, file, &recorded));
+        let start = |cav_id: &&'static str| {
+            let rate = if *cav_id == "10" { RateConfig::default() } else { rate };
+            run_agent(scope, &router, cav_id, stream, rate, &stop)
+        };
+        let agents: Vec<_> = taking_part(method).iter().map(start).collect();
+        let ego = scope.spawn(|| {
+            let bus = router.join("ego-10", "10");
+            let options = ego_node::NodeOptions { deadline: PATIENCE, ..ego_node::NodeOptions::default() };
+            let report = ego_node::run(&bus, &cav("10"), ego(method), &options, &stop).unwrap();
+            assert_eq!((report.frames, report.at_deadline, report.failed), (TICKS as u64, 0, 0));
+            leave(bus)
+        });
+        let replay = router.join("replay", "replay");
+        let route = |cav_id: &&str| Route { topic: topic(cav_id, stream), receiver: "ego-10".parse().unwrap() };
+        let expect = taking_part(method).iter().map(route);
+        let scorer = Route { topic: topic("10", Stream::Detections), receiver: "scorer".parse().unwrap() };
+        let options = StreamOptions {
+            expect: expect.chain([scorer]).chain(file.iter().flat_map(|_| to_recorder(method, stream))).collect(),
+            lockstep: vec![cav("10")],
+            agents: taking_part(method).iter().map(|cav_id| cav(cav_id)).collect(),
+            ..StreamOptions::default()
+        };
+        let playing = Replay::prepare(&replay, &scenario, options, &ending).unwrap();
+        playing.wait_until_ready().unwrap();
+        let report = playing.play();
+        assert!(report.is_complete() && report.ticks == TICKS as u64, "{report:?}");
+        let mut ledger = leave(replay);
+        agents.into_iter().for_each(|agent| ledger.merge(&agent.join().unwrap()));
+        ledger.merge(&ego.join().unwrap());
+        let (results, books) = listening.join().unwrap();
+        ledger.merge(&books);
+        recorded.request();
+        if let Some(report) = recorder.map(|recorder| recorder.join().unwrap()) {
+            assert!(report.is_complete() && report.messages > 0, "{report:?}");
+        }
+        (results, ledger)
+    })
+}
+
+/// The routes to a recorder that has to hear everything from the beginning.
+fn to_recorder(method: Method, stream: Stream) -> Vec<Route> {
+    let streams = [Stream::Lidar, Stream::Gnss, Stream::Pose, stream];
+    let vehicles = taking_part(method).iter().flat_map(|cav_id| streams.map(|stream| topic(cav_id, stream)));
+    let topics = vehicles.chain([Topic::Truth, topic("10", Stream::Detections)]);
+    topics.map(|topic| Route { topic, receiver: "recorder".parse().unwrap() }).collect()
+}
+
+#[test]
+fn a_recorded_run_replayed_gives_the_same_detections() {
+    let folder = tempfile::tempdir().unwrap();
+    scene::write(folder.path(), &AGENTS, TICKS);
+    for method in [Method::Max, Method::Late] {
+        let file = folder.path().join(format!("{method}.mcap"));
+        let (live, ledger) = play_and_record(folder.path(), method, RateConfig::default(), Some(&file));
+        assert!(ledger.balance().is_exact(), "{method}: a recorder is in nobody's books");
+        let recording = Recording::open(&file).unwrap();
+        assert_eq!(recording.damage(), []);
+        let told = |stream| recording.entries().iter().filter(|entry| entry.key.topic == topic("10", stream)).count();
+        assert_eq!([Stream::Lidar, Stream::Pose, Stream::Detections].map(told), [TICKS; 3], "{method}");
+        let (again, _) = play_in_lockstep(&file, method, RateConfig::default());
+        assert_eq!(live.len(), again.len(), "{method}");
+        assert!(live.iter().any(|(_, result)| !result.detections.is_empty()), "{method}: nothing to compare");
+        for ((capture, live), (again_capture, again)) in live.iter().zip(&again) {
+            assert_eq!((capture, live.pose), (again_capture, again.pose), "{method}");
+            assert_eq!(live.detections, again.detections, "{method} at {capture}");
+        }
+    }
+}
+
+/// The same pipelines without any network.
+fn play_offline(scenario: &Scenario, method: Method) -> Vec<(u64, Vec<Detection>)> {
+    let mut agents: Vec<Agent> = AGENTS.iter().map(|cav_id| agent(cav_id)).collect();
+    let mut ego = ego(method);
+    let mut results = Vec::new();
+    for (tick_index, tick) in scenario.ticks.iter().enumerate() {
+        let views: Vec<View> = (agents.iter_mut().enumerate())
+            .map(|(index, agent)| {
+                let frame = scenario.load(index, tick_index, &LoadOptions::default()).unwrap();
+                let input = AgentInput {
+                    capture_nanos: tick.capture_nanos,
+                    cloud: &frame.points,
+                    measured_pose: frame.world_from_lidar.as_ref(),
+                };
+                let output = agent.process(&input).unwrap();
+                let content = match own_content(method) {
+                    Exchange::Boxes => Content::Boxes(output.perception.detections),
+                    Exchange::Points => Content::Points(agent.detector().crop().without_own_body(&frame.points)),
+                    Exchange::Features | Exchange::Nothing => {
+                        Content::Features(DecodedFeatures { features: output.perception.features, sent: None })
+                    }
+                };
+                View { cav: agent.cav().clone(), pose: output.pose, capture_nanos: tick.capture_nanos, content }
+            })
+            .collect();
+        let detected = ego.detect(&views[0], &views[1..]).unwrap();
+        results.push((tick.capture_nanos, detected.detections));
+    }
+    results
+}
+
+#[test]
+fn live_in_lockstep_equals_offline_bit_by_bit_and_the_books_balance() {
+    let folder = tempfile::tempdir().unwrap();
+    scene::write(folder.path(), &AGENTS, TICKS);
+    let scenario = dataset::open(folder.path()).unwrap().scenarios.remove(0);
+    for method in Method::ALL {
+        let (live, ledger) = play_in_lockstep(folder.path(), method, RateConfig::default());
+        let offline = play_offline(&scenario, method);
+        assert!(offline.iter().any(|(_, detections)| !detections.is_empty()), "{method}: nothing to compare");
+        assert_eq!(live.len(), offline.len(), "{method}");
+        for (tick, ((live_capture, live), (capture, offline))) in live.iter().zip(&offline).enumerate() {
+            assert_eq!(live.agent_frame, tick as u64, "{method}");
+            assert_eq!((live_capture, live.detections.len()), (capture, offline.len()), "{method}");
+            for (live, offline) in live.detections.iter().zip(offline) {
+                assert_eq!(live, offline, "{method} at {capture}");
+            }
+        }
+        let expected = taking_part(method).len() - 1;
+        assert!(live.iter().all(|(_, result)| result.fused.len() == expected && result.skipped.is_empty()), "{method}");
+        assert!(live.iter().all(|(_, result)| result.fused.iter().all(|fused| fused.age_nanos == 0)), "{method}");
+
+        let balance = ledger.balance();
+        assert!(balance.is_exact(), "{method}: {balance:?}");
+        let total = ledger.total();
+        assert_eq!(total.in_flight, 0, "{method}: {ledger:?}");
+        assert_eq!(total.dropped_total(), 0, "{method}: {ledger:?}");
+    }
+}
+
+#[test]
+fn maps_that_keep_within_a_limit_are_fused_and_booked_with_the_reason() {
+    let folder = tempfile::tempdir().unwrap();
+    scene::write(folder.path(), &AGENTS, TICKS);
+    let values: i64 = detector().map_shape().iter().product();
+    // Half of what the map takes at a byte per value.
+    let limit = values as u64 / 2;
+    let rate = RateConfig { message_bytes: Some(limit), ..RateConfig::default() };
+    let (live, ledger) = play_in_lockstep(folder.path(), Method::Max, rate);
+    assert!(live.iter().all(|(_, result)| result.fused.len() == AGENTS.len() - 1 && result.skipped.is_empty()));
+    for fused in live.iter().flat_map(|(_, result)| &result.fused) {
+        let bytes = fused.payload_bytes + protocol::HEADER_LEN as u64;
+        assert!(bytes <= limit && bytes > limit / 2, "{bytes} of {limit}");
+    }
+    assert!(ledger.balance().is_exact());
+    let adapted = |cav_id: &str| {
+        let account = Account::published(topic(cav_id, Stream::Bev));
+        ledger.get(&account).unwrap().adapted.clone()
+    };
+    assert!(adapted("10").is_empty(), "what the ego's own agent sends does not cross the air");
+    let fewer = BTreeMap::from([(RateReason::SizeFewerCells, TICKS as u64)]);
+    assert!(AGENTS.iter().filter(|cav_id| **cav_id != "10").all(|cav_id| adapted(cav_id) == fewer), "{ledger:?}");
+}
+
+/// Sends a fleet's maps by hand, so that the test decides who is late, wrong or gone.
+struct Puppet {
+    bus: Bus,
+    publisher: bus::Publisher,
+    agent: Agent,
+    index: usize,
+    _presence: bus::Presence,
+}
+
+impl Puppet {
+    fn new(router: &TestRouter, index: usize) -> Self {
+        let bus = router.join(&format!("agent-{}", AGENTS[index]), AGENTS[index]);
+        let publisher =
+            bus.publisher(topic(AGENTS[index], Stream::Bev), PublisherOptions::FEATURES.lossless(8)).unwrap();
+        let presence = bus.announce(protocol::Role::Agent).unwrap();
+        Self { bus, publisher, agent: agent(AGENTS[index]), index, _presence: presence }
+    }
+
+    fn send(&mut self, scenario: &Scenario, tick_index: usize) {
+        let tick = &scenario.ticks[tick_index];
+        let frame = scenario.load(self.index, tick_index, &LoadOptions::default()).unwrap();
+        let input = AgentInput {
+            capture_nanos: tick.capture_nanos,
+            cloud: &frame.points,
+            measured_pose: frame.world_from_lidar.as_ref(),
+        };
+        let output = self.agent.process(&input).unwrap();
+        let pose = output.pose;
+        self.publisher.offer_encoded(tick.capture_nanos, move |stamp| {
+            let features =
+                protocol::encode_features(output.perception.features, &protocol::CodecConfig::default(), None)?;
+            protocol::wire::encode(stamp, protocol::message::Bev { pose, features })
+        });
+    }
+
+    fn wait_until_heard(&self, receiver: &str) {
+        let route = Route { topic: self.publisher.topic().clone(), receiver: receiver.parse().unwrap() };
+        bus::Barrier::new([route]).attend(&self.bus).unwrap().wait(PATIENCE).unwrap();
+    }
+}
+
+/// What vehicle 10 detects, as a scorer hears it.
+struct Results {
+    inbox: Arc<Inbox>,
+    _subscription: Subscription,
+    _bus: Bus,
+}
+
+impl Results {
+    fn of_10(router: &TestRouter) -> Self {
+        let bus = router.join("scorer", "scorer");
+        let inbox = bus.inbox(100, 1);
+        let subscription = bus.subscribe(topic("10", Stream::Detections), &inbox).unwrap();
+        Self { inbox, _subscription: subscription, _bus: bus }
+    }
+
+    fn next(&self) -> Detections {
+        let (_, Event::Message(arrival)) = next_event(&self.inbox) else { panic!("an end") };
+        self.inbox.decode(&arrival, &Limits::DEFAULT).unwrap()
+    }
+}
+
+/// Whose messages a result is made of, beside the ego's own.
+fn fused(result: &Detections) -> Vec<&str> {
+    result.fused.iter().map(|fused| fused.cav.as_str()).collect()
+}
+
+#[test]
+fn late_killed_and_lying_neighbours_are_named_and_the_ego_goes_on() {
+    let folder = tempfile::tempdir().unwrap();
+    scene::write(folder.path(), &AGENTS, TICKS);
+    let scenario = dataset::open(folder.path()).unwrap().scenarios.remove(0);
+    let router = TestRouter::open();
+    let stop = Stop::new();
+    let mut fleet: Vec<Puppet> = (0..3).map(|index| Puppet::new(&router, index)).collect();
+    let results = Results::of_10(&router);
+
+    let ledger = std::thread::scope(|scope| {
+        let ego = scope.spawn(|| {
+            let bus = router.join("ego-10", "10");
+            let options = ego_node::NodeOptions {
+                deadline: Duration::from_millis(400),
+                pairing: PairingConfig { max_age_nanos: 150_000_000, ..PairingConfig::default() },
+                keeps_running: true,
+                ..ego_node::NodeOptions::default()
+            };
+            ego_node::run(&bus, &cav("10"), ego(Method::Max), &options, &stop).unwrap();
+            leave(bus)
+        });
+        fleet.iter().for_each(|puppet| puppet.wait_until_heard("ego-10"));
+
+        // All there.
+        for index in [1, 2, 0] {
+            fleet[index].send(&scenario, 0);
+        }
+        assert_eq!(fused(&results.next()), ["20", "30"]);
+
+        // 30 is late: its message of the tick before is still young enough, and is used with its age.
+        fleet[1].send(&scenario, 1);
+        fleet[0].send(&scenario, 1);
+        let result = results.next();
+        assert_eq!(fused(&result), ["20", "30"]);
+        assert_eq!(result.fused[1].age_nanos, 100_000_000);
+
+        // Still silent: too old now, masked and named.
+        fleet[1].send(&scenario, 2);
+        fleet[0].send(&scenario, 2);
+        let result = results.next();
+        assert_eq!(fused(&result), ["20"]);
+        assert_eq!((result.skipped[0].cav.as_str(), result.skipped[0].reason), ("30", None));
+
+        // 20 sends garbage under its own name: counted, and the ego goes on without it.
+        let key = fleet[1].bus.key(topic("20", Stream::Bev)).to_string();
+        fleet[1].bus.session().put(&key, vec![0xAB; 4096]).wait().unwrap();
+        fleet[2].send(&scenario, 3);
+        fleet[0].send(&scenario, 3);
+        let result = results.next();
+        assert!(fused(&result).contains(&"30"), "{result:?}");
+
+        // 20 dies without a word.
+        let dead = fleet.remove(1);
+        dead.bus.session().close().wait().unwrap();
+        for tick in 4..6 {
+            fleet[1].send(&scenario, tick);
+            fleet[0].send(&scenario, tick);
+            assert!(fused(&results.next()).contains(&"30"));
+        }
+        stop.request();
+        ego.join().unwrap()
+    });
+    let from_20 = ledger.get(&Account::towards(topic("20", Stream::Bev), &process_id(protocol::Role::Ego, &cav("10"))));
+    let from_20 = from_20.unwrap();
+    assert_eq!(from_20.dropped.get(&DropReason::Decode), Some(&1), "{from_20:?}");
+    assert_eq!(from_20.received, 3);
+    let own = ledger.get(&Account::towards(topic("10", Stream::Bev), &process_id(protocol::Role::Ego, &cav("10"))));
+    assert_eq!(own.unwrap().received, 6);
+}
+
+#[test]
+fn maps_of_a_network_that_a_neighbour_names_as_another_are_left_out() {
+    let folder = tempfile::tempdir().unwrap();
+    scene::write(folder.path(), &AGENTS, TICKS);
+    let scenario = dataset::open(folder.path()).unwrap().scenarios.remove(0);
+    let (router, stop) = (TestRouter::open(), Stop::new());
+    let mut fleet: Vec<Puppet> = (0..3).map(|index| Puppet::new(&router, index)).collect();
+    let results = Results::of_10(&router);
+    let own = Descriptor {
+        model_hash: detector().model_hash(),
+        grid: detector().grid(),
+        channels: u32::try_from(detector().map_shape()[0]).unwrap(),
+        dtype: protocol::Dtype::F32,
+        streams: vec![Stream::Bev],
+    };
+    let ledger = std::thread::scope(|scope| {
+        let ego = scope.spawn(|| {
+            let bus = router.join("ego-10", "10");
+            // A frame that waited for what is left out would take for ever.
+            let options = ego_node::NodeOptions { deadline: PATIENCE, keeps_running: true, ..Default::default() };
+            let report = ego_node::run(&bus, &cav("10"), ego(Method::Max), &options, &stop).unwrap();
+            assert_eq!((report.frames, report.at_deadline), (4, 0));
+            leave(bus)
+        });
+        fleet.iter().for_each(|puppet| puppet.wait_until_heard("ego-10"));
+        let say = |puppet: &Puppet, descriptor: Descriptor| {
+            let publisher = puppet.bus.publisher(topic("20", Stream::Descriptor), PublisherOptions::POSE).unwrap();
+            publisher.offer(0, descriptor);
+            // It is on its way before the next map is.
+            publisher.finish();
+        };
+        let send_all = |fleet: &mut [Puppet], tick| [1, 2, 0].map(|index| fleet[index].send(&scenario, tick));
+
+        send_all(&mut fleet, 0);
+        assert_eq!(fused(&results.next()), ["20", "30"], "nothing is known of anybody");
+
+        say(&fleet[1], Descriptor { model_hash: ModelHash([9; 32]), ..own.clone() });
+        for tick in 1..3 {
+            send_all(&mut fleet, tick);
+            let result = results.next();
+            assert_eq!(fused(&result), ["30"]);
+            assert_eq!((result.skipped[0].cav.as_str(), result.skipped[0].reason), ("20", Some(DropReason::Shape)));
+        }
+
+        // It was started again, with the right weights.
+        let restarted = fleet.remove(1);
+        restarted.bus.session().close().wait().unwrap();
+        fleet.insert(1, Puppet::new(&router, 1));
+        fleet[1].wait_until_heard("ego-10");
+        say(&fleet[1], own);
+        send_all(&mut fleet, 3);
+        assert_eq!(fused(&results.next()), ["20", "30"]);
+        stop.request();
+        ego.join().unwrap()
+    });
+    let from_20 = ledger.get(&Account::towards(topic("20", Stream::Bev), &process_id(protocol::Role::Ego, &cav("10"))));
+    let from_20 = from_20.unwrap();
+    assert_eq!((from_20.received, from_20.dropped.get(&DropReason::Shape)), (2, Some(&2)), "{from_20:?}");
+    assert!(ledger.iter().all(|(account, _)| account.topic != topic("20", Stream::Descriptor)), "not booked");
+}
+
+#[test]
+fn an_agent_hears_its_own_sensors_only_and_says_so_when_it_has_no_pose() {
+    let folder = tempfile::tempdir().unwrap();
+    scene::write(folder.path(), &AGENTS, 3);
+    let scenario = dataset::open(folder.path()).unwrap().scenarios.remove(0);
+    let (router, stop) = (TestRouter::open(), Stop::new());
+    let ledger = std::thread::scope(|scope| {
+        let running = run_agent(scope, &router, "20", Stream::Bev, RateConfig::default(), &stop);
+        let replay = router.join("replay", "replay");
+        let lidar =
+            |cav_id| replay.publisher(topic(cav_id, Stream::Lidar), PublisherOptions::SENSOR.lossless(8)).unwrap();
+        let (own, other) = (lidar("20"), lidar("10"));
+        let route = Route { topic: topic("20", Stream::Lidar), receiver: "agent-20".parse().unwrap() };
+        bus::Barrier::new([route]).attend(&replay).unwrap().wait(PATIENCE).unwrap();
+        let frame = scenario.load(1, 0, &LoadOptions::default()).unwrap();
+        // A sweep whose pose never comes.
+        other.offer(1, protocol::Lidar { points: frame.points.clone() });
+        own.offer(1, protocol::Lidar { points: frame.points });
+        other.finish();
+        own.finish();
+        running.join().unwrap()
+    });
+    let heard: BTreeMap<String, u64> = (ledger.iter())
+        .filter(|(account, _)| account.to.is_some())
+        .map(|(account, counts)| (account.topic.to_string(), counts.received))
+        .collect();
+    assert_eq!(heard, BTreeMap::from([("20/gnss".to_owned(), 0), ("20/lidar".to_owned(), 1)]));
+    let sent = |stream| ledger.get(&Account::published(topic("20", stream))).unwrap().sent;
+    assert_eq!((sent(Stream::Pose), sent(Stream::Bev)), (1, 1), "it says that it has none");
+}

@@ -1,0 +1,7 @@
+//! Fleets: replay, agents and ego together, live and in simulation time, in one process and in several.
+
+mod compressor;
+mod in_process;
+mod localization;
+mod processes;
+mod simulation_time;

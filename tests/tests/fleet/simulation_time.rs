@@ -1,0 +1,394 @@
+//! Virtual time: the same bytes every time, in one process or in several, and the pipelines of a live run.
+
+use std::fs;
+use std::ops::ControlFlow;
+use std::path::Path;
+use std::process::{Command, Output};
+
+use agent::rate::RateConfig;
+use deploy::operate::run_fleet::{RunResult, UpOptions, up};
+use deploy::scenario::Scenario;
+use ego_fuser::pairing::PairingConfig;
+use ego_fuser_offline::evaluation::stepped::{ComputeTimes, Crew, SteppedConfig};
+use ego_fuser_offline::evaluation::{EvaluateConfig, EvaluatedFrame, Evaluator};
+use fusion::Method;
+use link::{ClockStep, DelayLaw, DeviceClock, LinkConfig, LossLaw};
+use localization::pose_source::PoseSourceConfig;
+use protocol::{CodecConfig, DropReason, Dtype};
+use serde_json::Value;
+use tests::fleet::{programs, results, write_scenario, write_sighted_weights};
+use tests::locks::exclusive_lock;
+
+const TICKS: usize = 8;
+const MS: u64 = 1_000_000;
+
+/// A fleet whose computers take no time, over a link.
+fn config(link: LinkConfig) -> SteppedConfig {
+    SteppedConfig {
+        link,
+        link_folder: ".".into(),
+        seed: 3,
+        deadline_nanos: 100 * MS,
+        pairing: PairingConfig::default(),
+        compute: ComputeTimes::NONE,
+        crew: Crew::First(usize::MAX),
+        vehicles: Default::default(),
+        ticks: 0..usize::MAX,
+        lidar_variant: None,
+    }
+}
+
+/// The frames of a scene in `folder`, and the books.
+fn evaluate(folder: &Path, stepped: Option<SteppedConfig>) -> (Vec<EvaluatedFrame>, protocol::Ledger) {
+    evaluate_with(folder, stepped, CodecConfig { dtype: Dtype::F16, ..CodecConfig::default() })
+}
+
+fn evaluate_with(
+    folder: &Path,
+    stepped: Option<SteppedConfig>,
+    codec: CodecConfig,
+) -> (Vec<EvaluatedFrame>, protocol::Ledger) {
+    tch::set_num_threads(1);
+    let config = EvaluateConfig {
+        weights: folder.join("weights.safetensors"),
+        method: Some(Method::Max),
+        pose_source: PoseSourceConfig::Recorded,
+        codec,
+        rate: RateConfig::default(),
+        protocol: None,
+        delay_nanos: 0,
+        attack: None,
+        trust: None,
+    };
+    let mut evaluator = Evaluator::new(config).unwrap();
+    if let Some(stepped) = stepped {
+        evaluator = evaluator.over_link(stepped);
+    }
+    let scenario = dataset::open(&folder.join("scene")).unwrap().scenarios.remove(0);
+    let mut frames = Vec::new();
+    let _ = evaluator
+        .run(&scenario, &mut |frame| {
+            frames.push(frame);
+            ControlFlow::Continue(())
+        })
+        .unwrap();
+    let ledger = evaluator.ledger().clone();
+    (frames, ledger)
+}
+
+fn scene() -> tempfile::TempDir {
+    let folder = tempfile::tempdir().unwrap();
+    tests::scene::write(folder.path(), &["4279", "4288", "4297"], TICKS);
+    write_sighted_weights(&folder.path().join("weights.safetensors"));
+    folder
+}
+
+fn ages_ms(frame: &EvaluatedFrame) -> Vec<i64> {
+    frame.result.fused.iter().map(|neighbour| neighbour.age_nanos / MS as i64).collect()
+}
+
+#[test]
+fn over_an_ideal_link_boxes_are_those_of_an_evaluation_without_one() {
+    let folder = scene();
+    let (offline, nothing) = evaluate(folder.path(), None);
+    let (stepped, ledger) = evaluate(folder.path(), Some(config(LinkConfig::default())));
+    assert_eq!(offline.len(), TICKS);
+    for (offline, stepped) in offline.iter().zip(&stepped) {
+        assert!(!offline.result.detections.is_empty());
+        assert_eq!(offline.result.detections, stepped.result.detections);
+        assert_eq!((&offline.result.fused, &offline.objects), (&stepped.result.fused, &stepped.objects));
+    }
+    assert!(nothing.is_empty() && ledger.balance().is_exact(), "{:?}", ledger.balance());
+    // Two neighbours with a pose and a map each per tick.
+    assert_eq!((ledger.total().sent, ledger.total().received), (4 * TICKS as u64, 4 * TICKS as u64));
+}
+
+/// What the ego leaves out for others it has itself, over a link and without one.
+#[test]
+fn a_budget_cuts_the_neighbours_maps_and_not_the_egos_own() {
+    let folder = scene();
+    let codec = CodecConfig { dtype: Dtype::F16, budget_bytes: Some(4000), ..CodecConfig::default() };
+    let (offline, _) = evaluate_with(folder.path(), None, codec);
+    let (stepped, _) = evaluate_with(folder.path(), Some(config(LinkConfig::default())), codec);
+    assert_eq!(offline.len(), TICKS);
+    for (offline, stepped) in offline.iter().zip(&stepped) {
+        // A whole map has 65 kB.
+        assert!(offline.result.fused.iter().all(|neighbour| neighbour.payload_bytes < 20_000));
+        assert!(!offline.result.detections.is_empty());
+        assert_eq!(offline.result.detections, stepped.result.detections);
+    }
+}
+
+#[test]
+fn the_ego_fuses_exactly_what_has_come_by_its_deadline() {
+    let folder = scene();
+    for (delay_ms, compute_ms, age_ms, first_tick) in
+        [(0.0, 100.0, 0, 0), (0.0, 80.0, 0, 0), (30.0, 80.0, 100, 1), (120.0, 80.0, 100, 1), (250.0, 0.0, 200, 2)]
+    {
+        let link = LinkConfig { delay: DelayLaw::ConstantMs(delay_ms), ..LinkConfig::default() };
+        let compute =
+            ComputeTimes { pose_ms: 20.0f64.min(compute_ms), map_ms: (compute_ms - 20.0).max(0.0), fuse_ms: 5.0 };
+        let (frames, ledger) = evaluate(folder.path(), Some(SteppedConfig { compute, ..config(link) }));
+        for (tick, frame) in frames.iter().enumerate() {
+            let expected = if tick < first_tick { vec![] } else { vec![age_ms; 2] };
+            assert_eq!(ages_ms(frame), expected, "delay {delay_ms} ms, tick {tick}");
+            // What is complete is not waited for.
+            let took_ms = (frame.stamp.publish_nanos - frame.stamp.capture_nanos) / MS;
+            let expected = if age_ms == 0 { compute_ms as u64 + 5 } else { 105 };
+            assert_eq!(took_ms, expected, "delay {delay_ms} ms, tick {tick}");
+        }
+        assert!(ledger.balance().is_exact(), "{:?}", ledger.balance());
+    }
+    // Older than may be fused.
+    let link = LinkConfig { delay: DelayLaw::ConstantMs(450.0), ..LinkConfig::default() };
+    let (frames, ledger) = evaluate(folder.path(), Some(config(link)));
+    assert!(frames.iter().all(|frame| frame.result.fused.is_empty() && frame.result.skipped.len() == 2));
+    assert!(ledger.total().dropped[&DropReason::Stale] > 0 && ledger.balance().is_exact());
+}
+
+#[test]
+fn a_clock_that_is_off_shifts_what_belongs_together() {
+    let folder = scene();
+    for (offset_ms, drift_ppm, ages_in_ms) in [
+        (-20.0, 0.0, [20, 20, 20]),
+        (-40.0, 0.0, [40, 40, 40]),
+        // 5 ms a frame.
+        (0.0, -5e4, [10, 15, 20]),
+    ] {
+        let clock = DeviceClock { offset_ms, drift_ppm, step: None };
+        let (frames, ledger) = evaluate(folder.path(), Some(config(LinkConfig { clock, ..LinkConfig::default() })));
+        // The scene begins at 0, and no clock shows less.
+        for (frame, age_ms) in frames[2..].iter().zip(ages_in_ms) {
+            assert_eq!(ages_ms(frame), [age_ms; 2], "{clock:?}");
+        }
+        assert!(ledger.balance().is_exact(), "{:?}", ledger.balance());
+    }
+}
+
+#[test]
+fn a_clock_that_is_set_costs_its_vehicle_and_nobody_else() {
+    let folder = scene();
+    let run = |by_ms| {
+        let clock = DeviceClock { step: Some(ClockStep { at_s: 0.2, by_ms }), ..DeviceClock::default() };
+        let (frames, ledger) = evaluate(folder.path(), Some(config(LinkConfig { clock, ..LinkConfig::default() })));
+        assert!(frames.len() == TICKS && ledger.balance().is_exact(), "by {by_ms} ms: {ledger:?}");
+        (frames.iter().map(ages_ms).collect::<Vec<_>>(), ledger)
+    };
+    let (ages_ms, ledger) = run(10_000.0);
+    // What it said before serves until it is too old.
+    let expected: Vec<Vec<i64>> = [0, 0, 100, 200, 300].map(|age_ms| vec![age_ms; 2]).into();
+    assert_eq!(ages_ms[..5], expected);
+    assert!(ages_ms[5..].iter().all(Vec::is_empty), "{ages_ms:?}");
+    // What it says since waits for a time that the scene does not see.
+    assert_eq!(ledger.total().in_flight, 2 * (TICKS as u64 - 2), "{ledger:?}");
+    let (ages_ms, _) = run(-30.0);
+    assert!(ages_ms[..2].iter().all(|ages| ages == &[0, 0]), "{ages_ms:?}");
+    assert!(ages_ms[2..].iter().all(|ages| ages == &[30, 30]), "{ages_ms:?}");
+}
+
+#[test]
+fn fewer_vehicles_leave_the_truth_as_it_is() {
+    let folder = scene();
+    let crew = |count| SteppedConfig { crew: Crew::First(count), ..config(LinkConfig::default()) };
+    let (all, _) = evaluate(folder.path(), Some(crew(3)));
+    let (two, _) = evaluate(folder.path(), Some(crew(2)));
+    assert!(all.iter().zip(&two).all(|(all, two)| all.objects == two.objects));
+    assert!(all.iter().all(|frame| frame.result.fused.len() == 2));
+    assert!(two.iter().all(|frame| frame.result.fused.len() == 1));
+}
+
+#[test]
+fn losses_are_counted_and_come_from_the_seed() {
+    let folder = scene();
+    let link = LinkConfig { loss: LossLaw::Bernoulli(0.4), duplicate: 0.3, ..LinkConfig::default() };
+    let run = |seed| evaluate(folder.path(), Some(SteppedConfig { seed, ..config(link.clone()) }));
+    let ((frames, ledger), (again, same)) = (run(1), run(1));
+    assert_eq!(ledger, same);
+    assert!(frames.iter().zip(&again).all(|(one, other)| one.result == other.result && one.stamp == other.stamp));
+    let total = ledger.total();
+    assert!(total.dropped[&DropReason::LinkLoss] > 0 && total.dropped[&DropReason::Duplicate] > 0, "{total:?}");
+    assert!(ledger.balance().is_exact(), "{:?}", ledger.balance());
+    assert_ne!(run(2).1, ledger);
+}
+
+const FILES: [&str; 4] = ["metrics.json", "frames.csv", "ledger.json", "detections.jsonl"];
+
+fn assert_same_bytes(one: &RunResult, other: &RunResult) {
+    for name in FILES {
+        let read = |run: &RunResult| fs::read(run.folder.file(name)).unwrap();
+        assert!(read(one) == read(other), "{name}");
+    }
+}
+
+fn run_up(folder: &Path, scenario: &Path, runs: &str) -> RunResult {
+    let options = UpOptions { runs: folder.join(runs), programs: programs().to_owned(), prefix: "up" };
+    up(&Scenario::load(scenario).unwrap(), &options).unwrap()
+}
+
+#[test]
+fn a_stepped_run_is_the_same_bytes_every_time() {
+    let folder = tempfile::tempdir().unwrap();
+    let air = "capacity: {token_bucket: {rate_mbps: 20}}\ndelay: {normal: {mean_ms: 60, std_ms: 30}}\nloss: {bernoulli: 0.2}\n";
+    fs::write(folder.path().join("air.yaml"), air).unwrap();
+    let rest = "clock: stepped\nstepped: {compute: {pose_ms: 10, map_ms: 40, fuse_ms: 20}}\n\
+        link: {air: air.yaml, seed: 5}\nego: {max_age_ms: 500}\nvehicles: {\"4288\": {pose: {noisy: {std_m: 0.5}}}}";
+    let scenario = write_scenario(folder.path(), TICKS, "seek: 1", rest);
+    let (one, two) = (run_up(folder.path(), &scenario, "one"), run_up(folder.path(), &scenario, "two"));
+    assert_same_bytes(&one, &two);
+    assert!(one.balance.is_exact() && one.metrics.clock == "stepped" && one.metrics.frames == TICKS as u64 - 1);
+    let latency = &one.metrics.latency_ms.capture_to_detection;
+    assert_eq!((latency.p50, latency.p99), (Some(120.0), Some(120.0)), "the deadline, and the fusion");
+    assert!(one.metrics.age_ms.p50.unwrap() >= 100.0 && one.metrics.pose.mean_m.unwrap() > 0.05);
+    let frames = fs::read_to_string(one.folder.file("frames.csv")).unwrap();
+    assert!(frames.starts_with("tick,agent_frame,") && frames.lines().nth(1).unwrap().starts_with("1,0,"), "{frames}");
+    assert_eq!(results(one.folder.path()).len(), TICKS - 1);
+}
+
+#[test]
+fn agents_in_processes_of_their_own_give_the_same_bytes() {
+    let _exclusive = exclusive_lock();
+    let folder = tempfile::tempdir().unwrap();
+    tests::scene::write(folder.path(), &["4279", "4288", "4297"], TICKS);
+    write_sighted_weights(&folder.path().join("weights.safetensors"));
+    let air = "capacity: {token_bucket: {rate_mbps: 20}}\ndelay: {normal: {mean_ms: 60, std_ms: 30}}\nloss: {bernoulli: 0.2}\n";
+    fs::write(folder.path().join("air.yaml"), air).unwrap();
+    // Everything that an agent's process has to be told: noise, codec, limits, one vehicle with settings of its own.
+    for (method, rest) in [
+        (
+            "max",
+            "agents: {codec: {dtype: i8, budget_bytes: 4000}}\nvehicles: {\"4288\": {pose: {noisy: {std_m: 0.5, mode: autoregressive}}}}",
+        ),
+        ("late", "agents: {pose: {noisy: {std_m: 0.3, std_deg: 1, mode: independent}}}"),
+        ("none", ""),
+    ] {
+        let run = |processes| {
+            let text = format!(
+                "run: test\nscene: {{dir: scene}}\nmodels: {{weights: weights.safetensors}}\nmethod: {method}\nclock: stepped\n\
+                 stepped: {{compute: {{pose_ms: 10, map_ms: 40, fuse_ms: 20}}, processes: {processes}}}\n\
+                 link: {{air: air.yaml, seed: 5}}\nego: {{max_age_ms: 500}}\n{rest}\n"
+            );
+            let path = folder.path().join("scenario.yaml");
+            fs::write(&path, text).unwrap();
+            run_up(folder.path(), &path, &format!("{method}-{processes}"))
+        };
+        let (one, many) = (run(false), run(true));
+        assert_same_bytes(&one, &many);
+        assert!(results(one.folder.path()).iter().any(|result| !result["detections"].as_array().unwrap().is_empty()));
+        let logs = fs::read_dir(many.folder.log_dir()).unwrap().count();
+        assert_eq!((logs, many.killed.len()), (3, 0), "one process a vehicle");
+    }
+}
+
+#[test]
+fn compute_times_are_measured_once_and_written_down() {
+    let folder = tempfile::tempdir().unwrap();
+    let scenario = write_scenario(folder.path(), 3, "", "clock: stepped");
+    // On a busy machine the times may be more than a frame lasts: then the run is refused, and says so.
+    let options = UpOptions { runs: folder.path().join("runs"), programs: programs().to_owned(), prefix: "up" };
+    match up(&Scenario::load(&scenario).unwrap(), &options) {
+        Ok(run) => {
+            let resolved = Scenario::load(&run.folder.file("scenario.yaml")).unwrap();
+            let compute = resolved.stepped.unwrap().compute.unwrap();
+            assert!(compute.map_ms >= 1.0 && compute.map_ms <= 100.0, "{compute:?}");
+        }
+        Err(error) => assert!(error.to_string().contains("every 100 ms"), "{error}"),
+    }
+}
+
+fn sweep(folder: &Path, out: &str, jobs: &str, more: &[&str]) -> Output {
+    let program = programs().join("v2vloc");
+    let mut command = Command::new(program);
+    command.arg("sweep").arg(folder.join("experiment.yaml")).arg("--out").arg(folder.join(out));
+    command.args(["--jobs", jobs]).args(more).output().unwrap()
+}
+
+fn said(output: &Output) -> String {
+    String::from_utf8_lossy(&output.stderr).into_owned()
+}
+
+#[test]
+fn a_sweep_is_the_same_csv_in_one_process_and_in_many() {
+    let folder = scene();
+    let text = "name: e\ntitle: A < B\ndataset: scene\nweights: weights.safetensors\nticks: 4\n\
+        compute: {pose_ms: 10, map_ms: 30, fuse_ms: 10}\nnoise_mode: independent\n\
+        grid:\n  method: [none, late, max]\n  latency_ms: [0, 200]\n  jitter_ms: [20]\n  bandwidth_mbps: [.inf, 10]\n  \
+        codec: [{dtype: f16}, {dtype: i8, keep: 0.25}]\n  loss: [0.2]\n  pose_noise: [{m: 0.2, deg: 0.2}]\n  agents: [2]\n  \
+        seed: [1]\n";
+    fs::write(folder.path().join("experiment.yaml"), text).unwrap();
+    let dry = sweep(folder.path(), "dry", "2", &["--dry-run"]);
+    assert!(dry.status.success() && dry.stdout.is_empty(), "{}", said(&dry));
+    assert!(
+        said(&dry).contains("3 method x 2 codec x 2 latency_ms x 2 bandwidth_mbps = 24 runs of 4 frames"),
+        "{}",
+        said(&dry)
+    );
+    assert!(said(&dry).contains("minutes for 24 runs with 2 jobs"), "{}", said(&dry));
+
+    let [one, many] = [("one", "1"), ("many", "3")].map(|(out, jobs)| sweep(folder.path(), out, jobs, &[]));
+    assert!(one.status.success() && many.status.success(), "{}\n{}", said(&one), said(&many));
+    let read = |out: &str, name: &str| fs::read_to_string(folder.path().join(out).join(name)).unwrap();
+    let csv = read("one", "e.csv");
+    assert_eq!(csv, read("many", "e.csv"));
+    assert_eq!(String::from_utf8_lossy(&one.stdout), csv);
+    assert_eq!(read("one", "report.html"), read("many", "report.html"));
+    let lines: Vec<Vec<&str>> = csv.lines().map(|line| line.split(',').collect()).collect();
+    assert!(lines.len() == 25 && lines.iter().all(|line| line.len() == lines[0].len()), "{csv}");
+    let column = |line: usize, name: &str| {
+        let place = lines[0].iter().position(|column| *column == name).unwrap_or_else(|| panic!("{name}"));
+        lines[line][place]
+    };
+    assert_eq!((column(1, "method"), column(1, "sent"), column(1, "frames_used")), ("none", "0", "0"));
+    let dense =
+        (17..25).find(|&line| column(line, "dtype") == "f16" && !column(line, "payload_bytes").is_empty()).unwrap();
+    let sparse =
+        (17..25).find(|&line| column(line, "keep") == "0.25" && !column(line, "payload_bytes").is_empty()).unwrap();
+    let bytes = |line| column(line, "payload_bytes").parse::<f64>().unwrap();
+    assert!(bytes(sparse) < 0.2 * bytes(dense), "{} {}", bytes(sparse), bytes(dense));
+    for name in ["ap_latency.svg", "ap_latency.png", "ap_bandwidth.svg", "ap_bytes.png", "report.html"] {
+        assert!(folder.path().join("one").join(name).exists(), "{name}");
+    }
+    let page = read("one", "report.html");
+    assert!(page.contains("A &lt; B") && page.contains("<svg") && !page.contains("src="), "self-contained");
+
+    // What is done is not done again; what the sweep is of decides that.
+    let again = sweep(folder.path(), "one", "2", &[]);
+    assert!(again.status.success() && said(&again).contains("24 done before"), "{}", said(&again));
+    assert_eq!(again.stdout, one.stdout);
+    fs::write(folder.path().join("experiment.yaml"), text.replace("seed: [1]", "seed: [1, 2]")).unwrap();
+    let more = sweep(folder.path(), "one", "2", &["--dry-run"]);
+    assert!(said(&more).contains("48 runs of 4 frames, 24 done before"), "{}", said(&more));
+}
+
+#[test]
+fn an_experiment_that_makes_no_sense_is_refused_by_its_field() {
+    let folder = scene();
+    let rest = "dataset: scene\nweights: weights.safetensors\n";
+    for (text, words) in [
+        ("grid: {method: [max], agents: [4]}", "grid.agents is 4, but scenario scene has 3 vehicles"),
+        ("link: dsrc\ngrid: {method: [max], loss: [0.1]}", "grid.loss and the loss of link dsrc contradict"),
+        ("grid: {method: [max], latencies: [1]}", "latencies"),
+        (
+            "compute: {pose_ms: 60, map_ms: 60, fuse_ms: 0}\ngrid: {method: [max]}",
+            "takes 120 ms, but the scene has a frame",
+        ),
+    ] {
+        fs::write(folder.path().join("experiment.yaml"), format!("name: e\n{rest}{text}\n")).unwrap();
+        let output = sweep(folder.path(), "out", "1", &[]);
+        assert!(output.status.code() == Some(2) && said(&output).contains(words), "{text}: {}", said(&output));
+    }
+}
+
+#[test]
+fn an_evaluation_crosses_a_link() {
+    let folder = scene();
+    let output = Command::new(programs().join("v2vloc"))
+        .args(["eval", "--method", "max", "--json", "--link", "opencood-sim", "--seed", "1", "--dataset"])
+        .arg(folder.path().join("scene"))
+        .arg("--weights")
+        .arg(folder.path().join("weights.safetensors"))
+        .output()
+        .unwrap();
+    assert!(output.status.success(), "{}", said(&output));
+    let metrics: Value = serde_json::from_slice(&output.stdout).unwrap();
+    assert_eq!((&metrics["clock"], &metrics["age_ms"]["p50"]), (&"stepped".into(), &100.0.into()));
+}

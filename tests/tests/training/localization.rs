@@ -1,0 +1,215 @@
+//! A localizer from nothing: generated drives, an encoder, a head, and poses from sweeps alone.
+
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+use agent_offline::training::{
+    EncoderReport, EncoderStart, EncoderTrainConfig, EndToEndReport, EndToEndTrainConfig, LocalizerTrainError,
+    RedundancyConfig, SceneReport, SceneTrainConfig, SweepAugmentation, train_encoder, train_end_to_end, train_scene,
+};
+use dataset::{self, LoadOptions};
+use localization::competitors::{EndToEndKind, EndToEndLocalizer};
+use localization::pgc::{Localizer, LocalizerError, SceneEncoder};
+use perception::train::{Length, RunConfig, TrainingError};
+use perception::weights::Weights;
+use protocol::{NoPoseReason, PointCloud, PoseEstimate};
+use simulator::generate::{Subset, SynthOptions, generate};
+use tch::Device;
+use tch::nn::VarStore;
+use tests::localizer::small_encoder;
+use tests::locks::random_generator_lock;
+
+/// Two short drives through one town, at whose crossings they meet themselves and each other.
+fn drives(out: &Path) -> PathBuf {
+    let folder = out.join("drives");
+    let options = SynthOptions {
+        traversals: 2,
+        frames: 24,
+        period_s: 0.5,
+        ..SynthOptions::new(Subset::Town1loc, 11, folder.clone())
+    };
+    generate(&options, &|_| {}).unwrap();
+    folder
+}
+
+fn run(out: &Path, steps: u64) -> RunConfig {
+    RunConfig { seed: 5, loader_threads: 2, ..RunConfig::new(Length::Steps(steps), out) }
+}
+
+fn encoder_config(scenes: &Path, out: &Path, steps: u64) -> EncoderTrainConfig {
+    EncoderTrainConfig {
+        scenes: vec![scenes.to_owned()],
+        validation: vec![scenes.to_owned()],
+        encoder: small_encoder(),
+        run: RunConfig { batch: 2, learning_rate: 3e-3, ..run(out, steps) },
+        validate_every: 10,
+    }
+}
+
+fn scene_config(scenes: &Path, encoder: &Path, out: &Path, steps: u64) -> SceneTrainConfig {
+    SceneTrainConfig {
+        scenes: vec![scenes.to_owned()],
+        validation: vec![scenes.to_owned()],
+        validation_sweeps: 12,
+        encoder: encoder.to_owned(),
+        town: "small".into(),
+        classes: 4,
+        centres: 12,
+        width: 64,
+        blocks: 1,
+        refiner: true,
+        augmentation: SweepAugmentation { copies: 1, turn_rad: 0.1, keep: 0.8 },
+        redundancy: Some(RedundancyConfig::default()),
+        run: RunConfig { batch: 512, learning_rate: 4e-3, ..run(out, steps) },
+        validate_every: Duration::from_secs(3600),
+    }
+}
+
+fn trained_encoder(scenes: &Path, out: &Path) -> PathBuf {
+    let mut losses = Vec::new();
+    let mut validations = 0;
+    let config = encoder_config(scenes, out, 40);
+    let mut observe = |report: &EncoderReport| match report {
+        EncoderReport::Read(data) => assert_eq!(data.left_out(), None),
+        EncoderReport::Stepped { loss, .. } => losses.push(*loss),
+        EncoderReport::Validated(..) => validations += 1,
+    };
+    let summary = train_encoder(&config, &mut observe).unwrap();
+    assert_eq!((summary.trained.steps, validations), (40, 4));
+    assert!(losses.last().unwrap() < &(0.9 * losses[0]), "{losses:?}");
+    assert!(summary.accuracy.unwrap().top1 > 0.005, "chance is below one in five hundred: {:?}", summary.accuracy);
+    summary.trained.weights
+}
+
+#[test]
+fn a_localizer_learns_two_drives_and_finds_itself_on_them() {
+    let _generator = random_generator_lock();
+    let dir = tempfile::tempdir().unwrap();
+    let scenes = drives(dir.path());
+    let encoder = trained_encoder(&scenes, &dir.path().join("encoder"));
+
+    let mut errors = Vec::new();
+    let config = scene_config(&scenes, &encoder, &dir.path().join("head"), 400);
+    let summary = train_scene(&config, &mut |report| {
+        if let SceneReport::Stepped { error_m, .. } = report {
+            errors.push(*error_m);
+        }
+    })
+    .unwrap();
+    assert!(errors.last().unwrap() < &(0.3 * errors[0]), "{errors:?}");
+    assert!(summary.accuracy.unwrap().success_3m > 0.5, "{:?}", summary.accuracy);
+
+    let localizer = Localizer::load(&encoder, &summary.trained.weights, Device::Cpu).unwrap();
+    let dataset = dataset::open(&scenes).unwrap();
+    let mut found = 0;
+    for tick in 0..12 {
+        let frame = dataset.scenarios[0].load(0, 2 * tick, &LoadOptions::default()).unwrap();
+        let answer = localizer.localize(&frame.points).unwrap();
+        let Some(pose) = answer.estimate.world_from_cav() else { continue };
+        let off = pose.isometry().translation.vector - frame.world_from_lidar.unwrap().isometry().translation.vector;
+        found += usize::from(off.norm() < 3.0);
+        assert!((0.0..=1.0).contains(&answer.estimate.confidence()));
+        assert_eq!(localizer.localize(&frame.points).unwrap().estimate, answer.estimate, "same sweep, same answer");
+    }
+    assert!(found >= 7, "{found} of 12");
+
+    // What cannot be localised is said, not made up.
+    let nan = PointCloud { xyzi: vec![[f32::NAN; 4]; 5000] };
+    let few = PointCloud { xyzi: (0..10).map(|k| [k as f32, 3.0, 0.5, 0.1]).collect() };
+    for cloud in [PointCloud::default(), nan, few] {
+        let estimate = localizer.localize(&cloud).unwrap().estimate;
+        assert_eq!(estimate, PoseEstimate::NoPose { reason: NoPoseReason::TooFewPoints, inlier_count: 0 });
+    }
+
+    // A head belongs to one encoder.
+    let other = dir.path().join("other");
+    let mut config = encoder_config(&scenes, &other, 1);
+    config.run.seed = 6;
+    train_encoder(&config, &mut |_| ()).unwrap();
+    let error = Localizer::load(&other.join("weights.safetensors"), &summary.trained.weights, Device::Cpu).unwrap_err();
+    assert!(matches!(error, LocalizerError::OtherEncoder { .. }), "{error}");
+    // And an encoder is no head.
+    let message = Localizer::load(&encoder, &encoder, Device::Cpu).unwrap_err().to_string();
+    assert!(message.contains("weights.safetensors") && message.contains("\"scene encoder\""), "{message}");
+}
+
+#[test]
+fn competitors_learn_on_the_features_of_an_encoder_that_stays_as_it_is() {
+    let _generator = random_generator_lock();
+    let dir = tempfile::tempdir().unwrap();
+    let scenes = drives(dir.path());
+    let encoder = train_encoder(&encoder_config(&scenes, &dir.path().join("encoder"), 1), &mut |_| ()).unwrap();
+    let encoder = encoder.trained.weights;
+    for (regresses, batch, steps) in [(EndToEndKind::SceneCoordinates, 2, 150), (EndToEndKind::Pose, 32, 300)] {
+        let config = |steps| EndToEndTrainConfig {
+            scenes: vec![scenes.clone()],
+            regresses,
+            town: "small".into(),
+            encoder: EncoderStart::Frozen(encoder.clone()),
+            run: RunConfig { batch, learning_rate: 3e-3, ..run(&dir.path().join(format!("{regresses:?}")), steps) },
+        };
+        let (mut errors, mut encoded) = (Vec::new(), 0);
+        let trained = train_end_to_end(&config(steps), &mut |report| match report {
+            EndToEndReport::Encoding(done, _) => encoded = *done,
+            EndToEndReport::Stepped { error_m, .. } => errors.push(*error_m),
+        })
+        .unwrap();
+        assert!(encoded == 48 && errors.last().unwrap() < &(0.7 * errors[0]), "{regresses:?}: {errors:?}");
+
+        // In the file lie the layers that were trained, behind the encoder as it was.
+        let localizer = EndToEndLocalizer::load(&trained.weights, Device::Cpu).unwrap();
+        assert_eq!(localizer.config().encoder, small_encoder());
+        let (before, after) = (VarStore::new(Device::Cpu), VarStore::new(Device::Cpu));
+        SceneEncoder::new(&before.root(), &small_encoder()).unwrap();
+        SceneEncoder::new(&(after.root() / "encoder"), &small_encoder()).unwrap();
+        Weights::load(&encoder).unwrap().copy_into(&before).unwrap();
+        Weights::load(&trained.weights).unwrap().copy_into(&after).unwrap();
+        let kept = after.variables();
+        for (name, tensor) in before.variables() {
+            assert!(tensor.equal(&kept[&format!("encoder.{name}")]), "{name}");
+        }
+
+        let mut resumed = config(steps + 10);
+        resumed.run.resume = true;
+        assert_eq!(train_end_to_end(&resumed, &mut |_| ()).unwrap().steps, steps + 10);
+    }
+}
+
+#[test]
+fn trainings_go_on_where_they_stopped_and_refuse_what_is_not_theirs() {
+    let _generator = random_generator_lock();
+    let dir = tempfile::tempdir().unwrap();
+    let scenes = drives(dir.path());
+    let whole = train_encoder(&encoder_config(&scenes, &dir.path().join("a"), 20), &mut |_| ()).unwrap();
+    let b = dir.path().join("b");
+    // Stopped at the second validation, whose checkpoint is then not yet written.
+    let mut validations = 0;
+    let stopped = std::panic::catch_unwind(std::panic::AssertUnwindSafe(|| {
+        let mut stop = |report: &EncoderReport| {
+            validations += u32::from(matches!(report, EncoderReport::Validated(..)));
+            assert!(validations < 2, "stopped by the test");
+        };
+        train_encoder(&encoder_config(&scenes, &b, 20), &mut stop)
+    }));
+    assert!(stopped.is_err());
+    let going_on = |steps| {
+        let mut config = encoder_config(&scenes, &b, steps);
+        config.run.resume = true;
+        config
+    };
+    let resumed = train_encoder(&going_on(20), &mut |_| ()).unwrap();
+    assert_eq!(resumed.trained.sha256, whole.trained.sha256, "bit for bit");
+
+    let mut other = going_on(30);
+    other.run.seed = 9;
+    let error = train_encoder(&other, &mut |_| ()).unwrap_err();
+    assert!(
+        matches!(error, LocalizerTrainError::Training(TrainingError::OtherTraining { field: "seed", .. })),
+        "{error}"
+    );
+    let checkpoint = b.join("checkpoint.safetensors");
+    let bytes = std::fs::read(&checkpoint).unwrap();
+    std::fs::write(&checkpoint, &bytes[..bytes.len() / 2]).unwrap();
+    let message = train_encoder(&going_on(30), &mut |_| ()).unwrap_err().to_string();
+    assert!(message.contains("checkpoint.safetensors") && message.contains("not a whole"), "{message}");
+}
