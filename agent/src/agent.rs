@@ -7,13 +7,13 @@ use std::time::{Duration, Instant};
 use protocol::{
     BevFeatures, CavId, CodecConfig, Detection, EncodedFeatures, PointCloud, Pose, PoseEstimate, StageTiming, WireError,
 };
+use support::stage_times::StageTimes;
 use tch::Tensor;
 
-use crate::attack::{Attack, Overheard};
 use crate::rate::{RateConfig, RateControl};
 use localization::pose_source::{PoseInput, PoseSource};
 use perception::boxes::postprocess::{AgentBoxes, PostprocessConfig, postprocess};
-use perception::detector::{Detector, DetectorError, EncodeTimes};
+use perception::detector::{Detector, DetectorError};
 
 /// Everything known about one sweep.
 #[derive(Debug, Clone, Copy)]
@@ -35,8 +35,8 @@ pub struct Perception {
     pub confidence: Vec<f32>,
     /// What this vehicle detects alone, in its own LiDAR frame, for late fusion.
     pub detections: Vec<Detection>,
-    /// Where the time went.
-    pub times: PerceptionTimes,
+    /// Time of the encoder's stages, of the map's way out of the tensor library, of the head, and of decoding and suppression.
+    pub times: Vec<StageTiming>,
 }
 
 /// Pose and perception of one sweep.
@@ -50,37 +50,6 @@ pub struct AgentOutput {
     pub perception: Perception,
 }
 
-/// Time per stage of [`Agent::perceive`].
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct PerceptionTimes {
-    /// The encoder's stages.
-    pub encode: EncodeTimes,
-    /// The map out of the tensor library.
-    pub message: Duration,
-    /// Scores, offsets, confidence.
-    pub head: Duration,
-    /// Decoding, suppression, clean-up.
-    pub boxes: Duration,
-}
-
-impl PerceptionTimes {
-    /// The stages by name, in the order they run.
-    #[must_use]
-    pub fn stages(&self) -> Vec<StageTiming> {
-        let EncodeTimes { voxelise, pillars, backbone } = self.encode;
-        [
-            ("voxelise", voxelise),
-            ("pillars", pillars),
-            ("backbone", backbone),
-            ("message", self.message),
-            ("head", self.head),
-            ("boxes", self.boxes),
-        ]
-        .map(|(stage, time)| StageTiming::new(stage, time))
-        .into()
-    }
-}
-
 /// One vehicle: where it believes to be and what it sees.
 #[derive(Debug)]
 pub struct Agent {
@@ -89,7 +58,6 @@ pub struct Agent {
     detector: Detector,
     postprocess: PostprocessConfig,
     rate: RateControl,
-    attack: Option<Attack>,
 }
 
 impl Agent {
@@ -97,7 +65,7 @@ impl Agent {
     #[must_use]
     pub fn new(cav: CavId, pose_source: Box<dyn PoseSource>, detector: Detector) -> Self {
         let postprocess = PostprocessConfig::for_late_fusion(detector.config());
-        Self { cav, pose_source, detector, postprocess, rate: RateControl::default(), attack: None }
+        Self { cav, pose_source, detector, postprocess, rate: RateControl::default() }
     }
 
     /// The same with maps that keep within `rate`, where [`Self::write_map`] writes them.
@@ -106,30 +74,10 @@ impl Agent {
         Self { rate: RateControl::new(rate), ..self }
     }
 
-    /// The same telling lies: to find out what they do to others.
-    #[must_use]
-    pub fn lying(self, attack: Option<Attack>) -> Self {
-        if let Some(attack) = &attack {
-            tracing::warn!(cav = %self.cav, lie = attack.lie().name(), "this vehicle has been told to LIE to its neighbours");
-        }
-        Self { attack, ..self }
-    }
-
-    /// Another vehicle's words, which a liar may repeat.
-    pub fn overhear(&mut self, overheard: impl FnOnce() -> Overheard) {
-        if let Some(attack) = &mut self.attack {
-            attack.overhear(overheard());
-        }
-    }
-
     /// The points it shares: those that are not on its own body.
     #[must_use]
-    pub fn share_points(&mut self, cloud: &PointCloud) -> PointCloud {
-        let points = self.detector.crop().without_own_body(cloud);
-        match &mut self.attack {
-            Some(attack) => attack.points(points),
-            None => points,
-        }
+    pub fn share_points(&self, cloud: &PointCloud) -> PointCloud {
+        self.detector.crop().without_own_body(cloud)
     }
 
     /// Who it is.
@@ -146,13 +94,12 @@ impl Agent {
 
     /// First step: the pose, which goes out before anything else is computed.
     pub fn estimate_pose(&mut self, input: &AgentInput<'_>) -> PoseEstimate {
-        let pose = self.pose_source.estimate(&PoseInput {
+        self.pose_source.estimate(&PoseInput {
             cav: &self.cav,
             capture_nanos: input.capture_nanos,
             cloud: input.cloud,
             measured: input.measured_pose,
-        });
-        self.attack.as_ref().map_or(pose, |attack| attack.pose(pose))
+        })
     }
 
     /// Last step where there is no queue: the map as `codec` wants it, or smaller where it has to be. A live agent does this
@@ -189,7 +136,7 @@ impl Agent {
     pub fn perceive(&mut self, cloud: &PointCloud) -> Result<Perception, DetectorError> {
         let encoded = self.detector.encode(cloud)?;
         let perception = self.perceive_map(&encoded.features)?;
-        Ok(Perception { times: PerceptionTimes { encode: encoded.times, ..perception.times }, ..perception })
+        Ok(Perception { times: [encoded.times, perception.times].concat(), ..perception })
     }
 
     /// The same from a map `[1, C, H, W]` that the encoder made before, as it came out of it.
@@ -197,23 +144,18 @@ impl Agent {
     /// # Errors
     /// [`DetectorError::Shape`] when it is not one of this detector's maps.
     pub fn perceive_map(&mut self, map: &Tensor) -> Result<Perception, DetectorError> {
-        let ((map, features), message) = timed(|| {
-            let sent = self.detector.squeezed(map)?;
-            Ok((self.detector.widened(&sent)?, self.detector.to_message(&sent)?))
-        })?;
-        let (heads, head) = timed(|| self.detector.heads(&map))?;
-        let (detections, boxes) = timed(|| {
-            let boxes = self.detector.boxes(&heads, self.postprocess.score_threshold)?;
-            let own = AgentBoxes { boxes: &boxes, output_from_agent: nalgebra::Isometry3::identity() };
-            let found = postprocess(&[own], &self.postprocess);
-            Ok(found.iter().map(|candidate| candidate.detection(Some(self.cav.clone()))).collect())
-        })?;
-        let times = PerceptionTimes { encode: EncodeTimes::default(), message, head, boxes };
-        let seen = Perception { features, confidence: heads.confidence, detections, times };
-        Ok(match &mut self.attack {
-            Some(attack) => attack.perception(seen),
-            None => seen,
-        })
+        let mut times = StageTimes::start();
+        let sent = self.detector.squeezed(map)?;
+        let (map, features) = (self.detector.widened(&sent)?, self.detector.to_message(&sent)?);
+        times.lap("message");
+        let heads = self.detector.heads(&map)?;
+        times.lap("head");
+        let boxes = self.detector.boxes(&heads, self.postprocess.score_threshold)?;
+        let own = AgentBoxes { boxes: &boxes, output_from_agent: nalgebra::Isometry3::identity() };
+        let found = postprocess(&[own], &self.postprocess);
+        let detections = found.iter().map(|candidate| candidate.detection(Some(self.cav.clone()))).collect();
+        times.lap("boxes");
+        Ok(Perception { features, confidence: heads.confidence, detections, times: times.into_timings() })
     }
 
     /// Both steps.
@@ -221,14 +163,10 @@ impl Agent {
     /// # Errors
     /// See [`Self::perceive`].
     pub fn process(&mut self, input: &AgentInput<'_>) -> Result<AgentOutput, DetectorError> {
-        let (pose, pose_time) = timed(|| Ok(self.estimate_pose(input)))?;
-        Ok(AgentOutput { pose, pose_time, perception: self.perceive(input.cloud)? })
+        let began = Instant::now();
+        let pose = self.estimate_pose(input);
+        Ok(AgentOutput { pose, pose_time: began.elapsed(), perception: self.perceive(input.cloud)? })
     }
-}
-
-fn timed<T>(step: impl FnOnce() -> Result<T, DetectorError>) -> Result<(T, Duration), DetectorError> {
-    let start = Instant::now();
-    step().map(|value| (value, start.elapsed()))
 }
 
 #[cfg(test)]
@@ -274,7 +212,8 @@ mod tests {
         assert!(!detections.is_empty() && detections.len() <= 1000);
         assert!(detections.windows(2).all(|pair| pair[0].score >= pair[1].score));
         assert!(detections.iter().all(|detection| detection.source.as_ref() == Some(agent.cav())));
-        assert_eq!(times.stages().len(), 6);
+        let stages: Vec<&str> = times.iter().map(|timing| timing.stage.as_str()).collect();
+        assert_eq!(stages, ["voxelise", "pillars", "backbone", "message", "head", "boxes"]);
         let second = agent.process(&input).unwrap();
         assert_eq!((second.perception.features, second.perception.detections), (features.clone(), detections.clone()));
     }

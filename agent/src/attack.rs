@@ -8,6 +8,7 @@ use serde::{Deserialize, Serialize};
 use support::random::SplitMix64;
 
 use crate::agent::Perception;
+use crate::output_filter::OutputFilter;
 
 /// Objects that are made up in every frame.
 const INVENTED: usize = 10;
@@ -109,13 +110,8 @@ impl Attack {
         };
         let places = (0..INVENTED).map(|_| place(&mut random)).collect();
         let offset_m = [distance_m * direction.cos(), distance_m * direction.sin()];
+        tracing::warn!(%cav, lie = lie.name(), "this vehicle has been told to LIE to its neighbours");
         Self { lie, random, offset_m, places, overheard: Overheard::default() }
-    }
-
-    /// What it lies about.
-    #[must_use]
-    pub fn lie(&self) -> Lie {
-        self.lie
     }
 
     /// Another vehicle's words, for [`Lie::Copied`].
@@ -125,9 +121,17 @@ impl Attack {
         }
     }
 
+    fn anything(&mut self) -> Detection {
+        let mut reach = || self.random.between(-INVENTED_WITHIN_M, INVENTED_WITHIN_M);
+        let (x, y) = (reach(), reach());
+        let heading = self.random.between(-3.1, 3.1);
+        vehicle([x, y, heading], self.random.between(0.3, 1.0) as f32)
+    }
+}
+
+impl OutputFilter for Attack {
     /// The pose it gives instead of its own.
-    #[must_use]
-    pub fn pose(&self, pose: PoseEstimate) -> PoseEstimate {
+    fn pose(&self, pose: PoseEstimate) -> PoseEstimate {
         let (Lie::ShiftedPose, Some(own)) = (self.lie, pose.world_from_cav()) else { return pose };
         let [x, y, z] = own.translation_m;
         let [dx, dy] = self.offset_m;
@@ -135,8 +139,7 @@ impl Attack {
     }
 
     /// What it says to see instead of what it does.
-    #[must_use]
-    pub fn perception(&mut self, truth: Perception) -> Perception {
+    fn perception(&mut self, truth: Perception) -> Perception {
         let mut told = truth;
         match self.lie {
             Lie::ShiftedPose => {}
@@ -161,8 +164,7 @@ impl Attack {
     }
 
     /// The points it says to have measured instead of its own.
-    #[must_use]
-    pub fn points(&mut self, truth: PointCloud) -> PointCloud {
+    fn points(&mut self, truth: PointCloud) -> PointCloud {
         match self.lie {
             Lie::ShiftedPose => truth,
             Lie::Noise => {
@@ -182,13 +184,6 @@ impl Attack {
                 told
             }
         }
-    }
-
-    fn anything(&mut self) -> Detection {
-        let mut reach = || self.random.between(-INVENTED_WITHIN_M, INVENTED_WITHIN_M);
-        let (x, y) = (reach(), reach());
-        let heading = self.random.between(-3.1, 3.1);
-        vehicle([x, y, heading], self.random.between(0.3, 1.0) as f32)
     }
 }
 
@@ -257,7 +252,6 @@ fn invent(features: &mut BevFeatures, confidence: &mut [f32], places: &[[f64; 3]
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::agent::PerceptionTimes;
 
     fn cav(name: &str) -> CavId {
         CavId::new(name).unwrap()
@@ -269,7 +263,7 @@ mod tests {
         let mut confidence = vec![0.0; grid.cells()];
         confidence[5050] = 0.9;
         let features = BevFeatures { grid, channels: 2, code_of: None, values };
-        Perception { features, confidence, detections: vec![], times: PerceptionTimes::default() }
+        Perception { features, confidence, detections: vec![], times: vec![] }
     }
 
     #[test]

@@ -9,6 +9,7 @@
 pub mod agent;
 pub mod attack;
 pub mod node;
+pub mod output_filter;
 pub mod rate;
 pub mod sweep_log;
 pub mod sweep_pairing;

@@ -13,8 +13,10 @@ use bus::{Arrival, Books, Bus, BusError, Event, Inbox, Publisher, PublisherOptio
 use protocol::codec::CodecConfig;
 use protocol::message::{Bev, Boxes, Descriptor, Points};
 use protocol::{DropReason, Dtype, Gnss, Lidar, Limits, PointCloud, PoseEstimate, Role, Stream, Topic, wire};
+use support::nanos;
 
 use crate::agent::{Agent, AgentInput, Perception};
+use crate::output_filter::{OutputFilter, Unfiltered};
 use crate::rate::{RateConfig, RateControl, Turn};
 use crate::sweep_log::SweepLog;
 use crate::sweep_pairing::{PairedSweep, SweepPairing};
@@ -75,7 +77,21 @@ pub struct NodeReport {
 /// # Errors
 /// [`BusError`] when the bus refuses. What goes wrong with single messages is counted and logged.
 pub fn run(bus: &Bus, agent: Agent, options: &NodeOptions, stop: &Stop) -> Result<NodeReport, BusError> {
-    let mut node = Node::open(bus, agent, options, stop)?;
+    run_filtered(bus, agent, Box::new(Unfiltered), options, stop)
+}
+
+/// [`run()`] with a filter on what is published.
+///
+/// # Errors
+/// As [`run()`].
+pub fn run_filtered(
+    bus: &Bus,
+    agent: Agent,
+    filter: Box<dyn OutputFilter>,
+    options: &NodeOptions,
+    stop: &Stop,
+) -> Result<NodeReport, BusError> {
+    let mut node = Node::open(bus, agent, filter, options, stop)?;
     let presence = bus.announce(Role::Agent)?;
     node.listen(stop);
     let Node { outlet, report, .. } = node;
@@ -87,6 +103,7 @@ pub fn run(bus: &Bus, agent: Agent, options: &NodeOptions, stop: &Stop) -> Resul
 struct Node<'a> {
     bus: &'a Bus,
     agent: Agent,
+    filter: Box<dyn OutputFilter>,
     options: &'a NodeOptions,
     inbox: Arc<Inbox>,
     lidar: Topic,
@@ -99,7 +116,13 @@ struct Node<'a> {
 }
 
 impl<'a> Node<'a> {
-    fn open(bus: &'a Bus, agent: Agent, options: &'a NodeOptions, stop: &Stop) -> Result<Self, BusError> {
+    fn open(
+        bus: &'a Bus,
+        agent: Agent,
+        filter: Box<dyn OutputFilter>,
+        options: &'a NodeOptions,
+        stop: &Stop,
+    ) -> Result<Self, BusError> {
         let topic = |stream| Topic::Stream { cav: agent.cav().clone(), stream };
         let (lidar, gnss) = (topic(Stream::Lidar), topic(Stream::Gnss));
         // One place: while a sweep is computed only the newest of those that come is worth keeping.
@@ -120,6 +143,7 @@ impl<'a> Node<'a> {
         Ok(Self {
             bus,
             agent,
+            filter,
             options,
             inbox,
             lidar,
@@ -179,7 +203,7 @@ impl<'a> Node<'a> {
             let Some(Lidar { points }) = self.inbox.decode(&sweep, &self.options.limits) else { continue };
             self.bus.books().timed("lidar transport", Duration::from_nanos(transport));
             self.bus.books().received(&self.lidar);
-            let arrived_nanos = unix_nanos().saturating_sub(nanos(sweep.at.elapsed()));
+            let arrived_nanos = unix_nanos().saturating_sub(nanos::of(sweep.at.elapsed()));
             self.process(&AgentInput { capture_nanos, cloud: &points, measured_pose: pose.as_ref() });
             // When everything is on its way.
             if let Some(Err(error)) = self.sweep_log.as_mut().map(|log| log.note(capture_nanos, arrived_nanos)) {
@@ -192,7 +216,7 @@ impl<'a> Node<'a> {
     fn process(&mut self, input: &AgentInput<'_>) {
         let books = self.bus.books();
         let began = Instant::now();
-        let pose = self.agent.estimate_pose(input);
+        let pose = self.filter.pose(self.agent.estimate_pose(input));
         books.timed("pose", began.elapsed());
         self.outlet.pose.offer(input.capture_nanos, pose);
         for stage in self.agent.pose_stages() {
@@ -202,12 +226,14 @@ impl<'a> Node<'a> {
         self.report.pose_jumps = self.agent.pose_jumps();
         match self.agent.perceive(input.cloud) {
             Ok(perception) => {
-                for stage in perception.times.stages() {
+                for stage in &perception.times {
                     books.timed(&stage.stage, Duration::from_nanos(stage.nanos));
                 }
                 books.timed("agent", began.elapsed());
                 self.report.sweeps += 1;
+                let perception = self.filter.perception(perception);
                 let shared = self.outlet.points.is_some().then(|| self.agent.share_points(input.cloud));
+                let shared = shared.map(|points| self.filter.points(points));
                 self.outlet.offer(input, pose, perception, shared, books);
             }
             Err(error) => {
@@ -216,10 +242,6 @@ impl<'a> Node<'a> {
             }
         }
     }
-}
-
-fn nanos(time: Duration) -> u64 {
-    u64::try_from(time.as_nanos()).unwrap_or(u64::MAX)
 }
 
 /// Everything an agent publishes.

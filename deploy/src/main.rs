@@ -7,7 +7,7 @@ mod command;
 use std::process::ExitCode;
 
 use clap::Parser;
-use support::output;
+use support::cli::exit_code;
 
 /// Collaborative perception without GNSS as a distributed system: run it, judge it, look at it.
 #[derive(Debug, Parser)]
@@ -25,23 +25,5 @@ struct CommandLine {
 
 fn main() -> ExitCode {
     bus::log_to_stderr();
-    match CommandLine::parse().command.run() {
-        Ok(outcome) => outcome.into(),
-        Err(error) => {
-            output::note(format_args!("v2vloc: {}", in_words(&error)));
-            command::exit_code(&error)
-        }
-    }
-}
-
-/// The chain of causes on one line, without those that the message above them quotes already.
-fn in_words(error: &anyhow::Error) -> String {
-    error.chain().fold(String::new(), |words, cause| {
-        let cause = cause.to_string();
-        match words.as_str() {
-            "" => cause,
-            said if said.contains(&cause) => words,
-            said => format!("{said}: {cause}"),
-        }
-    })
+    exit_code(CommandLine::parse().command.run(), command::is_bad_input)
 }

@@ -5,7 +5,6 @@
 
 mod box_correction;
 mod error;
-mod stages;
 mod view;
 
 use std::path::Path;
@@ -16,6 +15,7 @@ use perception::boxes::postprocess::{AgentBoxes, PostprocessConfig, postprocess}
 use perception::detector::Detector;
 use perception::weights::Weights;
 use protocol::{DecodedFeatures, Detection, DropReason, Pose, StageTiming};
+use support::stage_times::StageTimes;
 use tch::{Kind, TchError, Tensor, no_grad};
 
 use crate::misbehaviour::{Belief, Trust, TrustConfig};
@@ -27,7 +27,6 @@ use fusion::points::merge_points;
 use fusion::{AlignedMaps, EarlierMaps, FusionStage, SentMaps, StageError, ViewFacts};
 
 pub use error::EgoError;
-use stages::Stages;
 pub use view::{Content, View};
 
 /// Why a neighbour is not in a result.
@@ -156,7 +155,7 @@ impl Ego {
                 Err(reason) => skipped.push((index, reason)),
             }
         }
-        let mut stages = Stages::start();
+        let mut stages = StageTimes::start();
         let mut beliefs = Vec::new();
         if self.trust.is_some() && !fused.is_empty() {
             let found = self.judge(&aligned)?;
@@ -174,7 +173,7 @@ impl Ego {
             Exchange::Points => self.merge_points(&aligned, &mut stages),
             Exchange::Features | Exchange::Nothing => self.merge_features(&aligned, &mut stages),
         })?;
-        Ok(EgoOutput { detections, fused, skipped, beliefs, stages: stages.timings })
+        Ok(EgoOutput { detections, fused, skipped, beliefs, stages: stages.into_timings() })
     }
 
     /// How far each of the neighbours, which follow the ego itself, is believed.
@@ -218,7 +217,7 @@ impl Ego {
     }
 
     /// Intermediate fusion, and the ego alone.
-    fn merge_features(&mut self, aligned: &[Aligned<'_>], stages: &mut Stages) -> Result<Vec<Detection>, EgoError> {
+    fn merge_features(&mut self, aligned: &[Aligned<'_>], stages: &mut StageTimes) -> Result<Vec<Detection>, EgoError> {
         let (mut maps, mut sent) = (Vec::with_capacity(aligned.len()), Vec::with_capacity(aligned.len()));
         for Aligned { view, .. } in aligned {
             let Content::Features(map) = &view.content else { continue };
@@ -301,7 +300,7 @@ impl Ego {
     }
 
     /// Early fusion: one cloud in the ego frame.
-    fn merge_points(&mut self, aligned: &[Aligned<'_>], stages: &mut Stages) -> Result<Vec<Detection>, EgoError> {
+    fn merge_points(&mut self, aligned: &[Aligned<'_>], stages: &mut StageTimes) -> Result<Vec<Detection>, EgoError> {
         let clouds = aligned.iter().filter_map(|Aligned { view, .. }| match &view.content {
             Content::Points(points) => Some(points),
             Content::Features(_) | Content::Boxes(_) => None,
@@ -316,7 +315,7 @@ impl Ego {
     }
 
     /// Late fusion: the boxes of all in the ego frame, the best of those that overlap.
-    fn merge_boxes(&self, aligned: &[Aligned<'_>], stages: &mut Stages) -> Vec<Detection> {
+    fn merge_boxes(&self, aligned: &[Aligned<'_>], stages: &mut StageTimes) -> Vec<Detection> {
         let decoded: Vec<(Vec<Decoded>, Isometry3<f64>)> = (aligned.iter())
             .map(|Aligned { view, ego_from_cav }| {
                 let found = if let Content::Boxes(found) = &view.content { found.as_slice() } else { &[] };
@@ -335,7 +334,7 @@ impl Ego {
         detections
     }
 
-    fn boxes_of(&self, features: &Tensor, stages: &mut Stages) -> Result<Vec<Detection>, EgoError> {
+    fn boxes_of(&self, features: &Tensor, stages: &mut StageTimes) -> Result<Vec<Detection>, EgoError> {
         let heads = self.detector.heads(features)?;
         stages.lap("head");
         let decoded = self.detector.boxes(&heads, self.limits.score_threshold)?;

@@ -6,8 +6,9 @@ mod command;
 
 use std::process::ExitCode;
 
+use bus::BusError;
 use clap::Parser;
-use support::output;
+use support::cli::exit_code;
 
 /// Fuses the views of connected vehicles into boxes around the ego.
 #[derive(Debug, Parser)]
@@ -18,12 +19,5 @@ struct CommandLine {
 }
 
 fn main() -> ExitCode {
-    let command_line = CommandLine::parse();
-    match command_line.command.run() {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(error) => {
-            output::note(format_args!("ego-fuser: {error:#}"));
-            command::exit_code(&error)
-        }
-    }
+    exit_code(CommandLine::parse().command.run(), BusError::is_behind)
 }

@@ -27,6 +27,7 @@ use crate::Runs;
 use crate::Stream;
 use crate::Topic;
 use crate::Verb;
+use crate::text::excerpt;
 
 /// First chunk of every key.
 pub const KEY_ROOT: &str = "v2v";
@@ -62,13 +63,13 @@ pub enum KeyError {
 
 impl KeyError {
     pub(crate) fn unknown(text: &str) -> Self {
-        Self::Unknown { text: beginning(text) }
+        Self::Unknown { text: shown(text) }
     }
 }
 
 /// As much of a text as an error shows.
-pub(crate) fn beginning(text: &str) -> String {
-    text.chars().take(MAX_KEY_BYTES).collect()
+pub(crate) fn shown(text: &str) -> String {
+    excerpt(text, MAX_KEY_BYTES)
 }
 
 /// One key: a run and a topic in it.
@@ -139,7 +140,7 @@ impl FromStr for Key {
             return Err(KeyError::unknown(text));
         };
         let topic = topic.parse()?;
-        let run = RunId::new(run).map_err(|source| KeyError::Id { text: beginning(text), source })?;
+        let run = RunId::new(run).map_err(|source| KeyError::Id { text: shown(text), source })?;
         Ok(Self { run, topic })
     }
 }

@@ -97,6 +97,7 @@ mod reconciliation;
 pub mod rotated_iou;
 mod stream;
 mod string_enum;
+pub mod text;
 mod topic;
 pub mod wire;
 

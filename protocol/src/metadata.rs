@@ -10,6 +10,7 @@ use serde::de::DeserializeOwned;
 use crate::Kind;
 use crate::Limits;
 use crate::WireError;
+use crate::text::excerpt;
 
 const HARD_LIMIT: usize = Limits::HARD_METADATA_BYTES as usize;
 
@@ -38,16 +39,11 @@ pub(crate) fn append<T: Serialize>(kind: Kind, metadata: &T, head: &mut Vec<u8>)
 pub(crate) fn decode<T: DeserializeOwned>(kind: Kind, bytes: &[u8]) -> Result<T, WireError> {
     let refuse = |detail: String| WireError::Metadata { kind, detail };
     let (metadata, used) =
-        bincode::serde::decode_from_slice(bytes, CONFIG).map_err(|error| refuse(beginning(&error.to_string())))?;
+        bincode::serde::decode_from_slice(bytes, CONFIG).map_err(|error| refuse(excerpt(&error.to_string(), 200)))?;
     if used != bytes.len() {
         return Err(refuse(format!("{} of {} bytes are left over", bytes.len() - used, bytes.len())));
     }
     Ok(metadata)
-}
-
-/// A hostile text inside an error must not fill the log.
-fn beginning(text: &str) -> String {
-    text.chars().take(200).collect()
 }
 
 #[cfg(test)]

@@ -12,7 +12,7 @@ use crate::KeyError;
 use crate::ProcessId;
 use crate::RunId;
 use crate::Stream;
-use crate::key::{MAX_KEY_BYTES, beginning};
+use crate::key::{MAX_KEY_BYTES, shown};
 use crate::string_enum::{named, written_as_text};
 
 named! {
@@ -158,11 +158,11 @@ impl FromStr for Topic {
         }
         // `$` and `#` mean something to zenoh too.
         if text.contains(['*', '$', '#', '?']) {
-            return Err(KeyError::Wildcard { text: beginning(text) });
+            return Err(KeyError::Wildcard { text: shown(text) });
         }
         let chunks: Vec<&str> = text.split('/').collect();
         Self::from_chunks(&chunks)
-            .map_err(|source| KeyError::Id { text: beginning(text), source })?
+            .map_err(|source| KeyError::Id { text: shown(text), source })?
             .ok_or_else(|| KeyError::unknown(text))
     }
 }

@@ -14,6 +14,7 @@ use bus::bounded_queue::Taken;
 use bus::shutdown::Stop;
 use bus::{Arrival, Bus, BusError, Event, Inbox, InboxLimits, Publisher, PublisherOptions, RollCall, Subscription};
 use link::{Air, Fate, Outcome, Parcel};
+use support::nanos;
 
 /// Messages of one topic that may wait to be looked at, and that may wait to be passed on.
 const PLACES: usize = 64;
@@ -277,7 +278,7 @@ impl<'a> Node<'a> {
             stream,
             sequence: arrival.header.stamp.sequence,
             bytes: arrival.wire_bytes(),
-            offered_nanos: nanos_since(began, arrival.at),
+            offered_nanos: nanos::between(began, arrival.at),
             distance_m,
         });
         self.kept.insert(self.next_id, arrival);
@@ -296,7 +297,7 @@ impl<'a> Node<'a> {
     /// Passes on what has arrived by now.
     fn settle(&mut self) {
         let Some(began) = self.began else { return };
-        for Outcome { parcel, fate, .. } in self.air.advance(nanos_since(began, Instant::now())) {
+        for Outcome { parcel, fate, .. } in self.air.advance(nanos::between(began, Instant::now())) {
             match fate {
                 Fate::Dropped(reason) => {
                     if let Some(lost) = self.release(parcel.id) {
@@ -358,10 +359,6 @@ fn place_to_free<'v>(
 ) -> Option<&'v CavId> {
     let is_free = |(cav, vehicle): &(&CavId, &Vehicle)| vehicle.is_gone && *cav != ego && !has_kept(cav);
     vehicles.iter().find(is_free).map(|(cav, _)| cav)
-}
-
-fn nanos_since(began: Instant, at: Instant) -> u64 {
-    u64::try_from(at.saturating_duration_since(began).as_nanos()).unwrap_or(u64::MAX)
 }
 
 #[cfg(test)]

@@ -16,6 +16,7 @@
 use std::time::Duration;
 
 use anyhow::{Context, Result, bail};
+use support::statistics;
 use tests::faults::{FaultyFleet, Report, cold_start, plan, soak};
 use tests::machine;
 
@@ -61,13 +62,11 @@ fn under_faults(seed: u64, count: usize) -> Vec<String> {
     let faults = plan(seed, count);
     let report = FaultyFleet::start(folder.path())
         .suffer(&faults, |number, fault, ms| eprintln!("{number}: {fault}, as before after {ms} ms"));
-    let Report { mut findings, slowest, balances, differences, excused, stop, left_over, growth, restarts } = report;
-    findings.fused_again_ms.sort_unstable();
+    let Report { findings, slowest, balances, differences, excused, stop, left_over, growth, restarts } = report;
     let returns = findings.fused_again_ms.len();
-    let quantile = |share: f64| {
-        let place = (share * returns as f64).ceil() as usize;
-        findings.fused_again_ms.get(place.saturating_sub(1)).copied().unwrap_or(0)
-    };
+    let ms: Vec<f64> = findings.fused_again_ms.iter().map(|&ms| ms as f64).collect();
+    let ms = statistics::sorted(&ms);
+    let quantile = |q: f64| statistics::quantile(&ms, q).unwrap_or(0.0) as u64;
     let worst = quantile(1.0);
     println!("## {count} faults, seed {seed}\n");
     println!("{restarts} restarts; slowest to be as before: {} ms ({})", slowest.0, slowest.1);

@@ -36,6 +36,7 @@ use protocol::{
     CavId, CodecConfig, Detections, Dtype, EncodedFeatures, Limits, Pose, PoseEstimate, ProcessId, Role, RunId, Stream,
     Topic, encode_features, wire,
 };
+use support::statistics;
 use tests::bus::{PATIENCE, TestRouter};
 use tests::machine;
 
@@ -223,13 +224,10 @@ fn start_ego(router: &TestRouter, weights: &Path) -> Result<Child> {
 }
 
 fn row(map: &EncodedFeatures, count: usize, ticks: usize, cpu_ms: f64, heard: &[Heard]) -> Row {
-    let mut latencies: Vec<f64> =
+    let latencies: Vec<f64> =
         heard.iter().map(|heard| heard.publish_nanos.saturating_sub(heard.capture_nanos) as f64 / 1e6).collect();
-    latencies.sort_unstable_by(f64::total_cmp);
-    let quantile = |quantile: f64| {
-        let place = (latencies.len() as f64 * quantile).ceil() as usize;
-        latencies.get(place.saturating_sub(1)).copied().unwrap_or(f64::NAN)
-    };
+    let latencies = statistics::sorted(&latencies);
+    let quantile = |q: f64| statistics::quantile(&latencies, q).unwrap_or(f64::NAN);
     let fused: usize = heard.iter().map(|heard| heard.in_time).sum();
     Row {
         lattice: String::new(),

@@ -18,6 +18,7 @@ use std::time::{Duration, Instant};
 use bus::{Barrier, Bus, Event, Inbox, Publisher, PublisherOptions, Route, Subscription};
 use protocol::message::Bev;
 use protocol::{BevFeatures, BevGrid, Body, CodecConfig, Limits, Pose, PoseEstimate, Topic, encode_features};
+use support::statistics;
 use tests::bus::{PATIENCE, TestRouter, free_port, next_event, wait_for};
 use zenoh::bytes::ZBytes;
 use zenoh::qos::CongestionControl;
@@ -126,9 +127,10 @@ fn plain_sessions() -> [Session; 3] {
 }
 
 /// Median and 95th percentile, milliseconds.
-fn summary(mut times: Vec<Duration>) -> [f64; 2] {
-    times.sort_unstable();
-    [0.5, 0.95].map(|quantile| times[((times.len() - 1) as f64 * quantile).round() as usize].as_secs_f64() * 1e3)
+fn summary(times: &[Duration]) -> [f64; 2] {
+    let ms: Vec<f64> = times.iter().map(|time| time.as_secs_f64() * 1e3).collect();
+    let ms = statistics::sorted(&ms);
+    [0.5, 0.95].map(|q| statistics::quantile(&ms, q).unwrap_or(f64::NAN))
 }
 
 fn measure(mib: u32) -> bool {
@@ -147,7 +149,7 @@ fn measure(mib: u32) -> bool {
             times.iter_mut().zip(took).for_each(|(times, took)| times.push(took));
         }
     }
-    let [[ours, ours_p95], [plain, plain_p95], [bus, bus_p95]] = times.map(summary);
+    let [[ours, ours_p95], [plain, plain_p95], [bus, bus_p95]] = times.map(|times| summary(&times));
     let ratio = ours / plain;
     println!(
         "transport/{mib}MiB: ours p50 {ours:.2} ms, p95 {ours_p95:.2} ms; zenoh alone p50 {plain:.2} ms, \

@@ -1,36 +1,32 @@
-//! Line and point charts as PNG, for results.
+//! Chart with one x and one y axis: series of points as lines and dots.
 
-use std::path::Path;
+use plotters::chart::{ChartBuilder, ChartContext, SeriesLabelPosition};
+use plotters::coord::Shift;
+use plotters::coord::cartesian::Cartesian2d;
+use plotters::drawing::{DrawingArea, DrawingAreaErrorKind};
+use plotters::element::{Circle, Rectangle};
+use plotters::prelude::DrawingBackend;
+use plotters::series::LineSeries;
+use plotters::style::{Color, IntoFont, RGBColor, TRANSPARENT, TextStyle};
 
-use embedded_graphics::mono_font::MonoTextStyle;
-use embedded_graphics::mono_font::ascii::{FONT_7X13, FONT_9X15_BOLD};
-use embedded_graphics::pixelcolor::Rgb888;
-use embedded_graphics::prelude::{Point, Primitive, Size};
-use embedded_graphics::primitives::{Circle, PrimitiveStyle, Rectangle};
+use super::scale::Scale;
+use super::{FONT, FigureError, PAPER};
 
-use crate::canvas::{Canvas, CanvasError};
-
-/// Size of one chart, pixels.
-pub(crate) const CHART: Size = Size::new(560, 440);
-/// Space around the plotted area: left, top, right, bottom, pixels.
-pub(crate) const MARGIN: [i32; 4] = [64, 44, 20, 52];
-/// Lines and points are drawn this much larger and averaged down, which smooths their edges.
-const OVERSAMPLING: u32 = 3;
-
-const PAPER: Rgb888 = Rgb888::new(255, 255, 255);
-const INK: Rgb888 = Rgb888::new(40, 44, 52);
-const RULE: Rgb888 = Rgb888::new(226, 229, 234);
-/// Colours of the series; told apart by most colour-blind readers.
-pub(crate) const COLOURS: [Rgb888; 8] = [
-    Rgb888::new(0, 114, 178),
-    Rgb888::new(150, 150, 150),
-    Rgb888::new(213, 94, 0),
-    Rgb888::new(0, 158, 115),
-    Rgb888::new(204, 121, 167),
-    Rgb888::new(86, 180, 233),
-    Rgb888::new(230, 159, 0),
-    Rgb888::new(60, 60, 60),
+const INK: RGBColor = RGBColor(40, 44, 52);
+const RULE: RGBColor = RGBColor(226, 229, 234);
+/// Colours of the series, by Okabe and Ito with two greys: told apart with any colour vision.
+const COLOURS: [RGBColor; 8] = [
+    RGBColor(0, 114, 178),
+    RGBColor(150, 150, 150),
+    RGBColor(213, 94, 0),
+    RGBColor(0, 158, 115),
+    RGBColor(204, 121, 167),
+    RGBColor(86, 180, 233),
+    RGBColor(230, 159, 0),
+    RGBColor(60, 60, 60),
 ];
+/// Lines of the grid along an axis, at most.
+const TICKS: usize = 6;
 
 /// One axis.
 #[derive(Debug, Clone, PartialEq)]
@@ -59,7 +55,7 @@ pub enum Mark {
 pub struct Series {
     /// Name in the legend.
     pub name: String,
-    /// x and y; what is not finite is left out.
+    /// x and y; a point that is not finite or outside the axes is left out.
     pub points: Vec<(f64, f64)>,
     /// How it is drawn.
     pub mark: Mark,
@@ -74,9 +70,12 @@ pub struct Chart {
     pub x: Axis,
     /// Up.
     pub y: Axis,
-    /// What is drawn, later ones over earlier ones.
+    /// Later ones are drawn over earlier ones.
     pub series: Vec<Series>,
 }
+
+type Context<'a, DB> = ChartContext<'a, DB, Cartesian2d<Scale, Scale>>;
+type Drawn<DB> = Result<(), DrawingAreaErrorKind<<DB as DrawingBackend>::ErrorType>>;
 
 impl Axis {
     /// An axis of equal differences.
@@ -91,153 +90,118 @@ impl Axis {
         Self { label: label.into(), range, is_logarithmic: true }
     }
 
+    /// The range, or one that can be drawn where it is empty or endless.
+    pub(super) fn drawn_range(&self) -> [f64; 2] {
+        let [low, high] = self.range;
+        let lowest = if self.is_logarithmic { f64::MIN_POSITIVE } else { f64::MIN };
+        let can_be_drawn = low >= lowest && low < high && (high - low).is_finite();
+        if can_be_drawn { self.range } else { [0.1, 1.0] }
+    }
+
     /// Place of a value: 0 at the lower end, 1 at the upper.
     fn share(&self, value: f64) -> f64 {
-        let scale = |value: f64| if self.is_logarithmic { value.max(1e-300).ln() } else { value };
-        let [low, high] = self.range.map(scale);
+        let scale = |value: f64| if self.is_logarithmic { value.ln() } else { value };
+        let [low, high] = self.drawn_range().map(scale);
         (scale(value) - low) / (high - low)
     }
 
-    /// Where lines and numbers stand.
-    pub(crate) fn ticks(&self) -> Vec<f64> {
-        let [low, high] = self.range;
-        if self.is_logarithmic {
-            let decades = low.log10().ceil() as i32..=high.log10().floor() as i32;
-            return decades.map(|decade| 10.0_f64.powi(decade)).collect();
+    fn contains(&self, value: f64) -> bool {
+        (-0.01..=1.01).contains(&self.share(value))
+    }
+}
+
+impl Series {
+    fn points_on<'a>(&'a self, x: &'a Axis, y: &'a Axis) -> impl Iterator<Item = (f64, f64)> + Clone + 'a {
+        self.points.iter().copied().filter(|point| x.contains(point.0) && y.contains(point.1))
+    }
+
+    fn dot_radius(&self) -> Option<u32> {
+        match self.mark {
+            Mark::Dots => Some(2),
+            Mark::LineAndDots => Some(4),
+            Mark::Line => None,
         }
-        let step = (high - low) / 5.0;
-        (0..=5).map(|tick| low + f64::from(tick) * step).collect()
     }
-}
-
-/// Writes charts side by side into one PNG.
-///
-/// # Errors
-/// [`CanvasError`] when the file cannot be written.
-pub fn save(charts: &[Chart], path: &Path) -> Result<(), CanvasError> {
-    draw(charts).save(path)
-}
-
-fn draw(charts: &[Chart]) -> Canvas {
-    let size = Size::new(CHART.width * charts.len().max(1) as u32, CHART.height);
-    let mut large = Canvas::new(size * OVERSAMPLING, PAPER);
-    for (place, chart) in charts.iter().enumerate() {
-        chart.draw_marks(&mut large, place as i32 * CHART.width as i32);
-    }
-    let mut canvas = Canvas::new(size, PAPER);
-    canvas.paste_shrunk(&large, OVERSAMPLING);
-    for (place, chart) in charts.iter().enumerate() {
-        chart.draw_texts(&mut canvas, place as i32 * CHART.width as i32);
-    }
-    canvas
 }
 
 impl Chart {
-    /// Pixel of a value on the finished picture, for a chart whose left edge is at `left`.
-    pub(crate) fn pixel(&self, x: f64, y: f64, left: i32) -> Option<[f64; 2]> {
-        let [margin_left, top, right, bottom] = MARGIN.map(f64::from);
-        let (width, height) = (f64::from(CHART.width), f64::from(CHART.height));
-        let (across, up) = (self.x.share(x), self.y.share(y));
-        let inside = |share: f64| (-0.01..=1.01).contains(&share);
-        (inside(across) && inside(up)).then(|| {
-            let x = f64::from(left) + margin_left + across * (width - margin_left - right);
-            [x, height - bottom - up * (height - top - bottom)]
-        })
-    }
-
-    fn draw_marks(&self, canvas: &mut Canvas, left: i32) {
-        let scale = f64::from(OVERSAMPLING);
-        let at = |x, y| self.pixel(x, y, left).map(|[x, y]| Point::new((x * scale) as i32, (y * scale) as i32));
-        let rule = PrimitiveStyle::with_stroke(RULE, OVERSAMPLING);
-        let [x_range, y_range] = [self.x.range, self.y.range];
-        let vertical = self.x.ticks().into_iter().map(|x| ((x, y_range[0]), (x, y_range[1])));
-        let horizontal = self.y.ticks().into_iter().map(|y| ((x_range[0], y), (x_range[1], y)));
-        for (from, to) in vertical.chain(horizontal) {
-            if let (Some(from), Some(to)) = (at(from.0, from.1), at(to.0, to.1)) {
-                canvas.line(from, to, rule);
-            }
-        }
+    pub(super) fn draw<DB: DrawingBackend>(&self, area: &DrawingArea<DB, Shift>) -> Result<(), FigureError> {
+        let mut context = ChartBuilder::on(area)
+            .margin(12)
+            .margin_right(24)
+            .caption(&self.title, font(18))
+            .x_label_area_size(44)
+            .y_label_area_size(60)
+            .build_cartesian_2d(Scale::from(&self.x), Scale::from(&self.y))?;
+        self.draw_grid(&mut context)?;
         for (series, &colour) in self.series.iter().zip(COLOURS.iter().cycle()) {
-            let points: Vec<Point> = series.points.iter().filter_map(|&(x, y)| at(x, y)).collect();
-            if series.mark != Mark::Dots {
-                let style = PrimitiveStyle::with_stroke(colour, 2 * OVERSAMPLING);
-                points.windows(2).for_each(|pair| canvas.line(pair[0], pair[1], style));
-            }
-            let diameter = match series.mark {
-                Mark::Line => continue,
-                Mark::Dots => 3,
-                Mark::LineAndDots => 7,
-            };
-            for &point in &points {
-                let dot = Circle::with_center(point, diameter * OVERSAMPLING);
-                canvas.show(dot.into_styled(PrimitiveStyle::with_fill(colour)));
-            }
+            self.draw_series(series, colour, &mut context)?;
         }
+        Ok(self.draw_legend(&mut context)?)
     }
 
-    fn draw_texts(&self, canvas: &mut Canvas, left: i32) {
-        let (title, small) = (MonoTextStyle::new(&FONT_9X15_BOLD, INK), MonoTextStyle::new(&FONT_7X13, INK));
-        let bottom = CHART.height as i32 - MARGIN[3];
-        canvas.text(&self.title, Point::new(left + MARGIN[0], 18), title);
-        canvas.text(&self.y.label, Point::new(left + 8, 36), small);
-        let label_width = 7 * self.x.label.len() as i32;
-        canvas.text(&self.x.label, Point::new(left + CHART.width as i32 - MARGIN[2] - label_width, bottom + 36), small);
-        for x in self.x.ticks() {
-            let text = number(x);
-            let Some([pixel, _]) = self.pixel(x, self.y.range[0], left) else { continue };
-            canvas.text(&text, Point::new(pixel as i32 - 7 * text.len() as i32 / 2, bottom + 18), small);
+    fn draw_grid<'a, DB: DrawingBackend + 'a>(&self, context: &mut Context<'a, DB>) -> Drawn<DB> {
+        context
+            .configure_mesh()
+            .x_desc(&self.x.label)
+            .y_desc(&self.y.label)
+            .x_labels(TICKS)
+            .y_labels(TICKS)
+            .bold_line_style(RULE)
+            .light_line_style(TRANSPARENT)
+            .axis_style(INK)
+            .axis_desc_style(font(14))
+            .label_style(font(13))
+            .draw()
+    }
+
+    fn draw_series<'a, DB: DrawingBackend + 'a>(
+        &self,
+        series: &Series,
+        colour: RGBColor,
+        context: &mut Context<'a, DB>,
+    ) -> Drawn<DB> {
+        let points = || series.points_on(&self.x, &self.y);
+        if series.mark != Mark::Dots {
+            context.draw_series(LineSeries::new(points(), colour.stroke_width(2)))?;
         }
-        for y in self.y.ticks() {
-            let text = number(y);
-            let Some([_, pixel]) = self.pixel(self.x.range[0], y, left) else { continue };
-            canvas.text(&text, Point::new(left + MARGIN[0] - 8 - 7 * text.len() as i32, pixel as i32 + 4), small);
-        }
-        let mut row = MARGIN[1] + 16;
-        for (series, &colour) in self.series.iter().zip(COLOURS.iter().cycle()) {
-            let swatch = Rectangle::new(Point::new(left + MARGIN[0] + 12, row - 9), Size::new(10, 10));
-            canvas.show(swatch.into_styled(PrimitiveStyle::with_fill(colour)));
-            canvas.text(&series.name, Point::new(left + MARGIN[0] + 28, row), small);
-            row += 16;
-        }
+        let radius = series.dot_radius();
+        let dots =
+            radius.into_iter().flat_map(|radius| points().map(move |at| Circle::new(at, radius, colour.filled())));
+        let swatch = move |(x, y)| Rectangle::new([(x, y - 5), (x + 10, y + 5)], colour.filled());
+        context.draw_series(dots)?.label(&series.name).legend(swatch);
+        Ok(())
+    }
+
+    fn draw_legend<'a, DB: DrawingBackend + 'a>(&self, context: &mut Context<'a, DB>) -> Drawn<DB> {
+        context
+            .configure_series_labels()
+            .position(self.emptiest_corner())
+            .legend_area_size(16)
+            .margin(10)
+            .background_style(PAPER.mix(0.85))
+            .label_font(font(13))
+            .draw()
+    }
+
+    /// The quarter of the chart with the fewest points.
+    fn emptiest_corner(&self) -> SeriesLabelPosition {
+        let points = || self.series.iter().flat_map(|series| series.points_on(&self.x, &self.y));
+        let count = |is_right: bool, is_upper: bool| {
+            points()
+                .filter(|at| (self.x.share(at.0) > 0.5) == is_right && (self.y.share(at.1) > 0.5) == is_upper)
+                .count()
+        };
+        let corners = [
+            (count(false, true), SeriesLabelPosition::UpperLeft),
+            (count(true, true), SeriesLabelPosition::UpperRight),
+            (count(false, false), SeriesLabelPosition::LowerLeft),
+            (count(true, false), SeriesLabelPosition::LowerRight),
+        ];
+        corners.into_iter().min_by_key(|corner| corner.0).map_or(SeriesLabelPosition::UpperLeft, |corner| corner.1)
     }
 }
 
-/// A number as short as it can be read.
-pub(crate) fn number(value: f64) -> String {
-    let rounded = (value * 1000.0).round() / 1000.0;
-    format!("{rounded}")
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    fn chart() -> Chart {
-        let points = vec![(0.0, 0.1), (0.5, 1.0), (1.0, 10.0), (f64::NAN, 1.0), (0.5, f64::INFINITY), (7.0, 1.0)];
-        Chart {
-            title: "error".into(),
-            x: Axis::linear("sigma", [0.0, 1.0]),
-            y: Axis::logarithmic("metres", [0.01, 100.0]),
-            series: vec![Series { name: "sweeps".into(), points, mark: Mark::LineAndDots }],
-        }
-    }
-
-    #[test]
-    fn values_are_where_their_axes_say() {
-        let (chart, canvas) = (chart(), draw(&[chart(), chart()]));
-        let [x, y] = chart.pixel(0.5, 1.0, 0).unwrap();
-        assert_eq!(canvas.pixel(Point::new(x as i32, y as i32)), Some(COLOURS[0]));
-        // The second chart lies beside the first.
-        assert_eq!(canvas.pixel(Point::new(x as i32 + CHART.width as i32, y as i32)), Some(COLOURS[0]));
-        assert_eq!(chart.pixel(0.5, 1e9, 0), None);
-        assert_eq!(chart.y.ticks().len(), 5);
-    }
-
-    #[test]
-    fn a_chart_is_a_file() {
-        let folder = tempfile::tempdir().unwrap();
-        let path = folder.path().join("chart.png");
-        save(&[chart()], &path).unwrap();
-        assert!(std::fs::read(&path).unwrap().starts_with(b"\x89PNG"));
-    }
+fn font(pixels: i32) -> TextStyle<'static> {
+    (FONT, pixels).into_font().color(&INK)
 }

@@ -1,28 +1,6 @@
-//! Means, quantiles and rank correlation of samples.
+//! Rank correlation of paired samples.
 
-/// The mean; `None` for an empty sample.
-#[must_use]
-pub fn mean(values: &[f64]) -> Option<f64> {
-    (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
-}
-
-/// The values in ascending order.
-#[must_use]
-pub fn sorted(values: &[f64]) -> Vec<f64> {
-    let mut sorted = values.to_vec();
-    sorted.sort_by(f64::total_cmp);
-    sorted
-}
-
-/// The quantile `q` (0..=1) of a sorted sample, interpolated between neighbours; `None` for an empty one.
-#[must_use]
-pub fn quantile(sorted: &[f64], q: f64) -> Option<f64> {
-    let last = sorted.len().checked_sub(1)?;
-    let rank = q * last as f64;
-    let below = (rank.floor() as usize).min(last);
-    let above = (below + 1).min(last);
-    Some(sorted[below] + (sorted[above] - sorted[below]) * (rank - below as f64))
-}
+use support::statistics::mean;
 
 /// Spearman's rank correlation of paired samples, equal values sharing their mean rank; `None` when one of them does not
 /// vary, or there are fewer than two pairs.
@@ -61,14 +39,6 @@ fn pearson(a: &[f64], b: &[f64]) -> Option<f64> {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn quantiles_lie_between_neighbours() {
-        let sorted = sorted(&[3.0, 1.0, 2.0, 4.0, 5.0]);
-        assert_eq!(quantile(&sorted, 0.5), Some(3.0));
-        assert!((quantile(&sorted, 0.95).unwrap() - 4.8).abs() < 1e-12);
-        assert_eq!((quantile(&[], 0.5), mean(&[])), (None, None));
-    }
 
     #[test]
     fn ranks_count_and_not_values() {

@@ -2,13 +2,13 @@
 
 #![warn(clippy::print_stdout, clippy::print_stderr)]
 
-mod cli;
 mod command;
+mod command_line;
 
 use std::process::ExitCode;
 
 use clap::Parser;
 
 fn main() -> ExitCode {
-    cli::run(cli::Cli::parse())
+    command_line::run(command_line::Cli::parse())
 }

@@ -4,6 +4,7 @@
 
 use std::f32::consts::TAU;
 use std::hint::black_box;
+use std::time::Duration;
 
 use criterion::{Criterion, criterion_group, criterion_main};
 use perception::detector::Detector;
@@ -11,6 +12,7 @@ use perception::model_config::DetectorConfig;
 use perception::pillars::point_pillars::PointPillars;
 use perception::pillars::voxels::Voxeliser;
 use protocol::PointCloud;
+use support::statistics;
 use tch::Device;
 use tch::nn::VarStore;
 
@@ -56,11 +58,11 @@ fn encode(criterion: &mut Criterion) {
         group.bench_function(format!("{}/{threads}-thread/60000", config.name), |bencher| {
             bencher.iter(|| stages.push(detector.encode(black_box(&cloud)).expect("a sweep is encoded").times));
         });
-        let mut median = |pick: fn(&perception::detector::EncodeTimes) -> std::time::Duration| {
-            stages.sort_by_key(pick);
-            stages.get(stages.len() / 2).map(pick).unwrap_or_default()
+        let median = |place: usize| {
+            let nanos: Vec<f64> = stages.iter().filter_map(|times| Some(times.get(place)?.nanos as f64)).collect();
+            Duration::from_secs_f64(statistics::median(&nanos).unwrap_or(0.0) * 1e-9)
         };
-        let stage = [median(|t| t.voxelise), median(|t| t.pillars), median(|t| t.backbone)];
+        let stage = [0, 1, 2].map(median);
         println!(
             "{} stages: voxelise {:.2?}, pillars {:.2?}, backbone {:.2?}",
             config.name, stage[0], stage[1], stage[2]

@@ -6,6 +6,7 @@ use std::str::FromStr;
 use agent::agent::Agent;
 use agent::attack::{Attack, Lie};
 use agent::node::{self, NodeOptions};
+use agent::output_filter::{OutputFilter, Unfiltered};
 use agent::rate::RateConfig;
 use anyhow::Context;
 use bus::{BusArgs, STOP_LIMIT, log_to_stderr};
@@ -18,7 +19,7 @@ use perception::detector::Detector;
 use protocol::{CavId, CodecConfig, ConfidenceGate, Dtype, Role, Smoothing, Stream};
 use support::output;
 
-use crate::cli::BadInput;
+use support::cli::BadInput;
 
 /// Run one vehicle: its sensors in; pose, feature map, boxes or points out.
 ///
@@ -214,11 +215,12 @@ impl FromStr for SmoothingArg {
 pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
     log_to_stderr();
     tch::set_num_threads(i32::from(args.threads));
-    let agent = args.agent().map_err(BadInput)?;
+    let agent = args.agent().map_err(BadInput::of)?;
+    let filter = args.output_filter();
     let stop = args.bus.stop().context("installing signal handlers")?;
     let bus = args.bus.join(Role::Agent, &args.cav)?;
     tracing::info!(cav = %args.cav, weights = %args.weights.display(), "ready");
-    let report = node::run(&bus, agent, &args.options(), &stop)?;
+    let report = node::run_filtered(&bus, agent, filter, &args.options(), &stop)?;
     if let Err(overdue) = bus.leave(STOP_LIMIT) {
         tracing::warn!("{overdue}");
     }
@@ -236,14 +238,18 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<()> {
 impl Args {
     fn agent(&self) -> anyhow::Result<Agent> {
         let detector = Detector::load(&self.weights).context("weights")?;
-        let lie = self.lie.map(|lie| match lie {
-            LieAbout::ShiftedPose => Lie::ShiftedPose,
-            LieAbout::Noise => Lie::Noise,
-            LieAbout::Copied => Lie::Copied,
-            LieAbout::Invented => Lie::Invented,
-        });
-        let attack = lie.map(|lie| Attack::new(lie, &self.cav, 0));
-        Ok(Agent::new(self.cav.clone(), self.pose_source()?, detector).lying(attack))
+        Ok(Agent::new(self.cav.clone(), self.pose_source()?, detector))
+    }
+
+    fn output_filter(&self) -> Box<dyn OutputFilter> {
+        let lie = match self.lie {
+            None => return Box::new(Unfiltered),
+            Some(LieAbout::ShiftedPose) => Lie::ShiftedPose,
+            Some(LieAbout::Noise) => Lie::Noise,
+            Some(LieAbout::Copied) => Lie::Copied,
+            Some(LieAbout::Invented) => Lie::Invented,
+        };
+        Box::new(Attack::new(lie, &self.cav, 0))
     }
 
     fn pose_source(&self) -> anyhow::Result<Box<dyn PoseSource>> {

@@ -12,8 +12,11 @@ use fusion::Method;
 use protocol::RunId;
 use simulator::generate::{self, Subset, SynthError, SynthOptions};
 use support::output;
+use support::progress;
 
-use super::{BadInput, Outcome, programs};
+use super::programs;
+use support::cli::BadInput;
+use support::cli::Outcome;
 
 /// Seeds from here on are never trained with.
 const SEED: u64 = 1000;
@@ -60,7 +63,7 @@ impl Arguments {
         let mut results = Vec::new();
         for &method in &self.methods {
             scenario.method = method;
-            scenario.run = Some(RunId::new(&format!("{name}-{method}")).map_err(|error| BadInput(error.to_string()))?);
+            scenario.run = Some(RunId::new(&format!("{name}-{method}")).map_err(BadInput::of)?);
             scenario.check(&self.scenario)?;
             let options = UpOptions { runs: self.runs.clone(), programs: programs()?, prefix: "demo" };
             let result = up(&scenario, &options).with_context(|| format!("method {method}"))?;
@@ -80,7 +83,7 @@ impl Arguments {
         let name = format!("v2vdet-{}-{}x{}", self.seed, self.agents, self.frames);
         let folder = scenes.join(&name);
         let options = self.options(folder.clone());
-        if generate::are_kept(&options).map_err(|error| BadInput(error.to_string()))? {
+        if generate::are_kept(&options).map_err(BadInput::of)? {
             return Ok(folder);
         }
         output::note(format_args!(
@@ -121,12 +124,12 @@ impl Arguments {
 
 /// Generates a scene with a progress bar.
 fn generate(options: &SynthOptions) -> anyhow::Result<()> {
-    let bar = indicatif::ProgressBar::new(1000 * options.scenarios() as u64);
+    let bar = progress::percent_bar(options.scenarios());
     let generated = generate::generate_whole(options, &|thousandths| bar.set_position(thousandths));
     bar.finish_and_clear();
     match generated {
         Ok(_) => Ok(()),
         Err(error @ (SynthError::Write { .. } | SynthError::Alone { .. })) => Err(error.into()),
-        Err(error) => Err(BadInput(error.to_string()).into()),
+        Err(error) => Err(BadInput::of(error).into()),
     }
 }

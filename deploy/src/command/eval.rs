@@ -15,7 +15,7 @@ use ego_fuser::misbehaviour::TrustConfig;
 use ego_fuser::pairing::PairingConfig;
 use ego_fuser_offline::evaluation::stepped::{ComputeTimes, Crew, SteppedConfig};
 use fusion::Method;
-use indicatif::{ProgressBar, ProgressStyle};
+use indicatif::ProgressBar;
 use link::LinkConfig;
 use localization::pose_source::motion_gate::SanityConfig;
 use localization::pose_source::{
@@ -23,9 +23,12 @@ use localization::pose_source::{
 };
 use protocol::{CodecConfig, ConfidenceGate, Dtype};
 use support::output;
+use support::progress;
 use training::feature_store::KeptMaps;
 
-use super::{BadInput, Outcome, left_out};
+use super::left_out;
+use support::cli::BadInput;
+use support::cli::Outcome;
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct Arguments {
@@ -200,8 +203,7 @@ impl Arguments {
             return tables(spec, out);
         }
         let options = self.options()?;
-        let bar = ProgressBar::new((self.method.len() * frame_count(&options)?) as u64)
-            .with_style(ProgressStyle::with_template("{bar:30} {pos}/{len} frames  {msg}  {eta} left")?);
+        let bar = progress::bar(self.method.len() * frame_count(&options)?, "frames");
         let mut all = Vec::new();
         for &method in &self.method {
             bar.set_message(method.name());
@@ -269,12 +271,12 @@ impl Arguments {
     }
 
     fn stepped(&self, link: &str) -> Result<SteppedConfig, BadInput> {
-        let (link, link_folder) = LinkConfig::open(link).map_err(|error| BadInput(error.to_string()))?;
+        let (link, link_folder) = LinkConfig::open(link).map_err(BadInput::of)?;
         let &[pose_ms, map_ms, fuse_ms] = &self.compute[..] else {
-            return Err(BadInput(format!("--compute takes 3 numbers, not {}", self.compute.len())));
+            return Err(BadInput::new(format!("--compute takes 3 numbers, not {}", self.compute.len())));
         };
         if let Some(ms) = self.compute.iter().find(|ms| !(0.0..=60_000.0).contains(*ms)) {
-            return Err(BadInput(format!("--compute: {ms} is not 0 to 60000 ms")));
+            return Err(BadInput::new(format!("--compute: {ms} is not 0 to 60000 ms")));
         }
         let nanos = |ms: u64| ms.saturating_mul(1_000_000);
         Ok(SteppedConfig {
@@ -311,18 +313,18 @@ impl Arguments {
                     head: head.clone(),
                     sanity: SanityConfig::default(),
                 })),
-                _ => Err(BadInput("--pose-source pgc needs --encoder and --head".into())),
+                _ => Err(BadInput::new("--pose-source pgc needs --encoder and --head")),
             },
             PoseFrom::EndToEnd => match &self.end_to_end {
                 Some(weights) => Ok(PoseSourceConfig::EndToEnd(EndToEndPoseConfig {
                     weights: weights.clone(),
                     sanity: SanityConfig::default(),
                 })),
-                None => Err(BadInput("--pose-source end-to-end needs --end-to-end".into())),
+                None => Err(BadInput::new("--pose-source end-to-end needs --end-to-end")),
             },
             PoseFrom::Cached => match &self.poses {
                 Some(file) => Ok(PoseSourceConfig::Cached(CachedPoseConfig { file: file.clone(), scenario: None })),
-                None => Err(BadInput("--pose-source cached needs --poses".into())),
+                None => Err(BadInput::new("--pose-source cached needs --poses")),
             },
         }
     }
@@ -330,7 +332,7 @@ impl Arguments {
 
 /// Fills tables and prints them.
 fn tables(spec: &Path, out: &Path) -> anyhow::Result<Outcome> {
-    let mut progress = TableProgress(ProgressBar::new_spinner());
+    let mut progress = TableProgress(progress::spinner("frames"));
     let filled = table::run(&TableSpec::read(spec)?, out, &mut progress)?;
     progress.0.finish_and_clear();
     filled.iter().try_for_each(|table| output::line(table::markdown(table)))?;

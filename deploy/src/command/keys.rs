@@ -7,7 +7,8 @@ use deploy::operate::keys::{KeyError, KeyPlan, make};
 use protocol::{CavId, Party, Role};
 use support::output;
 
-use super::{BadInput, Outcome};
+use support::cli::BadInput;
+use support::cli::Outcome;
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct Arguments {
@@ -48,7 +49,7 @@ impl Arguments {
         plan.lifetime = Duration::from_secs(u64::from(self.days) * 24 * 3600);
         plan.replace = self.force;
         let written = make(&plan).map_err(|error| match error {
-            KeyError::There(_) | KeyError::Unusable { .. } => anyhow::Error::from(BadInput(error.to_string())),
+            KeyError::There(_) | KeyError::Unusable { .. } => anyhow::Error::from(BadInput::of(error)),
             KeyError::Io { .. } => anyhow::Error::from(error),
         })?;
         if self.json {

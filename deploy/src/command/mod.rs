@@ -9,8 +9,8 @@ mod sweep;
 mod up;
 mod view;
 
+use std::error::Error;
 use std::path::PathBuf;
-use std::process::ExitCode;
 
 use anyhow::Context;
 use bus::BusError;
@@ -22,6 +22,7 @@ use deploy::experiment::table::TableError;
 use deploy::operate::fleet::FleetError;
 use deploy::operate::run_fleet::UpError;
 use deploy::scenario::ScenarioError;
+use support::cli::Outcome;
 use support::output;
 
 /// What `v2vloc` can be asked to do.
@@ -62,21 +63,6 @@ impl Command {
     }
 }
 
-/// How a command that did not fail ended.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Outcome {
-    /// All went well.
-    Done,
-    /// Finished, but data was lost beyond what the link dropped.
-    DataLost,
-}
-
-impl Outcome {
-    pub(crate) fn of(lost_data: bool) -> Self {
-        if lost_data { Self::DataLost } else { Self::Done }
-    }
-}
-
 /// Prints what evaluations left out, each finding once, and the counts of the first that lacks anything.
 fn left_out<'a>(all: impl Iterator<Item = &'a LeftOut>) -> Outcome {
     let mut sum = LeftOut::default();
@@ -85,38 +71,20 @@ fn left_out<'a>(all: impl Iterator<Item = &'a LeftOut>) -> Outcome {
         sum.merge(one);
         first.get_or_insert(one);
     }
-    sum.problems().for_each(|problem| output::note(format_args!("left out: {}", problem.message)));
+    let outcome = sum.print();
     first.into_iter().for_each(output::note);
-    Outcome::of(!sum.is_nothing())
+    outcome
 }
 
-impl From<Outcome> for ExitCode {
-    fn from(outcome: Outcome) -> Self {
-        match outcome {
-            Outcome::Done => Self::SUCCESS,
-            Outcome::DataLost => Self::from(3),
-        }
-    }
-}
-
-/// Usage or input at fault, and not the program.
-#[derive(Debug, thiserror::Error)]
-#[error("{0}")]
-pub(crate) struct BadInput(pub(crate) String);
-
-/// Exit code of a failed command: 2 for bad usage or input, 1 otherwise.
-pub(crate) fn exit_code(error: &anyhow::Error) -> ExitCode {
-    let is_bad_input = error.chain().any(|cause| {
-        cause.is::<BadInput>()
-            || cause.is::<ScenarioError>()
-            || cause.is::<FleetError>()
-            || cause.is::<EvaluationError>()
-            || cause.is::<TableError>()
-            || BusError::is_behind(cause)
-            || cause.downcast_ref::<SweepError>().is_some_and(SweepError::is_bad_input)
-            || cause.downcast_ref::<UpError>().is_some_and(UpError::is_bad_input)
-    });
-    if is_bad_input { ExitCode::from(2) } else { ExitCode::FAILURE }
+/// Whether a cause of an error is a fault of usage or input, and not of the program.
+pub(crate) fn is_bad_input(cause: &(dyn Error + 'static)) -> bool {
+    cause.is::<ScenarioError>()
+        || cause.is::<FleetError>()
+        || cause.is::<EvaluationError>()
+        || cause.is::<TableError>()
+        || BusError::is_behind(cause)
+        || cause.downcast_ref::<SweepError>().is_some_and(SweepError::is_bad_input)
+        || cause.downcast_ref::<UpError>().is_some_and(UpError::is_bad_input)
 }
 
 /// The folder of the programs: they are built and installed together.

@@ -11,7 +11,7 @@ use protocol::{RunId, Runs};
 use support::output;
 use zenoh::Wait;
 
-use super::Outcome;
+use support::cli::Outcome;
 
 /// How often the router says what it has refused.
 const LOOK_ROUND: Duration = Duration::from_secs(5);

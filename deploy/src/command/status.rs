@@ -5,7 +5,8 @@ use std::path::PathBuf;
 use deploy::operate::status::RunStatus;
 use support::output;
 
-use super::{BadInput, Outcome};
+use support::cli::BadInput;
+use support::cli::Outcome;
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct Arguments {
@@ -22,7 +23,7 @@ pub(crate) struct Arguments {
 impl Arguments {
     /// Prints how the run goes.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
-        let bad_input = |error: deploy::operate::status::StatusError| BadInput(error.to_string());
+        let bad_input = |error: deploy::operate::status::StatusError| BadInput::of(error);
         let folder = match self.run {
             Some(run) if run.is_dir() => run,
             Some(name) => self.runs.join(name),

@@ -5,7 +5,8 @@ use std::path::PathBuf;
 use deploy::experiment::sweep::{Experiment, Sweep, SweepOptions};
 use support::output;
 
-use super::{Outcome, left_out};
+use super::left_out;
+use support::cli::Outcome;
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct Arguments {

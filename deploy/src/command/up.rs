@@ -9,7 +9,8 @@ use fusion::Method;
 use protocol::RunId;
 use support::output;
 
-use super::{Outcome, programs};
+use super::programs;
+use support::cli::Outcome;
 
 #[derive(Debug, clap::Args)]
 pub(crate) struct Arguments {

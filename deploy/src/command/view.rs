@@ -12,7 +12,8 @@ use deploy::view::{LiveRun, RecordedRun, ViewError, serve_live, serve_recorded};
 use protocol::{CavId, Role, RunId};
 use support::output;
 
-use super::{BadInput, Outcome};
+use support::cli::BadInput;
+use support::cli::Outcome;
 
 /// How far behind the processes of a run its viewer stands for the processor. Not last of all: on a machine with nothing to
 /// spare a page would show nothing.
@@ -48,7 +49,7 @@ impl Arguments {
         let server = match (&self.run, &self.name, &self.connect) {
             (Some(path), _, _) => {
                 let run = RecordedRun::open(path).map_err(|error| match error {
-                    ViewError::NotRecorded(_) | ViewError::Empty(_) => anyhow::Error::from(BadInput(error.to_string())),
+                    ViewError::NotRecorded(_) | ViewError::Empty(_) => anyhow::Error::from(BadInput::of(error)),
                     ViewError::Recording(_) => anyhow::Error::from(error),
                 })?;
                 output::note(format_args!("{} moments of run {}", run.len(), run.name()));
@@ -69,10 +70,10 @@ impl Arguments {
                 serve_live(self.listen, Arc::new(LiveRun::start(bus)?))
             }
             (None, _, _) => {
-                return Err(BadInput("name a run folder, or --live --name RUN --connect ROUTER".into()).into());
+                return Err(BadInput::new("name a run folder, or --live --name RUN --connect ROUTER").into());
             }
         };
-        let server = server.map_err(|error| BadInput(format!("cannot serve at {}: {error}", self.listen)))?;
+        let server = server.map_err(|error| BadInput::new(format!("cannot serve at {}: {error}", self.listen)))?;
         output::note(format_args!("http://{}/ (Ctrl-C ends it)", server.address()));
         while !stop.wait_until(Instant::now() + Duration::from_secs(3600)) {}
         say_dropped(&server);

@@ -8,9 +8,9 @@ use std::collections::BTreeMap;
 use dataset::LeftOut;
 use dataset::evaluation_protocol::EvaluationProtocol;
 pub use localization::pose_error::PoseError;
-use localization::statistics::{quantile, sorted};
 use protocol::{CavId, Counts, DropReason, Ledger};
 use serde::{Deserialize, Serialize};
+use support::statistics::{quantile, sorted};
 
 use crate::experiment::score::{Board, NeighbourRecord};
 

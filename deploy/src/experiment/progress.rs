@@ -3,8 +3,9 @@
 use std::io::IsTerminal;
 use std::time::{Duration, Instant};
 
-use indicatif::{ProgressBar, ProgressStyle};
+use indicatif::ProgressBar;
 use support::output;
+use support::progress;
 
 use crate::experiment::score::Progress;
 
@@ -20,18 +21,11 @@ pub struct Display {
 
 impl Display {
     /// A display for `ticks` ticks, or for a run without end.
-    ///
-    /// # Panics
-    /// Never: the templates are fixed.
     #[must_use]
     pub fn new(ticks: Option<usize>) -> Self {
-        let bar = std::io::stderr().is_terminal().then(|| {
-            let (bar, template) = match ticks {
-                Some(ticks) => (ProgressBar::new(ticks as u64), "{bar:30} {pos}/{len} frames  {msg}"),
-                None => (ProgressBar::new_spinner(), "{spinner} {pos} frames  {msg}"),
-            };
-            bar.with_style(ProgressStyle::with_template(template).expect("the templates above are well formed"))
-        });
+        let bar = std::io::stderr()
+            .is_terminal()
+            .then(|| ticks.map_or_else(|| progress::spinner("frames"), |ticks| progress::bar(ticks, "frames")));
         Self { bar, last_line: Instant::now(), shown_frames: 0 }
     }
 

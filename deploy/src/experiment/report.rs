@@ -4,6 +4,7 @@ use std::fmt::Write as _;
 
 use fusion::Exchange;
 use fusion::Method;
+use support::text_table::{Side, TextTable};
 
 use crate::experiment::metrics::{Answered, ByIou, Contribution, Metrics, Percentiles};
 use crate::experiment::progress::bytes;
@@ -142,37 +143,28 @@ fn wire_bytes(metrics: &Metrics) -> String {
     mean.map_or("-".into(), bytes)
 }
 
-/// A column of a table for people.
+/// A column of the table.
 struct Column {
     name: String,
-    is_left: bool,
+    side: Side,
     cells: Vec<String>,
 }
 
 impl Column {
     fn left(name: &str, all: &[Metrics], cell: impl Fn(&Metrics) -> String) -> Self {
-        Self { name: name.to_owned(), is_left: true, cells: all.iter().map(cell).collect() }
+        Self { name: name.to_owned(), side: Side::Left, cells: all.iter().map(cell).collect() }
     }
 
     fn right(name: &str, all: &[Metrics], cell: impl Fn(&Metrics) -> String) -> Self {
-        Self { is_left: false, ..Self::left(name, all, cell) }
-    }
-
-    /// A cell as wide as the widest.
-    fn padded(&self, cell: &str) -> String {
-        let width = self.cells.iter().map(String::len).fold(self.name.len(), usize::max);
-        if self.is_left { format!("{cell:<width$}") } else { format!("{cell:>width$}") }
+        Self { side: Side::Right, ..Self::left(name, all, cell) }
     }
 }
 
 /// Header and rows.
 fn lines(columns: &[Column], rows: usize) -> String {
-    let line = |cell: &dyn Fn(&Column) -> String| columns.iter().map(cell).collect::<Vec<_>>().join("  ") + "\n";
-    let mut text = line(&|column| column.padded(&column.name));
-    for row in 0..rows {
-        text += &line(&|column| column.padded(&column.cells[row]));
-    }
-    text
+    let mut table = TextTable::new(columns.iter().map(|column| (column.name.as_str(), column.side)));
+    (0..rows).for_each(|row| table.row(columns.iter().map(|column| column.cells[row].clone())));
+    table.to_string()
 }
 
 fn number(value: Option<f64>, digits: usize) -> String {

@@ -14,11 +14,11 @@ use ego_fuser::misbehaviour::TrustConfig;
 use ego_fuser::pairing::PairingConfig;
 use ego_fuser_offline::evaluation::stepped::{ComputeTimes, Crew, SteppedConfig, VehicleConfig};
 use ego_fuser_offline::evaluation::{EvaluateConfig, EvaluateError, EvaluatedFrame, Evaluator};
-use indicatif::{ProgressBar, ProgressStyle};
 use link::LinkConfig;
 use localization::pose_source::motion_gate::SanityConfig;
 use localization::pose_source::{self, EndToEndPoseConfig, NoisyPoseConfig, PgcConfig, PoseSourceConfig};
 use protocol::{CavId, DetectionsReport, RunId};
+use support::progress;
 
 use crate::experiment::evaluation::judge;
 use crate::experiment::fingerprint::Provenance;
@@ -168,9 +168,7 @@ fn play(fleet: &Fleet, recorded: &Recorded, evaluator: &mut Evaluator, folder: &
     let path = folder.file("detections.jsonl");
     let unwritable = |source| RunFolderError::Write { path: path.clone(), source };
     let mut file = BufWriter::new(File::create(&path).map_err(unwritable)?);
-    let style = ProgressStyle::with_template("{bar:30} {pos}/{len} ticks  {eta} left");
-    let bar =
-        ProgressBar::new(fleet.ticks.unwrap_or(0) as u64).with_style(style.unwrap_or(ProgressStyle::default_bar()));
+    let bar = progress::bar(fleet.ticks.unwrap_or(0), "ticks");
     let mut written = Ok(());
     let _ = evaluator.run(recorded, &mut |frame: EvaluatedFrame| {
         bar.inc(1);

@@ -1,13 +1,13 @@
 //! `runs/<name>/`: everything that is kept of a run.
 
 use std::collections::BTreeMap;
-use std::fmt::Write as _;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use protocol::RunId;
 use serde::Serialize;
+use support::csv_file::CsvText;
 
 use crate::experiment::score::{FrameRecord, StageStamps};
 
@@ -118,46 +118,43 @@ impl RunFolder {
 
 /// The table of a run's frames: a header line, then a line per frame.
 fn frames_csv(records: &[FrameRecord], swept: &BTreeMap<u64, u64>) -> String {
-    let mut text = String::from(
+    let mut text = CsvText::new(
         "tick,agent_frame,capture_nanos,latency_ms,detected,truth,found,fused,skipped,oldest_ms,stale,payload_bytes,wire_bytes,ego_error_m,\
-         ego_error_deg,swept_ms,posed_ms,published_ms,arrived_ms,decided_ms,fused_ms,detected_ms\n",
+         ego_error_deg,swept_ms,posed_ms,published_ms,arrived_ms,decided_ms,fused_ms,detected_ms",
     );
-    let optional = |number: &Option<f64>| number.map_or(String::new(), |number| format!("{number:.4}"));
-    for record in records {
-        // Destructured in full, so that a new column stops the build here.
-        let FrameRecord {
-            tick,
-            agent_frame,
-            capture_nanos,
-            latency_ms,
-            stamps,
-            detected,
-            truth,
-            found,
-            fused,
-            skipped,
-            oldest_ms,
-            stale,
-            payload_bytes,
-            wire_bytes,
-            ego_error_m,
-            ego_error_deg,
-        } = record;
-        let [latency_ms, oldest_ms, error_m, error_deg] =
-            [latency_ms, oldest_ms, ego_error_m, ego_error_deg].map(optional);
-        let swept_ms = swept.get(capture_nanos).and_then(|swept| stamps.since_began_ms(*swept));
-        let StageStamps { began_nanos: _, posed_ms, published_ms, arrived_ms, decided_ms, fused_ms, detected_ms } =
-            stamps;
-        let stamps =
-            [&swept_ms, posed_ms, published_ms, arrived_ms, decided_ms, fused_ms, detected_ms].map(optional).join(",");
-        // Writing to a string cannot fail.
-        let _ = writeln!(
-            text,
-            "{tick},{agent_frame},{capture_nanos},{latency_ms},{detected},{truth},{found},{fused},{skipped},\
-             {oldest_ms},{stale},{payload_bytes},{wire_bytes},{error_m},{error_deg},{stamps}"
-        );
-    }
-    text
+    records.iter().for_each(|record| text.row(frame_fields(record, swept)));
+    text.finish()
+}
+
+fn frame_fields(record: &FrameRecord, swept: &BTreeMap<u64, u64>) -> Vec<String> {
+    // Destructured in full, so that a new column stops the build here.
+    let FrameRecord {
+        tick,
+        agent_frame,
+        capture_nanos,
+        latency_ms,
+        stamps,
+        detected,
+        truth,
+        found,
+        fused,
+        skipped,
+        oldest_ms,
+        stale,
+        payload_bytes,
+        wire_bytes,
+        ego_error_m,
+        ego_error_deg,
+    } = record;
+    let StageStamps { began_nanos: _, posed_ms, published_ms, arrived_ms, decided_ms, fused_ms, detected_ms } = stamps;
+    let swept_ms = swept.get(capture_nanos).and_then(|swept| stamps.since_began_ms(*swept));
+    let number = |number: &Option<f64>| number.map_or(String::new(), |number| format!("{number:.4}"));
+    let mut fields = vec![tick.to_string(), agent_frame.to_string(), capture_nanos.to_string(), number(latency_ms)];
+    fields.extend([detected, truth, found, fused, skipped].map(ToString::to_string));
+    fields.extend([number(oldest_ms), stale.to_string(), payload_bytes.to_string(), wire_bytes.to_string()]);
+    fields.extend([ego_error_m, ego_error_deg].map(number));
+    fields.extend([&swept_ms, posed_ms, published_ms, arrived_ms, decided_ms, fused_ms, detected_ms].map(number));
+    fields
 }
 
 /// A name for a run that has none: `prefix` and the time, UTC, for example `up-20260131-235959`.

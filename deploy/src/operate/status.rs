@@ -1,6 +1,5 @@
 //! `status.json` in the folder of a run: how it goes, written while it goes and for the last time when it has ended.
 
-use std::fmt::Write as _;
 use std::fs;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
@@ -8,6 +7,7 @@ use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
 use protocol::HeardNeighbour;
 use serde::{Deserialize, Serialize};
 use support::atomic_file;
+use support::text_table::{Side, TextTable};
 
 use crate::experiment::score::Progress;
 use crate::operate::health::{ProcessStatus, State, Usage};
@@ -146,8 +146,6 @@ impl RunStatus {
     /// For people.
     #[must_use]
     pub fn table(&self) -> String {
-        let optional =
-            |value: Option<f64>, digits: usize| value.map_or("-".into(), |value| format!("{value:.digits$}"));
         let mut text = format!(
             "{} {} for {:.0} s at {}: {} frames, latency {} ms, {} fused, {} dropped\n",
             self.run,
@@ -159,38 +157,52 @@ impl RunStatus {
             self.fused,
             self.dropped
         );
-        let _ = writeln!(
-            text,
-            "{:20} {:9} {:>8} {:>8} {:>9} {:>9} {:>8} {:>5}  last fall or failure",
-            "process", "state", "pid", "up s", "restarts", "silent s", "MiB", "fds"
-        );
-        for process in &self.processes {
-            let pid = process.pid.map_or("-".into(), |pid| pid.to_string());
-            let _ = writeln!(
-                text,
-                "{:20} {:9} {pid:>8} {:>8.0} {:>9} {:>9} {:>8} {:>5}  {}",
-                process.name,
-                name_of(&process.state),
-                process.up_s,
-                process.restarts,
-                optional(process.silent_s, 1),
-                optional(process.resident_mib, 0),
-                process.descriptors.map_or("-".into(), |count| count.to_string()),
-                process.failure.as_deref().or(process.last_fall.as_deref()).unwrap_or("")
-            );
-        }
-        for neighbour in &self.neighbours {
-            let _ = writeln!(
-                text,
-                "neighbour {:10} clock {:>6} ms  trust {:>4}  {}",
-                neighbour.cav.as_str(),
-                optional(neighbour.clock_offset_s.map(|seconds| seconds * 1e3), 1),
-                optional(neighbour.trust, 2),
-                neighbour.doubt.map_or(String::new(), |doubt| format!("left out: {doubt}")),
-            );
+        text += &self.processes_table().to_string();
+        if !self.neighbours.is_empty() {
+            text += &self.neighbours_table().to_string();
         }
         text
     }
+
+    fn processes_table(&self) -> TextTable {
+        let left = ["process", "state"].map(|name| (name, Side::Left));
+        let right = ["pid", "up s", "restarts", "silent s", "MiB", "fds"].map(|name| (name, Side::Right));
+        let mut table = TextTable::new(left.into_iter().chain(right).chain([("last fall or failure", Side::Left)]));
+        for process in &self.processes {
+            table.row([
+                process.name.clone(),
+                name_of(&process.state),
+                process.pid.map_or("-".into(), |pid| pid.to_string()),
+                format!("{:.0}", process.up_s),
+                process.restarts.to_string(),
+                optional(process.silent_s, 1),
+                optional(process.resident_mib, 0),
+                process.descriptors.map_or("-".into(), |count| count.to_string()),
+                process.failure.clone().or_else(|| process.last_fall.clone()).unwrap_or_default(),
+            ]);
+        }
+        table
+    }
+
+    fn neighbours_table(&self) -> TextTable {
+        let numbers = ["clock ms", "trust"].map(|name| (name, Side::Right));
+        let mut table = TextTable::new(
+            [("neighbour", Side::Left)].into_iter().chain(numbers).chain([("left out because", Side::Left)]),
+        );
+        for neighbour in &self.neighbours {
+            table.row([
+                neighbour.cav.to_string(),
+                optional(neighbour.clock_offset_s.map(|seconds| seconds * 1e3), 1),
+                optional(neighbour.trust, 2),
+                neighbour.doubt.map_or(String::new(), |doubt| doubt.to_string()),
+            ]);
+        }
+        table
+    }
+}
+
+fn optional(value: Option<f64>, digits: usize) -> String {
+    value.map_or("-".into(), |value| format!("{value:.digits$}"))
 }
 
 /// A name as in the file.
@@ -305,7 +317,7 @@ mod tests {
         assert!(status.is_well());
         let table = status.table();
         assert!(table.starts_with("test running for 0 s at tcp/127.0.0.1:7447: 7 frames"), "{table}");
-        assert!(table.contains("clock   12.5 ms  trust 0.03  left out: invented"), "{table}");
+        assert!(table.ends_with("4279           12.5   0.03  invented\n"), "{table}");
         assert!(table.contains("agent-4288") && table.contains("was ended by signal 9"), "{table}");
 
         let dead = RunStatus { pid: u32::MAX, ..status.clone() };

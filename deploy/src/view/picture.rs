@@ -1,39 +1,48 @@
 //! One fused frame as a PNG, seen from above: points in the colour of the CAV that measured them, truth, detections.
 
-use std::path::{Path, PathBuf};
+use std::path::Path;
 
-use embedded_graphics::mono_font::MonoTextStyle;
-use embedded_graphics::mono_font::ascii::{FONT_8X13, FONT_10X20};
-use embedded_graphics::pixelcolor::Rgb888;
-use embedded_graphics::prelude::{OriginDimensions, Point, Primitive, Size};
-use embedded_graphics::primitives::{Circle, PrimitiveStyle, Rectangle};
-use figures::canvas::{Canvas, CanvasError};
+use figures::{self, FONT, FigureError, Image};
+use plotters::coord::cartesian::Cartesian2d;
+use plotters::coord::types::RangedCoordf64;
+use plotters::drawing::DrawingArea;
+use plotters::element::{Circle, EmptyElement, PathElement, Rectangle, Text};
+use plotters::prelude::BitMapBackend;
+use plotters::style::{Color, IntoFont, RGBColor, ShapeStyle, TextStyle};
 use protocol::{Box3d, Pose};
 
 /// Pixels a metre takes in the finished picture.
 const PIXELS_PER_M: f64 = 12.0;
-/// Everything but text is drawn this much larger and averaged down, which smooths its edges.
-const OVERSAMPLING: u32 = 2;
 /// Height of the strip below the map that holds legend and scale, pixels.
 const LEGEND_HEIGHT: u32 = 84;
+/// Narrowest picture, pixels: the legend needs as much.
+const MIN_WIDTH: u32 = 760;
 /// A picture is never larger than this, pixels a side: a scene's range comes from outside.
 const MAX_SIDE: f64 = 8_192.0;
+/// A box is drawn when all its corners are at most this far from the map, metres.
+const BOX_MARGIN_M: f64 = 50.0;
+/// Below this height in the LiDAR's frame is ground (about 1.9 m below the LiDAR), metres.
+const GROUND_Z_M: f64 = -1.5;
 
-const BACKGROUND: Rgb888 = Rgb888::new(14, 17, 22);
-const GRID: Rgb888 = Rgb888::new(38, 44, 54);
-const INK: Rgb888 = Rgb888::new(222, 226, 233);
-const FAINT: Rgb888 = Rgb888::new(139, 148, 160);
-const TRUTH: Rgb888 = Rgb888::new(63, 206, 120);
-const DETECTION: Rgb888 = Rgb888::new(255, 94, 77);
-/// Colours of the CAVs, ego first; told apart by most colour-blind readers, and from truth and detections.
-const CAV_COLOURS: [Rgb888; 6] = [
-    Rgb888::new(120, 190, 255),
-    Rgb888::new(255, 200, 87),
-    Rgb888::new(205, 140, 255),
-    Rgb888::new(94, 222, 224),
-    Rgb888::new(255, 150, 200),
-    Rgb888::new(190, 190, 190),
+const BACKGROUND: RGBColor = RGBColor(14, 17, 22);
+const GRID: RGBColor = RGBColor(38, 44, 54);
+const INK: RGBColor = RGBColor(222, 226, 233);
+const FAINT: RGBColor = RGBColor(139, 148, 160);
+/// Truth is light and detections are red: told apart with any colour vision.
+const TRUTH: RGBColor = RGBColor(240, 240, 240);
+const DETECTION: RGBColor = RGBColor(255, 94, 77);
+/// Colours of the CAVs, ego first; told apart from each other, and from truth and detections.
+const CAV_COLOURS: [RGBColor; 6] = [
+    RGBColor(120, 190, 255),
+    RGBColor(255, 200, 87),
+    RGBColor(205, 140, 255),
+    RGBColor(94, 222, 224),
+    RGBColor(255, 150, 200),
+    RGBColor(160, 160, 160),
 ];
+
+/// The map: metres in the ego's LiDAR frame, x to the right and y up.
+type Plane<'a> = DrawingArea<BitMapBackend<'a>, Cartesian2d<RangedCoordf64, RangedCoordf64>>;
 
 /// What one CAV measured.
 #[derive(Debug, Clone)]
@@ -74,14 +83,9 @@ pub enum PictureError {
         /// Lower and upper y, metres.
         y_m: [f64; 2],
     },
-    /// The file cannot be written.
-    #[error("cannot write {}: {reason}", path.display())]
-    Write {
-        /// The picture's file.
-        path: PathBuf,
-        /// Why.
-        reason: String,
-    },
+    /// The picture cannot be drawn or written.
+    #[error(transparent)]
+    Figure(#[from] FigureError),
 }
 
 impl Picture<'_> {
@@ -90,145 +94,162 @@ impl Picture<'_> {
     /// # Errors
     /// [`PictureError`] when the range makes no picture or the file cannot be written.
     pub fn save(&self, path: &Path) -> Result<(), PictureError> {
-        let failed = |error: CanvasError| PictureError::Write { path: path.into(), reason: error.to_string() };
-        self.draw()?.save(path).map_err(failed)
+        let map = self.map_size()?;
+        Ok(figures::save_image(path, picture_size(map), |image| self.draw(map, image))?)
     }
 
-    fn draw(&self) -> Result<Canvas, PictureError> {
+    /// Width and height of the map, pixels.
+    fn map_size(&self) -> Result<(u32, u32), PictureError> {
         let [width, height] = [self.x_m, self.y_m].map(|[low, high]| ((high - low) * PIXELS_PER_M).ceil());
-        if !(1.0..=MAX_SIDE).contains(&width) || !(1.0..=MAX_SIDE).contains(&height) {
-            return Err(PictureError::Range { x_m: self.x_m, y_m: self.y_m });
+        let can_be_drawn = |side: f64| (1.0..=MAX_SIDE).contains(&side);
+        if can_be_drawn(width) && can_be_drawn(height) {
+            Ok((width as u32, height as u32))
+        } else {
+            Err(PictureError::Range { x_m: self.x_m, y_m: self.y_m })
         }
-        let map = Size::new(width as u32, height as u32);
-        let mut large = Canvas::new(map * OVERSAMPLING, BACKGROUND);
-        self.draw_grid(&mut large);
+    }
+
+    fn draw(&self, (width, height): (u32, u32), image: &Image<'_>) -> Result<(), FigureError> {
+        image.fill(&BACKGROUND)?;
+        let (map, legend) = image.split_vertically(height);
+        let (x, y) = (self.x_m[0]..self.x_m[1], self.y_m[0]..self.y_m[1]);
+        let plane = map.apply_coord_spec(Cartesian2d::new(x, y, (0..width as i32, height as i32..0)));
+        self.draw_grid(&plane)?;
         // The ego last, so that its points lie on top.
-        for (index, view) in self.views.iter().enumerate().rev() {
-            self.draw_points(view, CAV_COLOURS[index % CAV_COLOURS.len()], &mut large);
+        for (view, colour) in self.coloured_views().rev() {
+            self.draw_points(view, colour, &plane)?;
         }
         for truth in &self.truth {
-            self.draw_box(truth, TRUTH, 3, &mut large);
+            self.draw_box(truth, TRUTH, &plane)?;
         }
-        for (found, _) in &self.detections {
-            self.draw_box(found, DETECTION, 3, &mut large);
-        }
-        for (index, view) in self.views.iter().enumerate() {
-            self.draw_position(view, CAV_COLOURS[index % CAV_COLOURS.len()], &mut large);
-        }
-        let mut canvas = Canvas::new(Size::new(map.width.max(760), map.height + LEGEND_HEIGHT), BACKGROUND);
-        canvas.paste_shrunk(&large, OVERSAMPLING);
         for (found, score) in &self.detections {
-            let at = self.pixel(found.center_m[0], found.center_m[1], 1) + Point::new(10, -8);
-            canvas.text(&format!("{score:.2}"), at, MonoTextStyle::new(&FONT_8X13, DETECTION));
+            self.draw_box(found, DETECTION, &plane)?;
+            self.draw_score(found, *score, &plane)?;
         }
-        self.draw_legend(&mut canvas, map.height as i32);
-        Ok(canvas)
+        for (view, colour) in self.coloured_views() {
+            self.draw_position(view, colour, &plane)?;
+        }
+        self.draw_legend(&legend)
     }
 
-    /// Where a point of the ego frame lies on a canvas drawn `scale` times larger than the picture.
-    fn pixel(&self, x: f64, y: f64, scale: u32) -> Point {
-        let pixels_per_m = PIXELS_PER_M * f64::from(scale);
-        // Far outside the canvas is outside, however far, and leaves room to add offsets.
-        let place = |metres: f64| (metres * pixels_per_m).clamp(-1e6, 1e6) as i32;
-        Point::new(place(x - self.x_m[0]), place(self.y_m[1] - y))
+    fn coloured_views(&self) -> impl DoubleEndedIterator<Item = (&View<'_>, RGBColor)> {
+        self.views.iter().enumerate().map(|(index, view)| (view, CAV_COLOURS[index % CAV_COLOURS.len()]))
     }
 
-    fn draw_grid(&self, canvas: &mut Canvas) {
-        let style = PrimitiveStyle::with_stroke(GRID, 1);
+    /// Whether a point lies on the map or at most `margin_m` beside it.
+    fn is_near(&self, x: f64, y: f64, margin_m: f64) -> bool {
+        let is_within = |[low, high]: [f64; 2], value| (low - margin_m..=high + margin_m).contains(&value);
+        is_within(self.x_m, x) && is_within(self.y_m, y)
+    }
+
+    /// A line every 10 m.
+    fn draw_grid(&self, plane: &Plane<'_>) -> Result<(), FigureError> {
         let tens = |[low, high]: [f64; 2]| {
             ((low / 10.0).ceil() as i64..=(high / 10.0).floor() as i64).map(|ten| 10.0 * ten as f64)
         };
         for x in tens(self.x_m) {
-            canvas.line(self.pixel(x, self.y_m[0], OVERSAMPLING), self.pixel(x, self.y_m[1], OVERSAMPLING), style);
+            plane.draw(&PathElement::new(self.y_m.map(|y| (x, y)), GRID))?;
         }
         for y in tens(self.y_m) {
-            canvas.line(self.pixel(self.x_m[0], y, OVERSAMPLING), self.pixel(self.x_m[1], y, OVERSAMPLING), style);
+            plane.draw(&PathElement::new(self.x_m.map(|x| (x, y)), GRID))?;
         }
+        Ok(())
     }
 
-    fn draw_points(&self, view: &View<'_>, colour: Rgb888, canvas: &mut Canvas) {
+    fn draw_points(&self, view: &View<'_>, colour: RGBColor, plane: &Plane<'_>) -> Result<(), FigureError> {
         let ego_from_cav = view.ego_from_cav.isometry();
         for &[x, y, z, _] in view.xyzi {
             let point = ego_from_cav * nalgebra::Point3::new(f64::from(x), f64::from(y), f64::from(z));
-            if !point.iter().all(|coordinate| coordinate.is_finite()) {
-                continue;
-            }
-            let at = self.pixel(point.x, point.y, OVERSAMPLING);
-            // The ground (about 1.9 m below the LiDAR) only hints at the road; what stands on it is bright.
-            let strength = if point.z < -1.5 { 0.3 } else { 0.85 };
-            for offset in [Point::new(0, 0), Point::new(1, 0), Point::new(0, 1), Point::new(1, 1)] {
-                canvas.blend(at + offset, colour, strength);
+            // The ground only hints at the road; what stands on it is bright.
+            let opacity = if point.z < GROUND_Z_M { 0.3 } else { 0.85 };
+            if self.is_near(point.x, point.y, 0.0) {
+                plane.draw_pixel((point.x, point.y), &colour.mix(opacity))?;
             }
         }
+        Ok(())
     }
 
-    fn draw_box(&self, shape: &Box3d, colour: Rgb888, stroke: u32, canvas: &mut Canvas) {
-        let style = PrimitiveStyle::with_stroke(colour, stroke);
+    /// The outline, with a stroke from the centre to the front.
+    fn draw_box(&self, shape: &Box3d, colour: RGBColor, plane: &Plane<'_>) -> Result<(), FigureError> {
         let corners = shape.corners();
-        let at = |index: usize| self.pixel(corners[index][0], corners[index][1], OVERSAMPLING);
-        for side in 0..4 {
-            canvas.line(at(side), at((side + 1) % 4), style);
+        if !corners.iter().all(|corner| self.is_near(corner[0], corner[1], BOX_MARGIN_M)) {
+            return Ok(());
         }
-        // A stroke from the centre to the front says which way it faces.
+        let outline = [0, 1, 2, 3, 0].map(|index: usize| (corners[index][0], corners[index][1]));
+        plane.draw(&PathElement::new(outline, stroke(colour)))?;
         let front = [0, 1].map(|axis| (corners[0][axis] + corners[1][axis]) / 2.0);
-        canvas.line(
-            self.pixel(shape.center_m[0], shape.center_m[1], OVERSAMPLING),
-            self.pixel(front[0], front[1], OVERSAMPLING),
-            style,
-        );
+        let [x, y, _] = shape.center_m;
+        Ok(plane.draw(&PathElement::new([(x, y), (front[0], front[1])], stroke(colour)))?)
     }
 
-    fn draw_position(&self, view: &View<'_>, colour: Rgb888, canvas: &mut Canvas) {
-        let [x, y, _] = view.ego_from_cav.translation_m;
-        let spot = Circle::with_center(self.pixel(x, y, OVERSAMPLING), 9 * OVERSAMPLING);
-        canvas.show(spot.into_styled(PrimitiveStyle::with_fill(colour)));
-        canvas.show(spot.into_styled(PrimitiveStyle::with_stroke(BACKGROUND, 2 * OVERSAMPLING)));
-    }
-
-    fn draw_legend(&self, canvas: &mut Canvas, top: i32) {
-        let (large, small) = (MonoTextStyle::new(&FONT_10X20, INK), MonoTextStyle::new(&FONT_8X13, FAINT));
-        canvas.line(
-            Point::new(0, top),
-            Point::new(canvas.size().width as i32, top),
-            PrimitiveStyle::with_stroke(GRID, 2),
-        );
-        canvas.text(&self.title, Point::new(14, top + 24), large);
-        let mut x = 14;
-        let row = top + 50;
-        for (label, colour, boxed) in self.legend() {
-            let swatch = Rectangle::new(Point::new(x, row - 10), Size::new(12, 12));
-            let style = if boxed { PrimitiveStyle::with_stroke(colour, 2) } else { PrimitiveStyle::with_fill(colour) };
-            canvas.show(swatch.into_styled(style));
-            canvas.text(&label, Point::new(x + 18, row), MonoTextStyle::new(&FONT_8X13, INK));
-            x += 18 + 8 * label.len() as i32 + 22;
+    fn draw_score(&self, found: &Box3d, score: f32, plane: &Plane<'_>) -> Result<(), FigureError> {
+        let [x, y, _] = found.center_m;
+        if !self.is_near(x, y, 0.0) {
+            return Ok(());
         }
-        let (left, right, bar) = (14, 14 + (10.0 * PIXELS_PER_M) as i32, top + 70);
-        let ink = PrimitiveStyle::with_stroke(FAINT, 2);
-        canvas.line(Point::new(left, bar), Point::new(right, bar), ink);
-        canvas.line(Point::new(left, bar - 4), Point::new(left, bar + 4), ink);
-        canvas.line(Point::new(right, bar - 4), Point::new(right, bar + 4), ink);
-        canvas.text("10 m   x to the right, y up, ego LiDAR frame", Point::new(right + 10, bar + 4), small);
+        let text = Text::new(format!("{score:.2}"), (10, -20), text(14, DETECTION));
+        Ok(plane.draw(&(EmptyElement::at((x, y)) + text))?)
     }
 
-    fn legend(&self) -> Vec<(String, Rgb888, bool)> {
-        let cavs = self.views.iter().zip(CAV_COLOURS.iter().cycle()).enumerate();
-        let mut entries: Vec<_> = cavs
-            .map(|(index, (view, &colour))| {
-                let role = if index == 0 { "ego" } else { "CAV" };
-                (format!("{role} {}", view.name), colour, false)
-            })
-            .collect();
-        entries.push((format!("truth ({})", self.truth.len()), TRUTH, true));
-        entries.push((format!("detected ({})", self.detections.len()), DETECTION, true));
-        entries
+    fn draw_position(&self, view: &View<'_>, colour: RGBColor, plane: &Plane<'_>) -> Result<(), FigureError> {
+        let [x, y, _] = view.ego_from_cav.translation_m;
+        if !self.is_near(x, y, 0.0) {
+            return Ok(());
+        }
+        plane.draw(&Circle::new((x, y), 6, BACKGROUND.filled()))?;
+        Ok(plane.draw(&Circle::new((x, y), 4, colour.filled()))?)
     }
+
+    fn draw_legend(&self, area: &Image<'_>) -> Result<(), FigureError> {
+        let right = area.dim_in_pixel().0 as i32;
+        area.draw(&PathElement::new([(0, 0), (right, 0)], stroke(GRID)))?;
+        area.draw(&Text::new(self.title.as_str(), (14, 8), text(18, INK)))?;
+        let mut x = 14;
+        for (label, colour, is_outline) in self.legend() {
+            let style = if is_outline { stroke(colour) } else { colour.filled() };
+            area.draw(&Rectangle::new([(x, 39), (x + 12, 51)], style))?;
+            area.draw(&Text::new(label.as_str(), (x + 18, 38), text(15, INK)))?;
+            x += 18 + area.estimate_text_size(&label, &text(15, INK))?.0 as i32 + 22;
+        }
+        draw_scale(area)
+    }
+
+    fn legend(&self) -> Vec<(String, RGBColor, bool)> {
+        let cavs = self.coloured_views().enumerate().map(|(index, (view, colour))| {
+            let role = if index == 0 { "ego" } else { "CAV" };
+            (format!("{role} {}", view.name), colour, false)
+        });
+        let truth = (format!("truth ({})", self.truth.len()), TRUTH, true);
+        let detected = (format!("detected ({})", self.detections.len()), DETECTION, true);
+        cavs.chain([truth, detected]).collect()
+    }
+}
+
+/// A bar of 10 m and the axes.
+fn draw_scale(area: &Image<'_>) -> Result<(), FigureError> {
+    let (left, right, y) = (14, 14 + (10.0 * PIXELS_PER_M) as i32, 68);
+    for line in [[(left, y), (right, y)], [(left, y - 4), (left, y + 4)], [(right, y - 4), (right, y + 4)]] {
+        area.draw(&PathElement::new(line, stroke(FAINT)))?;
+    }
+    let words = "10 m   x to the right, y up, ego LiDAR frame";
+    Ok(area.draw(&Text::new(words, (right + 10, y - 8), text(14, FAINT)))?)
+}
+
+fn picture_size((width, height): (u32, u32)) -> (u32, u32) {
+    (width.max(MIN_WIDTH), height + LEGEND_HEIGHT)
+}
+
+fn stroke(colour: RGBColor) -> ShapeStyle {
+    colour.stroke_width(2)
+}
+
+fn text(pixels: i32, colour: RGBColor) -> TextStyle<'static> {
+    (FONT, pixels).into_font().color(&colour)
 }
 
 #[cfg(test)]
 mod tests {
     use std::fs::File;
-
-    use embedded_graphics::prelude::RgbColor;
 
     use super::*;
 
@@ -247,49 +268,64 @@ mod tests {
         }
     }
 
-    fn colour_at(canvas: &Canvas, picture: &Picture<'_>, x: f64, y: f64) -> Rgb888 {
-        canvas.pixel(picture.pixel(x, y, 1)).unwrap()
+    fn pixels(picture: &Picture<'_>) -> Vec<u8> {
+        let map = picture.map_size().unwrap();
+        figures::render(picture_size(map), |image| picture.draw(map, image)).unwrap()
+    }
+
+    /// Whether a pixel within one of the place has about this colour.
+    fn shows(pixels: &[u8], [x, y]: [f64; 2], colour: RGBColor) -> bool {
+        let (column, row) = ((PIXELS_PER_M * (x + 40.0)) as usize, (PIXELS_PER_M * (20.0 - y)) as usize);
+        let wanted = [colour.0, colour.1, colour.2];
+        let is_like =
+            |at: usize| pixels[3 * at..].iter().zip(wanted).all(|(found, wanted)| found.abs_diff(wanted) < 40);
+        let around =
+            (row - 1..=row + 1).flat_map(|row| (column - 1..=column + 1).map(move |column| 960 * row + column));
+        around.into_iter().any(is_like)
     }
 
     #[test]
     fn everything_is_drawn_where_it_is() {
         let points = [[5.0, 5.0, 0.0, 0.5]; 4];
-        let picture = picture(&points);
-        let canvas = picture.draw().unwrap();
-        let near = |colour: Rgb888, wanted: Rgb888| {
-            [colour.r().abs_diff(wanted.r()), colour.g().abs_diff(wanted.g()), colour.b().abs_diff(wanted.b())]
-                .into_iter()
-                .all(|difference| difference < 40)
-        };
-        assert!(near(colour_at(&canvas, &picture, 5.0, 5.0), CAV_COLOURS[0]));
-        assert!(near(colour_at(&canvas, &picture, 20.0, 11.0), TRUTH), "left side of the true box");
-        assert!(near(colour_at(&canvas, &picture, -18.0, -10.5), DETECTION), "front of the detection");
-        assert!(near(colour_at(&canvas, &picture, 33.0, -13.0), BACKGROUND));
+        let pixels = pixels(&picture(&points));
+        assert!(shows(&pixels, [5.0, 5.0], CAV_COLOURS[0]));
+        assert!(shows(&pixels, [20.0, 11.0], TRUTH), "left side of the true box");
+        assert!(shows(&pixels, [-18.0, -10.5], DETECTION), "front of the detection");
+        assert!(shows(&pixels, [33.0, -13.0], BACKGROUND));
     }
 
     #[test]
     fn a_saved_picture_reads_back() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("frame.png");
-        picture(&[]).save(&file).unwrap();
+        let picture = picture(&[]);
+        picture.save(&file).unwrap();
         let mut reader = png::Decoder::new(std::io::BufReader::new(File::open(&file).unwrap())).read_info().unwrap();
-        let mut pixels = vec![0; reader.output_buffer_size().unwrap()];
-        reader.next_frame(&mut pixels).unwrap();
+        let mut read = vec![0; reader.output_buffer_size().unwrap()];
+        reader.next_frame(&mut read).unwrap();
         assert_eq!((reader.info().width, reader.info().height), (960, 480 + LEGEND_HEIGHT));
-        let green = pixels.chunks(3).filter(|rgb| *rgb == [TRUTH.r(), TRUTH.g(), TRUTH.b()]).count();
-        assert!(green > 50, "{green}");
+        assert!(read == pixels(&picture));
     }
 
     #[test]
-    fn points_that_are_nowhere_are_left_out() {
+    fn points_and_boxes_that_are_nowhere_are_left_out() {
         let points = [[f32::NAN, 0.0, 0.0, 0.0], [f32::INFINITY, 3e9, 0.0, 0.0], [1e30, -1e30, 0.0, 0.0]];
-        assert!(picture(&points).draw().unwrap() == picture(&[]).draw().unwrap());
+        let mut far = picture(&points);
+        far.views.push(View { name: "far".into(), ..far.views[0].clone() });
+        far.views[1].ego_from_cav.translation_m = [1e30, f64::NAN, 0.0];
+        let mut near = picture(&[]);
+        near.views.push(View { xyzi: &[], ego_from_cav: Pose::IDENTITY, ..far.views[1].clone() });
+        near.views[1].ego_from_cav.translation_m = [500.0, 0.0, 0.0];
+        let endless = Box3d { size_m: [f64::INFINITY, 2.0, 1.5], ..car(0.0, 0.0) };
+        far.truth = vec![endless, car(1e30, 0.0)];
+        near.truth = vec![car(500.0, 0.0), car(0.0, 500.0)];
+        assert!(pixels(&far) == pixels(&near));
     }
 
     #[test]
     fn a_range_that_makes_no_picture_is_refused() {
         for x_m in [[0.0, 0.0], [0.0, 1e9], [0.0, f64::NAN]] {
-            let error = Picture { x_m, ..picture(&[]) }.draw().err().unwrap();
+            let error = Picture { x_m, ..picture(&[]) }.map_size().unwrap_err();
             assert!(error.to_string().starts_with("cannot draw x"), "{error}");
         }
     }

@@ -6,13 +6,13 @@
 use std::f64::consts::TAU;
 
 use dataset::{LoadOptions, ReadError, Scenario};
-use localization::statistics::{quantile, sorted};
 use perception::detector::{Detector, DetectorError};
 use perception::weights::{Weights, WeightsError};
 use protocol::{PointCloud, Pose};
 use rand::{Rng, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use serde::Serialize;
+use support::statistics;
 use tch::{Kind, Tensor, no_grad};
 
 use ego_fuser::ego::Ego;
@@ -184,7 +184,7 @@ fn error(truth: &Pose, found: &Pose) -> [f64; 2] {
 fn summary(offset: &Offset, errors: &[[[f64; 2]; 2]]) -> Residual {
     let values = |moment: usize, which: usize| errors.iter().map(move |error| error[moment][which]);
     let mean = |moment, which| values(moment, which).sum::<f64>() / errors.len().max(1) as f64;
-    let median = |moment| quantile(&sorted(&values(moment, 0).collect::<Vec<_>>()), 0.5).unwrap_or(0.0);
+    let median = |moment| statistics::median(&values(moment, 0).collect::<Vec<_>>()).unwrap_or(0.0);
     Residual {
         offset: *offset,
         pairs: errors.len(),

@@ -5,6 +5,7 @@
 //! [`Evaluator::over_link`] messages cross the emulated air in virtual time ([`stepped`]).
 
 mod error;
+mod participant;
 mod sent;
 pub mod stepped;
 mod sweeps;
@@ -34,6 +35,7 @@ use fusion::method::{Exchange, Method};
 use training::feature_store::MapSource;
 
 pub use error::EvaluateError;
+use participant::Participant;
 use sent::{Sent, stamp, view};
 use stepped::{RemoteCrew, SteppedConfig, VehicleConfig};
 use sweeps::Sweep;
@@ -207,31 +209,31 @@ impl Evaluator {
         }
         let points = self.needs_points();
         let load = LoadOptions { points, ..LoadOptions::default() };
-        let mut agents = Vec::with_capacity(scenario.agents.len());
+        let mut participants = Vec::with_capacity(scenario.agents.len());
         for cav in &scenario.agents {
-            agents.push(self.agent(scenario, cav, agents.is_empty(), None)?);
+            participants.push(self.participant(scenario, cav, participants.is_empty(), None)?);
         }
-        let places: Vec<usize> = (0..agents.len()).collect();
+        let places: Vec<usize> = (0..participants.len()).collect();
         for tick in 0..scenario.ticks.len() {
             let sweeps = self.sweeps(scenario, tick, &places, &load, |_| true)?;
             if sweeps.first().is_none_or(|ego| ego.place != 0) {
                 continue;
             }
-            if on_frame(self.frame(&mut agents, sweeps, tick)?).is_break() {
+            if on_frame(self.frame(&mut participants, sweeps, tick)?).is_break() {
                 return Ok(ControlFlow::Break(()));
             }
         }
         Ok(ControlFlow::Continue(()))
     }
 
-    /// The pipeline of a vehicle.
-    fn agent(
+    /// A vehicle with its pipeline.
+    fn participant(
         &self,
         scenario: &Scenario,
         cav: &CavId,
         is_ego: bool,
         own: Option<&VehicleConfig>,
-    ) -> Result<Agent, EvaluateError> {
+    ) -> Result<Participant, EvaluateError> {
         let all = &self.config.pose_source;
         let source = match own {
             Some(own) => own.pose_source.clone(),
@@ -247,7 +249,7 @@ impl Evaluator {
             None => self.config.attack.and_then(|attack| attack.of(place, cav)),
         };
         let agent = Agent::new(cav.clone(), source.for_scenario(&scenario.name).build()?, detector);
-        Ok(agent.within(rate).lying(attack))
+        Ok(Participant::new(agent.within(rate), attack))
     }
 
     /// Whether sweeps have to be read at all.
@@ -258,7 +260,7 @@ impl Evaluator {
 
     fn frame(
         &mut self,
-        agents: &mut [Agent],
+        participants: &mut [Participant],
         sweeps: Vec<Sweep>,
         tick: usize,
     ) -> Result<EvaluatedFrame, EvaluateError> {
@@ -269,9 +271,9 @@ impl Evaluator {
             // Without an exchange, neighbours have nothing to encode; where they are is still asked.
             let is_needed = place == 0 || self.ego.method() != Method::None;
             let codec = if place == 0 { of_the_ego(self.config.codec) } else { self.config.codec };
-            let agent = &mut agents[place];
-            agent.overhear(|| sent.last().map(Sent::overheard).unwrap_or_default());
-            sent.push(view(agent, &frame, map.as_ref(), is_needed.then_some(exchange), &codec)?);
+            let participant = &mut participants[place];
+            participant.overhear(sent.last());
+            sent.push(view(participant, &frame, map.as_ref(), is_needed.then_some(exchange), &codec)?);
             frames.push(frame);
         }
         let poses = sent.iter().map(|sent| sent.pose).collect();

@@ -7,7 +7,7 @@ mod command;
 use std::process::ExitCode;
 
 use clap::Parser;
-use support::output;
+use support::cli::exit_code;
 
 /// Training and evaluation of collaborative detection.
 #[derive(Debug, Parser)]
@@ -18,12 +18,5 @@ struct CommandLine {
 }
 
 fn main() -> ExitCode {
-    let command_line = CommandLine::parse();
-    match command_line.command.run() {
-        Ok(()) => ExitCode::SUCCESS,
-        Err(error) => {
-            output::note(format_args!("ego-fuser: {error:#}"));
-            command::exit_code(&error)
-        }
-    }
+    exit_code(CommandLine::parse().command.run(), |_| false)
 }

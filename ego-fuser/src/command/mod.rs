@@ -4,11 +4,10 @@ mod methods;
 mod run;
 
 use std::io;
-use std::process::ExitCode;
 
 use anyhow::Context;
-use bus::BusError;
 use bus::malloc_settings;
+use support::cli::Outcome;
 use support::sibling_program::Forwarded;
 
 /// Program of the offline subcommands.
@@ -33,29 +32,19 @@ pub(crate) enum Command {
 
 impl Command {
     /// Carries out the subcommand.
-    pub(crate) fn run(self) -> anyhow::Result<()> {
+    pub(crate) fn run(self) -> anyhow::Result<Outcome> {
         let offline = |forwarded: Forwarded, name| -> io::Result<()> { Err(forwarded.exec(OFFLINE, name)) };
         match self {
-            Self::Methods(arguments) => arguments.run(),
+            Self::Methods(arguments) => arguments.run()?,
             Self::Run(arguments) => {
                 malloc_settings::ensure(&malloc_settings::KEPT_MEMORY).context("this program again")?;
-                arguments.run()
+                arguments.run()?;
             }
-            Self::Align(forwarded) => Ok(offline(forwarded, "align")?),
-            Self::Eval(forwarded) => Ok(offline(forwarded, "eval")?),
-            Self::Residual(forwarded) => Ok(offline(forwarded, "residual")?),
-            Self::Train(forwarded) => Ok(offline(forwarded, "train")?),
+            Self::Align(forwarded) => offline(forwarded, "align")?,
+            Self::Eval(forwarded) => offline(forwarded, "eval")?,
+            Self::Residual(forwarded) => offline(forwarded, "residual")?,
+            Self::Train(forwarded) => offline(forwarded, "train")?,
         }
+        Ok(Outcome::Done)
     }
-}
-
-/// Usage or input at fault, and not the program: exit code 2.
-#[derive(Debug, thiserror::Error)]
-#[error("{0}")]
-pub(crate) struct BadInput(pub(crate) String);
-
-/// Exit code of a command that failed: 2 for bad usage or input, 1 otherwise.
-pub(crate) fn exit_code(error: &anyhow::Error) -> ExitCode {
-    let is_bad_input = error.chain().any(|cause| cause.is::<BadInput>()) || BusError::is_behind(error.as_ref());
-    if is_bad_input { ExitCode::from(2) } else { ExitCode::FAILURE }
 }

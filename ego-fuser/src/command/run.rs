@@ -14,7 +14,7 @@ use fusion::Method;
 use protocol::{CavId, Role};
 use support::output;
 
-use super::BadInput;
+use support::cli::BadInput;
 
 /// Fuses what the ego's own agent and its neighbours send; detections out.
 #[derive(Debug, clap::Args)]
@@ -67,7 +67,7 @@ impl Arguments {
         log_to_stderr();
         tch::set_num_threads(i32::from(self.threads));
         let options = self.options()?;
-        let ego = Ego::load(&self.weights, self.method).map_err(|error| BadInput(format!("weights: {error}")))?;
+        let ego = Ego::load(&self.weights, self.method).map_err(|error| BadInput::new(format!("weights: {error}")))?;
         let ego = ego.with_comm_range(self.comm_range);
         let ego = ego.with_trust(self.trust.then(TrustConfig::default))?;
         let stop = self.bus.stop().context("installing signal handlers")?;
@@ -93,7 +93,7 @@ impl Arguments {
             [word] if word == "discover" => None,
             ids => {
                 let ids: Result<BTreeSet<CavId>, _> = ids.iter().map(|id| CavId::new(id)).collect();
-                Some(ids.map_err(|error| BadInput(format!("--neighbours: {error}")))?)
+                Some(ids.map_err(|error| BadInput::new(format!("--neighbours: {error}")))?)
             }
         };
         let max_age_nanos = self.max_age_ms.saturating_mul(1_000_000);

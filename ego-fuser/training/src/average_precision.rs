@@ -8,6 +8,7 @@
 //! [`Ordering::Global`] sorts by score over all frames; [`Ordering::Frame`] keeps the frames one after another (the
 //! default of OpenCOOD).
 
+use perception::boxes::postprocess;
 use protocol::rotated_iou::Polygon;
 use protocol::{Box3d, Detection};
 
@@ -145,8 +146,7 @@ impl Scorer {
 /// The bottom face of a box seen from above.
 #[must_use]
 pub fn footprint(box3d: &Box3d) -> Polygon {
-    let corners = box3d.corners();
-    Polygon::new(std::array::from_fn(|corner| [corners[corner][0], corners[corner][1]]))
+    postprocess::footprint(&box3d.corners())
 }
 
 /// Overlap with every object, single precision as in the reference.

@@ -7,6 +7,8 @@ use std::time::{Duration, Instant};
 
 use protocol::{Account, CavId, DropReason, Ledger, Limits, ProcessId, RateReason, StageSummary, Topic, WireError};
 
+use support::statistics::{quantile, sorted};
+
 use super::clock_offset::ClockOffset;
 
 /// Accounts of one process, as many as whoever receives a ledger takes.
@@ -298,12 +300,9 @@ impl State {
 
 impl Timings {
     fn summary(&self, stage: &str) -> StageSummary {
-        let mut sorted: Vec<Duration> = self.last.iter().copied().collect();
-        sorted.sort_unstable();
-        let quantile_ms = |quantile: f64| {
-            let rank = (quantile * sorted.len() as f64).ceil() as usize;
-            sorted.get(rank.saturating_sub(1)).map_or(0.0, |time| time.as_secs_f64() * 1e3)
-        };
+        let ms: Vec<f64> = self.last.iter().map(|time| time.as_secs_f64() * 1e3).collect();
+        let ms = sorted(&ms);
+        let quantile_ms = |q: f64| quantile(&ms, q).unwrap_or(0.0);
         StageSummary {
             stage: stage.to_owned(),
             count: self.count,
@@ -384,6 +383,6 @@ mod tests {
         }
         let stage = &books.stages()[0];
         assert_eq!((stage.stage.as_str(), stage.count), ("fuse", 100));
-        assert_eq!((stage.p50_ms, stage.p95_ms, stage.p99_ms, stage.max_ms), (50.0, 95.0, 99.0, 100.0));
+        assert_eq!((stage.p50_ms, stage.p95_ms, stage.p99_ms, stage.max_ms), (50.5, 95.05, 99.01, 100.0));
     }
 }

@@ -16,6 +16,7 @@ use super::flush_barrier::Receipt;
 use super::session::LONGEST_MESSAGE;
 use super::{Arrival, Books, BusError};
 use crate::batch_scheduling;
+use support::nanos;
 
 /// Between two probes of a publisher that has sent nothing yet.
 const PROBE_PERIOD: Duration = Duration::from_millis(50);
@@ -336,7 +337,7 @@ pub(super) fn payload(encoded: Encoded) -> ZBytes {
 #[must_use]
 pub fn unix_nanos() -> u64 {
     let since = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or_default();
-    u64::try_from(since.as_nanos()).unwrap_or(u64::MAX)
+    nanos::of(since)
 }
 
 #[cfg(test)]

@@ -1,15 +1,23 @@
-//! Program support: file access, terminal output and seeded randomness that all programs share.
+//! Program support: what all programs share and no crate of the field offers.
 //!
-//! - [`bounded_file`]: reads of outside files with a limit on their size.
-//! - [`atomic_file`]: files that appear complete or not at all.
-//! - [`output`]: standard output and error that survive a closed pipe.
-//! - [`sibling_program`]: subcommands that another program carries out.
+//! - [`cli`]: errors and exit codes; [`sibling_program`]: subcommands that another program carries out.
+//! - [`output`], [`progress`], [`text_table`]: standard output and error, progress bars, tables.
+//! - [`bounded_file`], [`atomic_file`], [`csv_file`]: reads with a limit on their size, files that appear complete or not at
+//!   all, CSV.
+//! - [`statistics`], [`stage_times`], [`nanos`]: quantiles and correlations, the stopwatch, durations in nanoseconds.
 //! - [`random`]: seeds derived from seeds, and draws that depend on nothing else.
 
 #![warn(clippy::print_stdout, clippy::print_stderr)]
 
 pub mod atomic_file;
 pub mod bounded_file;
+pub mod cli;
+pub mod csv_file;
+pub mod nanos;
 pub mod output;
+pub mod progress;
 pub mod random;
 pub mod sibling_program;
+pub mod stage_times;
+pub mod statistics;
+pub mod text_table;

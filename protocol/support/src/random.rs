@@ -1,4 +1,16 @@
-//! Random numbers whose stream is fixed by this file, so that a seed means the same bytes on every machine.
+//! Seeded random numbers: a stream that this file fixes, so that a seed means the same bytes on every machine.
+//!
+//! Two generators, each with one use:
+//!
+//! - [`SplitMix64`] where a simulation draws: sensors, traffic, weather, the channel, attacks, damaged test inputs. A
+//!   stream is cheap to begin, so each event has one of its own by [`SplitMix64::derived`] and no draw depends on how many
+//!   others came before it; a run may be cut into ticks, processes and threads.
+//! - `ChaCha8Rng` where an algorithm draws in one sequence: training and its augmentation, RANSAC, k-means, noise of
+//!   poses, the layout of a generated town. It can be sought to any place of its stream and serves `rand`'s distributions
+//!   and shuffles.
+//!
+//! Results and published data sets depend on both streams: new code follows the rule, and code that draws keeps its
+//! generator.
 
 use rand::RngCore;
 

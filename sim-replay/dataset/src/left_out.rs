@@ -7,6 +7,8 @@ use serde::{Deserialize, Serialize};
 
 use super::{LoadedTick, Problem};
 use crate::frame::Frame;
+use support::cli::Outcome;
+use support::output;
 
 /// Findings that are kept; further ones are only counted.
 const KEPT: usize = 1000;
@@ -78,6 +80,12 @@ impl LeftOut {
     /// The findings, each once, at most 1,000.
     pub fn problems(&self) -> impl Iterator<Item = &Problem> {
         self.problems.iter()
+    }
+
+    /// Prints the findings to standard error; the outcome of a command that lost no other data.
+    pub fn print(&self) -> Outcome {
+        self.problems().for_each(|problem| output::note(format_args!("left out: {}", problem.message)));
+        Outcome::of(!self.is_nothing())
     }
 
     fn keep(&mut self, problem: Problem) {

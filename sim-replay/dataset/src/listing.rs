@@ -5,6 +5,7 @@ use std::io::{self, Read, Seek, SeekFrom};
 use std::path::Path;
 
 use protocol::CavId;
+use protocol::text::hex;
 use rayon::prelude::*;
 use sha2::{Digest, Sha256};
 
@@ -87,7 +88,7 @@ fn edges(path: &Path, hash: &mut Sha256) -> io::Result<()> {
 }
 
 fn digits(hash: Sha256) -> String {
-    hash.finalize().iter().map(|byte| format!("{byte:02x}")).collect()
+    hex(&hash.finalize())
 }
 
 #[cfg(test)]
@@ -119,7 +120,7 @@ mod tests {
         assert_eq!((scenario.agents.len(), scenario.ticks.len()), (2, 2));
         let [first, second] = [0, 1].map(|tick| scenario.ticks[tick].capture_nanos);
         let text = format!("scene/4279/4288\n000068 {first}\n000070 {second}");
-        let expected: String = Sha256::digest(text).iter().map(|byte| format!("{byte:02x}")).collect();
+        let expected = hex(&Sha256::digest(text));
         assert_eq!(listing_sha256(&dataset.scenarios), expected);
     }
 

@@ -5,10 +5,13 @@
 
 use std::path::{Path, PathBuf};
 
+use csv::StringRecord;
 use nalgebra::{Isometry3, Translation3, UnitQuaternion};
+use protocol::text::excerpt;
 
 use super::faults::Faults;
 use super::{ReadError, files};
+use support::csv_file;
 
 /// Largest file that is read, bytes: some two million rows.
 const MAX_BYTES: u64 = 256 << 20;
@@ -42,8 +45,8 @@ impl GroundTruth {
     fn parse(path: &Path, text: &str, problems: &mut Vec<ReadError>) -> Self {
         let mut faults = Faults::default();
         let mut rows = Vec::new();
-        for (number, line) in (1..).zip(text.lines()).filter(|(_, line)| !line.trim().is_empty()) {
-            let row = faults.take(row(path, number, line)).flatten();
+        for (number, record) in csv_file::records(text) {
+            let row = faults.take(row(path, number, &record)).flatten();
             rows.extend(row.map(|(micros, pose)| (number, micros, pose)));
         }
         let times: Vec<u64> = rows.iter().map(|(_, micros, _)| *micros).collect();
@@ -96,18 +99,16 @@ fn longest_increasing(values: &[u64]) -> Vec<usize> {
 }
 
 /// Time and pose of a row; `None` where it holds no pose.
-fn row(path: &Path, line: u64, text: &str) -> Result<Option<(u64, Isometry3<f64>)>, ReadError> {
-    let words: Vec<&str> = text.split(',').map(str::trim).collect();
-    if words.len() != COLUMNS.len() {
-        let reason = format!("{} columns, expected {}", words.len(), COLUMNS.len());
+fn row(path: &Path, line: u64, record: &StringRecord) -> Result<Option<(u64, Isometry3<f64>)>, ReadError> {
+    if record.len() != COLUMNS.len() {
+        let reason = format!("{} columns, expected {}", record.len(), COLUMNS.len());
         return Err(ReadError::Malformed { path: path.to_owned(), line: Some(line), field: None, reason });
     }
     let mut numbers = [0.0; COLUMNS.len()];
-    for (column, word) in words.iter().enumerate() {
-        numbers[column] = word.parse::<f64>().map_err(|_| {
-            let word: String = word.chars().take(40).collect();
-            wrong(path, line, column, format!("{word:?} is no number"))
-        })?;
+    for (column, word) in record.iter().enumerate() {
+        numbers[column] = word
+            .parse::<f64>()
+            .map_err(|_| wrong(path, line, column, format!("{:?} is no number", excerpt(word, 40))))?;
     }
     let [micros, x, y, z, roll, pitch, heading] = numbers;
     // Times may be written like any other number: 1.326652795e15.

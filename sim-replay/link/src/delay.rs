@@ -2,14 +2,14 @@
 
 use super::config::DelayLaw;
 use super::loss::SentMessage;
-use super::nanos_of_ms;
 use super::trace::Trace;
+use support::nanos;
 use support::random::SplitMix64;
 
 impl DelayLaw {
     /// Delay of one message, nanoseconds.
     pub(super) fn draw(self, random: &mut SplitMix64, trace: Option<&Trace>, message: &SentMessage) -> u64 {
-        nanos_of_ms(match self {
+        nanos::of_ms(match self {
             Self::None => 0.0,
             Self::ConstantMs(ms) => ms,
             Self::UniformMs([low, high]) => random.between(low, high),

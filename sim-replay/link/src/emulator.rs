@@ -11,9 +11,9 @@ use super::chance::{Chance, Purpose};
 use super::config::{CapacityConfig, LinkConfig, LinkError, Medium};
 use super::device_clock::DeviceClock;
 use super::loss::{LossState, SentMessage};
-use super::nanos_of_ms;
 use super::queue_server::{Left, Line, Rules};
 use super::trace::Trace;
+use support::nanos;
 use support::random::derive_seed;
 
 /// A message as the air sees it.
@@ -245,7 +245,7 @@ impl Air {
         if let Some(reorder) = config.reorder
             && random(Purpose::Reorder).chance(reorder.probability)
         {
-            arrival_nanos = arrival_nanos.saturating_add(nanos_of_ms(reorder.extra_ms));
+            arrival_nanos = arrival_nanos.saturating_add(nanos::of_ms(reorder.extra_ms));
         }
         let mut twice = random(Purpose::Duplicate);
         if config.duplicate > 0.0 && twice.chance(config.duplicate) {
@@ -267,14 +267,14 @@ impl Air {
 impl LinkConfig {
     /// Whether an outage lies in a span.
     fn is_cut(&self, start_nanos: u64, end_nanos: u64) -> bool {
-        let nanos = |seconds: f64| nanos_of_ms(1e3 * seconds);
+        let nanos = |seconds: f64| nanos::of_ms(1e3 * seconds);
         self.outages.iter().any(|outage| start_nanos < nanos(outage.to_s) && end_nanos >= nanos(outage.from_s))
     }
 
     /// Cuts the time since `offered_nanos` down to whole steps, where the link has them.
     fn floored(&self, offered_nanos: u64, arrival_nanos: u64) -> u64 {
         let took_nanos = arrival_nanos.saturating_sub(offered_nanos);
-        match nanos_of_ms(self.floor_ms) {
+        match nanos::of_ms(self.floor_ms) {
             0 => arrival_nanos,
             step_nanos => offered_nanos + took_nanos / step_nanos * step_nanos,
         }

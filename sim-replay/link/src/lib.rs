@@ -30,8 +30,3 @@ pub use emulator::{Air, Fate, Outcome, Parcel};
 pub use preset::PRESETS;
 pub use trace::{Step, Trace, TraceError};
 pub use trace_config::TraceConfig;
-
-/// Nanoseconds of so many milliseconds; 0 for what is below 0 or no number.
-fn nanos_of_ms(ms: f64) -> u64 {
-    (ms * 1e6).round().max(0.0) as u64
-}

@@ -1,9 +1,11 @@
 //! Links that somebody has measured.
 
-use std::io;
 use std::path::{Path, PathBuf};
 
+use protocol::text::excerpt;
+
 use support::bounded_file;
+use support::csv_file::{CsvError, CsvFile, CsvRow};
 
 /// First line of a CSV trace.
 const HEADER: &str = "time_s,rate_mbps,delay_ms,loss";
@@ -15,14 +17,9 @@ const MAX_FILE_BYTES: u64 = 256 << 20;
 /// Why a trace cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum TraceError {
-    /// The file is missing or not readable.
-    #[error("{}: {source}", path.display())]
-    Io {
-        /// The file.
-        path: PathBuf,
-        /// What the system said.
-        source: io::Error,
-    },
+    /// The file or a row of it cannot be used.
+    #[error(transparent)]
+    Csv(#[from] CsvError),
     /// A line is not what it must be.
     #[error("{}:{line}: {found:?} must be {must}", path.display())]
     Line {
@@ -80,42 +77,17 @@ impl Trace {
     /// # Errors
     /// [`TraceError`] names the file and the line.
     pub fn read_csv(path: &Path, offset_nanos: u64) -> Result<Self, TraceError> {
-        let text = read(path)?;
-        let mut lines = text.lines().enumerate();
-        let header = lines.next().map_or("", |(_, line)| line.trim());
-        if header != HEADER {
-            return Err(wrong(path, 0, header, "the header time_s,rate_mbps,delay_ms,loss"));
-        }
         let mut steps: Vec<Step> = Vec::new();
-        for (index, line) in lines.filter(|(_, line)| !line.trim().is_empty()) {
-            let numbers: Option<Vec<f64>> = line.split(',').map(|field| field.trim().parse().ok()).collect();
-            let numbers = numbers.and_then(|numbers| <[f64; 4]>::try_from(numbers).ok());
-            let Some([time_s, rate_mbps, delay_ms, loss]) = numbers else {
-                return Err(wrong(path, index, line, "four numbers"));
-            };
-            let sound = (0.0..=1e9).contains(&time_s)
-                && (0.0..=1e6).contains(&rate_mbps)
-                && (0.0..=600_000.0).contains(&delay_ms)
-                && (0.0..=1.0).contains(&loss);
-            if !sound {
-                return Err(wrong(
-                    path,
-                    index,
-                    line,
-                    "a time, a rate up to 1e6, a delay up to 600,000, a loss up to 1",
-                ));
+        for row in CsvFile::read(path, HEADER, MAX_FILE_BYTES)?.rows() {
+            let row = row.complete()?;
+            let step = step(&row)?;
+            let is_later =
+                steps.last().map_or(step.from_nanos <= offset_nanos, |last| step.from_nanos > last.from_nanos);
+            if !is_later {
+                let must = "later than the line before, the first at offset_s (0) or before";
+                return Err(row.wrong(0, must).into());
             }
-            let from_nanos = (time_s * 1e9).round() as u64;
-            let rises = steps.last().map_or(from_nanos <= offset_nanos, |last| from_nanos > last.from_nanos);
-            if !rises {
-                return Err(wrong(
-                    path,
-                    index,
-                    line,
-                    "later than the line before, the first at offset_s (0) or before",
-                ));
-            }
-            steps.push(Step { from_nanos, bits_per_s: (rate_mbps * 1e6).round() as u64, delay_ms, loss });
+            steps.push(step);
         }
         let is_past = steps.last().is_some_and(|last| last.from_nanos < offset_nanos);
         if is_past {
@@ -159,12 +131,23 @@ impl Trace {
     }
 }
 
-fn read(path: &Path) -> Result<String, TraceError> {
-    bounded_file::read_text(path, MAX_FILE_BYTES).map_err(|source| TraceError::Io { path: path.to_owned(), source })
+fn step(row: &CsvRow<'_>) -> Result<Step, CsvError> {
+    let time_s = row.number(0, 0.0..=1e9, "0 to 1e9 seconds")?;
+    let rate_mbps = row.number(1, 0.0..=1e6, "0 to 1e6 Mbit/s")?;
+    Ok(Step {
+        from_nanos: (time_s * 1e9).round() as u64,
+        bits_per_s: (rate_mbps * 1e6).round() as u64,
+        delay_ms: row.number(2, 0.0..=600_000.0, "0 to 600,000 ms")?,
+        loss: row.number(3, 0.0..=1.0, "0 to 1")?,
+    })
+}
+
+fn read(path: &Path) -> Result<String, CsvError> {
+    bounded_file::read_text(path, MAX_FILE_BYTES).map_err(|source| CsvError::Io { path: path.to_owned(), source })
 }
 
 fn wrong(path: &Path, index: usize, found: &str, must: &'static str) -> TraceError {
-    TraceError::Line { path: path.to_owned(), line: index + 1, found: found.chars().take(80).collect(), must }
+    TraceError::Line { path: path.to_owned(), line: index + 1, found: excerpt(found, 80), must }
 }
 
 #[cfg(test)]
@@ -218,7 +201,10 @@ mod tests {
             let message = Trace::read_csv(&path, 0).unwrap_err().to_string();
             assert!(message.contains(&format!("trace.txt:{line}:")), "{message}");
         }
-        assert!(matches!(Trace::read_csv(Path::new("no/such/trace.csv"), 0), Err(TraceError::Io { .. })));
+        assert!(matches!(
+            Trace::read_csv(Path::new("no/such/trace.csv"), 0),
+            Err(TraceError::Csv(CsvError::Io { .. }))
+        ));
         let (_folder, path) = file("time,rate\n");
         assert!(Trace::read_csv(&path, 0).unwrap_err().to_string().contains("header"));
         let (_folder, path) = file("2\n5\n3\n");

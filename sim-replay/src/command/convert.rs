@@ -1,14 +1,13 @@
 //! `sim-replay convert`: write a data set in another layout.
 
-use std::io::IsTerminal;
 use std::path::{Path, PathBuf};
 
 use dataset::{self, IntensityScale, OpenOptions};
-use indicatif::ProgressBar;
 use simulator::generate::{ConvertOptions, Converted, SceneLayout, SynthError, convert};
 use support::output;
+use support::progress;
 
-use crate::cli::Outcome;
+use support::cli::Outcome;
 
 /// Problems that are printed; all are counted, and stand in the JSON summary.
 const SHOWN_PROBLEMS: usize = 10;
@@ -54,7 +53,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
         ));
         return Ok(Outcome::BadInput);
     }
-    let bar = if std::io::stderr().is_terminal() { ProgressBar::new(0) } else { ProgressBar::hidden() };
+    let bar = progress::bar(0, "frames");
     let options = ConvertOptions { out: args.out.clone(), layout: args.layout, force: args.force };
     let result = convert(&input, &options, &|done, total| {
         bar.set_length(total as u64);

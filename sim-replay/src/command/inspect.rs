@@ -5,12 +5,12 @@ use std::path::{Path, PathBuf};
 
 use dataset::evaluation_protocol::ProtocolConfig;
 use dataset::{IntensityScale, OpenOptions, layouts_text};
-use indicatif::{ProgressBar, ProgressStyle};
 use serde::Serialize;
 use sim_replay::inspect::{Report, inspect, inspect_map};
 use support::output;
+use support::progress;
 
-use crate::cli::Outcome;
+use support::cli::Outcome;
 
 /// Say what a dataset holds (agents, frames, points, rates, boxes, merged ground truth) and what is wrong with it.
 #[derive(Debug, clap::Args)]
@@ -65,10 +65,7 @@ fn print(report: &(impl Serialize + Display), json: bool) -> anyhow::Result<()> 
 /// Reads everything; a bar on a terminal says how far.
 fn with_progress(args: &Args) -> Report {
     // Hidden by itself where stderr is no terminal.
-    let bar = ProgressBar::new(0);
-    if let Ok(style) = ProgressStyle::with_template("{bar:40} {pos}/{len} frames, {eta} left") {
-        bar.set_style(style);
-    }
+    let bar = progress::bar(0, "frames");
     let options = OpenOptions { intensity_scale: args.intensity_scale, ..OpenOptions::default() };
     let report = inspect(&args.dir, &options, &args.protocol, &|done, total| {
         bar.set_length(total as u64);

@@ -7,7 +7,7 @@ use protocol::{CavId, Role, Stream};
 use sim_replay::link_node::{self, LinkReport, NodeOptions};
 use support::output;
 
-use crate::cli::Outcome;
+use support::cli::Outcome;
 
 /// Carry what agents send to an ego, as a wireless link would: late, in a queue, or not at all.
 #[derive(Debug, clap::Args)]

@@ -9,7 +9,7 @@ use recording::RecordingOptions;
 use sim_replay::recorder::{self, RecordReport, RecorderError, RecorderOptions};
 use support::output;
 
-use crate::cli::Outcome;
+use support::cli::Outcome;
 
 /// Write everything that is said in a run into an MCAP file, which `sim-replay stream` plays and Foxglove opens.
 ///

@@ -6,7 +6,7 @@ use bus::log_to_stderr;
 use recording::{RecordingOptions, recover};
 use support::output;
 
-use crate::cli::Outcome;
+use support::cli::Outcome;
 
 /// Copy what is whole of a recording that was cut short (power, disk, kill) or damaged into a new, indexed file.
 ///

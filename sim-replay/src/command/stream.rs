@@ -12,7 +12,7 @@ use protocol::{CavId, DropReason, Role};
 use sim_replay::stream::{AirReport, Replay, StreamError, StreamOptions, StreamReport};
 use support::output;
 
-use crate::cli::Outcome;
+use support::cli::Outcome;
 
 /// Publish a scene as if its vehicles were driving now.
 ///

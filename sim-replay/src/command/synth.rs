@@ -1,17 +1,17 @@
 //! `sim-replay synth`: generate scenes.
 
 use std::collections::BTreeMap;
-use std::io::{self, IsTerminal};
+use std::io;
 use std::ops::RangeInclusive;
 use std::path::PathBuf;
 use std::time::Instant;
 
-use indicatif::{ProgressBar, ProgressStyle};
 use simulator::generate::{self, SceneLayout, Subset, Summary, SynthError, SynthOptions, Weather};
 use simulator::map::TownSource;
 use support::output;
+use support::progress;
 
-use crate::cli::Outcome;
+use support::cli::Outcome;
 
 /// Findings of a map that are printed one by one.
 const PRINTED_FINDINGS: usize = 20;
@@ -77,7 +77,7 @@ pub(crate) struct Args {
 pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
     let json = args.json;
     let options = options(args);
-    let bar = progress_bar(options.scenarios());
+    let bar = progress::percent_bar(options.scenarios());
     let start = Instant::now();
     let result = generate::generate(&options, &|thousandths| bar.set_position(thousandths));
     bar.finish_and_clear();
@@ -111,16 +111,6 @@ fn options(args: Args) -> SynthOptions {
         threads: args.threads.unwrap_or_else(|| std::thread::available_parallelism().map_or(1, usize::from)).max(1),
         ..SynthOptions::new(args.subset, args.seed, args.out)
     }
-}
-
-/// A bar on standard error where that is a terminal; a silent one elsewhere.
-fn progress_bar(scenarios: usize) -> ProgressBar {
-    if !std::io::stderr().is_terminal() {
-        return ProgressBar::hidden();
-    }
-    let template = format!("{{wide_bar}} {{percent}} % of {scenarios} scenarios, {{eta}} left");
-    let bar = ProgressBar::new(1000 * scenarios as u64);
-    bar.with_style(ProgressStyle::with_template(&template).unwrap_or_else(|_| ProgressStyle::default_bar()))
 }
 
 /// Names on standard error what was not built as the map gives it.

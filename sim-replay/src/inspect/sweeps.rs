@@ -8,6 +8,7 @@ use serde::Serialize;
 use super::Problem;
 use dataset::pcd::{IntensityKind, IntensityOrigin, PcdCloud};
 use dataset::{IntensityScale, Plausibility};
+use support::statistics;
 
 /// Points of a sweep that its median is taken of at most.
 const MEDIAN_OF: usize = 4096;
@@ -50,7 +51,7 @@ impl SweepFindings {
         plausibility.add(&cloud.points);
         let values = || cloud.points.xyzi.iter().map(|point| point[3]);
         let step = cloud.points.len().div_ceil(MEDIAN_OF).max(1);
-        let median = median(values().step_by(step).collect());
+        let median = median(&values().step_by(step).collect::<Vec<_>>());
         let range = median
             .map(|median| [values().fold(f32::INFINITY, f32::min), median, values().fold(f32::NEG_INFINITY, f32::max)]);
         Self {
@@ -65,12 +66,9 @@ impl SweepFindings {
     }
 }
 
-fn median(mut values: Vec<f32>) -> Option<f32> {
-    if values.is_empty() {
-        return None;
-    }
-    let middle = values.len() / 2;
-    Some(*values.select_nth_unstable_by(middle, f32::total_cmp).1)
+fn median(values: &[f32]) -> Option<f32> {
+    let values: Vec<f64> = values.iter().copied().map(f64::from).collect();
+    statistics::median(&values).map(|median| median as f32)
 }
 
 /// The sweeps of an agent together, in order; `None` where no sweep has a point.
@@ -81,7 +79,7 @@ pub(super) fn summarize(sweeps: &[&SweepFindings]) -> Option<SweepReport> {
         form: first.form,
         intensity: first.intensity.clone(),
         min_intensity: ranges().map(|[min, ..]| min).fold(f32::INFINITY, f32::min),
-        median_intensity: median(ranges().map(|[_, median, _]| median).collect())?,
+        median_intensity: median(&ranges().map(|[_, median, _]| median).collect::<Vec<_>>())?,
         max_intensity: ranges().map(|[.., max]| max).fold(f32::NEG_INFINITY, f32::max),
     })
 }

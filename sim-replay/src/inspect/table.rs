@@ -7,6 +7,7 @@ use protocol::Handedness;
 
 use super::{AgentReport, Report, ScenarioReport, Summary, TickReport};
 use dataset::Layout;
+use support::text_table::{Side, TextTable};
 
 /// Problems that are printed before the rest is only counted.
 const MAX_PROBLEMS: usize = 50;
@@ -53,14 +54,7 @@ impl Report {
         let rate = scenario.rate_hz.map(|rate| format!(" at {rate:.1} Hz")).unwrap_or_default();
         let seconds = scenario.seconds;
         writeln!(f, "\n{}: {}{rate}, {seconds:.1} s, {axes} on disk", scenario.name, count(scenario.frames, "frame"))?;
-        writeln!(
-            f,
-            "  {:<12} {:>26} {:>9} {:>20} {:>12} {:>20} {:>10}",
-            "agent", "points", "dropped", "boxes", "empty boxes", "radar", "metres"
-        )?;
-        for agent in &scenario.agents {
-            write_agent(f, agent)?;
-        }
+        write!(f, "{}", agents_table(&scenario.agents))?;
         for agent in &scenario.agents {
             if let Some(sweeps) = &agent.sweeps {
                 writeln!(f, "  sweeps of {}: {sweeps}", agent.id)?;
@@ -104,18 +98,21 @@ fn write_missing(f: &mut fmt::Formatter<'_>, scenario: &ScenarioReport) -> fmt::
     Ok(())
 }
 
-fn write_agent(f: &mut fmt::Formatter<'_>, agent: &AgentReport) -> fmt::Result {
-    writeln!(
-        f,
-        "  {:<12} {:>26} {:>9} {:>20} {:>12} {:>20} {:>10}",
-        agent.id.as_str(),
-        shown(agent.points),
-        agent.dropped_points,
-        shown(agent.boxes),
-        agent.boxes_without_points,
-        shown(agent.radar_points),
-        agent.distance_m.map_or("no pose".into(), |metres| format!("{metres:.1}")),
-    )
+fn agents_table(agents: &[AgentReport]) -> TextTable {
+    let right = ["points", "dropped", "boxes", "empty boxes", "radar", "metres"].map(|name| (name, Side::Right));
+    let mut table = TextTable::new([("agent", Side::Left)].into_iter().chain(right));
+    for agent in agents {
+        table.row([
+            agent.id.to_string(),
+            shown(agent.points),
+            agent.dropped_points.to_string(),
+            shown(agent.boxes),
+            agent.boxes_without_points.to_string(),
+            shown(agent.radar_points),
+            agent.distance_m.map_or("no pose".into(), |metres| format!("{metres:.1}")),
+        ]);
+    }
+    table
 }
 
 /// The mean, and the span where there is one.

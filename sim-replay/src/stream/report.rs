@@ -9,6 +9,7 @@ use serde::Serialize;
 use dataset::frame::Frame;
 
 use super::sensor_link::AirReport;
+use support::statistics::{quantile, sorted};
 
 /// Publishing later than this counts as late.
 const LATE: Duration = Duration::from_millis(5);
@@ -118,11 +119,9 @@ impl Lateness {
     }
 
     pub(super) fn sum_up(&mut self) {
-        self.samples.sort_unstable();
-        let quantile_ms = |quantile: f64| {
-            let rank = (quantile * self.samples.len() as f64).ceil() as usize;
-            self.samples.get(rank.saturating_sub(1)).map_or(0.0, |late| late.as_secs_f64() * 1e3)
-        };
+        let ms: Vec<f64> = self.samples.iter().map(|late| late.as_secs_f64() * 1e3).collect();
+        let ms = sorted(&ms);
+        let quantile_ms = |q: f64| quantile(&ms, q).unwrap_or(0.0);
         (self.p50_ms, self.p95_ms) = (quantile_ms(0.5), quantile_ms(0.95));
     }
 }
@@ -155,6 +154,6 @@ mod tests {
         let mut lateness = Lateness::default();
         (1..=100).for_each(|ms| lateness.add(Duration::from_millis(ms)));
         lateness.sum_up();
-        assert_eq!((lateness.late_ticks, lateness.p50_ms, lateness.p95_ms, lateness.max_ms), (95, 50.0, 95.0, 100.0));
+        assert_eq!((lateness.late_ticks, lateness.p50_ms, lateness.p95_ms, lateness.max_ms), (95, 50.5, 95.05, 100.0));
     }
 }

@@ -9,6 +9,7 @@ use serde::Serialize;
 
 use dataset::frame::Frame;
 use link::{Air, Fate, LinkConfig, LinkError, Outcome, Parcel};
+use support::nanos;
 
 /// x, y, z and intensity of a point, bytes; for a radar's its velocity.
 const POINT_BYTES: u64 = 16;
@@ -63,7 +64,7 @@ impl SensorAir {
         let Frame { points, radar, .. } = &held.frame;
         let points = points.len() + radar.as_ref().map_or(0, |radar| radar.len());
         let bytes = HEADER_LEN as u64 + POINT_BYTES * points as u64;
-        let (id, offered_nanos) = (self.next_id, self.nanos(now));
+        let (id, offered_nanos) = (self.next_id, nanos::between(self.began, now));
         self.next_id += 1;
         let next_sequence = self.next_sequences.entry(cav.clone()).or_default();
         let sequence = *next_sequence;
@@ -82,7 +83,7 @@ impl SensorAir {
     /// What has arrived by now.
     pub(super) fn arrived(&mut self, now: Instant) -> Vec<Held> {
         let mut arrived = Vec::new();
-        for Outcome { parcel, fate, .. } in self.air.advance(self.nanos(now)) {
+        for Outcome { parcel, fate, .. } in self.air.advance(nanos::between(self.began, now)) {
             match fate {
                 Fate::Dropped(reason) => {
                     self.held.remove(&parcel.id);
@@ -98,10 +99,6 @@ impl SensorAir {
 
     pub(super) fn report(&self) -> &AirReport {
         &self.report
-    }
-
-    fn nanos(&self, at: Instant) -> u64 {
-        u64::try_from(at.saturating_duration_since(self.began).as_nanos()).unwrap_or(u64::MAX)
     }
 }
 

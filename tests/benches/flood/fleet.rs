@@ -18,6 +18,7 @@ use protocol::{
     Topic, encode_features, wire,
 };
 use serde::{Deserialize, Serialize};
+use support::statistics;
 use tests::bus::free_port;
 use tests::machine;
 use zenoh::Wait;
@@ -60,10 +61,7 @@ pub(crate) struct Measured {
 }
 
 pub(crate) fn quantile(values: &[f64], quantile: f64) -> f64 {
-    let mut sorted = values.to_vec();
-    sorted.sort_by(f64::total_cmp);
-    let rank = (quantile * sorted.len() as f64).ceil() as usize;
-    sorted.get(rank.saturating_sub(1)).copied().unwrap_or(f64::NAN)
+    statistics::quantile(&statistics::sorted(values), quantile).unwrap_or(f64::NAN)
 }
 
 /// Runs the fleet once.

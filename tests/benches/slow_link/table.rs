@@ -7,6 +7,7 @@ use std::path::Path;
 
 use anyhow::Result;
 use protocol::DropReason;
+use support::statistics;
 use tests::machine;
 
 use super::ends::Seen;
@@ -59,9 +60,9 @@ impl Row {
             dropped,
             unexplained,
             offer_max_ms: seen.offers.iter().map(|offer| offer.waited_nanos as f64 / 1e6).fold(0.0, f64::max),
-            transport_p50_ms: quantile(took.collect(), 0.5),
-            age_p50_ms: quantile(ages.clone(), 0.5),
-            age_p95_ms: quantile(ages, 0.95),
+            transport_p50_ms: quantile(&took.collect::<Vec<_>>(), 0.5),
+            age_p50_ms: quantile(&ages, 0.5),
+            age_p95_ms: quantile(&ages, 0.95),
             age_target_ms: cell.age_target_ms(),
             throughput_mbps: throughput_mbps(seen),
         }
@@ -179,10 +180,8 @@ fn millis(from_nanos: u64, to_nanos: u64) -> f64 {
 }
 
 /// Not a number where there are no values: nothing is on target then.
-fn quantile(mut values: Vec<f64>, quantile: f64) -> f64 {
-    values.sort_unstable_by(f64::total_cmp);
-    let place = (values.len() as f64 * quantile).ceil() as usize;
-    values.get(place.saturating_sub(1)).copied().unwrap_or(f64::NAN)
+fn quantile(values: &[f64], quantile: f64) -> f64 {
+    statistics::quantile(&statistics::sorted(values), quantile).unwrap_or(f64::NAN)
 }
 
 fn size(bytes: usize) -> String {

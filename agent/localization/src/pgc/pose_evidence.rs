@@ -126,7 +126,7 @@ fn mean_over(cells: &[u32], epsilon_m: &[f32], value: impl Fn(f32) -> f64) -> f6
     values.sum::<f64>() / cells.len().max(1) as f64
 }
 
-/// Median over all cells; 0 for none.
+/// Upper median over all cells; 0 for none. Input of the fitted confidence model, which knows this rule.
 fn median(epsilon_m: &[f32]) -> f64 {
     let mut sorted = epsilon_m.to_vec();
     let middle = sorted.len() / 2;

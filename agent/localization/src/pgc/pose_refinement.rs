@@ -109,7 +109,8 @@ fn distance_m(pair: &Correspondence, pose: &Isometry3<f64>) -> f64 {
     if pair.usable() { pair.residual_m(pose) } else { f64::INFINITY }
 }
 
-/// A quarter of the values is below it; infinite where there are none.
+/// A quarter of the values is below it; infinite where there are none. Input of the fitted confidence model, which knows
+/// this rule.
 fn lower_quartile(mut values: Vec<f64>) -> f64 {
     let quarter = values.len() / 4;
     if values.is_empty() { f64::INFINITY } else { *values.select_nth_unstable_by(quarter, f64::total_cmp).1 }

@@ -1,9 +1,8 @@
 //! Pose errors that a pose generator really made, one row per sweep.
 
-use std::io;
 use std::path::{Path, PathBuf};
 
-use support::bounded_file;
+use support::csv_file::{CsvError, CsvFile, CsvRow};
 
 use super::noise::PlanarError;
 
@@ -18,36 +17,9 @@ const MAX_BYTES: u64 = 64 << 20;
 /// Why a table of errors cannot be read.
 #[derive(Debug, thiserror::Error)]
 pub enum ErrorTableError {
-    /// The file is missing or not readable.
-    #[error("{}: {source}", path.display())]
-    Io {
-        /// The file.
-        path: PathBuf,
-        /// What the system said.
-        source: io::Error,
-    },
-    /// The first line is another.
-    #[error("{}:1: header is {found:?}, must be {HEADER:?}", path.display())]
-    Header {
-        /// The file.
-        path: PathBuf,
-        /// The line found.
-        found: String,
-    },
-    /// A line is neither five numbers nor `no_pose`.
-    #[error("{}:{line}: {field} is {found:?}, must be {must}", path.display())]
-    Row {
-        /// The file.
-        path: PathBuf,
-        /// Line number, from 1.
-        line: usize,
-        /// Column.
-        field: &'static str,
-        /// What stood there.
-        found: String,
-        /// What would be right.
-        must: &'static str,
-    },
+    /// The file or a row of it cannot be used.
+    #[error(transparent)]
+    Csv(#[from] CsvError),
     /// There is no row.
     #[error("{}: no row below the header", path.display())]
     Empty {
@@ -84,19 +56,7 @@ impl ErrorTable {
     /// # Errors
     /// [`ErrorTableError`] names the file, the line and the column.
     pub fn read(path: &Path) -> Result<Self, ErrorTableError> {
-        let text = bounded_file::read_text(path, MAX_BYTES)
-            .map_err(|source| ErrorTableError::Io { path: path.to_owned(), source })?;
-        let mut lines = text.lines().enumerate();
-        let header = lines.next().map_or("", |(_, line)| line.trim());
-        if header != HEADER {
-            let found = header.chars().take(80).collect();
-            return Err(ErrorTableError::Header { path: path.to_owned(), found });
-        }
-        let rows: Result<Vec<_>, _> = lines
-            .filter(|(_, line)| !line.trim().is_empty())
-            .map(|(index, line)| parse_row(line.trim()).map_err(|problem| problem.at(path, index + 1)))
-            .collect();
-        let rows = rows?;
+        let rows = CsvFile::read(path, HEADER, MAX_BYTES)?.rows().map(parse_row).collect::<Result<Vec<_>, _>>()?;
         if rows.is_empty() { Err(ErrorTableError::Empty { path: path.to_owned() }) } else { Ok(Self { rows }) }
     }
 
@@ -108,37 +68,15 @@ impl ErrorTable {
     }
 }
 
-/// What is wrong with a line.
-struct RowProblem {
-    field: &'static str,
-    found: String,
-    must: &'static str,
-}
-
-impl RowProblem {
-    fn at(self, path: &Path, line: usize) -> ErrorTableError {
-        let Self { field, found, must } = self;
-        let found = found.chars().take(80).collect();
-        ErrorTableError::Row { path: path.to_owned(), line, field, found, must }
-    }
-}
-
-fn parse_row(line: &str) -> Result<TableRow, RowProblem> {
-    if line == "no_pose" {
+fn parse_row(row: CsvRow<'_>) -> Result<TableRow, CsvError> {
+    if row.field(0) == "no_pose" {
         return Ok(TableRow::NoPose);
     }
-    let columns: Vec<&str> = line.split(',').map(str::trim).collect();
-    let &[x, y, z, yaw, confidence] = columns.as_slice() else {
-        return Err(RowProblem { field: "line", found: line.to_owned(), must: "five numbers or no_pose" });
-    };
-    let number = |field, text: &str, low: f64, high: f64, must| match text.parse::<f64>() {
-        Ok(value) if (low..=high).contains(&value) => Ok(value),
-        _ => Err(RowProblem { field, found: text.to_owned(), must }),
-    };
-    let metres = |field, text| number(field, text, -MAX_ERROR_M, MAX_ERROR_M, "metres within 100 km");
-    let position_m = [metres("x_m", x)?, metres("y_m", y)?, metres("z_m", z)?];
-    let yaw_rad = number("yaw_deg", yaw, -360.0, 360.0, "degrees within a turn")?.to_radians();
-    let confidence = number("confidence", confidence, 0.0, 1.0, "0 to 1")? as f32;
+    let row = row.complete()?;
+    let metres = |column| row.number(column, -MAX_ERROR_M..=MAX_ERROR_M, "metres within 100 km");
+    let position_m = [metres(0)?, metres(1)?, metres(2)?];
+    let yaw_rad = row.number(3, -360.0..=360.0, "degrees within a turn")?.to_radians();
+    let confidence = row.number(4, 0.0..=1.0, "0 to 1")? as f32;
     Ok(TableRow::Pose { error: PlanarError { position_m, yaw_rad }, confidence })
 }
 

@@ -1,41 +1,32 @@
 //! Poses that were found once, one row per sweep, on disk and by name.
 
 use std::collections::HashMap;
-use std::fmt::Write as _;
 use std::fs::OpenOptions;
 use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 
 use protocol::{CavId, NoPoseReason, Pose, PoseEstimate};
 use serde::{Deserialize, Serialize};
-use support::bounded_file;
+use support::csv_file::{CsvError, CsvFile, CsvRow, CsvText};
 
 /// The first line of a table.
 const HEADER: &str = "scenario,cav,capture_nanos,x_m,y_m,z_m,qw,qx,qy,qz,confidence,no_pose,inliers";
-const COLUMNS: usize = 13;
 /// Largest file that is read, bytes: two million sweeps.
 const MAX_BYTES: u64 = 256 << 20;
 
 /// Why a table of poses cannot be read or written.
 #[derive(Debug, thiserror::Error)]
 pub enum PoseTableError {
-    /// The system refused.
+    /// The file or a row of it cannot be used.
+    #[error(transparent)]
+    Csv(#[from] CsvError),
+    /// The file cannot be written.
     #[error("{}: {source}", path.display())]
-    Io {
+    Write {
         /// The file.
         path: PathBuf,
-        /// What the system said.
+        /// The system's reason.
         source: io::Error,
-    },
-    /// A line is no row of a table.
-    #[error("{}:{line}: {problem}", path.display())]
-    Line {
-        /// The file.
-        path: PathBuf,
-        /// Line number, from 1.
-        line: usize,
-        /// What is wrong with it.
-        problem: String,
     },
     /// A scenario that was asked for has no row.
     #[error("{}: there is no pose of scenario {scenario} in it", path.display())]
@@ -85,21 +76,12 @@ impl PoseTable {
     /// # Errors
     /// [`PoseTableError`] names the file and the line.
     pub fn read(path: &Path) -> Result<Self, PoseTableError> {
-        let text = bounded_file::read_text(path, MAX_BYTES)
-            .map_err(|source| PoseTableError::Io { path: path.to_owned(), source })?;
-        let at = |line, problem| PoseTableError::Line { path: path.to_owned(), line, problem };
-        let mut lines = text.lines().enumerate();
-        let header = lines.next().map_or("", |(_, line)| line);
-        if header.trim() != HEADER {
-            let found: String = header.chars().take(80).collect();
-            return Err(at(1, format!("header is {found:?}, must be {HEADER:?}")));
-        }
         let mut table = Self { path: path.to_owned(), ..Self::default() };
-        for (index, line) in lines.filter(|(_, line)| !line.trim().is_empty()) {
-            let (scenario, sweep, estimate) = parse(line.trim()).map_err(|problem| at(index + 1, problem))?;
-            let of_scenario = table.scenarios.entry(scenario).or_default();
-            if of_scenario.insert(sweep, estimate).is_some() {
-                return Err(at(index + 1, "the sweep has a row already".into()));
+        for row in CsvFile::read(path, HEADER, MAX_BYTES)?.rows() {
+            let row = row.complete()?;
+            let of_scenario = table.scenarios.entry(row.field(0).to_owned()).or_default();
+            if of_scenario.insert(sweep_key(&row)?, estimate(&row)?).is_some() {
+                return Err(row.fault("the sweep has a row already").into());
             }
         }
         Ok(table)
@@ -132,12 +114,13 @@ impl PoseTable {
     /// Appends the rows of a scenario to a file, which gets its header where it is new.
     ///
     /// # Errors
-    /// [`PoseTableError::Io`] when the file cannot be written.
+    /// [`PoseTableError::Write`] when the file cannot be written.
     pub fn append(path: &Path, scenario: &str, rows: &[PoseRow<'_>]) -> Result<(), PoseTableError> {
-        let mut text = if path.exists() { String::new() } else { format!("{HEADER}\n") };
-        rows.iter().for_each(|row| write_row(&mut text, last_part(scenario), row));
+        let mut text = if path.exists() { CsvText::headless() } else { CsvText::new(HEADER) };
+        rows.iter().for_each(|row| text.row(fields(last_part(scenario), row)));
+        let text = text.finish();
         let append = |path: &Path| OpenOptions::new().create(true).append(true).open(path)?.write_all(text.as_bytes());
-        append(path).map_err(|source| PoseTableError::Io { path: path.to_owned(), source })
+        append(path).map_err(|source| PoseTableError::Write { path: path.to_owned(), source })
     }
 
     /// The poses of one scenario: the one asked for, or the only one there is.
@@ -196,54 +179,48 @@ fn last_part(scenario: &str) -> &str {
     scenario.rsplit('/').next().unwrap_or(scenario)
 }
 
-fn write_row(text: &mut String, scenario: &str, row: &PoseRow<'_>) {
+fn fields(scenario: &str, row: &PoseRow<'_>) -> [String; 13] {
     let PoseRow { cav, capture_nanos, estimate } = row;
-    // Writing to a string cannot fail.
-    let _ = write!(text, "{scenario},{cav},{capture_nanos},");
-    let _ = match estimate {
+    let mut fields: [String; 13] = Default::default();
+    fields[..3].clone_from_slice(&[scenario.to_owned(), cav.to_string(), capture_nanos.to_string()]);
+    match estimate {
         PoseEstimate::Pose { world_from_cav: Pose { translation_m, rotation_wxyz }, confidence } => {
-            let [x, y, z] = translation_m;
-            let [qw, qx, qy, qz] = rotation_wxyz;
-            writeln!(text, "{x:.5},{y:.5},{z:.5},{qw:.9},{qx:.9},{qy:.9},{qz:.9},{confidence:.6},,")
+            fields[3..6].clone_from_slice(&translation_m.map(|metres| format!("{metres:.5}")));
+            fields[6..10].clone_from_slice(&rotation_wxyz.map(|part| format!("{part:.9}")));
+            fields[10] = format!("{confidence:.6}");
         }
         PoseEstimate::NoPose { reason, inlier_count } => {
             let reason = serde_json::to_value(reason).ok();
-            let reason = reason.as_ref().and_then(serde_json::Value::as_str).unwrap_or_default();
-            writeln!(text, ",,,,,,,,{reason},{inlier_count}")
+            fields[11] = reason.as_ref().and_then(serde_json::Value::as_str).unwrap_or_default().to_owned();
+            fields[12] = inlier_count.to_string();
         }
-    };
-}
-
-fn parse(line: &str) -> Result<(String, SweepKey, PoseEstimate), String> {
-    let columns: Vec<&str> = line.split(',').map(str::trim).collect();
-    if columns.len() != COLUMNS {
-        return Err(format!("{} columns, must be {COLUMNS}", columns.len()));
     }
-    let cav = CavId::new(columns[1]).map_err(|error| format!("cav: {error}"))?;
-    let capture_nanos = columns[2].parse().map_err(|_| format!("capture_nanos is {:?}", columns[2]))?;
-    let estimate = if columns[11].is_empty() { pose(&columns[3..11])? } else { no_pose(columns[11], columns[12])? };
-    Ok((columns[0].to_owned(), (cav, capture_nanos), estimate))
+    fields
 }
 
-fn pose(columns: &[&str]) -> Result<PoseEstimate, String> {
-    let number = |column: usize| {
-        columns[column].parse::<f64>().map_err(|_| format!("{:?} is no number of a pose", columns[column]))
-    };
-    let translation_m = [number(0)?, number(1)?, number(2)?];
-    let rotation_wxyz = [number(3)?, number(4)?, number(5)?, number(6)?];
+fn sweep_key(row: &CsvRow<'_>) -> Result<SweepKey, CsvError> {
+    let cav = CavId::new(row.field(1)).map_err(|error| row.fault(format_args!("cav: {error}")))?;
+    Ok((cav, row.field(2).parse().map_err(|_| row.wrong(2, "whole nanoseconds"))?))
+}
+
+fn estimate(row: &CsvRow<'_>) -> Result<PoseEstimate, CsvError> {
+    if row.field(11).is_empty() { pose(row) } else { no_pose(row) }
+}
+
+fn pose(row: &CsvRow<'_>) -> Result<PoseEstimate, CsvError> {
+    let number = |column| row.number(column, f64::MIN..=f64::MAX, "a finite number");
+    let translation_m = [number(3)?, number(4)?, number(5)?];
+    let rotation_wxyz = [number(6)?, number(7)?, number(8)?, number(9)?];
     let world_from_cav = Pose { translation_m, rotation_wxyz };
-    world_from_cav.validate().map_err(|error| error.to_string())?;
-    let confidence = number(7)?;
-    if !(0.0..=1.0).contains(&confidence) {
-        return Err(format!("confidence is {confidence}, must be 0 to 1"));
-    }
+    world_from_cav.validate().map_err(|error| row.fault(error))?;
+    let confidence = row.number(10, 0.0..=1.0, "0 to 1")?;
     Ok(PoseEstimate::new(world_from_cav, confidence as f32))
 }
 
-fn no_pose(reason: &str, inliers: &str) -> Result<PoseEstimate, String> {
-    let reason: NoPoseReason = serde_json::from_value(serde_json::Value::String(reason.to_owned()))
-        .map_err(|_| format!("no_pose is {reason:?}, which is no reason"))?;
-    let inlier_count = inliers.parse().map_err(|_| format!("inliers is {inliers:?}"))?;
+fn no_pose(row: &CsvRow<'_>) -> Result<PoseEstimate, CsvError> {
+    let reason: NoPoseReason = serde_json::from_value(serde_json::Value::String(row.field(11).to_owned()))
+        .map_err(|_| row.wrong(11, "a reason for no pose"))?;
+    let inlier_count = row.field(12).parse().map_err(|_| row.wrong(12, "a count"))?;
     Ok(PoseEstimate::NoPose { reason, inlier_count })
 }
 
@@ -303,7 +280,7 @@ mod tests {
             ("a,b\n".to_owned(), "poses.csv:1"),
             (format!("{HEADER}\n{good}\n{good}\n"), "poses.csv:3: the sweep has a row already"),
             (format!("{HEADER}\ns,a,1,0\n"), "4 columns"),
-            (format!("{HEADER}\ns,a,1,0,0,0,1,0,0,0,1.5,,\n"), "confidence is 1.5"),
+            (format!("{HEADER}\ns,a,1,0,0,0,1,0,0,0,1.5,,\n"), "confidence is \"1.5\", must be 0 to 1"),
             (format!("{HEADER}\ns,a,1,0,0,NaN,1,0,0,0,0.5,,\n"), "poses.csv:2"),
             (format!("{HEADER}\ns,a,1,0,0,0,9,0,0,0,0.5,,\n"), "poses.csv:2"),
             (format!("{HEADER}\ns,a,1,,,,,,,,,tired,0\n"), "tired"),

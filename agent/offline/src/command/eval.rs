@@ -11,7 +11,6 @@ use agent_offline::icp_map::{IcpMapPose, read_map};
 use anyhow::Context;
 use clap::ValueEnum;
 use dataset::LeftOut;
-use figures::chart;
 use indicatif::{ProgressBar, ProgressStyle};
 use localization::competitors::EndToEndLocalizer;
 use localization::pgc::confidence::{CONFIDENCE_KEY, Confidence, ConfidenceModel, FitReport, check_good_loss};
@@ -24,10 +23,11 @@ use localization::registration::sc2pcr::Sc2PcrConfig;
 use perception::train::cuda_device;
 use perception::weights::annotate;
 use support::output;
+use support::progress;
 use tch::Device;
 
 use super::scene_heads::{TownHead, by_head};
-use crate::cli::{BadInput, Outcome};
+use support::cli::{BadInput, Outcome};
 
 /// Localise recorded sweeps and compare with their true poses.
 #[derive(Debug, clap::Args)]
@@ -132,11 +132,11 @@ enum Subject {
 /// Localises, fits, writes and prints.
 pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     tch::set_num_threads(i32::from(args.threads));
-    check_good_loss(args.good_loss).map_err(|error| BadInput(anyhow::anyhow!("--good-loss: {error}")))?;
+    check_good_loss(args.good_loss).map_err(|error| BadInput::new(format!("--good-loss: {error}")))?;
     let groups = by_head(&args.head, &args.scene)?;
     if args.fit_confidence && groups.len() > 1 {
         let count = groups.len();
-        return Err(BadInput(anyhow::anyhow!("--fit-confidence fits one head, and {count} are asked for")).into());
+        return Err(BadInput::new(format!("--fit-confidence fits one head, and {count} are asked for")).into());
     }
     let (mut sweeps, mut left_out) = (Vec::new(), LeftOut::default());
     for (head, scenes) in &groups {
@@ -155,7 +155,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     } else {
         output::text(table(&summary))?;
     }
-    Ok(Outcome::of(&left_out))
+    Ok(left_out.print())
 }
 
 impl Args {
@@ -163,15 +163,15 @@ impl Args {
         if self.icp_map.is_empty() {
             let device = match self.device {
                 ComputeOn::Cpu => Device::Cpu,
-                ComputeOn::Cuda => cuda_device().map_err(|error| BadInput(error.into()))?,
+                ComputeOn::Cuda => cuda_device().map_err(BadInput::of)?,
             };
-            return Ok(Subject::Localizer(self.localizer(head, device).map_err(|error| BadInput(error.into()))?));
+            return Ok(Subject::Localizer(self.localizer(head, device).map_err(BadInput::of)?));
         }
         if !self.map_spacing.is_finite() || self.map_spacing < 0.0 {
-            return Err(BadInput(anyhow::anyhow!("--map-spacing is {}, must be 0 or more", self.map_spacing)));
+            return Err(BadInput::new(format!("--map-spacing is {}, must be 0 or more", self.map_spacing)));
         }
         let config = IcpConfig::default();
-        let map = read_map(&self.icp_map, self.map_spacing, &config).map_err(|error| BadInput(error.into()))?;
+        let map = read_map(&self.icp_map, self.map_spacing, &config).map_err(BadInput::of)?;
         Ok(Subject::Source(Box::new(IcpMapPose::new(Arc::new(map), config))))
     }
 
@@ -204,8 +204,7 @@ impl Args {
             every: count(self.every),
             sweeps: self.sweeps.map(count),
         };
-        let bar =
-            ProgressBar::new(0).with_style(ProgressStyle::with_template("{bar:30} {pos}/{len} sweeps  {eta} left")?);
+        let bar = progress::bar(0, "sweeps");
         let mut on_sweep = |done, all| {
             bar.set_length(all as u64);
             bar.set_position(done as u64);
@@ -218,14 +217,13 @@ impl Args {
         match evaluated {
             Ok(evaluated) => Ok(evaluated),
             Err(error @ EvaluationError::Localizer(_)) => Err(error.into()),
-            Err(error) => Err(BadInput(error.into()).into()),
+            Err(error) => Err(BadInput::of(error).into()),
         }
     }
 
     fn fit(&self, head: &Path, sweeps: &mut [EvaluatedSweep]) -> anyhow::Result<FitReport> {
         let labelled: Vec<_> = sweeps.iter().filter_map(EvaluatedSweep::labelled).collect();
-        let (model, report) =
-            ConfidenceModel::fit(&labelled, self.good_loss).map_err(|error| BadInput(error.into()))?;
+        let (model, report) = ConfidenceModel::fit(&labelled, self.good_loss).map_err(BadInput::of)?;
         let sha256 = annotate(head, CONFIDENCE_KEY, &serde_json::to_string(&model)?)?;
         output::note(format_args!("{}: confidence written, SHA-256 is now {sha256}", head.display()));
         let confidence = Confidence::Calibrated(model);
@@ -242,7 +240,7 @@ impl Args {
             write_error_table(path, sweeps).with_context(|| writing(path))?;
         }
         if let Some(path) = &self.plot {
-            chart::save(&reliability_charts(sweeps), path).with_context(|| writing(path))?;
+            figures::save_png(&reliability_charts(sweeps), path)?;
         }
         Ok(())
     }

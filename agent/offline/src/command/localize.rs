@@ -3,14 +3,15 @@
 use std::path::{Path, PathBuf};
 
 use dataset::{self, LeftOut, LoadOptions, Problem, Scenario};
-use indicatif::{ProgressBar, ProgressStyle};
+use indicatif::ProgressBar;
 use localization::pose_source::motion_gate::SanityConfig;
 use localization::pose_source::{LocalizedPose, PgcConfig, PoseInput, PoseRow, PoseSource, PoseTable};
 use protocol::PoseEstimate;
 use support::output;
+use support::progress;
 
 use super::scene_heads::{TownHead, head_of};
-use crate::cli::{BadInput, Outcome};
+use support::cli::{BadInput, Outcome};
 
 /// Localise every sweep of scenes once and write poses and confidences as a table, for trainings and evaluations.
 ///
@@ -50,8 +51,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
         let scenes: Vec<String> = args.scene.iter().map(|scene| scene.display().to_string()).collect();
         return Err(bad(anyhow::anyhow!("there is no sweep in {}", scenes.join(", "))));
     }
-    let bar = ProgressBar::new(sweeps as u64)
-        .with_style(ProgressStyle::with_template("{bar:30} {pos}/{len} sweeps  {eta} left")?);
+    let bar = progress::bar(sweeps, "sweeps");
     let mut found = 0;
     let mut left_out = LeftOut::default();
     for (scenario, head) in scenarios.iter().zip(heads) {
@@ -63,7 +63,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
         done.len(),
         args.out.display()
     ))?;
-    Ok(Outcome::of(&left_out))
+    Ok(left_out.print())
 }
 
 impl Args {
@@ -105,5 +105,5 @@ fn frames(scenario: &Scenario) -> usize {
 }
 
 fn bad(error: impl Into<anyhow::Error>) -> anyhow::Error {
-    BadInput(error.into()).into()
+    BadInput::of(error).into()
 }

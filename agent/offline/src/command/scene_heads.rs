@@ -7,7 +7,7 @@ use anyhow::Context;
 use dataset::{self, Scenario};
 use serde::Deserialize;
 
-use crate::cli::BadInput;
+use support::cli::BadInput;
 
 /// A generated town: the name of its map and the seed of all that stands on it.
 #[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
@@ -47,15 +47,13 @@ pub(crate) fn head_of<'a>(heads: &'a [TownHead], scenario: &Scenario) -> Result<
     }
     if let Some(TownHead { weights, .. }) = heads.iter().find(|head| head.town.is_none()) {
         let (weights, count) = (weights.display(), heads.len());
-        return Err(BadInput(anyhow::anyhow!(
-            "--head {weights}: of {count} heads each needs its town, TOWN={weights}"
-        )));
+        return Err(BadInput::new(format!("--head {weights}: of {count} heads each needs its town, TOWN={weights}")));
     }
     let town =
-        town_of(scenario).with_context(|| format!("the town of scenario {}", scenario.name)).map_err(BadInput)?;
+        town_of(scenario).with_context(|| format!("the town of scenario {}", scenario.name)).map_err(BadInput::of)?;
     let head = heads.iter().find(|head| head.town.as_ref() == Some(&town));
     let Town { name, town_seed } = &town;
-    let missing = || BadInput(anyhow::anyhow!("{}: no --head for town {name}:{town_seed}", scenario.name));
+    let missing = || BadInput::new(format!("{}: no --head for town {name}:{town_seed}", scenario.name));
     Ok(&head.ok_or_else(missing)?.weights)
 }
 
@@ -72,12 +70,12 @@ pub(crate) fn by_head<'a>(
     }
     let mut groups: Vec<(&Path, Vec<PathBuf>)> = Vec::new();
     for folder in scenes {
-        let scenarios = dataset::open(folder).map_err(|error| BadInput(error.into()))?.scenarios;
+        let scenarios = dataset::open(folder).map_err(BadInput::of)?.scenarios;
         let needed = scenarios.iter().map(|scenario| head_of(heads, scenario)).collect::<Result<Vec<_>, _>>()?;
-        let missing = || BadInput(anyhow::anyhow!("{}: there is no scenario in it", folder.display()));
+        let missing = || BadInput::new(format!("{}: there is no scenario in it", folder.display()));
         let &head = needed.first().ok_or_else(missing)?;
         if needed.iter().any(|other| *other != head) {
-            return Err(BadInput(anyhow::anyhow!("{}: scenarios of several towns", folder.display())));
+            return Err(BadInput::new(format!("{}: scenarios of several towns", folder.display())));
         }
         match groups.iter_mut().find(|(of, _)| *of == head) {
             Some((_, folders)) => folders.push(folder.clone()),

@@ -4,11 +4,12 @@ use std::collections::BTreeMap;
 
 use protocol::PoseEstimate;
 use serde::Serialize;
+use support::statistics::{mean, median, quantile, sorted};
 
 use super::{EvaluatedSweep, outcome};
-use figures::chart::{Axis, Chart, Mark, Series};
+use figures::{Axis, Chart, Mark, Series};
 use localization::pgc::confidence::{BAD_M, observed};
-use localization::statistics::{mean, quantile, sorted, spearman};
+use localization::statistics::spearman;
 
 /// Groups of equally many sweeps that calibration is judged by.
 const BINS: usize = 10;
@@ -155,7 +156,7 @@ fn calibration(judged: &[Judged]) -> Vec<CalibrationBin> {
             poses: poses.len(),
             sigma: mean(&of(|pose| pose.sigma)).unwrap_or(0.0),
             observed: mean(&of(|pose| observed(pose.error_m))).unwrap_or(0.0),
-            p50_m: quantile(&sorted(&of(|pose| pose.error_m)), 0.5).unwrap_or(0.0),
+            p50_m: median(&of(|pose| pose.error_m)).unwrap_or(0.0),
             success_3m: mean(&of(|pose| f64::from(u8::from(pose.error_m < BAD_M)))).unwrap_or(0.0),
         }
     };
@@ -185,8 +186,7 @@ fn median_times(sweeps: &[EvaluatedSweep]) -> BTreeMap<String, f64> {
         }
         add("total", stages.total().as_secs_f64() * 1e3);
     }
-    let median = |ms: Vec<f64>| quantile(&sorted(&ms), 0.5).unwrap_or(0.0);
-    times.into_iter().map(|(stage, ms)| (stage, median(ms))).collect()
+    times.into_iter().map(|(stage, ms)| (stage, median(&ms).unwrap_or(0.0))).collect()
 }
 
 /// The reliability curve, and every pose by sigma and error.

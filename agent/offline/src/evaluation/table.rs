@@ -1,13 +1,14 @@
 //! Every sweep of an evaluation as a row of text.
 
-use std::fmt::Write as _;
 use std::fs;
 use std::io;
 use std::path::Path;
 
 use protocol::{Pose, PoseEstimate};
+use support::csv_file::CsvText;
 
 use super::{EvaluatedSweep, outcome};
+use localization::pgc::PoseEvidence;
 
 const HEADER: &str = "scenario,cav,frame,true_x_m,true_y_m,true_z_m,true_yaw_deg,x_m,y_m,z_m,yaw_deg,error_m,error_deg,\
     sigma,outcome,cells,inliers,inlier_ratio,rms_m,inlier_epsilon_m,median_epsilon_m,position_std_m,rotation_std_deg,\
@@ -30,72 +31,81 @@ pub fn write_error_table(path: &Path, sweeps: &[EvaluatedSweep]) -> io::Result<(
 }
 
 fn csv(sweeps: &[EvaluatedSweep]) -> String {
-    let mut text = format!("{HEADER}\n");
-    for sweep in sweeps {
-        let EvaluatedSweep { scenario, cav, stem, truth, localization } = sweep;
-        // Writing to a string cannot fail.
-        let _ = write!(text, "{scenario},{cav},{stem},{}", pose(truth));
-        match (&localization.found, sweep.error()) {
-            (Some(found), Some(error)) => {
-                let evidence = &found.evidence;
-                let _ = write!(
-                    text,
-                    ",{},{:.4},{:.4},{:.4},{},{},{},{:.4},{:.4},{:.4},{:.4},{:.4},{:.4}",
-                    pose(&found.world_from_sensor.into()),
-                    error.distance_m,
-                    error.angle_deg,
-                    found.sigma,
-                    outcome(&localization.estimate),
-                    evidence.cells,
-                    evidence.inliers,
-                    evidence.inlier_ratio,
-                    evidence.rms_m,
-                    evidence.inlier_epsilon_m,
-                    evidence.median_epsilon_m,
-                    evidence.position_std_m,
-                    evidence.rotation_std_rad.to_degrees(),
-                );
-                let _ = match &evidence.second {
-                    Some(second) => write!(
-                        text,
-                        ",{:.4},{:.4},{:.4},{:.4},{:.4},{:.3},{:.4}",
-                        second.inlier_ratio,
-                        second.rms_m,
-                        second.median_epsilon_m,
-                        second.moved_m,
-                        second.residual_quartile_m,
-                        second.information_per_m2,
-                        second.worst_axis_std_m
-                    ),
-                    None => write!(text, ",,,,,,,"),
-                };
-            }
-            _ => {
-                let _ = write!(text, ",,,,,,,,{},,,,,,,,,,,,,,,", outcome(&localization.estimate));
-            }
-        }
-        let _ = writeln!(text, ",{:.3}", localization.times.total().as_secs_f64() * 1e3);
-    }
-    text
+    let mut text = CsvText::new(HEADER);
+    sweeps.iter().for_each(|sweep| text.row(row(sweep)));
+    text.finish()
 }
 
-fn pose(pose: &Pose) -> String {
+fn row(sweep: &EvaluatedSweep) -> Vec<String> {
+    let EvaluatedSweep { scenario, cav, stem, truth, localization } = sweep;
+    let mut fields = vec![scenario.clone(), cav.to_string(), stem.clone()];
+    fields.extend(pose(truth));
+    let outcome = outcome(&localization.estimate).to_owned();
+    if let (Some(found), Some(error)) = (&localization.found, sweep.error()) {
+        fields.extend(pose(&found.world_from_sensor.into()));
+        fields.extend([error.distance_m, error.angle_deg, found.sigma].map(four));
+        fields.push(outcome);
+        fields.extend(evidence_fields(&found.evidence));
+    } else {
+        fields.resize(fields.len() + 7, String::new());
+        fields.push(outcome);
+        fields.resize(fields.len() + 15, String::new());
+    }
+    fields.push(format!("{:.3}", localization.times.total().as_secs_f64() * 1e3));
+    fields
+}
+
+fn evidence_fields(evidence: &PoseEvidence) -> Vec<String> {
+    let mut fields = vec![evidence.cells.to_string(), evidence.inliers.to_string()];
+    fields.extend(
+        [
+            evidence.inlier_ratio,
+            evidence.rms_m,
+            evidence.inlier_epsilon_m,
+            evidence.median_epsilon_m,
+            evidence.position_std_m,
+            evidence.rotation_std_rad.to_degrees(),
+        ]
+        .map(four),
+    );
+    let second = evidence.second.as_ref().map(|second| {
+        let [ratio, rms, epsilon, moved, quartile, worst] = [
+            second.inlier_ratio,
+            second.rms_m,
+            second.median_epsilon_m,
+            second.moved_m,
+            second.residual_quartile_m,
+            second.worst_axis_std_m,
+        ]
+        .map(four);
+        [ratio, rms, epsilon, moved, quartile, format!("{:.3}", second.information_per_m2), worst]
+    });
+    fields.extend(second.unwrap_or_default());
+    fields
+}
+
+fn four(value: f64) -> String {
+    format!("{value:.4}")
+}
+
+fn pose(pose: &Pose) -> [String; 4] {
     let [x, y, z] = pose.translation_m;
-    format!("{x:.4},{y:.4},{z:.4},{:.4}", pose.yaw_rad().to_degrees())
+    [x, y, z, pose.yaw_rad().to_degrees()].map(four)
 }
 
 fn error_table(sweeps: &[EvaluatedSweep]) -> String {
-    let mut text = String::from("x_m,y_m,z_m,yaw_deg,confidence\n");
+    let mut text = CsvText::new("x_m,y_m,z_m,yaw_deg,confidence");
     for sweep in sweeps {
-        let _ = match &sweep.localization.estimate {
+        match &sweep.localization.estimate {
             PoseEstimate::Pose { world_from_cav, confidence } => {
                 let error: Pose = sweep.truth.isometry().inv_mul(&world_from_cav.isometry()).into();
-                writeln!(text, "{},{confidence:.4}", pose(&error))
+                let [x, y, z, yaw] = pose(&error);
+                text.row([x, y, z, yaw, format!("{confidence:.4}")]);
             }
-            PoseEstimate::NoPose { .. } => writeln!(text, "no_pose"),
-        };
+            PoseEstimate::NoPose { .. } => text.row(["no_pose"]),
+        }
     }
-    text
+    text.finish()
 }
 
 #[cfg(test)]

@@ -1,6 +1,7 @@
 //! How good a head is, on cached features of sweeps it was not trained on.
 
 use serde::Serialize;
+use support::statistics;
 use tch::{Kind, Tensor, no_grad};
 
 use super::error::LocalizerTrainError;
@@ -45,7 +46,7 @@ pub(super) fn validate(
     let moved: [f32; 3] = std::array::from_fn(|axis| (cache.origin_m[axis] - origin[axis]) as f32);
     let targets = &cache.targets_m + Tensor::f_from_slice(&moved)?.f_to_device(cache.targets_m.device())?;
     let error = (&regression.coordinates_m - targets).f_abs()?.f_sum_dim_intlist(1_i64, false, Kind::Float)?;
-    let mut cell_errors: Vec<f64> = Vec::try_from(&error.f_to_kind(Kind::Double)?)?;
+    let cell_errors: Vec<f64> = Vec::try_from(&error.f_to_kind(Kind::Double)?)?;
     let world: Vec<f32> = Vec::try_from(&regression.coordinates_m.f_reshape([-1])?)?;
     let sensor: Vec<f32> = Vec::try_from(&cache.sensor_m.f_reshape([-1])?)?;
     let epsilon: Vec<f32> = Vec::try_from(&regression.epsilon_m)?;
@@ -79,18 +80,14 @@ pub(super) fn validate(
         |limit: f64| translations.iter().filter(|&&error| error < limit).count() as f64 / translations.len() as f64;
     let (success_3m, success_1m) = (share(3.0), share(1.0));
     Ok(SceneAccuracy {
-        cell_p50_m: median(&mut cell_errors),
-        pose_p50_m: median(&mut translations),
-        pose_p50_deg: median(&mut rotations),
+        cell_p50_m: median(&cell_errors),
+        pose_p50_m: median(&translations),
+        pose_p50_deg: median(&rotations),
         success_3m,
         success_1m,
     })
 }
 
-fn median(values: &mut [f64]) -> f64 {
-    if values.is_empty() {
-        return f64::NAN;
-    }
-    let middle = values.len() / 2;
-    *values.select_nth_unstable_by(middle, f64::total_cmp).1
+fn median(values: &[f64]) -> f64 {
+    statistics::median(values).unwrap_or(f64::NAN)
 }

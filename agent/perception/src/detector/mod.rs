@@ -4,15 +4,15 @@ mod error;
 mod output;
 
 use std::path::Path;
-use std::time::{Duration, Instant};
 
 use protocol::message::ModelHash;
 use protocol::{BevFeatures, BevGrid, DecodedFeatures, PointCloud};
+use support::stage_times::StageTimes;
 use tch::nn::VarStore;
 use tch::{Device, Kind, Tensor};
 
 pub use error::DetectorError;
-pub use output::{EncodeTimes, Encoded, Heads};
+pub use output::{Encoded, Heads};
 
 use output::flat;
 
@@ -168,19 +168,19 @@ impl Detector {
     }
 
     fn encode_within(&mut self, crop: &Crop, cloud: &PointCloud) -> Result<Encoded, DetectorError> {
-        let mut clock = StageClock::start();
+        let mut times = StageTimes::start();
         self.cropped.clear();
         crop.keep(&cloud.xyzi, &mut self.cropped);
         if self.config.y_axis == YAxis::Right {
             self.cropped.iter_mut().for_each(|point| point[1] = -point[1]);
         }
         let pillars = self.voxeliser.voxelise(&self.cropped);
-        let voxelise = clock.lap();
+        times.lap("voxelise");
         self.canvas.fill(0.0);
         self.projection.scatter(&pillars, &self.lattice, &mut self.canvas);
         let (height, width) = (self.lattice.height as i64, self.lattice.width as i64);
         let canvas = Tensor::f_from_slice(&self.canvas)?.f_view([1, height, width, -1])?.f_permute([0, 3, 1, 2])?;
-        let pillar_time = clock.lap();
+        times.lap("pillars");
         let features = tch::no_grad(|| {
             let wide = self.backbone.forward(&canvas, false);
             match &self.shrink {
@@ -188,8 +188,8 @@ impl Detector {
                 None => wide.f_contiguous(),
             }
         })?;
-        let times = EncodeTimes { voxelise, pillars: pillar_time, backbone: clock.lap() };
-        Ok(Encoded { features, points: self.cropped.len(), pillars: pillars.len(), times })
+        times.lap("backbone");
+        Ok(Encoded { features, points: self.cropped.len(), pillars: pillars.len(), times: times.into_timings() })
     }
 
     /// The transmitted part of an encoded map `[1, C, H, W]`: the compressor's code `[1, C / ratio, H, W]`; the map itself where
@@ -302,22 +302,6 @@ fn one_map(features: &Tensor, expected: [i64; 3]) -> Result<Tensor, DetectorErro
     let [channels, height, width] = expected;
     // One memory layout, or the same values would give other last bits.
     Ok(features.f_contiguous()?.f_view([1, channels, height, width])?)
-}
-
-/// Time from lap to lap.
-struct StageClock(Instant);
-
-impl StageClock {
-    fn start() -> Self {
-        Self(Instant::now())
-    }
-
-    fn lap(&mut self) -> Duration {
-        let now = Instant::now();
-        let lap = now - self.0;
-        self.0 = now;
-        lap
-    }
 }
 
 #[cfg(test)]

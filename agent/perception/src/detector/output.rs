@@ -1,22 +1,10 @@
 //! What a detector returns.
 
-use std::time::Duration;
-
+use protocol::StageTiming;
 use tch::{TchError, Tensor};
 
 use super::error::DetectorError;
 use crate::layers::head::HeadOutput;
-
-/// Time that each stage of [`Detector::encode`](super::Detector::encode) took.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
-pub struct EncodeTimes {
-    /// Crop and sorting into pillars.
-    pub voxelise: Duration,
-    /// Pillar features on the canvas.
-    pub pillars: Duration,
-    /// 2D convolutions.
-    pub backbone: Duration,
-}
 
 /// What the encoder makes of one sweep.
 #[derive(Debug)]
@@ -28,8 +16,8 @@ pub struct Encoded {
     pub points: usize,
     /// Pillars on them.
     pub pillars: usize,
-    /// Where the time went.
-    pub times: EncodeTimes,
+    /// Time of crop and sorting into pillars, pillar features, and 2D convolutions.
+    pub times: Vec<StageTiming>,
 }
 
 /// What the head makes of a map.

@@ -1,11 +1,11 @@
 //! A progress bar where somebody watches, else a line now and then.
 
 use std::cell::Cell;
-use std::io::IsTerminal;
 use std::time::{Duration, Instant};
 
-use indicatif::{ProgressBar, ProgressStyle};
+use indicatif::ProgressBar;
 use support::output;
+use support::progress;
 
 use super::run_config::Length;
 
@@ -13,8 +13,8 @@ use super::run_config::Length;
 const LINE_EVERY: Duration = Duration::from_secs(10);
 /// So long sweeps are encoded before it is foretold how long all of them take.
 const FORETOLD_AFTER: Duration = Duration::from_secs(3);
-/// Resolution of the bar.
-const TICKS: u64 = 10_000;
+/// Parts of the bar, of 1000 steps each.
+const PARTS: usize = 10;
 
 /// Shows on standard error how a training goes.
 #[derive(Debug)]
@@ -40,12 +40,8 @@ struct Encoding {
 
 impl Default for TrainingBar {
     fn default() -> Self {
-        let is_watched = std::io::stderr().is_terminal();
-        let bar = if is_watched { ProgressBar::new(TICKS) } else { ProgressBar::hidden() };
-        if let Ok(style) = ProgressStyle::with_template("{wide_bar} {percent}% {elapsed} eta {eta} {msg}") {
-            bar.set_style(style);
-        }
-        Self { bar, is_watched, last_line: Cell::new(None), encoding: Cell::new(None), length: None }
+        let bar = progress::percent_bar(PARTS);
+        Self { is_watched: !bar.is_hidden(), bar, last_line: Cell::new(None), encoding: Cell::new(None), length: None }
     }
 }
 
@@ -79,7 +75,7 @@ impl TrainingBar {
 
     fn show(&self, share_done: f64, remaining_s: Option<f64>, text: &str) {
         if self.is_watched {
-            self.bar.set_position((share_done * TICKS as f64) as u64);
+            self.bar.set_position((share_done * 1000.0 * PARTS as f64) as u64);
             self.bar.set_message(text.to_owned());
         } else if self.last_line.get().is_none_or(|last| last.elapsed() >= LINE_EVERY) {
             let to_go = remaining_s.map(|seconds| format!(", {seconds:.0} s to go")).unwrap_or_default();

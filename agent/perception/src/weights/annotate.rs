@@ -4,13 +4,13 @@ use std::collections::BTreeMap;
 use std::fs;
 use std::path::Path;
 
+use protocol::text::hex;
 use safetensors::tensor::SafeTensors;
 use serde_json::Value;
 use sha2::{Digest, Sha256};
 use support::atomic_file;
 
 use super::error::WeightsError;
-use super::hex;
 
 /// Key of the header that metadata lie under.
 const METADATA: &str = "__metadata__";

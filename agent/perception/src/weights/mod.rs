@@ -11,6 +11,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 use half::{bf16, f16};
+use protocol::text::hex;
 use safetensors::tensor::{Dtype, SafeTensors, TensorView};
 use serde::de::DeserializeOwned;
 use sha2::{Digest, Sha256};
@@ -224,10 +225,6 @@ fn check_finite(path: &Path, name: &str, values: &[f32]) -> Result<(), WeightsEr
             Err(WeightsError::NotFinite { path: path.to_owned(), name: name.to_owned(), index, value })
         }
     }
-}
-
-fn hex(digest: &[u8]) -> String {
-    digest.iter().map(|byte| format!("{byte:02x}")).collect()
 }
 
 #[cfg(test)]

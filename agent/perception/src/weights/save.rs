@@ -4,14 +4,15 @@ use std::collections::{BTreeMap, HashMap};
 use std::path::Path;
 
 use half::f16;
+use protocol::text::hex;
 use safetensors::tensor::{Dtype, TensorView};
 use sha2::{Digest, Sha256};
 use support::atomic_file;
 use tch::nn::VarStore;
 use tch::{Kind, Tensor};
 
+use super::check_finite;
 use super::error::WeightsError;
-use super::{check_finite, hex};
 
 /// How parameters lie on disk.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]

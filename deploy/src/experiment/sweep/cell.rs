@@ -14,6 +14,7 @@ use link::LinkConfig;
 use localization::pose_source::PoseSourceConfig;
 use perception::model_config::DetectorConfig;
 use perception::weights::Weights;
+use protocol::text::hex;
 use protocol::{Counts, DropReason, Dtype, Stream, Topic};
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
@@ -97,7 +98,7 @@ impl CellKey {
     pub fn file(&self, folder: &Path) -> PathBuf {
         let text = serde_json::to_string(self).unwrap_or_default();
         let digest = Sha256::digest(text.as_bytes());
-        let name: String = digest.iter().take(12).map(|byte| format!("{byte:02x}")).collect();
+        let name = hex(&digest[..12]);
         folder.join(format!("{}-{name}.json", self.point.method))
     }
 }

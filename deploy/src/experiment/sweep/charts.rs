@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use figures::chart::{Axis, Chart, Mark, Series};
+use figures::{Axis, Chart, Mark, Series};
 use fusion::Exchange;
 
 use super::cell::Cell;
@@ -147,7 +147,7 @@ fn chart(
         let decades = [low.log10().floor(), high.log10().ceil().max(low.log10().floor() + 1.0)];
         Axis::logarithmic(dimension.label, decades.map(|decade| 10f64.powf(decade)))
     } else {
-        Axis::linear(dimension.label, rounded(low, high, dimension.name == "bytes"))
+        Axis::linear(dimension.label, span(low, high, dimension.name == "bytes"))
     };
     let title = format!("{}: {title}", experiment.name);
     Some(Chart { title, x, y: Axis::linear("AP, ordered by score", [0.0, 1.0]), series })
@@ -172,13 +172,10 @@ fn line(name: String, points: Points) -> Series {
     Series { name, points, mark: Mark::LineAndDots }
 }
 
-/// Ends of an axis whose five steps read well; from 0 unless all values lie far from it.
-fn rounded(low: f64, high: f64, is_far_from_zero: bool) -> [f64; 2] {
+/// Ends of an axis: from 0 unless all values lie far from it, and wider than nothing.
+fn span(low: f64, high: f64, is_far_from_zero: bool) -> [f64; 2] {
     let from = if is_far_from_zero { low.floor() } else { 0.0 };
-    let step = ((high - from) / 5.0).max(1e-9);
-    let magnitude = 10f64.powf(step.log10().floor());
-    let nice = [1.0, 2.0, 2.5, 5.0, 10.0].into_iter().find(|nice| nice * magnitude >= step - 1e-12).unwrap_or(10.0);
-    [from, from + 5.0 * nice * magnitude]
+    [from, if high > from { high } else { from + 1.0 }]
 }
 
 #[cfg(test)]
@@ -186,14 +183,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn axes_end_where_they_read_well() {
-        for ((low, high), ends) in
-            [((0.0, 500.0), [0.0, 500.0]), ((0.0, 0.6), [0.0, 1.0]), ((1.0, 4.0), [0.0, 5.0]), ((0.0, 0.5), [0.0, 0.5])]
-        {
-            let found = rounded(low, high, false);
-            assert!((found[1] - ends[1]).abs() < 1e-9 && found[0] == 0.0, "{low} {high}: {found:?}");
-        }
-        assert_eq!(rounded(14.3, 20.9, true), [14.0, 24.0]);
+    fn axes_begin_at_zero_unless_all_values_are_far_from_it() {
+        assert_eq!([span(100.0, 500.0, false), span(0.0, 0.0, false)], [[0.0, 500.0], [0.0, 1.0]]);
+        assert_eq!(span(14.3, 20.9, true), [14.0, 20.9]);
     }
 
     #[test]

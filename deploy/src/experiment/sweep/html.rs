@@ -2,10 +2,7 @@
 
 use std::fmt::Write as _;
 
-use figures::chart_svg::{self, escaped};
-
 use super::cell::Cell;
-use super::charts::Figure;
 use super::spec::Experiment;
 use super::table::{NOTES, rows};
 
@@ -15,9 +12,9 @@ const STYLE: &str = "body{font:16px/1.5 system-ui,sans-serif;margin:2rem auto;ma
     th,td{padding:.2rem .6rem;text-align:right;border-bottom:1px solid #e2e5ea}th{position:sticky;top:0;background:#fff}\
     pre{background:#f5f6f8;padding:1rem;overflow-x:auto;font-size:.85rem}dt{font-weight:600}dd{margin:0 0 .4rem 1rem}";
 
-/// The page of an experiment, whose file says `spec`.
+/// The page of an experiment, whose file says `spec`, with the SVG of its figures.
 // Writing to a string cannot fail.
-pub(super) fn page(experiment: &Experiment, spec: &str, cells: &[Cell], figures: &[Figure]) -> String {
+pub(super) fn page(experiment: &Experiment, spec: &str, cells: &[Cell], figures: &[String]) -> String {
     let title = if experiment.title.is_empty() { &experiment.name } else { &experiment.title };
     let mut page = format!(
         "<!doctype html>\n<html lang=\"en\"><head><meta charset=\"utf-8\">\n\
@@ -34,7 +31,7 @@ pub(super) fn page(experiment: &Experiment, spec: &str, cells: &[Cell], figures:
         escaped(&experiment.name)
     );
     for figure in figures {
-        let _ = writeln!(page, "<figure>{}</figure>", chart_svg::text(&figure.charts));
+        let _ = writeln!(page, "<figure>{figure}</figure>");
     }
     let (columns, lines) = rows(experiment, cells);
     let cells_of = |tag: &str, fields: &mut dyn Iterator<Item = String>| {
@@ -56,6 +53,11 @@ pub(super) fn page(experiment: &Experiment, spec: &str, cells: &[Cell], figures:
     }
     let _ = writeln!(page, "</ul>\n<h2>Experiment</h2>\n<pre>{}</pre>\n</body></html>", escaped(spec));
     page
+}
+
+/// Text that means itself inside of markup.
+fn escaped(text: &str) -> String {
+    text.replace('&', "&amp;").replace('<', "&lt;").replace('>', "&gt;").replace('"', "&quot;")
 }
 
 /// Program, data and weights, each once.

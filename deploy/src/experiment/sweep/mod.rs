@@ -19,11 +19,13 @@ use std::time::Instant;
 
 use dataset::{self, LeftOut, ReadError, Scenario};
 use ego_fuser_offline::evaluation::EvaluateError;
+use figures;
+use figures::FigureError;
 use fusion::Exchange;
-use indicatif::{ProgressBar, ProgressStyle};
 use link::LinkError;
 use simulator::generate::{self, Subset, SynthError, SynthOptions};
 use support::output;
+use support::progress;
 use training::feature_store::FeatureStore;
 
 pub use cell::{Cell, CellKey, MessageCounts};
@@ -84,8 +86,8 @@ pub enum SweepError {
     #[error("a worker has failed: {0}")]
     Worker(String),
     /// A chart cannot be drawn.
-    #[error("charts: {0}")]
-    Chart(String),
+    #[error(transparent)]
+    Chart(#[from] FigureError),
 }
 
 impl SweepError {
@@ -227,7 +229,7 @@ impl Sweep {
         for file in files {
             let refused = |error: EvaluateError| SweepError::Evaluation(Box::new(error.into()));
             let weights = perception::weights::Weights::load(&file).map_err(|error| refused(error.into()))?;
-            let bar = progress("{bar:30} {pos}/{len} sweeps encoded  {eta} left", 0);
+            let bar = progress::bar(0, "sweeps encoded");
             let kept = cell::kept_maps(&self.experiment, &self.maps());
             let store = FeatureStore::open(&kept, &weights, &self.all, &mut |stored, all| {
                 bar.set_length(all as u64);
@@ -240,7 +242,7 @@ impl Sweep {
     }
 
     fn compute(&self, missing: &[usize], jobs: usize) -> Result<(), SweepError> {
-        let bar = progress("{bar:30} {pos}/{len} frames  {msg}  {eta} left", missing.len() * self.frames());
+        let bar = progress::bar(missing.len() * self.frames(), "frames");
         let done = std::sync::atomic::AtomicUsize::new(0);
         let on_done = || {
             let done = 1 + done.fetch_add(1, std::sync::atomic::Ordering::Relaxed);
@@ -302,15 +304,16 @@ impl Sweep {
             fs::write(&path, text).map_err(|source| SweepError::Io { path, source })
         };
         write(&format!("{}.csv", self.experiment.name), &text)?;
-        let figures = charts::figures(&self.experiment, cells);
-        for figure in &figures {
-            write(&format!("{}.svg", figure.name), &figures::chart_svg::text(&figure.charts))?;
-            figures::chart::save(&figure.charts, &self.out.join(format!("{}.png", figure.name)))
-                .map_err(|error| SweepError::Chart(error.to_string()))?;
+        let mut drawings = Vec::new();
+        for figure in charts::figures(&self.experiment, cells) {
+            let svg = figures::svg(&figure.charts)?;
+            write(&format!("{}.svg", figure.name), &svg)?;
+            drawings.push(svg);
+            figures::save_png(&figure.charts, &self.out.join(format!("{}.png", figure.name)))?;
         }
         let spec =
             fs::read_to_string(&self.file).map_err(|source| SweepError::Io { path: self.file.clone(), source })?;
-        write("report.html", &html::page(&self.experiment, &spec, cells, &figures))?;
+        write("report.html", &html::page(&self.experiment, &spec, cells, &drawings))?;
         Ok(text)
     }
 }
@@ -329,14 +332,9 @@ fn generate(experiment: &Experiment) -> Result<(), SweepError> {
         return Ok(());
     }
     output::note(format_args!("generating {} scenarios into {}", generate.scenarios, experiment.dataset.display()));
-    let bar = progress("{bar:30} {percent} %  {eta} left", 1000 * options.scenarios());
+    let bar = progress::percent_bar(options.scenarios());
     let generated = generate::generate_whole(&options, &|thousandths| bar.set_position(thousandths));
     bar.finish_and_clear();
     generated?;
     Ok(())
-}
-
-fn progress(template: &str, length: usize) -> ProgressBar {
-    let style = ProgressStyle::with_template(template).unwrap_or_else(|_| ProgressStyle::default_bar());
-    ProgressBar::new(length as u64).with_style(style)
 }

@@ -2,6 +2,7 @@
 
 use fusion::Exchange;
 use protocol::DropReason;
+use support::csv_file::CsvText;
 
 use super::cell::Cell;
 use super::spec::Experiment;
@@ -51,12 +52,9 @@ pub(super) const NOTES: &[(&str, &str)] = &[
 /// The whole table.
 #[must_use]
 pub fn csv(experiment: &Experiment, cells: &[Cell]) -> String {
-    let mut text = format!("{COLUMNS}\n");
-    for cell in cells {
-        text += &line(experiment, cell).join(",");
-        text.push('\n');
-    }
-    text
+    let mut text = CsvText::new(COLUMNS);
+    cells.iter().for_each(|cell| text.row(line(experiment, cell)));
+    text.finish()
 }
 
 /// The names of the columns, and the fields of each line.

@@ -8,6 +8,7 @@ use dataset::evaluation_protocol::ProtocolConfig;
 use ego_fuser::misbehaviour::TrustConfig;
 use fusion::Method;
 use localization::pose_source::PoseSourceConfig;
+use protocol::text::hex;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 use support::atomic_file;
@@ -75,7 +76,7 @@ impl CellKey {
     pub(super) fn file(&self, folder: &Path) -> PathBuf {
         let text = serde_json::to_string(self).unwrap_or_default();
         let digest = Sha256::digest(text.as_bytes());
-        let name: String = digest.iter().take(12).map(|byte| format!("{byte:02x}")).collect();
+        let name = hex(&digest[..12]);
         folder.join(format!("{}-{name}.json", self.method))
     }
 }

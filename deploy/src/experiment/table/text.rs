@@ -3,6 +3,8 @@
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
 
+use support::csv_file::CsvText;
+
 use super::{Cell, FilledRow, FilledTable};
 use crate::experiment::metrics::ByIou;
 
@@ -69,44 +71,33 @@ fn provenance(table: &FilledTable) -> String {
 /// A line per cell and training.
 #[must_use]
 pub fn csv(table: &FilledTable) -> String {
-    let mut text = String::from(
+    let mut text = CsvText::new(
         "table,row,column,training,method,poses,delay_ms,frames,ap_global_30,ap_global_50,ap_global_70,ap_frame_30,\
          ap_frame_50,ap_frame_70,payload_bytes_mean,log2_payload,pose_mean_m,pose_p95_m,no_pose,commit,weights_sha256,\
-         data_sha256\n",
+         data_sha256",
     );
     for FilledRow { label, cells } in &table.rows {
         for (column, trainings) in table.columns.iter().zip(cells) {
             for (training, cell) in trainings.iter().enumerate() {
-                let Cell { key, metrics, commit, .. } = cell;
-                let [global, frame] = [metrics.ap_global, metrics.ap_frame_order].map(|ap| {
-                    let ByIou { at_30, at_50, at_70 } = ap;
-                    [at_30, at_50, at_70].map(plain).join(",")
-                });
-                let numbers = [
-                    metrics.comm.payload_bytes_mean,
-                    metrics.comm.log2_payload,
-                    metrics.pose.mean_m,
-                    metrics.pose.p95_m,
-                ];
-                let _ = writeln!(
-                    text,
-                    "{},{},{},{training},{},{},{},{},{global},{frame},{},{},{commit},{},{}",
-                    quoted(&table.name),
-                    quoted(label),
-                    quoted(column),
-                    key.method,
-                    key.poses.name(),
-                    key.delay_ms,
-                    metrics.frames,
-                    numbers.map(plain).join(","),
-                    metrics.pose.no_pose,
-                    key.weights_sha256,
-                    key.data_sha256,
-                );
+                let place = [table.name.clone(), label.clone(), column.clone(), training.to_string()];
+                text.row(place.into_iter().chain(cell_fields(cell)));
             }
         }
     }
-    text
+    text.finish()
+}
+
+fn cell_fields(cell: &Cell) -> Vec<String> {
+    let Cell { key, metrics, commit, .. } = cell;
+    let mut fields = vec![key.method.to_string(), key.poses.name().to_owned(), key.delay_ms.to_string()];
+    fields.push(metrics.frames.to_string());
+    for ByIou { at_30, at_50, at_70 } in [metrics.ap_global, metrics.ap_frame_order] {
+        fields.extend([at_30, at_50, at_70].map(plain));
+    }
+    let (comm, pose) = (&metrics.comm, &metrics.pose);
+    fields.extend([comm.payload_bytes_mean, comm.log2_payload, pose.mean_m, pose.p95_m].map(plain));
+    fields.extend([pose.no_pose.to_string(), commit.clone(), key.weights_sha256.clone(), key.data_sha256.clone()]);
+    fields
 }
 
 /// Mean over trainings, and their standard deviation where there are several.
@@ -136,11 +127,6 @@ fn precision(cells: &[Cell], of: impl Fn(&Cell) -> ByIou) -> String {
 
 fn plain(value: Option<f64>) -> String {
     value.map_or(String::new(), |value| format!("{value:.6}"))
-}
-
-/// A name between quotes where it needs them.
-fn quoted(name: &str) -> String {
-    if name.contains([',', '"', '\n']) { format!("\"{}\"", name.replace('"', "\"\"")) } else { name.to_owned() }
 }
 
 #[cfg(test)]

@@ -4,6 +4,7 @@ use std::collections::BTreeMap;
 use std::fmt::Write as _;
 
 use serde::Serialize;
+use support::statistics::{mean, median};
 
 use super::compare::{AlignmentError, PairOutcome};
 
@@ -67,10 +68,8 @@ impl Tally {
         let within = |metres: f64| share(self.errors.iter().filter(|error| error.metres < metres).count());
         let bytes_mean = self.bytes / pairs.max(1) as f64;
         let of = |value: fn(&AlignmentError) -> f64| {
-            let mut values: Vec<f64> = self.errors.iter().map(value).collect();
-            values.sort_by(f64::total_cmp);
-            let mean = values.iter().sum::<f64>() / values.len().max(1) as f64;
-            (!values.is_empty()).then(|| (mean, values[values.len() / 2]))
+            let values: Vec<f64> = self.errors.iter().map(value).collect();
+            mean(&values).zip(median(&values))
         };
         let (metres, degrees) = (of(|error| error.metres), of(|error| error.degrees));
         Row {

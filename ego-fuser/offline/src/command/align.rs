@@ -17,8 +17,10 @@ use localization::registration::icp::IcpConfig;
 use perception::detector::Detector;
 use protocol::CavId;
 use support::output;
+use support::progress;
 
-use super::{BadInput, progress, scenarios};
+use super::scenarios;
+use support::cli::BadInput;
 
 /// Compares ways to align the ego and a neighbour: time per pair, bytes on the air, success.
 ///
@@ -147,10 +149,10 @@ impl Arguments {
 
     fn icp_map(&self) -> Result<Box<dyn Approach>> {
         if self.map.is_empty() || self.map_spacing.is_nan() || self.map_spacing < 0.0 {
-            return Err(BadInput("icp-map needs --map DIR, and a spacing that is not negative".into()).into());
+            return Err(BadInput::new("icp-map needs --map DIR, and a spacing that is not negative").into());
         }
         let config = IcpConfig::default();
-        let map = read_map(&self.map, self.map_spacing, &config).map_err(|error| BadInput(error.to_string()))?;
+        let map = read_map(&self.map, self.map_spacing, &config).map_err(BadInput::of)?;
         tracing::info!(planes = map.planes(), "map");
         let source = IcpMapPose::new(Arc::new(map), config);
         let build = move || Ok(Box::new(source.clone()) as Box<dyn PoseSource>);
@@ -162,9 +164,9 @@ impl Arguments {
             return Ok(BoxSource::Annotated);
         }
         let Some(weights) = &self.weights else {
-            return Err(BadInput("detected boxes need --weights FILE; or say --boxes annotated".into()).into());
+            return Err(BadInput::new("detected boxes need --weights FILE; or say --boxes annotated").into());
         };
-        let detector = Detector::load(weights).map_err(|error| BadInput(error.to_string()))?;
+        let detector = Detector::load(weights).map_err(BadInput::of)?;
         let cav = CavId::new("detector").context("a name")?;
         Ok(BoxSource::Detected(Box::new(Agent::new(cav, Box::new(RecordedPose), detector))))
     }
@@ -175,7 +177,7 @@ impl Arguments {
         boxes: &mut BoxSource,
         scenarios: &[Scenario],
     ) -> Result<Vec<Row>> {
-        let bar = progress("scenes", scenarios.len());
+        let bar = progress::bar(scenarios.len(), "scenes");
         let mut tallies = vec![Tally::default(); approaches.len()];
         for scenario in scenarios {
             let ticks = (0..scenario.ticks.len()).step_by(self.every as usize).take(self.frames.unwrap_or(usize::MAX));
@@ -189,7 +191,7 @@ impl Arguments {
 
 fn from_source(source: &NamedSource) -> Result<Box<dyn Approach>> {
     let NamedSource { name, file } = source;
-    let bad = |error: &dyn std::fmt::Display| BadInput(format!("{}: {error}", file.display()));
+    let bad = |error: &dyn std::fmt::Display| BadInput::new(format!("{}: {error}", file.display()));
     let text = std::fs::read_to_string(file).map_err(|error| bad(&error))?;
     let config: PoseSourceConfig = serde_saphyr::from_str(&text).map_err(|error| bad(&error))?;
     // Once in vain, so that a missing file is found before the first scene.

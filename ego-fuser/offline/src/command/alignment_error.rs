@@ -4,11 +4,13 @@ use std::path::PathBuf;
 
 use anyhow::Result;
 use dataset::IntensityScale;
-use ego_fuser_offline::alignment_error::{Offset, ResidualMeter};
+use ego_fuser_offline::alignment_error::{Offset, Residual, ResidualMeter};
 use perception::weights::Weights;
 use support::output;
+use support::text_table::{Side, TextTable};
 
-use super::{BadInput, scenarios};
+use super::scenarios;
+use support::cli::BadInput;
 
 /// Put offsets on the true poses of neighbours and measure how much of them the method's own alignment takes away.
 #[derive(Debug, clap::Args)]
@@ -45,29 +47,31 @@ impl Arguments {
         tch::set_num_threads(1);
         let is_sensible = |value: &f64| (0.0..=100.0).contains(value);
         if !self.shifts.iter().chain(&self.turns).all(is_sensible) {
-            return Err(BadInput("--shifts and --turns are 0 to 100".into()).into());
+            return Err(BadInput::new("--shifts and --turns are 0 to 100").into());
         }
         let shifts = self.shifts.iter().map(|&shift_m| Offset { shift_m, turn_deg: 0.0 });
         let turns = self.turns.iter().map(|&turn_deg| Offset { shift_m: 0.0, turn_deg });
         let offsets: Vec<Offset> = shifts.chain(turns).collect();
-        let weights = Weights::load(&self.weights).map_err(|error| BadInput(error.to_string()))?;
-        let mut meter = ResidualMeter::load(&weights).map_err(|error| BadInput(error.to_string()))?;
+        let weights = Weights::load(&self.weights).map_err(BadInput::of)?;
+        let mut meter = ResidualMeter::load(&weights).map_err(BadInput::of)?;
         let found = meter.measure(&scenarios(&self.data, self.intensity_scale)?, self.every, &offsets, self.seed)?;
         if self.json {
             output::line(serde_json::to_string_pretty(&found)?)?;
             return Ok(());
         }
-        output::line("offset        pairs  mean m before/after  median m before/after  mean degrees before/after")?;
-        for residual in found {
-            let Offset { shift_m, turn_deg } = residual.offset;
-            let [mean, median, angle] = [residual.mean_m, residual.p50_m, residual.mean_deg]
-                .map(|[before, after]| format!("{before:.3} / {after:.3}"));
-            output::line(format_args!(
-                "{:<13} {:>5}  {mean:>19}  {median:>21}  {angle:>25}",
-                format!("{shift_m} m {turn_deg} deg"),
-                residual.pairs
-            ))?;
-        }
+        output::text(table(&found))?;
         Ok(())
     }
+}
+
+fn table(found: &[Residual]) -> TextTable {
+    let right = ["pairs", "mean m before/after", "median m before/after", "mean degrees before/after"];
+    let mut table = TextTable::new([("offset", Side::Left)].into_iter().chain(right.map(|name| (name, Side::Right))));
+    for residual in found {
+        let Offset { shift_m, turn_deg } = residual.offset;
+        let [mean, median, angle] = [residual.mean_m, residual.p50_m, residual.mean_deg]
+            .map(|[before, after]| format!("{before:.3} / {after:.3}"));
+        table.row([format!("{shift_m} m {turn_deg} deg"), residual.pairs.to_string(), mean, median, angle]);
+    }
+    table
 }

@@ -16,10 +16,11 @@ use localization::pose_source::PoseSourceConfig;
 use perception::weights::{KIND_KEY, Weights};
 use protocol::CodecConfig;
 use serde_json::json;
+use support::cli::BadInput;
+use support::cli::Outcome;
 use support::output;
+use support::progress;
 use training::average_precision::{Ordering, Scorer, THRESHOLDS};
-
-use super::{BadInput, check_left_out, progress};
 
 /// A data set with the protocol that it is judged by.
 struct Data {
@@ -57,13 +58,13 @@ pub(crate) struct Arguments {
 
 impl Arguments {
     /// Evaluates and prints a line per method.
-    pub(crate) fn run(self) -> Result<()> {
+    pub(crate) fn run(self) -> Result<Outcome> {
         tch::set_num_threads(i32::from(self.threads.max(1)));
         let mut left_out = LeftOut::default();
         let data = self.open(&mut left_out)?;
         if kind_of(&self.weights)?.as_deref() == Some(MULTI_SCALE_KIND) {
             self.run_multi_scale(&data, &mut left_out)?;
-            return Ok(check_left_out(&left_out)?);
+            return Ok(print_left_out(&left_out));
         }
         let methods =
             if self.method.is_empty() { vec![None] } else { self.method.iter().map(|method| Some(*method)).collect() };
@@ -87,8 +88,17 @@ impl Arguments {
         if self.json {
             output::line(serde_json::to_string_pretty(&rows)?)?;
         }
-        Ok(check_left_out(&left_out)?)
+        Ok(print_left_out(&left_out))
     }
+}
+
+/// Prints the findings, and their counts where data are missing.
+fn print_left_out(left_out: &LeftOut) -> Outcome {
+    let outcome = left_out.print();
+    if outcome == Outcome::DataLost {
+        output::note(left_out);
+    }
+    outcome
 }
 
 impl Arguments {
@@ -96,10 +106,9 @@ impl Arguments {
     fn open(&self, left_out: &mut LeftOut) -> Result<Vec<Data>> {
         let options = OpenOptions { intensity_scale: self.intensity_scale, ..OpenOptions::default() };
         let open = |folder: &PathBuf| {
-            let Dataset { layout, scenarios, problems } =
-                dataset::open_with(folder, &options).map_err(|error| BadInput(error.to_string()))?;
+            let Dataset { layout, scenarios, problems } = dataset::open_with(folder, &options).map_err(BadInput::of)?;
             left_out.add_files(&problems);
-            let protocol = self.protocol.resolve(layout).map_err(BadInput)?;
+            let protocol = self.protocol.resolve(layout).map_err(BadInput::new)?;
             let scenarios = scenarios.iter().filter_map(|scenario| protocol.arrange(scenario)).collect();
             Ok(Data { protocol, scenarios })
         };
@@ -109,9 +118,9 @@ impl Arguments {
     /// A network that fuses at every level is one method of its own.
     fn run_multi_scale(&self, data: &[Data], left_out: &mut LeftOut) -> Result<()> {
         if !self.method.is_empty() {
-            return Err(BadInput("a multi-scale network has one method: leave --method out".to_owned()).into());
+            return Err(BadInput::new("a multi-scale network has one method: leave --method out").into());
         }
-        let mut detector = OfflineDetector::load(&self.weights).map_err(|error| BadInput(error.to_string()))?;
+        let mut detector = OfflineDetector::load(&self.weights).map_err(BadInput::of)?;
         let rule = detector.rule();
         let frames = self.frames.unwrap_or(usize::MAX);
         let mut tally = Tally::default();
@@ -143,7 +152,7 @@ impl Arguments {
 
 /// What the network of a weights file is for, where the file says it.
 fn kind_of(weights: &Path) -> Result<Option<String>, BadInput> {
-    let weights = Weights::load(weights).map_err(|error| BadInput(error.to_string()))?;
+    let weights = Weights::load(weights).map_err(BadInput::of)?;
     Ok(weights.metadata(KIND_KEY).map(ToOwned::to_owned))
 }
 
@@ -156,9 +165,10 @@ fn evaluate(
 ) -> Result<(serde_json::Value, LeftOut)> {
     let (mut tally, mut left_out, mut name) = (Tally::default(), LeftOut::default(), "");
     for data in data {
-        let mut evaluator = Evaluator::new(config(data)).map_err(|error| BadInput(error.to_string()))?;
+        let mut evaluator = Evaluator::new(config(data)).map_err(BadInput::of)?;
         name = evaluator.ego().method().name();
-        let bar = progress(name, data.scenarios.iter().map(|scenario| scenario.ticks.len().min(frames)).sum());
+        let frame_count = data.scenarios.iter().map(|scenario| scenario.ticks.len().min(frames)).sum();
+        let bar = progress::bar(frame_count, "frames").with_message(name);
         for scenario in &data.scenarios {
             let mut done = 0;
             let _ = evaluator.run(scenario, &mut |frame| {
@@ -228,13 +238,14 @@ impl Tally {
 mod tests {
     use std::process::ExitCode;
 
-    use super::super::exit_code;
+    use support::cli::exit_code;
+
     use super::*;
 
     #[test]
     fn weights_that_are_not_there_are_bad_input() {
         let error = anyhow::Error::from(kind_of(Path::new("no/such.safetensors")).unwrap_err());
         assert!(error.to_string().contains("no/such.safetensors"), "{error}");
-        assert_eq!(exit_code(&error), ExitCode::from(2));
+        assert_eq!(exit_code(Err(error), |_| false), ExitCode::from(2));
     }
 }

@@ -20,7 +20,7 @@ use training::loss::{LossConfig, Unassigned};
 use training::samples::{Augmentation, Moments, SampleConfig, SampleKind, SamplePoses};
 use training::train::{self, Accuracy, Observer, StepReport, TrainConfig, TrainError};
 
-use super::BadInput;
+use support::cli::BadInput;
 
 /// Trains a method on scenes; writes checkpoint, curve.csv and curve.png, weights.safetensors and model-card.md.
 #[derive(Debug, clap::Args)]
@@ -153,14 +153,14 @@ impl Arguments {
     fn config(&self) -> Result<TrainConfig> {
         if !(0.0..=1.0).contains(&self.drop_neighbour) || self.validate_every == 0 {
             let reason = "--drop-neighbour is a probability, --validate-every is above zero";
-            return Err(BadInput(reason.into()).into());
+            return Err(BadInput::new(reason).into());
         }
         for folder in self.data.iter().chain(&self.validation) {
             std::fs::read_dir(folder)
-                .map_err(|error| BadInput(format!("{}: {error}", folder.display())))
+                .map_err(|error| BadInput::new(format!("{}: {error}", folder.display())))
                 .context("datasets")?;
         }
-        let rule = self.protocol.resolve(Layout::Opv2v).map_err(BadInput)?.ground_truth;
+        let rule = self.protocol.resolve(Layout::Opv2v).map_err(BadInput::new)?.ground_truth;
         let samples = SampleConfig {
             augmentation: Augmentation { turn_rad: self.turn.to_radians(), ..Augmentation::default() },
             drop_neighbour: self.drop_neighbour,
@@ -173,7 +173,7 @@ impl Arguments {
             ..SampleConfig::training(SampleKind::Single)
         };
         let unassigned = if self.ignore_unassigned { Unassigned::Ignored } else { Unassigned::Background };
-        let run = self.options.run_config(self.batch, self.lr).map_err(|error| BadInput(error.to_string()))?;
+        let run = self.options.run_config(self.batch, self.lr).map_err(BadInput::of)?;
         Ok(TrainConfig {
             data: self.data.clone(),
             validation: self.validation.clone(),
@@ -202,7 +202,7 @@ impl Arguments {
 
     /// The poses that maps are aligned by.
     fn poses(&self) -> Result<SamplePoses> {
-        let read = |file: &PathBuf| PoseTable::read(file).map(Arc::new).map_err(|error| BadInput(error.to_string()));
+        let read = |file: &PathBuf| PoseTable::read(file).map(Arc::new).map_err(BadInput::of);
         let is_noisy = self.position_noise != 0.0 || self.heading_noise != 0.0;
         let noise = is_noisy.then(|| NoisyPoseConfig {
             mode: match self.noise_mode {
@@ -216,7 +216,7 @@ impl Arguments {
         });
         let tables = self.poses.iter().map(read).collect::<Result<_, _>>()?;
         let poses = SamplePoses { tables, noise, noise_share: self.noise_share, lost_share: self.lost_share };
-        poses.validate().map_err(|error| BadInput(error.to_string()))?;
+        poses.validate().map_err(BadInput::of)?;
         Ok(poses)
     }
 
@@ -228,12 +228,12 @@ impl Arguments {
         let detector = match &self.init {
             Some(init) => {
                 let config = Weights::load(init).and_then(|weights| weights.config());
-                config.map_err(|error| BadInput(error.to_string()))?
+                config.map_err(BadInput::of)?
             }
             None => self.config.clone(),
         };
         let fusion = FusionConfig::for_detector(self.method, &detector).ablated(&self.without, self.frames);
-        Ok(Some(fusion.map_err(|error| BadInput(error.to_string()))?))
+        Ok(Some(fusion.map_err(BadInput::of)?))
     }
 }
 
@@ -243,7 +243,7 @@ fn blamed(error: TrainError) -> anyhow::Error {
         TrainError::Model(ModelError::Weights(_) | ModelError::Config(_) | ModelError::Method(_))
         | TrainError::NotTrained(_)
         | TrainError::NothingToFreeze
-        | TrainError::NothingToKeep(_) => BadInput(error.to_string()).into(),
+        | TrainError::NothingToKeep(_) => BadInput::of(error).into(),
         error => error.into(),
     }
 }

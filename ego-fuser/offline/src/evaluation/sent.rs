@@ -1,14 +1,14 @@
 //! What a vehicle says of a frame, through the same messages as in a live run.
 
-use agent::agent::{Agent, AgentInput, Perception};
+use agent::agent::AgentInput;
 use agent::attack::Overheard;
 use dataset::frame::Frame;
-use perception::detector::DetectorError;
 use protocol::message::{Bev, Boxes, Payload, Points};
 use protocol::{CavId, CodecConfig, HEADER_LEN, Header, Limits, PoseEstimate, RateChoice, Stamp, WireError, wire};
 use tch::Tensor;
 
 use super::EvaluateError;
+use super::participant::Participant;
 use ego_fuser::ego::{Content, View};
 use fusion::method::Exchange;
 
@@ -63,7 +63,7 @@ impl Sent {
 /// # Errors
 /// [`EvaluateError`] when it cannot see, write or read its own message.
 pub(super) fn view(
-    agent: &mut Agent,
+    participant: &mut Participant,
     frame: &Frame,
     map: Option<&Tensor>,
     exchange: Option<Exchange>,
@@ -74,8 +74,8 @@ pub(super) fn view(
         cloud: &frame.points,
         measured_pose: frame.world_from_lidar.as_ref(),
     };
-    let pose = agent.estimate_pose(&input);
-    let stamp = stamp(agent.cav(), frame.capture_nanos);
+    let pose = participant.pose(&input);
+    let stamp = stamp(participant.cav(), frame.capture_nanos);
     let (_, pose_bytes) = through_the_wire(&stamp, pose)?;
     let sent = |content, payload_bytes, wire_bytes| Sent {
         cav: frame.cav.clone(),
@@ -90,18 +90,18 @@ pub(super) fn view(
     let (content, bytes) = match exchange {
         None => return Ok(sent(None, 0, 0)),
         Some(Exchange::Points) => {
-            let points = agent.share_points(&frame.points);
+            let points = participant.points(&frame.points);
             let (message, bytes) = through_the_wire(&stamp, Points { pose, points })?;
             (Content::Points(message.points), bytes)
         }
         Some(Exchange::Boxes) => {
-            let detections = perceive(agent, frame, map)?.detections;
+            let detections = participant.perceive(frame, map)?.detections;
             let (message, bytes) = through_the_wire(&stamp, Boxes { pose, detections })?;
             (Content::Boxes(message.detections), bytes)
         }
         Some(Exchange::Features | Exchange::Nothing) => {
-            let Perception { features, confidence, .. } = perceive(agent, frame, map)?;
-            let features = agent.write_map(features, &confidence, codec, frame.capture_nanos)?;
+            let perception = participant.perceive(frame, map)?;
+            let features = participant.write_map(perception, codec, frame.capture_nanos)?;
             let (message, bytes) = through_the_wire(&stamp, Bev { pose, features })?;
             let rate = message.features.rate;
             let content = Content::Features(message.features.decode(&Limits::default())?);
@@ -110,13 +110,6 @@ pub(super) fn view(
         }
     };
     Ok(sent(Some(content), bytes - HEADER_LEN as u64, bytes + pose_bytes))
-}
-
-fn perceive(agent: &mut Agent, frame: &Frame, map: Option<&Tensor>) -> Result<Perception, DetectorError> {
-    match map {
-        Some(map) => agent.perceive_map(map),
-        None => agent.perceive(&frame.points),
-    }
 }
 
 /// Encodes and decodes a message; its size on the wire.

@@ -12,7 +12,6 @@ use std::collections::{BTreeMap, VecDeque};
 use std::ops::{ControlFlow, Range};
 use std::path::PathBuf;
 
-use agent::agent::Agent;
 use agent::attack::Lie;
 use agent::rate::RateConfig;
 use dataset::frame::Frame;
@@ -26,6 +25,7 @@ use support::random::derive_seed;
 pub use compute::ComputeTimes;
 pub use remote::{RemoteCrew, RemoteError};
 
+use super::participant::Participant;
 use super::sent::{Sent, stamp, view};
 use super::sweeps::Sweep;
 use super::{EvaluateError, EvaluatedFrame, Evaluator, of_the_ego};
@@ -112,7 +112,7 @@ struct Member {
 
 /// Where a vehicle computes.
 enum Pipeline {
-    Here(Box<Agent>, CodecConfig),
+    Here(Box<Participant>, CodecConfig),
     /// In a process of its own.
     Elsewhere,
 }
@@ -167,8 +167,8 @@ impl<'a> Run<'a> {
             let codec = own.map_or(evaluator.config.codec, |own| own.codec);
             let gate = codec.gate.or(evaluator.ego.method().gate());
             let codec = if crew.is_empty() { of_the_ego(codec) } else { CodecConfig { gate, ..codec } };
-            let agent = evaluator.agent(scenario, cav, crew.is_empty(), own)?;
-            crew.push(Member { place, cav: cav.clone(), pipeline: Pipeline::Here(Box::new(agent), codec) });
+            let participant = evaluator.participant(scenario, cav, crew.is_empty(), own)?;
+            crew.push(Member { place, cav: cav.clone(), pipeline: Pipeline::Here(Box::new(participant), codec) });
         }
         let is_witness = |place: &usize| matches!(config.crew, Crew::First(_)) && !places.contains(place);
         let witnesses = (0..scenario.agents.len()).filter(is_witness).collect();
@@ -243,9 +243,9 @@ impl<'a> Run<'a> {
             let is_needed = all.is_empty() || method != Method::None;
             let exchange = is_needed.then(|| own_content(method));
             let Some(member) = self.crew.iter_mut().find(|member| member.place == *place) else { continue };
-            if let Pipeline::Here(agent, codec) = &mut member.pipeline {
-                agent.overhear(|| all.last().map(Sent::overheard).unwrap_or_default());
-                all.push(view(agent, frame, map.as_ref(), exchange, codec)?);
+            if let Pipeline::Here(participant, codec) = &mut member.pipeline {
+                participant.overhear(all.last());
+                all.push(view(participant, frame, map.as_ref(), exchange, codec)?);
             }
         }
         Ok(all)

@@ -1,7 +1,9 @@
 //! The course of a training as CSV, one row per report, with AP where a validation was made; and as a picture.
 
-use figures::chart::{self, Axis, Chart, Mark, Series};
+use csv::StringRecord;
+use figures::{self, Axis, Chart, Mark, Series};
 use perception::train::{Curve, Trainer, TrainingError};
+use support::csv_file;
 
 use super::validation::Accuracy;
 use super::{StepReport, TrainError};
@@ -40,7 +42,7 @@ impl DetectorCurve {
         let path = self.0.path();
         let text =
             std::fs::read_to_string(path).map_err(|source| TrainingError::Io { path: path.to_owned(), source })?;
-        Ok(chart::save(&charts(title, &text), &path.with_extension("png"))?)
+        Ok(figures::save_png(&charts(title, &text), &path.with_extension("png"))?)
     }
 }
 
@@ -64,8 +66,8 @@ fn charts(title: &str, csv: &str) -> Vec<Chart> {
 fn column_over_steps(csv: &str, column: &str) -> Vec<(f64, f64)> {
     let Some(place) = HEADER.split(',').position(|name| name == column) else { return Vec::new() };
     // A row that was cut off by the end of a process has no such column.
-    let number = |row: &str, place| row.split(',').nth(place)?.parse::<f64>().ok();
-    csv.lines().filter_map(|row| Some((number(row, 0)?, number(row, place)?))).collect()
+    let number = |row: &StringRecord, place| row.get(place)?.parse::<f64>().ok();
+    csv_file::records(csv).filter_map(|(_, row)| Some((number(&row, 0)?, number(&row, place)?))).collect()
 }
 
 /// Means of so many neighbours that [`SMOOTH_POINTS`] are left.

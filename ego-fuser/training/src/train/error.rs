@@ -29,7 +29,7 @@ pub enum TrainError {
     NothingToKeep(Method),
     /// The picture of the curve cannot be written.
     #[error(transparent)]
-    Picture(#[from] figures::canvas::CanvasError),
+    Picture(#[from] figures::FigureError),
     /// The tensor library refused.
     #[error("training: {0}")]
     Torch(#[from] tch::TchError),

@@ -5,22 +5,22 @@ use std::path::PathBuf;
 use anyhow::Context;
 use perception::train::{DataListing, RunConfig, TrainingBar, TrainingOptions};
 
-use crate::cli::BadInput;
+use support::cli::BadInput;
 
 /// An error for which the exit code is 2.
 pub(crate) fn bad(reason: &str) -> anyhow::Error {
-    BadInput(anyhow::anyhow!(reason.to_owned())).into()
+    BadInput::new(reason.to_owned()).into()
 }
 
 /// What a training is told; a fault of the options is one of usage.
 pub(crate) fn run_config(options: &TrainingOptions, batch: usize, learning_rate: f64) -> anyhow::Result<RunConfig> {
-    Ok(options.run_config(batch, learning_rate).map_err(|error| BadInput(error.into()))?)
+    Ok(options.run_config(batch, learning_rate).map_err(BadInput::of)?)
 }
 
 /// Refuses folders that are not there before anything is computed.
 pub(crate) fn check_folders<'a>(folders: impl IntoIterator<Item = &'a PathBuf>) -> anyhow::Result<()> {
     for folder in folders {
-        std::fs::read_dir(folder).with_context(|| folder.display().to_string()).map_err(BadInput)?;
+        std::fs::read_dir(folder).with_context(|| folder.display().to_string()).map_err(BadInput::of)?;
     }
     Ok(())
 }

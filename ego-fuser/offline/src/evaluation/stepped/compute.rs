@@ -4,8 +4,9 @@ use std::time::{Duration, Instant};
 
 use agent::agent::AgentInput;
 use dataset::{LoadOptions, Scenario};
-use localization::statistics::{quantile, sorted};
 use serde::{Deserialize, Serialize};
+use support::nanos;
+use support::statistics::median;
 
 use super::super::{EvaluateError, Evaluator, view};
 use ego_fuser::ego::own_content;
@@ -32,15 +33,15 @@ impl ComputeTimes {
     pub const NONE: Self = Self { pose_ms: 0.0, map_ms: 0.0, fuse_ms: 0.0 };
 
     pub(super) fn pose_nanos(&self) -> u64 {
-        nanos(self.pose_ms)
+        nanos::of_ms(self.pose_ms)
     }
 
     pub(super) fn map_nanos(&self) -> u64 {
-        nanos(self.map_ms)
+        nanos::of_ms(self.map_ms)
     }
 
     pub(super) fn fuse_nanos(&self) -> u64 {
-        nanos(self.fuse_ms)
+        nanos::of_ms(self.fuse_ms)
     }
 
     /// Until an agent has published everything of a sweep.
@@ -72,13 +73,14 @@ impl Evaluator {
     pub fn measure(&mut self, scenario: &Scenario) -> Result<ComputeTimes, EvaluateError> {
         let exchange = own_content(self.ego.method());
         let vehicles = scenario.agents.iter().take(MEASURED_VEHICLES);
-        let mut agents =
-            vehicles.map(|cav| self.agent(scenario, cav, true, None)).collect::<Result<Vec<_>, EvaluateError>>()?;
+        let mut participants = vehicles
+            .map(|cav| self.participant(scenario, cav, true, None))
+            .collect::<Result<Vec<_>, EvaluateError>>()?;
         let [mut pose, mut map, mut fuse] = [const { Vec::<f64>::new() }; 3];
         self.ego.forget();
         for tick in 0..scenario.ticks.len().min(MEASURED_TICKS) {
-            let mut sent = Vec::with_capacity(agents.len());
-            for (place, agent) in agents.iter_mut().enumerate() {
+            let mut sent = Vec::with_capacity(participants.len());
+            for (place, participant) in participants.iter_mut().enumerate() {
                 if !scenario.is_present(place, tick) {
                     continue;
                 }
@@ -89,9 +91,9 @@ impl Evaluator {
                     measured_pose: frame.world_from_lidar.as_ref(),
                 };
                 let began = Instant::now();
-                agent.estimate_pose(&input);
+                participant.pose(&input);
                 let pose_time = began.elapsed();
-                sent.extend(view(agent, &frame, None, Some(exchange), &self.config.codec)?.into_view());
+                sent.extend(view(participant, &frame, None, Some(exchange), &self.config.codec)?.into_view());
                 pose.push(ms(pose_time));
                 map.push(ms(began.elapsed().saturating_sub(2 * pose_time)));
             }
@@ -102,15 +104,11 @@ impl Evaluator {
             fuse.push(ms(began.elapsed()));
         }
         self.ego.forget();
-        let median = |sample: &[f64]| quantile(&sorted(sample), 0.5).unwrap_or(0.0).ceil();
+        let median = |sample: &[f64]| median(sample).unwrap_or(0.0).ceil();
         Ok(ComputeTimes { pose_ms: median(&pose), map_ms: median(&map), fuse_ms: median(&fuse) })
     }
 }
 
 fn ms(time: Duration) -> f64 {
     time.as_secs_f64() * 1e3
-}
-
-fn nanos(ms: f64) -> u64 {
-    (ms * 1e6).round().max(0.0) as u64
 }

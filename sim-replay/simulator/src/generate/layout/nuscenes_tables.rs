@@ -6,6 +6,7 @@ use std::collections::BTreeMap;
 
 use nalgebra::Isometry3;
 use protocol::Pose;
+use protocol::text::hex;
 use serde_json::{Map, Value, json};
 use sha2::{Digest, Sha256};
 
@@ -251,7 +252,7 @@ fn scene_token(scene: &SceneTables<'_>, kind: &str, parts: &[&str]) -> String {
 
 fn token(parts: &[&str]) -> String {
     let digest = Sha256::digest(parts.join("/"));
-    digest.iter().take(TOKEN_BYTES).map(|byte| format!("{byte:02x}")).collect()
+    hex(&digest[..TOKEN_BYTES])
 }
 
 /// The name in the taxonomy of nuScenes, which counts vans as cars.

@@ -1,4 +1,4 @@
-//! Command line of the vehicle's process, and its exit codes.
+//! Command line of the vehicle's process.
 
 use std::io;
 use std::process::ExitCode;
@@ -7,7 +7,7 @@ use anyhow::Context;
 use bus::BusError;
 use bus::malloc_settings;
 use clap::{Parser, Subcommand};
-use support::output;
+use support::cli::{Outcome, exit_code};
 use support::sibling_program::Forwarded;
 
 use crate::command;
@@ -37,11 +37,6 @@ enum Command {
     Train(Forwarded),
 }
 
-/// Usage or input at fault, and not the program: exit code 2.
-#[derive(Debug, thiserror::Error)]
-#[error(transparent)]
-pub(crate) struct BadInput(pub(crate) anyhow::Error);
-
 impl Command {
     fn run(&self) -> anyhow::Result<()> {
         let offline = |forwarded: &Forwarded, name| -> io::Result<()> { Err(forwarded.exec(OFFLINE, name)) };
@@ -57,10 +52,7 @@ impl Command {
     }
 }
 
-/// Runs a subcommand and prints the chain of causes where it failed.
+/// Runs a subcommand.
 pub(crate) fn run(cli: Cli) -> ExitCode {
-    let Err(error) = cli.command.run() else { return ExitCode::SUCCESS };
-    output::note(format_args!("error: {error:#}"));
-    let is_bad_input = error.is::<BadInput>() || BusError::is_behind(error.as_ref());
-    if is_bad_input { ExitCode::from(2) } else { ExitCode::FAILURE }
+    exit_code(cli.command.run().map(|()| Outcome::Done), BusError::is_behind)
 }

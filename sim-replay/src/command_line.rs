@@ -1,11 +1,11 @@
-//! The sub-commands and the exit codes they share.
+//! Command line: the sub-commands.
 
 use std::process::ExitCode;
 
 use clap::{Parser, Subcommand};
 
 use bus::BusError;
-use support::output;
+use support::cli::exit_code;
 
 use crate::command;
 
@@ -33,18 +33,7 @@ enum Command {
     Synth(command::synth::Args),
 }
 
-/// How a command that did not fail ended.
-#[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(crate) enum Outcome {
-    /// All went well.
-    Done,
-    /// The input is wrong; what is wrong has been said.
-    BadInput,
-    /// Finished, but not everything of the input came through.
-    DataLost,
-}
-
-/// Runs what was asked for and prints the chain of causes where it failed.
+/// Runs what was asked for.
 pub(crate) fn run(cli: Cli) -> ExitCode {
     let outcome = match cli.command {
         Command::Convert(args) => command::convert::run(&args),
@@ -55,13 +44,5 @@ pub(crate) fn run(cli: Cli) -> ExitCode {
         Command::Stream(args) => command::stream::run(&args),
         Command::Synth(args) => command::synth::run(args),
     };
-    match outcome {
-        Ok(Outcome::Done) => ExitCode::SUCCESS,
-        Ok(Outcome::BadInput) => ExitCode::from(2),
-        Ok(Outcome::DataLost) => ExitCode::from(3),
-        Err(error) => {
-            output::note(format_args!("error: {error:#}"));
-            if BusError::is_behind(error.as_ref()) { ExitCode::from(2) } else { ExitCode::FAILURE }
-        }
-    }
+    exit_code(outcome, BusError::is_behind)
 }

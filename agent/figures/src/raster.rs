@@ -1,0 +1,49 @@
+//! RGB image in memory: drawn on by plotters, written as a PNG.
+
+use std::fs::File;
+use std::io::{self, BufWriter};
+use std::path::Path;
+
+use plotters::coord::Shift;
+use plotters::drawing::{DrawingArea, IntoDrawingArea};
+use plotters::prelude::BitMapBackend;
+
+use super::{FigureError, load_font};
+
+/// Area of an image; x to the right and y down, pixels.
+pub type Image<'a> = DrawingArea<BitMapBackend<'a>, Shift>;
+
+/// Draws an image of `size` (width and height, pixels) and writes it as a PNG.
+///
+/// # Errors
+/// [`FigureError`] of `draw`, or when the file cannot be written.
+pub fn save_image(
+    path: &Path,
+    size: (u32, u32),
+    draw: impl FnOnce(&Image<'_>) -> Result<(), FigureError>,
+) -> Result<(), FigureError> {
+    let rgb = render(size, draw)?;
+    write_png(path, size, &rgb).map_err(|source| FigureError::Write { path: path.to_owned(), source })
+}
+
+/// Pixels of a drawn image, row by row from the top, three bytes each.
+///
+/// # Errors
+/// [`FigureError`] of `draw`.
+pub fn render(
+    size: (u32, u32),
+    draw: impl FnOnce(&Image<'_>) -> Result<(), FigureError>,
+) -> Result<Vec<u8>, FigureError> {
+    load_font()?;
+    let mut rgb = vec![0; 3 * size.0 as usize * size.1 as usize];
+    draw(&BitMapBackend::with_buffer(&mut rgb, size).into_drawing_area())?;
+    Ok(rgb)
+}
+
+fn write_png(path: &Path, (width, height): (u32, u32), rgb: &[u8]) -> io::Result<()> {
+    let mut encoder = png::Encoder::new(BufWriter::new(File::create(path)?), width, height);
+    encoder.set_color(png::ColorType::Rgb);
+    let mut writer = encoder.write_header()?;
+    writer.write_image_data(rgb)?;
+    Ok(writer.finish()?)
+}

@@ -1,0 +1,58 @@
+//! Scale of an axis: equal differences or equal ratios, as one type for plotters.
+
+use std::ops::Range;
+
+use plotters::coord::ranged1d::{KeyPointHint, NoDefaultFormatting, Ranged, ValueFormatter};
+use plotters::coord::types::RangedCoordf64;
+use plotters::prelude::{IntoLogRange, LogCoord};
+
+use super::chart::Axis;
+
+pub(super) enum Scale {
+    Linear(RangedCoordf64),
+    Logarithmic(LogCoord<f64>),
+}
+
+impl From<&Axis> for Scale {
+    fn from(axis: &Axis) -> Self {
+        let [low, high] = axis.drawn_range();
+        if axis.is_logarithmic {
+            Self::Logarithmic((low..high).log_scale().into())
+        } else {
+            Self::Linear((low..high).into())
+        }
+    }
+}
+
+impl Ranged for Scale {
+    type FormatOption = NoDefaultFormatting;
+    type ValueType = f64;
+
+    fn map(&self, value: &f64, limit: (i32, i32)) -> i32 {
+        match self {
+            Self::Linear(scale) => scale.map(value, limit),
+            Self::Logarithmic(scale) => scale.map(value, limit),
+        }
+    }
+
+    fn key_points<Hint: KeyPointHint>(&self, hint: Hint) -> Vec<f64> {
+        match self {
+            Self::Linear(scale) => scale.key_points(hint),
+            Self::Logarithmic(scale) => scale.key_points(hint),
+        }
+    }
+
+    fn range(&self) -> Range<f64> {
+        match self {
+            Self::Linear(scale) => scale.range(),
+            Self::Logarithmic(scale) => scale.range(),
+        }
+    }
+}
+
+impl ValueFormatter<f64> for Scale {
+    /// As short as it can be read.
+    fn format(value: &f64) -> String {
+        format!("{}", (value * 1000.0).round() / 1000.0)
+    }
+}

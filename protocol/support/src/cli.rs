@@ -1,0 +1,102 @@
+//! End of a program: how errors are printed, and the exit codes 0 to 3.
+
+use std::error::Error;
+use std::fmt::{Debug, Display};
+use std::process::ExitCode;
+
+use crate::output;
+
+/// Usage or input at fault, and not the program: exit code 2.
+#[derive(Debug, thiserror::Error)]
+#[error(transparent)]
+pub struct BadInput(anyhow::Error);
+
+impl BadInput {
+    /// From an error with its causes.
+    pub fn of(error: impl Into<anyhow::Error>) -> Self {
+        Self(error.into())
+    }
+
+    /// From a message.
+    pub fn new(message: impl Display + Debug + Send + Sync + 'static) -> Self {
+        Self(anyhow::Error::msg(message))
+    }
+}
+
+/// End of a command that did not fail.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Outcome {
+    /// All went well: exit code 0.
+    Done,
+    /// The input is wrong; the faults are printed already: exit code 2.
+    BadInput,
+    /// Finished, but data were left out or lost: exit code 3.
+    DataLost,
+}
+
+impl Outcome {
+    /// [`Self::DataLost`] if data were lost.
+    #[must_use]
+    pub fn of(lost_data: bool) -> Self {
+        if lost_data { Self::DataLost } else { Self::Done }
+    }
+}
+
+/// Exit code of a command; prints the chain of causes where it failed. `is_bad_input` knows causes that are faults of the
+/// input, beside [`BadInput`].
+pub fn exit_code(result: anyhow::Result<Outcome>, is_bad_input: impl Fn(&(dyn Error + 'static)) -> bool) -> ExitCode {
+    match result {
+        Ok(Outcome::Done) => ExitCode::SUCCESS,
+        Ok(Outcome::BadInput) => ExitCode::from(2),
+        Ok(Outcome::DataLost) => ExitCode::from(3),
+        Err(error) => {
+            output::note(format_args!("error: {}", chain_of(&error)));
+            let is_bad = error.chain().any(|cause| cause.is::<BadInput>() || is_bad_input(cause));
+            if is_bad { ExitCode::from(2) } else { ExitCode::FAILURE }
+        }
+    }
+}
+
+/// The chain of causes on one line, without those that the message above them quotes already.
+fn chain_of(error: &anyhow::Error) -> String {
+    error.chain().fold(String::new(), |text, cause| {
+        let cause = cause.to_string();
+        match text.as_str() {
+            "" => cause,
+            above if above.contains(&cause) => text,
+            above => format!("{above}: {cause}"),
+        }
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use anyhow::Context;
+
+    use super::*;
+
+    fn code_of(result: anyhow::Result<Outcome>) -> ExitCode {
+        exit_code(result, |cause| cause.is::<std::num::ParseIntError>())
+    }
+
+    #[test]
+    fn exit_codes_are_0_to_3() {
+        for (outcome, code) in [(Outcome::Done, 0), (Outcome::BadInput, 2), (Outcome::DataLost, 3)] {
+            assert_eq!(code_of(Ok(outcome)), ExitCode::from(code));
+        }
+        assert_eq!((Outcome::of(false), Outcome::of(true)), (Outcome::Done, Outcome::DataLost));
+        assert_eq!(code_of(Err(anyhow::anyhow!("broken"))), ExitCode::from(1));
+        let bad: anyhow::Result<Outcome> = Err(BadInput::new("--frames is 0").into());
+        assert_eq!(code_of(bad.context("reading")), ExitCode::from(2));
+        let bad = "x".parse::<i32>().context("--frames").map(|_| Outcome::Done);
+        assert_eq!(code_of(bad), ExitCode::from(2));
+    }
+
+    #[test]
+    fn a_cause_that_is_quoted_is_printed_once() {
+        let error = anyhow::anyhow!("no such file").context("a.yaml: no such file").context("scenario");
+        assert_eq!(chain_of(&error), "scenario: a.yaml: no such file");
+        let error = BadInput::of(anyhow::anyhow!("inner").context("outer"));
+        assert_eq!(chain_of(&error.into()), "outer: inner");
+    }
+}

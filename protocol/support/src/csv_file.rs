@@ -1,0 +1,243 @@
+//! CSV files: rows under a known header with errors that name file, line and field, and texts written row by row.
+
+use std::fmt::Display;
+use std::io;
+use std::ops::RangeInclusive;
+use std::path::{Path, PathBuf};
+
+use csv::{ReaderBuilder, StringRecord, Terminator, Trim, Writer, WriterBuilder};
+use protocol::text::excerpt;
+
+use crate::bounded_file;
+
+/// Characters of a foreign field or line that an error shows.
+const SHOWN_CHARS: usize = 80;
+
+/// Why a CSV file cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum CsvError {
+    /// The file is missing or not readable.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// The system's reason.
+        source: io::Error,
+    },
+    /// The first line is another.
+    #[error("{}:1: header is {found:?}, must be {expected:?}", path.display())]
+    Header {
+        /// The file.
+        path: PathBuf,
+        /// The line found.
+        found: String,
+        /// The line that belongs there.
+        expected: &'static str,
+    },
+    /// A row is not what it must be.
+    #[error("{}:{line}: {problem}", path.display())]
+    Row {
+        /// The file.
+        path: PathBuf,
+        /// Line number, from 1.
+        line: u64,
+        /// The fault, with the value found and the values allowed.
+        problem: String,
+    },
+}
+
+/// A file whose header is as expected.
+#[derive(Debug, Clone)]
+pub struct CsvFile {
+    path: PathBuf,
+    header: &'static str,
+    text: String,
+}
+
+/// One row of a file; blanks around its fields are cut off.
+#[derive(Debug, Clone)]
+pub struct CsvRow<'a> {
+    file: &'a CsvFile,
+    line: u64,
+    record: StringRecord,
+}
+
+impl CsvFile {
+    /// Reads a file of at most `max_bytes` whose first line is `header`, the names of the columns with commas between.
+    ///
+    /// # Errors
+    /// [`CsvError::Io`] and [`CsvError::Header`].
+    pub fn read(path: &Path, header: &'static str, max_bytes: u64) -> Result<Self, CsvError> {
+        let path = path.to_owned();
+        match bounded_file::read_text(&path, max_bytes) {
+            Ok(text) => Self { path, header, text }.checked(),
+            Err(source) => Err(CsvError::Io { path, source }),
+        }
+    }
+
+    fn checked(self) -> Result<Self, CsvError> {
+        let found = self.text.lines().next().unwrap_or_default().trim();
+        if found == self.header {
+            return Ok(self);
+        }
+        let found = excerpt(found, SHOWN_CHARS);
+        Err(CsvError::Header { path: self.path, found, expected: self.header })
+    }
+
+    /// The rows below the header; lines without content are left out.
+    pub fn rows(&self) -> impl Iterator<Item = CsvRow<'_>> {
+        records(&self.text).skip(1).map(|(line, record)| CsvRow { file: self, line, record })
+    }
+}
+
+impl CsvRow<'_> {
+    /// A field by its place; empty where the row is too short.
+    #[must_use]
+    pub fn field(&self, column: usize) -> &str {
+        self.record.get(column).unwrap_or_default()
+    }
+
+    /// The row itself, if it has a field for every column.
+    ///
+    /// # Errors
+    /// [`CsvError::Row`].
+    pub fn complete(self) -> Result<Self, CsvError> {
+        let expected = self.file.header.split(',').count();
+        if self.record.len() == expected {
+            return Ok(self);
+        }
+        Err(self.fault(format_args!("{:?} has {} columns, must be {expected}", self.shown(), self.record.len())))
+    }
+
+    /// A field as a number within `range`; `must` says in words which numbers are allowed.
+    ///
+    /// # Errors
+    /// [`CsvError::Row`] names the field.
+    pub fn number(&self, column: usize, range: RangeInclusive<f64>, must: &str) -> Result<f64, CsvError> {
+        let number = self.field(column).parse().ok().filter(|number| range.contains(number));
+        number.ok_or_else(|| self.wrong(column, must))
+    }
+
+    /// The error for a field that is not what it must be.
+    #[must_use]
+    pub fn wrong(&self, column: usize, must: impl Display) -> CsvError {
+        let name = self.file.header.split(',').nth(column).unwrap_or_default();
+        self.fault(format_args!("{name} is {:?}, must be {must}", excerpt(self.field(column), SHOWN_CHARS)))
+    }
+
+    /// The error for this row.
+    #[must_use]
+    pub fn fault(&self, problem: impl Display) -> CsvError {
+        CsvError::Row { path: self.file.path.clone(), line: self.line, problem: problem.to_string() }
+    }
+
+    fn shown(&self) -> String {
+        excerpt(&self.record.iter().collect::<Vec<_>>().join(","), SHOWN_CHARS)
+    }
+}
+
+/// Line number (from 1) and fields of every line of a text that has content. Rows may have different lengths.
+pub fn records(text: &str) -> impl Iterator<Item = (u64, StringRecord)> {
+    let mut reader = ReaderBuilder::new()
+        .has_headers(false)
+        .flexible(true)
+        .trim(Trim::All)
+        .terminator(Terminator::Any(b'\n'))
+        .from_reader(text.as_bytes());
+    let next = move || {
+        let mut record = StringRecord::new();
+        // Text in memory gives no other errors than an end.
+        let is_there = reader.read_record(&mut record).unwrap_or(false);
+        is_there.then_some(record)
+    };
+    std::iter::from_fn(next).filter_map(|record| {
+        let position = record.position()?;
+        // The reader passes over empty lines after it has noted the position.
+        let rest = text.as_bytes().get(usize::try_from(position.byte()).ok()?..)?;
+        let empty_lines = rest.iter().take_while(|byte| **byte == b'\n').count() as u64;
+        let is_blank = record.iter().all(str::is_empty) && record.len() == 1;
+        (!is_blank).then_some((position.line() + empty_lines, record))
+    })
+}
+
+/// A CSV text that grows row by row; fields get quotes where they need them.
+#[derive(Debug)]
+pub struct CsvText(Writer<Vec<u8>>);
+
+impl CsvText {
+    /// A text that begins with `header`, the names of the columns with commas between.
+    #[must_use]
+    pub fn new(header: &str) -> Self {
+        let mut text = Self::headless();
+        text.row(header.split(',').map(str::trim));
+        text
+    }
+
+    /// A text without a header.
+    #[must_use]
+    pub fn headless() -> Self {
+        Self(WriterBuilder::new().flexible(true).from_writer(Vec::new()))
+    }
+
+    /// Appends a row.
+    pub fn row(&mut self, fields: impl IntoIterator<Item: AsRef<[u8]>>) {
+        // Writing to memory cannot fail.
+        let _ = self.0.write_record(fields);
+    }
+
+    /// The whole text.
+    #[must_use]
+    pub fn finish(self) -> String {
+        let bytes = self.0.into_inner().unwrap_or_default();
+        String::from_utf8_lossy(&bytes).into_owned()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn file(text: &str) -> Result<CsvFile, CsvError> {
+        CsvFile { path: "a.csv".into(), header: "name,size_m", text: text.into() }.checked()
+    }
+
+    #[test]
+    fn what_is_written_is_read_with_its_quotes() {
+        let mut text = CsvText::new("name, size_m");
+        text.row(["a, \"b\"", "1.5"]);
+        text.row(["no_pose"]);
+        let text = text.finish();
+        assert_eq!(text, "name,size_m\n\"a, \"\"b\"\"\",1.5\nno_pose\n");
+        let file = file(&text).unwrap();
+        let rows: Vec<CsvRow<'_>> = file.rows().collect();
+        assert_eq!((rows.len(), rows[0].field(0), rows[1].field(0), rows[1].field(1)), (2, "a, \"b\"", "no_pose", ""));
+        assert_eq!(rows[0].number(1, 0.0..=2.0, "0 to 2").unwrap(), 1.5);
+    }
+
+    #[test]
+    fn lines_are_counted_with_blank_ones_and_either_line_end() {
+        for text in ["name,size_m\n\n \na,1\n\nb,2", "name,size_m\r\n\r\n \r\na,1\r\n\r\nb,2\r\n"] {
+            let file = file(text).unwrap();
+            let rows: Vec<(u64, String)> = file.rows().map(|row| (row.line, row.shown())).collect();
+            assert_eq!(rows, [(4, "a,1".into()), (6, "b,2".into())], "{text:?}");
+        }
+    }
+
+    #[test]
+    fn a_fault_names_file_line_field_and_both_values() {
+        let file_with = |row: &str| file(&format!("name,size_m\n{row}\n")).unwrap();
+        let message = |row: &str| {
+            let file = file_with(row);
+            let row = file.rows().next().unwrap();
+            row.complete().and_then(|row| row.number(1, 0.0..=1.0, "0 to 1")).unwrap_err().to_string()
+        };
+        assert_eq!(message("a,2"), "a.csv:2: size_m is \"2\", must be 0 to 1");
+        assert_eq!(message("a,NaN"), "a.csv:2: size_m is \"NaN\", must be 0 to 1");
+        assert_eq!(message("a,1,2"), "a.csv:2: \"a,1,2\" has 3 columns, must be 2");
+        assert_eq!(message("\"a,1"), "a.csv:2: \"a,1\" has 1 columns, must be 2");
+        assert_eq!(file("x,y\n").unwrap_err().to_string(), "a.csv:1: header is \"x,y\", must be \"name,size_m\"");
+        assert!(file("").is_err());
+        let error = CsvFile::read(Path::new("/nowhere/a.csv"), "x", 9).unwrap_err().to_string();
+        assert!(error.starts_with("/nowhere/a.csv: "), "{error}");
+    }
+}

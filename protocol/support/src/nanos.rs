@@ -1,0 +1,34 @@
+//! Whole nanoseconds of times; times that do not fit become the nearest that does.
+
+use std::time::{Duration, Instant};
+
+/// Of a span of time.
+#[must_use]
+pub fn of(time: Duration) -> u64 {
+    u64::try_from(time.as_nanos()).unwrap_or(u64::MAX)
+}
+
+/// From `began` to `at`; 0 where that is earlier.
+#[must_use]
+pub fn between(began: Instant, at: Instant) -> u64 {
+    of(at.saturating_duration_since(began))
+}
+
+/// Of milliseconds, rounded; 0 for negative ones and for NaN.
+#[must_use]
+pub fn of_ms(ms: f64) -> u64 {
+    (ms * 1e6).round().max(0.0) as u64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn times_out_of_range_become_the_nearest_in_range() {
+        assert_eq!((of(Duration::from_micros(3)), of(Duration::MAX)), (3_000, u64::MAX));
+        assert_eq!([1.5, -1.0, f64::NAN, 1e300].map(of_ms), [1_500_000, 0, 0, u64::MAX]);
+        let now = Instant::now();
+        assert_eq!((between(now, now + Duration::from_nanos(7)), between(now + Duration::from_nanos(7), now)), (7, 0));
+    }
+}

@@ -1,0 +1,63 @@
+//! Mean and quantiles of samples: the only definition of a percentile in reports.
+
+/// The mean; `None` for an empty sample.
+#[must_use]
+pub fn mean(values: &[f64]) -> Option<f64> {
+    (!values.is_empty()).then(|| values.iter().sum::<f64>() / values.len() as f64)
+}
+
+/// The values in ascending order.
+#[must_use]
+pub fn sorted(values: &[f64]) -> Vec<f64> {
+    let mut sorted = values.to_vec();
+    sorted.sort_by(f64::total_cmp);
+    sorted
+}
+
+/// The quantile `q` (0..=1) of a sample in ascending order, interpolated linearly between the two nearest ranks as by
+/// NumPy's default (method 7 of Hyndman and Fan 1996); `None` for an empty sample.
+///
+/// Every p50, p95 and p99 of a report is this one. Order statistics that a fitted model takes as its input are not
+/// percentiles of a report and keep the rule that the model was fitted with.
+#[must_use]
+pub fn quantile(sorted: &[f64], q: f64) -> Option<f64> {
+    let last = sorted.len().checked_sub(1)?;
+    let rank = q * last as f64;
+    let below = (rank.floor() as usize).min(last);
+    let above = (below + 1).min(last);
+    let (low, high, share) = (sorted[below], sorted[above], rank - below as f64);
+    // Infinite values have no difference.
+    Some(if share == 0.0 || low == high { low } else { low + (high - low) * share })
+}
+
+/// The median of a sample in any order; `None` for an empty one.
+#[must_use]
+pub fn median(values: &[f64]) -> Option<f64> {
+    quantile(&sorted(values), 0.5)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn quantiles_are_those_of_numpy() {
+        // numpy.quantile([1, 2, 3, 4, 5], [0.5, 0.95]), numpy.quantile([1, 2, 3, 4], [0, 0.5, 1])
+        let five = sorted(&[3.0, 1.0, 2.0, 4.0, 5.0]);
+        assert_eq!(quantile(&five, 0.5), Some(3.0));
+        assert!((quantile(&five, 0.95).unwrap() - 4.8).abs() < 1e-12);
+        let four = [1.0, 2.0, 3.0, 4.0];
+        assert_eq!([0.0, 0.5, 1.0].map(|q| quantile(&four, q)), [Some(1.0), Some(2.5), Some(4.0)]);
+        assert_eq!((median(&[4.0, 1.0, 3.0]), median(&[])), (Some(3.0), None));
+        assert_eq!((quantile(&[], 0.5), mean(&[]), mean(&four)), (None, None, Some(2.5)));
+    }
+
+    #[test]
+    fn infinite_values_are_values() {
+        let sample = [1.0, f64::INFINITY, f64::INFINITY];
+        assert_eq!(
+            [0.0, 0.25, 0.5, 0.75].map(|q| quantile(&sample, q)),
+            [Some(1.0), Some(f64::INFINITY), Some(f64::INFINITY), Some(f64::INFINITY)]
+        );
+    }
+}

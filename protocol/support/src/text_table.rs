@@ -1,0 +1,60 @@
+//! Text table of one style: no borders, two spaces between columns, numbers to the right.
+
+use std::fmt;
+
+use comfy_table::{CellAlignment, Table, presets};
+
+/// Side that the cells of a column stand on.
+#[derive(Debug, Clone, Copy, PartialEq, Eq)]
+pub enum Side {
+    /// Texts.
+    Left,
+    /// Numbers.
+    Right,
+}
+
+/// A table for people, as lines that each end in a line end.
+#[derive(Debug, Clone)]
+pub struct TextTable(Table);
+
+impl TextTable {
+    /// A table with these columns.
+    #[must_use]
+    pub fn new<'a>(columns: impl IntoIterator<Item = (&'a str, Side)>) -> Self {
+        let (names, sides): (Vec<&str>, Vec<Side>) = columns.into_iter().unzip();
+        let mut table = Table::new();
+        table.load_style(presets::NOTHING).set_header(names);
+        for (column, side) in table.column_iter_mut().zip(sides) {
+            column.set_padding((0, 2));
+            column.set_cell_alignment(match side {
+                Side::Left => CellAlignment::Left,
+                Side::Right => CellAlignment::Right,
+            });
+        }
+        Self(table)
+    }
+
+    /// Appends a row.
+    pub fn row(&mut self, cells: impl IntoIterator<Item = String>) {
+        self.0.add_row(cells);
+    }
+}
+
+impl fmt::Display for TextTable {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.0.lines().try_for_each(|line| writeln!(f, "{}", line.trim_end()))
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn texts_stand_left_and_numbers_right() {
+        let mut table = TextTable::new([("name", Side::Left), ("size", Side::Right), ("note", Side::Left)]);
+        table.row(["a".to_owned(), "1.5".to_owned(), "largest".to_owned()]);
+        table.row(["longer".to_owned(), "12345".to_owned(), String::new()]);
+        assert_eq!(table.to_string(), "name     size  note\na         1.5  largest\nlonger  12345\n");
+    }
+}
