@@ -5,7 +5,6 @@
 
 mod box_correction;
 mod error;
-mod view;
 
 use std::path::Path;
 
@@ -22,12 +21,12 @@ use crate::misbehaviour::{Belief, Trust, TrustConfig};
 use fusion::f64_tensor;
 use fusion::history::{History, KeptMap};
 use fusion::method::{Exchange, Method};
-use fusion::model::METHOD_KEY;
+use fusion::model::{FusionStage, METHOD_KEY, StageError};
 use fusion::points::merge_points;
-use fusion::{AlignedMaps, EarlierMaps, FusionStage, SentMaps, StageError, ViewFacts};
+use fusion::{AlignedMaps, MapMetadata, ReceivedMaps};
 
+pub use crate::view::{Content, View};
 pub use error::EgoError;
-pub use view::{Content, View};
 
 /// Why a neighbour is not in a result.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -78,7 +77,7 @@ impl Ego {
         let method = match (method, weights.metadata(METHOD_KEY)) {
             (Some(method), _) => method,
             (None, Some(name)) => name.parse()?,
-            (None, None) => Method::None,
+            (None, None) => Method::NONE,
         };
         let detector = Detector::from_weights(&weights, &weights.config()?)?;
         let fusion = FusionStage::from_weights(&weights, method, detector.config())?;
@@ -96,7 +95,7 @@ impl Ego {
 
     fn assembled(detector: Detector, method: Method, fusion: FusionStage) -> Self {
         let limits = PostprocessConfig::for_detector(detector.config());
-        let history = History::new(fusion.frames());
+        let history = History::new(fusion.requirements().history.frames);
         Self { method, detector, fusion, history, trust: None, limits, comm_range_m: Self::COMM_RANGE_M }
     }
 
@@ -138,7 +137,7 @@ impl Ego {
     /// # Errors
     /// [`EgoError`] when the ego's own view is not what the method takes.
     pub fn detect(&mut self, own: &View, neighbours: &[View]) -> Result<EgoOutput, EgoError> {
-        let needed = own_content(self.method);
+        let needed = self.method.own_content();
         if own.content.exchange() != needed {
             return Err(EgoError::OwnContent { method: self.method, needed, found: own.content.exchange() });
         }
@@ -185,7 +184,7 @@ impl Ego {
 
     /// Where a neighbour stands relative to the ego, or why it has no part.
     fn align(&self, own: &View, view: &View) -> Result<Pose, Skipped> {
-        if self.method == Method::None {
+        if self.method.exchange() == Exchange::Nothing {
             return Err(Skipped::NotNeeded);
         }
         let no_pose = Skipped::Unusable(DropReason::NoPose);
@@ -225,31 +224,31 @@ impl Ego {
             maps.push(values);
             sent.push(cells);
         }
-        let mut facts: Vec<ViewFacts> =
-            aligned.iter().enumerate().map(|(agent, view)| view.facts(agent, aligned[0].view)).collect();
-        if let Some(pose_graph) = self.fusion.config().pose_graph() {
-            box_correction::correct_by_boxes(&mut facts, &maps, &self.detector, pose_graph)?;
+        let mut metadata: Vec<MapMetadata> =
+            aligned.iter().enumerate().map(|(agent, view)| view.metadata(agent, aligned[0].view)).collect();
+        if let Some(pose_graph) = &self.fusion.requirements().pose_graph {
+            box_correction::correct_by_boxes(&mut metadata, &maps, &self.detector, pose_graph)?;
             stages.lap("correct");
         }
         let mut earlier = Vec::new();
         for (agent, kept, ego_from_cav) in self.earlier(aligned) {
-            earlier.push(&kept.shown);
+            earlier.push(&kept.map);
             let age_nanos = aligned[0].view.capture_nanos as i64 - kept.capture_nanos as i64;
-            facts.push(ViewFacts {
+            metadata.push(MapMetadata {
                 agent,
                 ego_from_cav,
                 confidence: kept.confidence,
                 age_secs: age_nanos as f64 * 1e-9,
             });
         }
-        let newest = SentMaps { maps: Tensor::f_cat(&maps, 0)?, sent: Some(Tensor::f_cat(&sent, 0)?) };
-        let earlier = (!earlier.is_empty()).then(|| EarlierMaps::together(&earlier)).transpose()?;
-        let moved = self.fusion.align_kept(&newest, earlier, &facts)?;
+        let newest = ReceivedMaps::new(Tensor::f_cat(&maps, 0)?, Some(Tensor::f_cat(&sent, 0)?));
+        let earlier = (!earlier.is_empty()).then(|| ReceivedMaps::together(&earlier)).transpose()?;
+        let on_grid = self.fusion.align_with(&newest, earlier, &metadata)?;
         stages.lap("align");
-        let fused = f64_tensor::as_batch(&self.fusion.fuse(&moved, &facts, false)?)?;
+        let fused = f64_tensor::as_batch(&self.fusion.fuse(&on_grid)?.map)?;
         stages.lap("fuse");
         let detections = self.boxes_of(&fused, stages)?;
-        self.keep(aligned, maps.into_iter().zip(sent), &moved)?;
+        self.keep(aligned, maps.into_iter().zip(sent), &on_grid)?;
         Ok(detections)
     }
 
@@ -284,16 +283,17 @@ impl Ego {
         &mut self,
         aligned: &[Aligned<'_>],
         maps: impl Iterator<Item = (Tensor, Tensor)>,
-        moved: &AlignedMaps,
+        on_grid: &AlignedMaps,
     ) -> Result<(), EgoError> {
-        if self.fusion.frames() < 2 {
+        if self.fusion.requirements().history.frames < 2 {
             return Ok(());
         }
         for ((Aligned { view, .. }, (map, sent)), index) in aligned.iter().zip(maps).zip(0..) {
             let Some(world_from_cav) = view.pose.world_from_cav().copied() else { continue };
             let confidence = f64::from(view.pose.confidence());
-            let shown = self.fusion.kept(&SentMaps { maps: map, sent: Some(sent) }, &moved.turned(index)?)?;
-            let kept = KeptMap { capture_nanos: view.capture_nanos, world_from_cav, confidence, shown };
+            let turned = on_grid.received.maps.f_narrow(0, index, 1)?;
+            let map = self.fusion.kept(&ReceivedMaps::new(map, Some(sent)), &turned)?;
+            let kept = KeptMap { capture_nanos: view.capture_nanos, world_from_cav, confidence, map };
             self.history.keep(&view.cav, kept);
         }
         Ok(())
@@ -350,15 +350,6 @@ fn keep<T>(items: Vec<T>, is_out: &[bool]) -> Vec<T> {
     items.into_iter().zip(is_out).filter_map(|(item, is_out)| (!is_out).then_some(item)).collect()
 }
 
-/// What the ego needs of itself: like its neighbours, and its own map where it is alone.
-#[must_use]
-pub fn own_content(method: Method) -> Exchange {
-    match method.exchange() {
-        Exchange::Nothing => Exchange::Features,
-        other => other,
-    }
-}
-
 /// A view and where it lies.
 struct Aligned<'a> {
     view: &'a View,
@@ -366,10 +357,10 @@ struct Aligned<'a> {
 }
 
 impl Aligned<'_> {
-    fn facts(&self, agent: usize, ego: &View) -> ViewFacts {
+    fn metadata(&self, agent: usize, ego: &View) -> MapMetadata {
         let confidence = f64::from(self.view.pose.confidence());
         let age_secs = self.view.age_nanos(ego) as f64 * 1e-9;
-        ViewFacts { agent, ego_from_cav: self.ego_from_cav, confidence, age_secs }
+        MapMetadata { agent, ego_from_cav: self.ego_from_cav, confidence, age_secs }
     }
 }
 

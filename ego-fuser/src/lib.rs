@@ -14,3 +14,4 @@ mod neighbourhood;
 pub mod node;
 pub mod pairing;
 mod peer_models;
+pub mod view;

@@ -123,7 +123,7 @@ fn recorded_map(lattice: &str, folder: &Path, dtype: Dtype) -> Result<(PathBuf, 
             let config =
                 DetectorConfig { lidar_range_m: [-25.6, -19.2, -3.0, 25.6, 19.2, 1.0], ..DetectorConfig::lean() };
             tch::manual_seed(7);
-            let model = CooperativeModel::new(&config, Method::Max, tch::Device::Cpu)?;
+            let model = CooperativeModel::new(&config, Method::MAX, tch::Device::Cpu)?;
             let file = folder.join("small.safetensors");
             weights::save(&file, &model.variables, &model.about(), weights::Precision::Single)?;
             file

@@ -95,7 +95,7 @@ fn tiny() -> CooperativeModel {
         shrink: Some(ShrinkConfig::Pointwise { channels: 8 }),
         ..DetectorConfig::lean()
     };
-    CooperativeModel::new(&config, Method::Max, tch::Device::Cpu).expect("a configuration that fits")
+    CooperativeModel::new(&config, Method::MAX, tch::Device::Cpu).expect("a configuration that fits")
 }
 
 /// A folder with a scene of two vehicles, weights and a scenario.

@@ -47,7 +47,7 @@ pub(crate) struct Arguments {
     #[arg(long, default_value_t = 2, value_parser = clap::value_parser!(u8).range(2..=4))]
     agents: u8,
     /// Fusion methods, one run each.
-    #[arg(long, value_delimiter = ',', default_values_t = [Method::None, Method::Late, Method::Max, Method::Pastat])]
+    #[arg(long, value_delimiter = ',', default_values_t = [Method::NONE, Method::LATE, Method::MAX, Method::PASTAT])]
     methods: Vec<Method>,
     /// Print the metrics of the last method's run as JSON instead of a table of all.
     #[arg(long)]

@@ -31,7 +31,7 @@ pub enum WeightsChoiceError {
         /// The method.
         method: Method,
         /// The method it would be trained for.
-        name: Method,
+        name: &'static str,
         /// How many there are.
         found: usize,
     },
@@ -43,7 +43,7 @@ pub enum WeightsChoiceError {
         /// The method.
         method: Method,
         /// The method it would be trained for.
-        name: Method,
+        name: &'static str,
         /// The method that the file names.
         trained: String,
     },
@@ -64,13 +64,9 @@ pub fn weights_of(path: &Path, method: Method) -> Result<PathBuf, WeightsChoiceE
     if !path.is_dir() {
         return Ok(path.to_path_buf());
     }
-    let candidates: &[Method] = match method {
-        Method::Late => &[Method::None],
-        Method::Early => &[Method::Early, Method::None],
-        _ => &[method],
-    };
-    let mut last = (method, 0);
-    for &name in candidates {
+    let candidates = method.weights_names();
+    let mut last = (method.name(), 0);
+    for &name in &candidates {
         let mut files = files_of(path, name)?;
         match (files.pop(), files.len()) {
             (Some(file), 0) => return Ok(file),
@@ -84,16 +80,16 @@ pub fn weights_of(path: &Path, method: Method) -> Result<PathBuf, WeightsChoiceE
     let (name, found) = last;
     let trained = path.join(TRAINED_FILE);
     if found == 0 && trained.is_file() {
-        return trained_for(trained, method, candidates);
+        return trained_for(trained, method, &candidates);
     }
     Err(WeightsChoiceError::NotOne { folder: path.to_path_buf(), method, name, found })
 }
 
 /// The weights of a training, if it was one of a method that `method` can run with.
-fn trained_for(file: PathBuf, method: Method, candidates: &[Method]) -> Result<PathBuf, WeightsChoiceError> {
+fn trained_for(file: PathBuf, method: Method, candidates: &[&'static str]) -> Result<PathBuf, WeightsChoiceError> {
     let weights = Weights::load(&file)?;
     match weights.metadata(METHOD_KEY) {
-        Some(trained) if candidates.iter().all(|name| name.name() != trained) => {
+        Some(trained) if !candidates.contains(&trained) => {
             let trained = trained.to_owned();
             Err(WeightsChoiceError::OtherMethod { file, method, name: candidates[0], trained })
         }
@@ -101,7 +97,7 @@ fn trained_for(file: PathBuf, method: Method, candidates: &[Method]) -> Result<P
     }
 }
 
-fn files_of(folder: &Path, name: Method) -> Result<Vec<PathBuf>, WeightsChoiceError> {
+fn files_of(folder: &Path, name: &str) -> Result<Vec<PathBuf>, WeightsChoiceError> {
     let io = |source| WeightsChoiceError::Io { folder: folder.to_path_buf(), source };
     let ending = format!("-{name}.safetensors");
     let mut files = Vec::new();
@@ -111,7 +107,7 @@ fn files_of(folder: &Path, name: Method) -> Result<Vec<PathBuf>, WeightsChoiceEr
             files.push(entry.path());
         }
     }
-    let trained = folder.join(name.name()).join(TRAINED_FILE);
+    let trained = folder.join(name).join(TRAINED_FILE);
     files.extend(trained.is_file().then_some(trained));
     Ok(files)
 }
@@ -133,14 +129,14 @@ mod tests {
             std::fs::write(folder.path().join(name), b"").unwrap();
         }
         let of = |method| weights_of(folder.path(), method);
-        for method in [Method::None, Method::Late, Method::Early] {
+        for method in [Method::NONE, Method::LATE, Method::EARLY] {
             assert!(of(method).unwrap().ends_with("lean-none.safetensors"), "{method}");
         }
         std::fs::write(folder.path().join("lean-early.safetensors"), b"").unwrap();
-        assert!(of(Method::Early).unwrap().ends_with("lean-early.safetensors"));
-        assert!(of(Method::Max).unwrap_err().to_string().contains("2 files named *-max.safetensors"));
-        assert!(of(Method::Attention).unwrap_err().to_string().contains("0 files"));
-        assert_eq!(weights_of(Path::new("w.safetensors"), Method::Late).unwrap(), Path::new("w.safetensors"));
+        assert!(of(Method::EARLY).unwrap().ends_with("lean-early.safetensors"));
+        assert!(of(Method::MAX).unwrap_err().to_string().contains("2 files named *-max.safetensors"));
+        assert!(of(Method::ATTENTION).unwrap_err().to_string().contains("0 files"));
+        assert_eq!(weights_of(Path::new("w.safetensors"), Method::LATE).unwrap(), Path::new("w.safetensors"));
     }
 
     /// A training's folder with weights that say what they were trained for.
@@ -155,12 +151,12 @@ mod tests {
     #[test]
     fn the_folder_of_a_training_serves_the_method_it_was_trained_for() {
         let folder = tempfile::tempdir().unwrap();
-        write_trained(folder.path(), Method::None);
+        write_trained(folder.path(), Method::NONE);
         let of = |method| weights_of(folder.path(), method);
-        for method in [Method::None, Method::Late, Method::Early] {
+        for method in [Method::NONE, Method::LATE, Method::EARLY] {
             assert!(of(method).unwrap().ends_with(TRAINED_FILE), "{method}");
         }
-        let refused = of(Method::Attention).unwrap_err().to_string();
+        let refused = of(Method::ATTENTION).unwrap_err().to_string();
         assert!(
             refused.contains("trained for none, and method attention needs weights trained for attention"),
             "{refused}"
@@ -170,14 +166,14 @@ mod tests {
     #[test]
     fn trainings_side_by_side_are_found_by_the_names_of_their_methods() {
         let folder = tempfile::tempdir().unwrap();
-        for method in [Method::None, Method::Max] {
+        for method in [Method::NONE, Method::MAX] {
             write_trained(&folder.path().join(method.name()), method);
         }
         let of = |method| weights_of(folder.path(), method);
-        assert_eq!(of(Method::Max).unwrap(), folder.path().join("max").join(TRAINED_FILE));
-        assert_eq!(of(Method::Late).unwrap(), folder.path().join("none").join(TRAINED_FILE));
-        assert!(of(Method::Attention).unwrap_err().to_string().contains("attention/weights.safetensors"));
+        assert_eq!(of(Method::MAX).unwrap(), folder.path().join("max").join(TRAINED_FILE));
+        assert_eq!(of(Method::LATE).unwrap(), folder.path().join("none").join(TRAINED_FILE));
+        assert!(of(Method::ATTENTION).unwrap_err().to_string().contains("attention/weights.safetensors"));
         std::fs::write(folder.path().join("lean-max.safetensors"), b"").unwrap();
-        assert!(of(Method::Max).unwrap_err().to_string().contains("2 files"), "two that could be meant");
+        assert!(of(Method::MAX).unwrap_err().to_string().contains("2 files"), "two that could be meant");
     }
 }

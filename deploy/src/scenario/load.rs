@@ -101,7 +101,7 @@ mod tests {
     #[test]
     fn scene_and_weights_are_enough() {
         let scenario = parse(SMALL).unwrap();
-        assert_eq!(scenario.method, Method::Max);
+        assert_eq!(scenario.method, Method::MAX);
         assert_eq!(scenario.network.listen, "tcp/127.0.0.1:0");
         assert_eq!(scenario.scene.rate, 1.0);
     }

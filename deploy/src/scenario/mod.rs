@@ -200,7 +200,7 @@ impl Models {
 
 impl Scenario {
     fn default_method() -> Method {
-        Method::Max
+        Method::MAX
     }
 
     /// Whether some vehicle finds its pose itself with the networks of `models.localizer`.

@@ -8,8 +8,9 @@ use bus::malloc_settings;
 use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
 use fusion::Exchange;
 use fusion::Method;
-use fusion::pastat::Part;
-use fusion::{EarlierMaps, FusionConfig, FusionStage, SentMaps, ViewFacts};
+use fusion::model::FusionStage;
+use fusion::pastat::{Part, ablated};
+use fusion::{FusionConfig, MapMetadata, ReceivedMaps};
 use perception::model_config::DetectorConfig;
 use protocol::{BevGrid, Pose};
 use tch::nn::VarStore;
@@ -30,26 +31,27 @@ fn fuse(criterion: &mut Criterion) {
     for agents in [1usize, 2, 4] {
         for Case { name, stage, is_lost } in cases(&config) {
             // The newest of all first, as the ego gives them.
-            let entries = (0..stage.frames()).flat_map(|step| (0..agents).map(move |agent| (step, agent)));
+            let entries =
+                (0..stage.requirements().history.frames).flat_map(|step| (0..agents).map(move |agent| (step, agent)));
             let facts: Vec<_> = entries.map(|(step, agent)| entry(step, agent)).collect();
             let size = [facts.len() as i64, shape[0], shape[1], shape[2]];
-            let seen = facts.iter().enumerate().map(|(index, ViewFacts { ego_from_cav, .. })| {
+            let seen = facts.iter().enumerate().map(|(index, MapMetadata { ego_from_cav, .. })| {
                 let own = (is_lost && index > 0).then(|| World::random(shape, &grid));
                 own.as_ref().unwrap_or(&world).seen_from(ego_from_cav)
             });
             let seen: Vec<Tensor> = seen.collect();
             let features = Tensor::cat(&seen, 0);
             // As the ego keeps them.
-            let of = |first: i64, count: i64| SentMaps { maps: features.narrow(0, first, count), sent: None };
+            let of = |first: i64, count: i64| ReceivedMaps::new(features.narrow(0, first, count), None);
             let newest = of(0, agents as i64);
-            let kept: Vec<EarlierMaps> = no_grad(|| {
+            let kept: Vec<ReceivedMaps> = no_grad(|| {
                 let kept = |map| stage.kept(&of(map, 1), &of(map, 1).maps).expect("maps are maps");
                 (agents as i64..size[0]).map(kept).collect()
             });
             let align = || {
-                let kept: Vec<&EarlierMaps> = kept.iter().collect();
-                let earlier = (!kept.is_empty()).then(|| EarlierMaps::together(&kept).expect("maps of one size"));
-                stage.align_kept(&newest, earlier, &facts).expect("maps lie on the lattice")
+                let kept: Vec<&ReceivedMaps> = kept.iter().collect();
+                let earlier = (!kept.is_empty()).then(|| ReceivedMaps::together(&kept).expect("maps of one size"));
+                stage.align_with(&newest, earlier, &facts).expect("maps lie on the lattice")
             };
             group.bench_function(BenchmarkId::new(format!("warp/{name}"), agents), |bencher| {
                 bencher.iter(|| black_box(no_grad(align)));
@@ -58,7 +60,7 @@ fn fuse(criterion: &mut Criterion) {
             let maps = no_grad(align);
             group.bench_function(BenchmarkId::new(format!("fuse/{name}"), agents), |bencher| {
                 bencher.iter(|| {
-                    let fused = no_grad(|| stage.fuse(&maps, &facts, false)).expect("views fit together");
+                    let fused = no_grad(|| stage.fuse(&maps)).expect("maps fit together").map;
                     assert_eq!(fused.size(), shape);
                     black_box(fused)
                 });
@@ -110,21 +112,21 @@ fn cases(config: &DetectorConfig) -> Vec<Case> {
         let stage = FusionStage::new(&variables.root(), fusion, method, config).expect("lean is a valid configuration");
         Case { name: name.to_owned(), stage, is_lost }
     };
-    let usual = |method: Method| FusionConfig::for_detector(method, config);
+    let usual = |method: Method| method.default_fusion(config);
     let methods = Method::ALL.into_iter().filter(|method| method.exchange() == Exchange::Features);
     let mut cases: Vec<_> = methods.map(|method| case(&method.to_string(), method, &usual(method), false)).collect();
-    let pastat = usual(Method::Pastat);
-    let no_recall = pastat.clone().ablated(&[Part::Recall], None).expect("it is a PASTAT");
-    cases.push(case("pastat-no-recall", Method::Pastat, &no_recall, false));
-    cases.push(case("pastat-lost", Method::Pastat, &pastat, true));
+    let pastat = usual(Method::PASTAT);
+    let no_recall = ablated(&pastat, &[Part::TemporalMemory], None).expect("it is a PASTAT");
+    cases.push(case("pastat-no-recall", Method::PASTAT, &no_recall, false));
+    cases.push(case("pastat-lost", Method::PASTAT, &pastat, true));
     cases
 }
 
 /// What is known of a vehicle's map from some time steps ago.
-fn entry(step: usize, agent: usize) -> ViewFacts {
+fn entry(step: usize, agent: usize) -> MapMetadata {
     let [step_m, agent_m] = [step, agent].map(|count| 7.0 * count as f64);
     let pose = Pose::from_xyz_yaw([agent_m - 0.1 * step_m, 2.0 * agent as f64, 0.0], 0.2 * agent as f64);
-    ViewFacts { age_secs: 0.1 * step as f64, ..ViewFacts::fresh(agent, pose) }
+    MapMetadata { age_secs: 0.1 * step as f64, ..MapMetadata::fresh(agent, pose) }
 }
 
 criterion_group!(benches, fuse);

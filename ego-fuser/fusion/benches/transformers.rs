@@ -11,10 +11,11 @@ use std::time::Instant;
 
 use bus::malloc_settings;
 use criterion::{BenchmarkId, Criterion, criterion_group, criterion_main};
-use fusion::cobevt::{Cobevt, CobevtConfig};
+use fusion::cobevt::Cobevt;
 use fusion::ermvp::{Ermvp, ErmvpConfig};
+use fusion::swap_fusion::SwapFusionConfig;
 use fusion::v2xvit::{V2xVit, V2xVitConfig};
-use fusion::{AlignedViews, AttentionFusion, Fusion, ViewFacts};
+use fusion::{AlignedMaps, AttentionFusion, Fusion, MapMetadata};
 use protocol::{BevGrid, Pose};
 use tch::nn::VarStore;
 use tch::{Device, Kind, Tensor, no_grad};
@@ -41,7 +42,7 @@ fn v2xvit_gflop(config: &V2xVitConfig, agents: i64, cells: i64) -> f64 {
 }
 
 /// The same for CoBEVT, where all agents are wanted to the end.
-fn cobevt_gflop(config: &CobevtConfig, agents: i64, cells: i64) -> f64 {
+fn cobevt_gflop(config: &SwapFusionConfig, agents: i64, cells: i64) -> f64 {
     let attention =
         4 * config.channels * config.channels + 2 * agents * config.window * config.window * config.channels;
     let half = attention + 2 * config.channels * config.hidden;
@@ -61,7 +62,7 @@ fn fuse(criterion: &mut Criterion) {
     let [channels, height, width] = FULL;
     let cells = height * width;
     let variables = VarStore::new(Device::Cpu);
-    let (vit, cobevt) = (V2xVitConfig::full(channels), CobevtConfig::full(channels));
+    let (vit, cobevt) = (V2xVitConfig::full(channels), SwapFusionConfig::full(channels));
     let v2xvit_fusion = V2xVit::new(&(variables.root() / "v2xvit"), &vit).expect("the published sizes are valid");
     let cobevt_fusion = Cobevt::new(&(variables.root() / "cobevt"), &cobevt).expect("the published sizes are valid");
     for agents in [2, 5] {
@@ -73,7 +74,7 @@ fn fuse(criterion: &mut Criterion) {
     measure(criterion, "attention", &AttentionFusion, 5, FULL, attention_gflop(5, FULL));
     tch::set_num_threads(1);
     let [channels, height, width] = LEAN;
-    let (vit, cobevt) = (V2xVitConfig::lean(channels), CobevtConfig::lean(channels));
+    let (vit, cobevt) = (V2xVitConfig::lean(channels), SwapFusionConfig::lean(channels));
     let lean = VarStore::new(Device::Cpu);
     let ermvp = ErmvpConfig::lean(channels);
     let ermvp_fusion = Ermvp::new(&(lean.root() / "ermvp"), &ermvp).expect("the lean sizes are valid");
@@ -97,25 +98,17 @@ fn measure(criterion: &mut Criterion, name: &str, fusion: &dyn Fusion, agents: i
     let features = Tensor::rand([agents, channels, height, width], float);
     let mask = Tensor::ones([agents, 1, height, width], float);
     let facts: Vec<_> = (0..agents as usize)
-        .map(|agent| ViewFacts::fresh(agent, Pose::from_xyz_yaw([9.0 * agent as f64, 0.0, 0.0], 0.0)))
+        .map(|agent| MapMetadata::fresh(agent, Pose::from_xyz_yaw([9.0 * agent as f64, 0.0, 0.0], 0.0)))
         .collect();
     let grid = BevGrid { x_min_m: -140.8, y_min_m: -38.4, cell_m: 1.6, width: width as u32, height: height as u32 };
-    let views = AlignedViews {
-        features: &features,
-        mask: &mask,
-        own_frame: &features,
-        sent: None,
-        grid: &grid,
-        facts: &facts,
-        earlier: None,
-    };
+    let maps = AlignedMaps::newest(&features, &mask, &facts, &grid);
     let mut best_secs = f64::INFINITY;
     let mut group = criterion.benchmark_group("transformers");
     group.sample_size(10);
     group.bench_function(BenchmarkId::new(name, agents), |bencher| {
         bencher.iter(|| {
             let start = Instant::now();
-            let fused = no_grad(|| fusion.fuse(&views, false)).expect("views fit together");
+            let fused = no_grad(|| fusion.fuse(&maps)).expect("maps fit together").map;
             best_secs = best_secs.min(start.elapsed().as_secs_f64());
             assert_eq!(fused.size(), shape);
             black_box(fused)

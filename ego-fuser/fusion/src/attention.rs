@@ -1,9 +1,42 @@
 //! AttFuse (OPV2V): scaled dot-product self-attention over the agents at every cell, without projections.
 
 use perception::layers::agent_attention::attend_ego;
-use tch::{TchError, Tensor};
+use perception::model_config::{ConfigError, DetectorConfig};
+use serde::{Deserialize, Serialize};
+use tch::{TchError, Tensor, nn};
 
-use super::{AlignedViews, Fusion};
+use super::interface::{Fusion, FusionOutput};
+use super::maps::AlignedMaps;
+use super::settings::FusionSettings;
+use super::spec::{Exchange, FusionSpec, MethodSpec};
+use crate::warp::WarpedMaps;
+
+/// AttFuse.
+pub static METHOD: MethodSpec = MethodSpec {
+    name: "attention",
+    summary: "feature maps, self-attention over agents at each cell (AttFuse)",
+    exchange: Exchange::Features,
+    gate: None,
+    runs_with_weights_of: &[],
+    fusion: FusionSpec::of::<AttentionConfig>(),
+};
+
+/// Settings of [`AttentionFusion`]: none.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct AttentionConfig {}
+
+impl FusionSettings for AttentionConfig {
+    const KIND: &'static str = "attention";
+
+    fn for_detector(_detector: &DetectorConfig) -> Self {
+        Self {}
+    }
+
+    fn build(&self, _path: &nn::Path<'_>) -> Result<Box<dyn Fusion>, ConfigError> {
+        Ok(Box::new(AttentionFusion))
+    }
+}
 
 /// Per-cell attention of the ego over all agents.
 ///
@@ -12,13 +45,18 @@ use super::{AlignedViews, Fusion};
 pub struct AttentionFusion;
 
 impl Fusion for AttentionFusion {
-    fn fuse(&self, views: &AlignedViews<'_>, _train: bool) -> Result<Tensor, TchError> {
-        if views.features.size4()?.0 == 1 {
-            return views.features.f_get(0);
-        }
-        let is_seen = views.mask.f_squeeze_dim(1)?.f_ne(0.0)?;
-        attend_ego(views.features, Some(&is_seen))
+    fn fuse(&self, maps: &AlignedMaps) -> Result<FusionOutput, TchError> {
+        Ok(attended(&maps.warped)?.into())
     }
+}
+
+/// `[C, H, W]` that the ego attends to at every cell.
+pub(super) fn attended(WarpedMaps { features, mask }: &WarpedMaps) -> Result<Tensor, TchError> {
+    if features.size4()?.0 == 1 {
+        return features.f_get(0);
+    }
+    let is_seen = mask.f_squeeze_dim(1)?.f_ne(0.0)?;
+    attend_ego(features, Some(&is_seen))
 }
 
 #[cfg(test)]
@@ -27,7 +65,7 @@ mod tests {
     use tch::{Device, Kind};
 
     use super::*;
-    use crate::ViewFacts;
+    use crate::MapMetadata;
 
     #[test]
     fn where_a_neighbour_has_seen_nothing_the_ego_attends_to_the_others() {
@@ -35,20 +73,11 @@ mod tests {
         let features = Tensor::randn([3, 4, 5, 7], (Kind::Float, Device::Cpu));
         let mask = Tensor::ones([3, 1, 5, 7], (Kind::Float, Device::Cpu));
         let _ = mask.narrow(0, 2, 1).narrow(2, 1, 2).fill_(0.0);
-        let facts = [0, 1, 2].map(|agent| ViewFacts::fresh(agent, Pose::IDENTITY));
-        let own_frame = &features;
-        let views = AlignedViews {
-            features: &features,
-            mask: &mask,
-            own_frame,
-            sent: None,
-            grid: &grid,
-            facts: &facts,
-            earlier: None,
-        };
+        let facts = [0, 1, 2].map(|agent| MapMetadata::fresh(agent, Pose::IDENTITY));
+        let maps = AlignedMaps::newest(&features, &mask, &facts, &grid);
         let scores = (features.narrow(0, 0, 1) * &features).sum_dim_intlist([1_i64].as_slice(), true, None) / 2.0;
         let shares = scores.masked_fill(&mask.eq(0.0), f64::NEG_INFINITY).softmax(0, None);
         let expected = (shares * &features).sum_dim_intlist([0_i64].as_slice(), false, None);
-        assert_eq!(AttentionFusion.fuse(&views, false).unwrap(), expected, "to the bit");
+        assert_eq!(AttentionFusion.fuse(&maps).unwrap().map, expected, "to the bit");
     }
 }

@@ -22,6 +22,11 @@ impl Classes {
         Self { weight: of("weight", &[anchors, channels, 1, 1]), bias: of("bias", &[anchors]) }
     }
 
+    /// The same head; nothing is copied.
+    pub(crate) fn shallow_clone(&self) -> Self {
+        Self { weight: self.weight.shallow_clone(), bias: self.bias.shallow_clone() }
+    }
+
     /// How likely a vehicle is around each cell of a map `[1, C, H, W]`: `[1, 1, H, W]`, the logit of its best anchor. No
     /// gradient flows.
     pub(crate) fn likely(&self, map: &Tensor) -> Result<Tensor, TchError> {

@@ -2,12 +2,27 @@
 //!
 //! The correction happens before maps are moved, see [`crate::pose_graph`]; what is left for the fusion is
 //! attention or the maximum. The published network has a residual backbone and fuses at each of its levels; that is
-//! [`ego_fuser_offline::multi_scale`], for imported weights. Live, an agent sends one map, and it is fused once.
+//! `multi_scale`, for imported weights. Live, an agent sends one map, and it is fused once.
 
+use perception::model_config::{ConfigError, DetectorConfig};
 use serde::{Deserialize, Serialize};
+use tch::nn;
 
+use super::interface::Fusion;
+use super::settings::{FusionSettings, Requirements};
+use super::spec::{Exchange, FusionSpec, MethodSpec};
 use super::where2comm::{Aggregation, Missing, Where2comm, Where2commConfig};
 use crate::pose_graph::PoseGraphConfig;
+
+/// CoAlign.
+pub static METHOD: MethodSpec = MethodSpec {
+    name: "coalign",
+    summary: "feature maps, poses corrected by the boxes in common, attention (CoAlign)",
+    exchange: Exchange::Features,
+    gate: None,
+    runs_with_weights_of: &[],
+    fusion: FusionSpec::of::<CoAlignConfig>(),
+};
 
 /// Settings of CoAlign.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -34,5 +49,21 @@ impl CoAlignConfig {
     #[must_use]
     pub fn fusion(&self) -> Where2comm {
         Where2comm::new(&Where2commConfig { aggregation: self.aggregation, missing: self.missing })
+    }
+}
+
+impl FusionSettings for CoAlignConfig {
+    const KIND: &'static str = "coalign";
+
+    fn for_detector(_detector: &DetectorConfig) -> Self {
+        Self::default()
+    }
+
+    fn build(&self, _path: &nn::Path<'_>) -> Result<Box<dyn Fusion>, ConfigError> {
+        Ok(Box::new(self.fusion()))
+    }
+
+    fn requirements(&self) -> Requirements {
+        Requirements { pose_graph: self.pose_graph, ..Requirements::default() }
     }
 }

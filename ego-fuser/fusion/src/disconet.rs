@@ -4,14 +4,27 @@
 //! training and not part of the network; weights trained here have had no teacher.
 
 use perception::layers::convolution::Norm;
-use perception::model_config::ConfigError;
+use perception::model_config::{ConfigError, DetectorConfig};
 use serde::{Deserialize, Serialize};
 use tch::nn;
 use tch::{TchError, Tensor};
 
-use super::config::within;
+use super::bounds::within;
 use super::conv_gru::Conv;
-use super::{AlignedViews, Fusion};
+use super::interface::{Fusion, FusionOutput};
+use super::maps::AlignedMaps;
+use super::settings::{FusionSettings, of_size};
+use super::spec::{Exchange, FusionSpec, MethodSpec};
+
+/// DiscoNet.
+pub static METHOD: MethodSpec = MethodSpec {
+    name: "disconet",
+    summary: "feature maps, a learnt weight per agent and cell (DiscoNet)",
+    exchange: Exchange::Features,
+    gate: None,
+    runs_with_weights_of: &[],
+    fusion: FusionSpec::of::<DiscoNetConfig>(),
+};
 
 /// Batch norm of the reference: PyTorch's defaults.
 const NORM: (f64, f64) = (1e-5, 0.1);
@@ -46,6 +59,18 @@ impl DiscoNetConfig {
     pub fn validate(&self) -> Result<(), ConfigError> {
         within("fusion channels", self.channels, 1..=4096)?;
         self.hidden.iter().try_for_each(|&hidden| within("fusion hidden channels", hidden, 1..=4096))
+    }
+}
+
+impl FusionSettings for DiscoNetConfig {
+    const KIND: &'static str = "disconet";
+
+    fn for_detector(detector: &DetectorConfig) -> Self {
+        of_size(detector, Self::lean, Self::full)
+    }
+
+    fn build(&self, path: &nn::Path<'_>) -> Result<Box<dyn Fusion>, ConfigError> {
+        Ok(Box::new(DiscoNet::new(path, self)?))
     }
 }
 
@@ -91,14 +116,14 @@ impl DiscoNet {
 }
 
 impl Fusion for DiscoNet {
-    fn fuse(&self, views: &AlignedViews<'_>, train: bool) -> Result<Tensor, TchError> {
-        let maps = views.features;
-        if maps.size4()?.0 == 1 {
-            return maps.f_get(0);
+    fn fuse(&self, maps: &AlignedMaps) -> Result<FusionOutput, TchError> {
+        let features = &maps.warped.features;
+        if maps.count()? == 1 {
+            return Ok(features.f_get(0)?.into());
         }
-        let scores = self.scores(maps, train)?;
-        let weights = scores.f_masked_fill(&views.mask.f_eq(0.0)?, f64::NEG_INFINITY)?.f_softmax(0, None)?;
-        (weights * maps).f_sum_dim_intlist([0i64].as_slice(), false, None)
+        let scores = self.scores(features, maps.is_training)?;
+        let weights = scores.f_masked_fill(&maps.warped.mask.f_eq(0.0)?, f64::NEG_INFINITY)?.f_softmax(0, None)?;
+        Ok((weights * features).f_sum_dim_intlist([0i64].as_slice(), false, None)?.into())
     }
 }
 
@@ -109,7 +134,7 @@ mod tests {
     use tch::{Device, Kind};
 
     use super::*;
-    use crate::ViewFacts;
+    use crate::MapMetadata;
 
     #[test]
     fn every_parameter_learns() {
@@ -120,17 +145,9 @@ mod tests {
         let features = Tensor::rand([3, 8, 6, 10], (Kind::Float, Device::Cpu));
         let mask = Tensor::ones([3, 1, 6, 10], (Kind::Float, Device::Cpu));
         let grid = BevGrid { x_min_m: 0.0, y_min_m: 0.0, cell_m: 1.0, width: 10, height: 6 };
-        let facts: Vec<_> = (0..3).map(|agent| ViewFacts::fresh(agent, Pose::IDENTITY)).collect();
-        let views = AlignedViews {
-            features: &features,
-            mask: &mask,
-            own_frame: &features,
-            sent: None,
-            grid: &grid,
-            facts: &facts,
-            earlier: None,
-        };
-        network.fuse(&views, true).unwrap().square().sum(Kind::Float).backward();
+        let facts: Vec<_> = (0..3).map(|agent| MapMetadata::fresh(agent, Pose::IDENTITY)).collect();
+        let maps = AlignedMaps { is_training: true, ..AlignedMaps::newest(&features, &mask, &facts, &grid) };
+        network.fuse(&maps).unwrap().map.square().sum(Kind::Float).backward();
         for (name, variable) in variables.variables() {
             if variable.requires_grad() {
                 // A bias before a batch norm has no say.

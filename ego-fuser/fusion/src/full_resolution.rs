@@ -11,7 +11,7 @@ use crate::warp::{BILINEAR, Cells, NEAREST, PADDING_ZEROS, places_of};
 
 /// A map on the lattice of its sender, in axes of the ego.
 #[derive(Debug)]
-pub(crate) enum WholeMap {
+pub(crate) enum FullResolutionMap {
     /// Numbers, where no gradient flows: a map is kept for several frames, and turned into numbers once.
     Numbers {
         /// What it shows.
@@ -30,14 +30,14 @@ pub(crate) enum WholeMap {
 
 /// What maps show at some cells of the ego.
 #[derive(Debug)]
-pub(crate) struct Seen {
+pub(crate) struct CellSamples {
     /// `[R, C]`: zeros where they show nothing.
     pub(crate) features: Tensor,
     /// `[R, 1]`, 1 where they show something.
     pub(crate) mask: Tensor,
 }
 
-impl WholeMap {
+impl FullResolutionMap {
     /// Of a map `[1, C, H, W]`, none of whose numbers is below zero, and which of its cells were sent, `[1, 1, H, W]`; absent:
     /// all.
     pub(crate) fn of(map: &Tensor, sent: Option<&Tensor>) -> Result<Self, TchError> {
@@ -65,7 +65,7 @@ impl WholeMap {
         maps: &[(usize, Pose, &Self)],
         cells: &[[usize; 2]],
         grid: &BevGrid,
-    ) -> Result<BTreeMap<usize, Seen>, TchError> {
+    ) -> Result<BTreeMap<usize, CellSamples>, TchError> {
         maps.iter().try_fold(BTreeMap::new(), |mut by_step, (step, pose, map)| {
             let seen = map.at(&places_of(cells, pose, grid))?;
             let most = match by_step.get(step) {
@@ -78,7 +78,7 @@ impl WholeMap {
     }
 
     /// What it shows at places in `grid_sampler`'s coordinates, two for each: `[R, C]`, and whether it does, `[R, 1]`.
-    fn at(&self, places: &[f32]) -> Result<Seen, TchError> {
+    fn at(&self, places: &[f32]) -> Result<CellSamples, TchError> {
         let count = places.len() / 2;
         match self {
             Self::Numbers { cells, sent } => {
@@ -89,7 +89,7 @@ impl WholeMap {
                     mask[place] = 1.0;
                 });
                 let of = |values: &[f32]| Tensor::f_from_slice(values)?.f_view([count as i64, -1]);
-                Ok(Seen { features: of(&features)?, mask: of(&mask)? })
+                Ok(CellSamples { features: of(&features)?, mask: of(&mask)? })
             }
             Self::Tensors { map, sent } => {
                 let lattice = Tensor::f_from_slice(places)?.f_view([1, 1, -1, 2])?.f_to_device(map.device())?;
@@ -98,13 +98,13 @@ impl WholeMap {
                     read.f_squeeze_dim(2)?.f_squeeze_dim(0)?.f_transpose(0, 1)
                 };
                 let mask = read(sent, NEAREST)?.f_ceil()?;
-                Ok(Seen { features: read(map, BILINEAR)? * &mask, mask })
+                Ok(CellSamples { features: read(map, BILINEAR)? * &mask, mask })
             }
         }
     }
 }
 
-impl Seen {
+impl CellSamples {
     /// The most of both.
     fn or(&self, other: &Self) -> Result<Self, TchError> {
         Ok(Self { features: self.features.f_maximum(&other.features)?, mask: self.mask.f_maximum(&other.mask)? })
@@ -127,15 +127,19 @@ mod tests {
         (uniform(3, &[3, 4, 16, 32]), uniform(5, &[3, 1, 16, 32]).gt(0.2).to_kind(Kind::Float))
     }
 
-    fn seen(with_gradient: [bool; 3], entries: &[(usize, usize)], cells: &[[usize; 2]]) -> BTreeMap<usize, Seen> {
+    fn seen(
+        with_gradient: [bool; 3],
+        entries: &[(usize, usize)],
+        cells: &[[usize; 2]],
+    ) -> BTreeMap<usize, CellSamples> {
         let (maps, sent) = maps();
         let whole = (0..3).map(|entry| {
             let map = maps.narrow(0, entry, 1).copy().set_requires_grad(with_gradient[entry as usize]);
-            WholeMap::of(&map, Some(&sent.narrow(0, entry, 1))).unwrap()
+            FullResolutionMap::of(&map, Some(&sent.narrow(0, entry, 1))).unwrap()
         });
-        let whole: Vec<WholeMap> = whole.collect();
+        let whole: Vec<FullResolutionMap> = whole.collect();
         let told = entries.iter().map(|&(step, entry)| (step, poses()[entry], &whole[entry]));
-        WholeMap::seen(&told.collect::<Vec<_>>(), cells, &GRID).unwrap()
+        FullResolutionMap::seen(&told.collect::<Vec<_>>(), cells, &GRID).unwrap()
     }
 
     #[test]

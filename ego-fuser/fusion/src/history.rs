@@ -7,7 +7,7 @@ use std::collections::{BTreeMap, VecDeque};
 
 use protocol::{CavId, Pose};
 
-use crate::EarlierMaps;
+use crate::ReceivedMaps;
 
 /// Maps older than this tell of another situation, nanoseconds.
 pub const MAX_AGE_NANOS: u64 = 1_000_000_000;
@@ -23,8 +23,8 @@ pub struct KeptMap {
     pub world_from_cav: Pose,
     /// How sure it was.
     pub confidence: f64,
-    /// One map, as the fusion keeps it.
-    pub shown: EarlierMaps,
+    /// One map, as the fusion stage keeps it.
+    pub map: ReceivedMaps,
 }
 
 /// Maps by vehicle, oldest first.
@@ -85,6 +85,7 @@ impl History {
 #[cfg(test)]
 mod tests {
     use proptest::prelude::*;
+    use tch::{Device, Kind, Tensor};
 
     use super::*;
 
@@ -99,7 +100,7 @@ mod tests {
             capture_nanos: frame * FRAME,
             world_from_cav: Pose::IDENTITY,
             confidence: 1.0,
-            shown: EarlierMaps::of_nothing(),
+            map: ReceivedMaps::new(Tensor::zeros([1, 1, 1, 1], (Kind::Float, Device::Cpu)), None),
         }
     }
 

@@ -1,142 +1,122 @@
-//! The registry of collaboration methods: what the agents of one frame exchange, by name.
+//! The table of collaboration methods, and [`Method`], a handle to one of them.
 
+use std::borrow::Cow;
 use std::fmt;
+use std::hash::{Hash, Hasher};
 use std::str::FromStr;
 
+use clap::builder::{PossibleValue, PossibleValuesParser, TryMapValueParser, TypedValueParser, ValueParserFactory};
+use perception::model_config::DetectorConfig;
 use protocol::ConfidenceGate;
-use serde::{Deserialize, Serialize};
+use serde::de::Error;
+use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
-/// How the views of several CAVs become one set of boxes.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Method {
-    /// The ego alone: the baseline that every exchange must beat.
-    None,
-    /// Boxes are exchanged and merged by NMS.
-    Late,
-    /// Points are exchanged and encoded together in the ego frame.
-    Early,
-    /// Feature maps, element-wise maximum (F-Cooper).
-    Max,
-    /// Feature maps, self-attention over the agents at each cell (AttFuse, OPV2V).
-    Attention,
-    /// Feature maps, only the cells around which a vehicle is likely (Where2comm).
-    Where2comm,
-    /// Feature maps, their poses corrected by the boxes in common (CoAlign).
-    #[serde(rename = "coalign")]
-    CoAlign,
-    /// Feature maps, messages between the vehicles (V2VNet).
-    #[serde(rename = "v2vnet")]
-    V2vNet,
-    /// Feature maps, a learnt weight for each agent and cell (DiscoNet).
-    #[serde(rename = "disconet")]
-    DiscoNet,
-    /// Feature maps, attention over agents and within windows of several sizes (V2X-ViT).
-    #[serde(rename = "v2xvit")]
-    V2xVit,
-    /// Feature maps, attention over agents within windows and grids (CoBEVT).
-    Cobevt,
-    /// Feature maps, the cells worth sending, corrected by what vehicles agree on (ERMVP).
-    Ermvp,
-    /// Feature maps of several frames, attention along the ways of objects (TraF-Align).
-    TrafAlign,
-    /// Feature maps of several frames, aligned by pose confidence and content, transformer (PASTAT).
-    Pastat,
+use crate::{
+    FusionConfig, MethodSpec, attention, coalign, cobevt, disconet, ermvp, max, own, pastat, traf_align, v2vnet,
+    v2xvit, where2comm,
+};
+
+pub use crate::Exchange;
+
+/// A collaboration method: how the views of several CAVs become one set of boxes.
+#[derive(Clone, Copy)]
+pub struct Method(&'static MethodSpec);
+
+/// Every method, in the order of tables, as `NAME: specification`.
+macro_rules! methods {
+    ($($name:ident: $spec:path,)*) => {
+        impl Method {
+            $(#[doc = concat!("See [`", stringify!($spec), "`].")]
+            pub const $name: Self = Self(&$spec);)*
+
+            /// Every method, in the order of tables.
+            pub const ALL: [Self; [$(stringify!($name)),*].len()] = [$(Self::$name),*];
+        }
+    };
 }
 
-/// What has to cross the air for a method.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Exchange {
-    /// Nothing at all.
-    Nothing,
-    /// Boxes with scores.
-    Boxes,
-    /// Raw points.
-    Points,
-    /// BEV feature maps.
-    Features,
+methods! {
+    NONE: own::NONE,
+    LATE: own::LATE,
+    EARLY: own::EARLY,
+    MAX: max::METHOD,
+    ATTENTION: attention::METHOD,
+    WHERE2COMM: where2comm::METHOD,
+    COALIGN: coalign::METHOD,
+    V2VNET: v2vnet::METHOD,
+    DISCONET: disconet::METHOD,
+    V2XVIT: v2xvit::METHOD,
+    COBEVT: cobevt::METHOD,
+    ERMVP: ermvp::METHOD,
+    TRAF_ALIGN: traf_align::METHOD,
+    PASTAT: pastat::METHOD,
 }
 
 impl Method {
-    /// Every method, in the order of tables.
-    pub const ALL: [Self; 14] = [
-        Self::None,
-        Self::Late,
-        Self::Early,
-        Self::Max,
-        Self::Attention,
-        Self::Where2comm,
-        Self::CoAlign,
-        Self::V2vNet,
-        Self::DiscoNet,
-        Self::V2xVit,
-        Self::Cobevt,
-        Self::Ermvp,
-        Self::TrafAlign,
-        Self::Pastat,
-    ];
+    /// A method that is not in the table: it is known to this process by its handle alone.
+    #[must_use]
+    pub const fn of(spec: &'static MethodSpec) -> Self {
+        Self(spec)
+    }
+
+    /// Its specification.
+    #[must_use]
+    pub const fn spec(self) -> &'static MethodSpec {
+        self.0
+    }
 
     /// The name on the command line and in result files.
     #[must_use]
-    pub fn name(self) -> &'static str {
-        match self {
-            Self::None => "none",
-            Self::Late => "late",
-            Self::Early => "early",
-            Self::Max => "max",
-            Self::Attention => "attention",
-            Self::Where2comm => "where2comm",
-            Self::CoAlign => "coalign",
-            Self::V2vNet => "v2vnet",
-            Self::DiscoNet => "disconet",
-            Self::V2xVit => "v2xvit",
-            Self::Cobevt => "cobevt",
-            Self::Ermvp => "ermvp",
-            Self::TrafAlign => "traf_align",
-            Self::Pastat => "pastat",
-        }
+    pub const fn name(self) -> &'static str {
+        self.0.name
     }
 
     /// One line for `--help` and tables.
     #[must_use]
-    pub fn summary(self) -> &'static str {
-        match self {
-            Self::None => "the ego alone",
-            Self::Late => "boxes, merged by rotated NMS",
-            Self::Early => "points, encoded together in the ego frame",
-            Self::Max => "feature maps, element-wise maximum (F-Cooper)",
-            Self::Attention => "feature maps, self-attention over agents at each cell (AttFuse)",
-            Self::Where2comm => "feature maps, only the cells around which a vehicle is likely (Where2comm)",
-            Self::CoAlign => "feature maps, poses corrected by the boxes in common, attention (CoAlign)",
-            Self::V2vNet => "feature maps, messages between the vehicles (V2VNet)",
-            Self::DiscoNet => "feature maps, a learnt weight per agent and cell (DiscoNet)",
-            Self::V2xVit => "feature maps, attention over agents and windows of several sizes (V2X-ViT)",
-            Self::Cobevt => "feature maps, attention over agents within windows and grids (CoBEVT)",
-            Self::Ermvp => "feature maps, the cells worth sending, poses corrected by agreement about them (ERMVP)",
-            Self::TrafAlign => "feature maps with history, attention along trajectories (TraF-Align)",
-            Self::Pastat => "feature maps with history, aligned by confidence and content, transformer (PASTAT)",
+    pub const fn summary(self) -> &'static str {
+        self.0.summary
+    }
+
+    /// Content of its messages.
+    #[must_use]
+    pub const fn exchange(self) -> Exchange {
+        self.0.exchange
+    }
+
+    /// Content that the ego needs of its own sweep: that of its messages, and its feature map where it is alone.
+    #[must_use]
+    pub const fn own_content(self) -> Exchange {
+        match self.exchange() {
+            Exchange::Nothing => Exchange::Features,
+            other => other,
         }
     }
 
-    /// What the agents send for it.
+    /// Cells of their maps that agents send unless configured otherwise; absent: all.
     #[must_use]
-    pub fn exchange(self) -> Exchange {
-        match self {
-            Self::None => Exchange::Nothing,
-            Self::Late => Exchange::Boxes,
-            Self::Early => Exchange::Points,
-            _ => Exchange::Features,
+    pub const fn gate(self) -> Option<ConfidenceGate> {
+        self.0.gate
+    }
+
+    /// Names of the methods whose weights it runs with, best first.
+    #[must_use]
+    pub fn weights_names(self) -> Vec<&'static str> {
+        match self.0.runs_with_weights_of {
+            [] => vec![self.name()],
+            names => names.to_vec(),
         }
     }
 
-    /// Which cells of their maps agents send, where nothing else is said; absent: all.
-    ///
-    /// For Where2comm twice the published threshold: `lean` heads put the background just above that one. On validation
-    /// scenes a fifth of the bytes is left then, and AP@0.5 is what it was.
+    /// Default settings of its fusion behind a detector; methods that exchange no feature maps fuse none.
     #[must_use]
-    pub fn gate(self) -> Option<ConfidenceGate> {
-        (self == Self::Where2comm).then(|| ConfidenceGate { threshold: 0.02, ..ConfidenceGate::default() })
+    pub fn default_fusion(self, detector: &DetectorConfig) -> FusionConfig {
+        (self.0.fusion.default_config)(detector)
+    }
+
+    /// Whether settings are of its fusion.
+    #[must_use]
+    pub fn has_fusion(self, config: &FusionConfig) -> bool {
+        self.0.fusion.kind == config.kind()
     }
 }
 
@@ -159,21 +139,57 @@ impl fmt::Display for Method {
     }
 }
 
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn names_round_trip() {
-        for method in Method::ALL {
-            assert_eq!(method.to_string().parse(), Ok(method));
-            assert_eq!(serde_json::to_value(method).unwrap(), method.name());
-        }
-    }
-
-    #[test]
-    fn the_message_lists_every_method() {
-        let message = "pastat2".parse::<Method>().unwrap_err().to_string();
-        assert!(Method::ALL.iter().all(|method| message.contains(method.name())), "{message}");
+impl fmt::Debug for Method {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(f, "Method({})", self.name())
     }
 }
+
+impl PartialEq for Method {
+    fn eq(&self, other: &Self) -> bool {
+        self.name() == other.name()
+    }
+}
+
+impl Eq for Method {}
+
+impl Hash for Method {
+    fn hash<H: Hasher>(&self, state: &mut H) {
+        self.name().hash(state);
+    }
+}
+
+impl Serialize for Method {
+    fn serialize<S: Serializer>(&self, serializer: S) -> Result<S::Ok, S::Error> {
+        serializer.serialize_str(self.name())
+    }
+}
+
+impl<'de> Deserialize<'de> for Method {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        Cow::<str>::deserialize(deserializer)?.parse().map_err(D::Error::custom)
+    }
+}
+
+/// On command lines the names are listed by `--help` and where another is given.
+impl ValueParserFactory for Method {
+    type Parser = TryMapValueParser<PossibleValuesParser, fn(String) -> Result<Self, UnknownMethod>>;
+
+    fn value_parser() -> Self::Parser {
+        let values = Self::ALL.map(|method| PossibleValue::new(method.name()).help(method.summary()));
+        PossibleValuesParser::new(values).try_map(|name| name.parse())
+    }
+}
+
+impl<'de> Deserialize<'de> for FusionConfig {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let mut fields = serde_json::Map::deserialize(deserializer)?;
+        let kind = fields.remove("kind").ok_or_else(|| D::Error::missing_field("kind"))?;
+        let fusion = Method::ALL.map(|method| method.spec().fusion).into_iter().find(|fusion| kind == fusion.kind);
+        let fusion = fusion.ok_or_else(|| D::Error::custom(format_args!("no fusion is of kind {kind}")))?;
+        (fusion.parse)(fields.into()).map_err(D::Error::custom)
+    }
+}
+
+#[cfg(test)]
+mod tests;

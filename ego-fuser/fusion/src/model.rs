@@ -1,5 +1,7 @@
 //! The whole network of a method, encoder to head, for training and for the ego's half of inference.
 
+mod stage;
+
 use std::collections::BTreeMap;
 use std::path::Path;
 
@@ -18,10 +20,14 @@ use tch::nn::VarStore;
 use tch::{Device, Kind, TchError, Tensor};
 
 use crate::method::{Method, UnknownMethod};
+use crate::own::OwnConfig;
 use crate::targets::{LatticeError, TargetAssigner, TargetRule};
 use crate::warp::WarpError;
 use crate::where2comm::most_confident;
-use crate::{FUSION_KEY, FUSION_PREFIX, FusionConfig, FusionStage, ViewFacts, channel_mixing, stored_config};
+use crate::{AlignedMaps, FUSION_KEY, FusionConfig, FusionOutput, MapMetadata, ReceivedMaps, channel_mixing};
+
+use stage::{FUSION_PREFIX, stored_config};
+pub use stage::{FusionStage, StageError};
 
 /// Metadata key of the method that weights were trained with.
 pub const METHOD_KEY: &str = "method";
@@ -62,7 +68,7 @@ pub enum ModelError {
 pub struct CooperativeOutput {
     /// Scores and boxes of every anchor.
     pub head: HeadOutput,
-    /// For each sample how the fusion has moved its views but the first, see [`crate::Fusion::fuse_and_correct`].
+    /// For each sample the shifts of its maps by the fusion, see [`FusionOutput::corrections`].
     pub corrections: Vec<Option<Tensor>>,
 }
 
@@ -84,7 +90,7 @@ impl CooperativeModel {
     /// # Errors
     /// [`ModelError::Config`] when no network can be built from `config`.
     pub fn new(config: &DetectorConfig, method: Method, device: Device) -> Result<Self, ModelError> {
-        Self::with_fusion(config, method, &FusionConfig::for_detector(method, config), device)
+        Self::with_fusion(config, method, &method.default_fusion(config), device)
     }
 
     /// The same with a fusion of another size.
@@ -130,7 +136,7 @@ impl CooperativeModel {
         let method = match (method, weights.metadata(METHOD_KEY)) {
             (Some(method), _) => method,
             (None, Some(name)) => name.parse()?,
-            (None, None) => Method::None,
+            (None, None) => Method::NONE,
         };
         let config = weights.config()?;
         let fusion = match fusion {
@@ -148,7 +154,7 @@ impl CooperativeModel {
     #[must_use]
     pub fn about(&self) -> BTreeMap<String, String> {
         let config = serde_json::to_string(&self.network.config).expect("a configuration is JSON");
-        let fusion = serde_json::to_string(self.fusion.config()).expect("a configuration is JSON");
+        let fusion = self.fusion.config().to_json();
         let method = self.method.name().to_owned();
         [(CONFIG_KEY, config), (METHOD_KEY, method), (FUSION_KEY, fusion)]
             .map(|(key, value)| (key.to_owned(), value))
@@ -193,7 +199,7 @@ impl CooperativeModel {
     pub fn forward(
         &self,
         pillars: &PillarBatch,
-        facts: &[Vec<ViewFacts>],
+        facts: &[Vec<MapMetadata>],
         train: bool,
     ) -> Result<CooperativeOutput, ModelError> {
         let features = self.network.features(pillars, train);
@@ -207,7 +213,7 @@ impl CooperativeModel {
     pub fn fuse_and_detect(
         &self,
         features: &Tensor,
-        facts: &[Vec<ViewFacts>],
+        facts: &[Vec<MapMetadata>],
         train: bool,
     ) -> Result<CooperativeOutput, ModelError> {
         let told: usize = facts.iter().map(Vec::len).sum();
@@ -215,20 +221,21 @@ impl CooperativeModel {
         if views != told as i64 {
             return Err(ModelError::ViewCount { views, told });
         }
-        if self.fusion.config() == &FusionConfig::Own && told == facts.len() {
+        if self.fusion.config().settings::<OwnConfig>().is_some() && told == facts.len() {
             let corrections = facts.iter().map(|_| None).collect();
             return Ok(CooperativeOutput { head: self.network.heads(features)?, corrections });
         }
         let (mut fused, mut corrections) = (Vec::with_capacity(facts.len()), Vec::with_capacity(facts.len()));
         let mut first = 0;
         for facts in facts {
-            let views = features.f_narrow(0, first, facts.len() as i64)?;
+            let maps = features.f_narrow(0, first, facts.len() as i64)?;
             first += facts.len() as i64;
-            let sent = if train { self.sent_in_training(&views)? } else { None };
-            let aligned = self.fusion.align(&views, sent.as_ref(), facts)?;
-            let (map, moved_by) = self.fusion.fuse_and_correct(&aligned, facts, train)?;
+            let sent = if train { self.sent_in_training(&maps)? } else { None };
+            let aligned = self.fusion.align(&ReceivedMaps::new(maps, sent), facts)?;
+            let FusionOutput { map, corrections: shifts } =
+                self.fusion.fuse(&AlignedMaps { is_training: train, ..aligned })?;
             fused.push(map);
-            corrections.push(moved_by);
+            corrections.push(shifts);
         }
         Ok(CooperativeOutput { head: self.network.heads(&Tensor::f_stack(&fused, 0)?)?, corrections })
     }
@@ -237,7 +244,7 @@ impl CooperativeModel {
     /// share of the cells that they are surest of, so that every threshold is learnt for. The ego has all of its own.
     fn sent_in_training(&self, features: &Tensor) -> Result<Option<Tensor>, TchError> {
         let agents = features.size4()?.0;
-        if !matches!(self.fusion.config(), FusionConfig::Where2comm(_)) || agents < 2 {
+        if !self.fusion.requirements().partial_maps_in_training || agents < 2 {
             return Ok(None);
         }
         tch::no_grad(|| {

@@ -1,4 +1,4 @@
-//! Early fusion: the points of several sweeps in one frame.
+//! Early fusion: the point clouds of several vehicles in the frame of the ego.
 
 use nalgebra::Point3;
 use protocol::{PointCloud, Pose};

@@ -3,15 +3,89 @@
 //! A window is a square of neighbouring cells; a grid is as many cells spread evenly over the whole map. Tokens of both
 //! are those of all agents, and scores are moved by a table over the offset between agents, rows and columns.
 
+use perception::model_config::ConfigError;
+use serde::{Deserialize, Serialize};
 use tch::nn::{self, Init};
 use tch::{Device, Kind, TchError, Tensor};
 
-use super::cobevt::CobevtConfig;
 use super::layers::{FeedForward, LayerNorm, Linear, attend, dropout, unseen};
 use super::partition::{Partition, shape_error};
 
 /// Tokens that are computed at once outside of training: what lies between two steps then stays in the cache.
 const CHUNK: i64 = 1280;
+
+/// Sizes of swap fusion.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct SwapFusionConfig {
+    /// Channels of the maps.
+    pub channels: i64,
+    /// Layers, each of window and grid attention.
+    pub depth: usize,
+    /// Agents that the table of offsets is made for.
+    pub slots: i64,
+    /// Cells along an edge of a window.
+    pub window: i64,
+    /// Channels of a head.
+    pub head_channels: i64,
+    /// Channels inside the feed-forward networks.
+    pub hidden: i64,
+    /// Whether empty slots are computed and count in the mean at the end: for published weights.
+    pub count_missing: bool,
+    /// Share of values left out in training.
+    pub dropout: f64,
+}
+
+impl SwapFusionConfig {
+    /// The published sizes, for maps of `channels` (256 there).
+    #[must_use]
+    pub fn full(channels: i64) -> Self {
+        Self {
+            channels,
+            depth: 3,
+            slots: 5,
+            window: 4,
+            head_channels: (channels / 8).max(1),
+            hidden: channels,
+            count_missing: false,
+            dropout: 0.1,
+        }
+    }
+
+    /// For live traffic on two cores: two layers, heads as wide as the published ones, nothing left out
+    /// (drawing what to leave out costs as much as a layer norm and a projection).
+    #[must_use]
+    pub fn lean(channels: i64) -> Self {
+        Self { depth: 2, head_channels: (channels / 2).max(1), dropout: 0.0, ..Self::full(channels) }
+    }
+
+    /// Checks that a network can be built.
+    ///
+    /// # Errors
+    /// [`ConfigError`] names the field, its value and what it must be.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        let sizes = [
+            ("fusion.channels", self.channels, 4096),
+            ("fusion.depth", self.depth as i64, 64),
+            ("fusion.slots", self.slots, 64),
+            ("fusion.window", self.window, 64),
+            ("fusion.head_channels", self.head_channels, 4096),
+            ("fusion.hidden", self.hidden, 4096),
+        ];
+        if let Some((field, size, _)) = sizes.into_iter().find(|(_, size, most)| !(1..=*most).contains(size)) {
+            return Err(ConfigError::Value { field, value: size.to_string(), must: "at least 1 and not absurd" });
+        }
+        if self.channels % self.head_channels != 0 {
+            let value = self.head_channels.to_string();
+            return Err(ConfigError::Value { field: "fusion.head_channels", value, must: "a divisor of the channels" });
+        }
+        if !(0.0..1.0).contains(&self.dropout) {
+            let value = self.dropout.to_string();
+            return Err(ConfigError::Value { field: "fusion.dropout", value, must: "a share below 1" });
+        }
+        Ok(())
+    }
+}
 
 /// What is added to scores for the offset between two tokens of a group: agents, rows and columns.
 #[derive(Debug)]
@@ -24,7 +98,7 @@ pub(super) struct OffsetTable {
 }
 
 impl OffsetTable {
-    pub(super) fn new(path: &nn::Path<'_>, config: &CobevtConfig) -> Self {
+    pub(super) fn new(path: &nn::Path<'_>, config: &SwapFusionConfig) -> Self {
         let heads = config.channels / config.head_channels;
         let offsets = (2 * config.slots - 1) * (2 * config.window - 1) * (2 * config.window - 1);
         let table = path / "relative_position_bias_table";
@@ -67,7 +141,7 @@ struct GroupAttention {
 }
 
 impl GroupAttention {
-    fn new(path: &nn::Path<'_>, config: &CobevtConfig) -> Self {
+    fn new(path: &nn::Path<'_>, config: &SwapFusionConfig) -> Self {
         Self {
             heads: config.channels / config.head_channels,
             to_qkv: Linear::new(&(path / "to_qkv"), config.channels, 3 * config.channels, false),
@@ -112,7 +186,7 @@ impl HalfBlock {
         partition: Partition,
         attention: &nn::Path<'_>,
         feed: &nn::Path<'_>,
-        config: &CobevtConfig,
+        config: &SwapFusionConfig,
     ) -> Self {
         Self {
             partition,
@@ -204,7 +278,7 @@ impl SwapFusion {
     /// Variables `layers` and `mlp_head` below `path`. `config` is valid; `masked` says which of the two networks of the
     /// reference the names are of.
     #[must_use]
-    pub fn new(path: &nn::Path<'_>, config: &CobevtConfig, masked: bool) -> Self {
+    pub fn new(path: &nn::Path<'_>, config: &SwapFusionConfig, masked: bool) -> Self {
         let mut halves = Vec::with_capacity(2 * config.depth);
         for layer in 0..config.depth {
             let path = path / "layers" / layer;
@@ -298,5 +372,19 @@ impl SwapFusion {
             done.push(half.forward(&x, slots.asked, biased.as_ref().unwrap_or(&bias), false)?);
         }
         Tensor::f_cat(&done, 0)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn what_cannot_be_built_is_named() {
+        assert!(SwapFusionConfig::full(256).validate().is_ok());
+        assert!(SwapFusionConfig::lean(64).validate().is_ok());
+        let message = |config: SwapFusionConfig| config.validate().unwrap_err().to_string();
+        assert!(message(SwapFusionConfig { window: 0, ..SwapFusionConfig::lean(64) }).contains("fusion.window is 0"));
+        assert!(message(SwapFusionConfig { head_channels: 24, ..SwapFusionConfig::lean(64) }).contains("divisor"));
     }
 }

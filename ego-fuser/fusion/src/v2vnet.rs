@@ -5,16 +5,29 @@
 //! round with an empty state: its reset gate and all weights that look at the state have no effect, and are neither
 //! multiplied here nor trained.
 
-use perception::model_config::ConfigError;
-use protocol::Pose;
+use perception::model_config::{ConfigError, DetectorConfig};
+use protocol::{BevGrid, Pose};
 use serde::{Deserialize, Serialize};
 use tch::nn;
-use tch::{Kind, TchError, Tensor};
+use tch::{Device, Kind, TchError, Tensor};
 
-use super::config::within;
+use super::bounds::within;
 use super::conv_gru::{Conv, ConvGru};
-use super::{AlignedViews, Fusion, ViewFacts, present};
+use super::interface::{Fusion, FusionOutput};
+use super::maps::{AlignedMaps, MapMetadata, present};
+use super::settings::{FusionSettings, of_size};
+use super::spec::{Exchange, FusionSpec, MethodSpec};
 use crate::warp::{BILINEAR, NEAREST, PADDING_ZEROS, cav_from_ego_normalized};
+
+/// V2VNet.
+pub static METHOD: MethodSpec = MethodSpec {
+    name: "v2vnet",
+    summary: "feature maps, messages between the vehicles (V2VNet)",
+    exchange: Exchange::Features,
+    gate: None,
+    runs_with_weights_of: &[],
+    fusion: FusionSpec::of::<V2vNetConfig>(),
+};
 
 /// How a node takes its messages together.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -65,6 +78,18 @@ impl V2vNetConfig {
         within("fusion rounds", self.rounds as i64, 1..=16)?;
         within("fusion gru_layers", self.gru_layers as i64, 0..=8)?;
         within("odd fusion kernel", if self.kernel % 2 == 1 { self.kernel } else { 0 }, 1..=15)
+    }
+}
+
+impl FusionSettings for V2vNetConfig {
+    const KIND: &'static str = "v2vnet";
+
+    fn for_detector(detector: &DetectorConfig) -> Self {
+        of_size(detector, Self::lean, Self::full)
+    }
+
+    fn build(&self, path: &nn::Path<'_>) -> Result<Box<dyn Fusion>, ConfigError> {
+        Ok(Box::new(V2vNet::new(path, self)?))
     }
 }
 
@@ -154,22 +179,23 @@ impl Incoming {
         maps.f_grid_sampler(&lattice, BILINEAR, PADDING_ZEROS, self.corners_aligned)
     }
 
-    /// What comes to `receiver` from all, by their poses; `reach` is known for the ego and computed for others.
+    /// What comes to `receiver` from all, by the poses of their maps; `reach` is known for the ego and computed for others.
     fn between(
         receiver: usize,
-        facts: &[ViewFacts],
-        views: &AlignedViews<'_>,
+        nodes: &[MapMetadata],
+        grid: &BevGrid,
         reach: Option<&Tensor>,
+        device: Device,
     ) -> Result<Self, TchError> {
-        let receiver_from_ego = facts[receiver].ego_from_cav.isometry().inverse();
-        let relative = |facts: &ViewFacts| -> Pose { (receiver_from_ego * facts.ego_from_cav.isometry()).into() };
-        let entries = facts.iter().flat_map(|facts| cav_from_ego_normalized(&relative(facts), views.grid));
+        let receiver_from_ego = nodes[receiver].ego_from_cav.isometry().inverse();
+        let relative = |node: &MapMetadata| -> Pose { (receiver_from_ego * node.ego_from_cav.isometry()).into() };
+        let entries = nodes.iter().flat_map(|node| cav_from_ego_normalized(&relative(node), grid));
         let theta = Tensor::f_from_slice(&entries.collect::<Vec<f32>>())?.f_view([-1, 2, 3])?;
-        let theta = theta.f_to_device(views.features.device())?;
+        let theta = theta.f_to_device(device)?;
         let mask = match reach {
             Some(reach) => reach.shallow_clone(),
             None => {
-                let size = [facts.len() as i64, 1, i64::from(views.grid.height), i64::from(views.grid.width)];
+                let size = [nodes.len() as i64, 1, i64::from(grid.height), i64::from(grid.width)];
                 let everywhere = Tensor::f_ones(size, (Kind::Float, theta.device()))?;
                 let lattice = Tensor::f_affine_grid_generator(&theta, size, false)?;
                 everywhere.f_grid_sampler(&lattice, NEAREST, PADDING_ZEROS, false)?
@@ -182,23 +208,26 @@ impl Incoming {
 impl Fusion for V2vNet {
     /// Agents whose map does not reach the ego at all are no nodes of the graph. Between two neighbours all of a map
     /// counts, cells that were not sent as zeros.
-    fn fuse(&self, views: &AlignedViews<'_>, _train: bool) -> Result<Tensor, TchError> {
-        let nodes = present(views.mask)?;
-        let facts: Vec<ViewFacts> = nodes.iter().map(|&node| views.facts[node as usize]).collect();
-        let index = Tensor::f_from_slice(&nodes)?.f_to_device(views.features.device())?;
-        let (maps, mask) = (views.own_frame.f_index_select(0, &index)?, views.mask.f_index_select(0, &index)?);
-        let receivers = if self.config.rounds > 1 { facts.len() } else { 1 };
-        let incoming =
-            (0..receivers).map(|receiver| Incoming::between(receiver, &facts, views, (receiver == 0).then_some(&mask)));
-        self.propagate(&maps, &incoming.collect::<Result<Vec<_>, _>>()?)
+    fn fuse(&self, aligned: &AlignedMaps) -> Result<FusionOutput, TchError> {
+        let AlignedMaps { warped, received, metadata, grid, .. } = aligned;
+        let entries = present(&warped.mask)?;
+        let nodes: Vec<MapMetadata> = entries.iter().map(|&entry| metadata[entry as usize]).collect();
+        let device = warped.features.device();
+        let index = Tensor::f_from_slice(&entries)?.f_to_device(device)?;
+        let (maps, mask) = (received.maps.f_index_select(0, &index)?, warped.mask.f_index_select(0, &index)?);
+        let receivers = if self.config.rounds > 1 { nodes.len() } else { 1 };
+        let incoming = (0..receivers).map(|receiver| {
+            let reach = (receiver == 0).then_some(&mask);
+            Incoming::between(receiver, &nodes, grid, reach, device)
+        });
+        Ok(self.propagate(&maps, &incoming.collect::<Result<Vec<_>, _>>()?)?.into())
     }
 }
 
 #[cfg(test)]
 mod tests {
-    use protocol::BevGrid;
     use tch::nn::VarStore;
-    use tch::{Device, no_grad};
+    use tch::no_grad;
 
     use super::*;
     use crate::test_data::redraw;
@@ -216,7 +245,7 @@ mod tests {
     #[test]
     fn a_neighbour_of_a_neighbour_is_heard_after_two_rounds_only() {
         let grid = BevGrid { x_min_m: -12.0, y_min_m: -2.0, cell_m: 1.0, width: 24, height: 4 };
-        let facts: Vec<_> = (0..3).map(|agent| ViewFacts::fresh(agent, Pose::IDENTITY)).collect();
+        let facts: Vec<_> = (0..3).map(|agent| MapMetadata::fresh(agent, Pose::IDENTITY)).collect();
         // Of the third the ego has one cell in a corner, and what it has to say lies elsewhere.
         let mask = Tensor::ones([3, 1, 4, 24], FLOAT);
         let _ = mask.get(2).narrow(2, 1, 23).fill_(0.0);
@@ -224,17 +253,8 @@ mod tests {
             let (_variables, network) = network(config);
             let own_frame = Tensor::full([3, 4, 4, 24], 0.5, FLOAT);
             let _ = own_frame.get(2).narrow(2, 12, 12).fill_(third);
-            let features = own_frame.shallow_clone();
-            let views = AlignedViews {
-                features: &features,
-                mask: &mask,
-                own_frame: &own_frame,
-                sent: None,
-                grid: &grid,
-                facts: &facts,
-                earlier: None,
-            };
-            no_grad(|| network.fuse(&views, false)).unwrap()
+            let maps = AlignedMaps::newest(&own_frame, &mask, &facts, &grid);
+            no_grad(|| network.fuse(&maps)).unwrap().map
         };
         for (rounds, is_heard) in [(1, false), (2, true)] {
             let config = V2vNetConfig { rounds, ..V2vNetConfig::full(4) };

@@ -17,9 +17,9 @@ use tch::{Kind, Tensor, no_grad};
 
 use ego_fuser::ego::Ego;
 use fusion::method::{Method, UnknownMethod};
-use fusion::model::METHOD_KEY;
+use fusion::model::{FusionStage, METHOD_KEY, StageError};
 use fusion::warp::WarpError;
-use fusion::{FusionStage, StageError, ViewFacts};
+use fusion::{MapMetadata, ReceivedMaps};
 
 /// Why nothing is measured.
 #[derive(Debug, thiserror::Error)]
@@ -93,7 +93,7 @@ impl ResidualMeter {
     /// # Errors
     /// [`ResidualError`] names the file and what is wrong with it.
     pub fn load(weights: &Weights) -> Result<Self, ResidualError> {
-        let method = weights.metadata(METHOD_KEY).unwrap_or(Method::None.name()).parse()?;
+        let method = weights.metadata(METHOD_KEY).unwrap_or(Method::NONE.name()).parse()?;
         let detector = Detector::from_weights(weights, &weights.config()?)?;
         let fusion = FusionStage::from_weights(weights, method, detector.config())?;
         Ok(Self { detector, fusion })
@@ -155,12 +155,12 @@ impl ResidualMeter {
         let (sin, cos) = rng.random_range(0.0..TAU).sin_cos();
         let turn_rad = offset.turn_deg.to_radians() * if rng.random_bool(0.5) { 1.0 } else { -1.0 };
         let off = moved(&pair.ego_from_cav, [offset.shift_m * cos, offset.shift_m * sin, turn_rad]);
-        let facts = [ViewFacts::fresh(0, Pose::IDENTITY), ViewFacts::fresh(1, off)];
-        let correction = no_grad(|| {
-            let maps = self.fusion.align(&pair.maps, None, &facts)?;
-            self.fusion.fuse_and_correct(&maps, &facts, false)
+        let facts = [MapMetadata::fresh(0, Pose::IDENTITY), MapMetadata::fresh(1, off)];
+        let fused = no_grad(|| {
+            let received = ReceivedMaps::new(pair.maps.shallow_clone(), None);
+            self.fusion.fuse(&self.fusion.align(&received, &facts)?)
         })?;
-        let correction = correction.1.ok_or(ResidualError::NoAlignment)?;
+        let correction = fused.corrections.ok_or(ResidualError::NoAlignment)?;
         let values: Vec<f64> = Vec::try_from(correction.f_to_kind(Kind::Double)?.f_view([-1])?)?;
         let [dx, dy, theta] = [0, 1, 2].map(|index| values[index]);
         let corrected = moved(&off, [dx, dy, theta]);

@@ -4,6 +4,7 @@
 //! Nothing is lost, and nothing is late unless asked for, so a live run paced like that gives the same boxes. With
 //! [`Evaluator::over_link`] messages cross the emulated air in virtual time ([`stepped`]).
 
+pub mod alignment;
 mod error;
 mod participant;
 mod sent;
@@ -29,7 +30,7 @@ use perception::weights::Weights;
 use protocol::message::{Detections, FusedNeighbour, SkippedNeighbour};
 use protocol::{Box3d, CavId, CodecConfig, Ledger, PoseEstimate, Stamp};
 
-use ego_fuser::ego::{Ego, EgoOutput, Skipped, View, own_content};
+use ego_fuser::ego::{Ego, EgoOutput, Skipped, View};
 use ego_fuser::misbehaviour::{TrustConfig, heard};
 use fusion::method::{Exchange, Method};
 use training::feature_store::MapSource;
@@ -254,7 +255,7 @@ impl Evaluator {
 
     /// Whether sweeps have to be read at all.
     fn needs_points(&self) -> bool {
-        let shares_points = own_content(self.ego.method()) == Exchange::Points;
+        let shares_points = self.ego.method().own_content() == Exchange::Points;
         self.maps.is_none() || shares_points || self.config.pose_source.looks_at_sweeps()
     }
 
@@ -264,12 +265,12 @@ impl Evaluator {
         sweeps: Vec<Sweep>,
         tick: usize,
     ) -> Result<EvaluatedFrame, EvaluateError> {
-        let exchange = own_content(self.ego.method());
+        let exchange = self.ego.method().own_content();
         let mut sent = Vec::with_capacity(sweeps.len());
         let mut frames = Vec::with_capacity(sweeps.len());
         for Sweep { place, frame, map } in sweeps {
             // Without an exchange, neighbours have nothing to encode; where they are is still asked.
-            let is_needed = place == 0 || self.ego.method() != Method::None;
+            let is_needed = place == 0 || self.ego.method().exchange() != Exchange::Nothing;
             let codec = if place == 0 { of_the_ego(self.config.codec) } else { self.config.codec };
             let participant = &mut participants[place];
             participant.overhear(sent.last());

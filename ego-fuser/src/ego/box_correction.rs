@@ -9,29 +9,29 @@ use perception::detector::{Detector, DetectorError};
 use protocol::Detection;
 use tch::Tensor;
 
-use fusion::ViewFacts;
+use fusion::MapMetadata;
 use fusion::pose_graph::{Observer, PoseGraphConfig, correct};
 
 /// Boxes at or below this score are no landmarks: the reference's threshold for boxes that poses are corrected by. It has
 /// nothing to do with which boxes are judged.
 const LANDMARK_SCORE: f32 = 0.2;
 
-/// Corrects the poses in `facts` by what each map `[1, C, H, W]` shows; the ego's stays.
+/// Corrects the poses in `metadata` by what each map `[1, C, H, W]` shows; the ego's stays.
 pub(super) fn correct_by_boxes(
-    facts: &mut [ViewFacts],
+    metadata: &mut [MapMetadata],
     maps: &[Tensor],
     detector: &Detector,
     config: &PoseGraphConfig,
 ) -> Result<(), DetectorError> {
-    if facts.len() < 2 {
+    if metadata.len() < 2 {
         return Ok(());
     }
     let boxes = maps.iter().map(|map| boxes_in(map, detector)).collect::<Result<Vec<_>, _>>()?;
-    let observers: Vec<Observer<'_>> = (facts.iter().zip(&boxes))
-        .map(|(facts, boxes)| Observer { ego_from_agent: facts.ego_from_cav, boxes })
+    let observers: Vec<Observer<'_>> = (metadata.iter().zip(&boxes))
+        .map(|(map, boxes)| Observer { ego_from_agent: map.ego_from_cav, boxes })
         .collect();
-    for (facts, corrected) in facts.iter_mut().zip(correct(&observers, config)) {
-        facts.ego_from_cav = corrected.ego_from_agent;
+    for (map, corrected) in metadata.iter_mut().zip(correct(&observers, config)) {
+        map.ego_from_cav = corrected.ego_from_agent;
     }
     Ok(())
 }

@@ -5,8 +5,8 @@ use perception::weights::WeightsError;
 use protocol::BevGrid;
 use tch::TchError;
 
-use fusion::StageError;
 use fusion::method::{Exchange, Method, UnknownMethod};
+use fusion::model::StageError;
 use fusion::warp::WarpError;
 
 /// Why the ego has no result at all. What is wrong with a neighbour never leads here.

@@ -184,7 +184,7 @@ mod tests {
     use protocol::{Box3d, Detection};
 
     use super::*;
-    use crate::ego::Content;
+    use crate::view::Content;
 
     /// Boxes as a vehicle at a place sees those of a world.
     fn boxes(world: &[[f64; 2]], from: [f64; 2]) -> Content {

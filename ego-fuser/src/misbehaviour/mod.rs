@@ -17,7 +17,7 @@ use protocol::message::HeardNeighbour;
 use protocol::{CavId, Doubt, PointCloud, Pose};
 use serde::{Deserialize, Serialize};
 
-use crate::ego::View;
+use crate::view::View;
 use evidence::Evidence;
 use seen::{Seen, likeness};
 
@@ -90,7 +90,7 @@ impl Belief {
     }
 }
 
-/// What is said of the neighbours that were looked at, but for their clocks; `beliefs` are those of [`crate::ego::EgoOutput`].
+/// What is said of the neighbours that were looked at, but for their clocks; `beliefs` are those of an `EgoOutput`.
 #[must_use]
 pub fn heard(beliefs: &[(usize, Belief)], views: &[View]) -> Vec<HeardNeighbour> {
     let of = |(index, view): (usize, &View)| {

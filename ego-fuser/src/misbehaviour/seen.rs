@@ -7,7 +7,7 @@ use perception::model_config::YAxis;
 use protocol::BevGrid;
 use tch::Tensor;
 
-use crate::ego::Content;
+use crate::view::Content;
 
 /// Boxes below this score say nothing about who sent them.
 const SURE: f32 = 0.3;

@@ -16,11 +16,11 @@ use bus::shutdown::Stop;
 use bus::{Bus, BusError, Event, Inbox, InboxLimits, Publisher, PublisherOptions, Subscription};
 use protocol::{CavId, DropReason, Limits, Role, Stream, Topic};
 
-use crate::ego::{Ego, View, own_content};
+use crate::ego::{Ego, View};
 use crate::neighbourhood::{Neighbourhood, heard_on, sender_of};
 use crate::pairing::{Pairing, PairingConfig};
 use crate::peer_models::PeerModels;
-use fusion::method::{Exchange, Method};
+use fusion::method::Exchange;
 
 /// Messages of one sender that may wait while a frame is fused. An ego that needs longer than its frames' period answers
 /// frames that have waited this long, so no more than what a short pause costs.
@@ -136,7 +136,7 @@ struct Node<'a> {
 
 impl<'a> Node<'a> {
     fn open(bus: &'a Bus, cav: &CavId, ego: Ego, options: &'a NodeOptions, stop: &Stop) -> Result<Self, BusError> {
-        let stream = stream_of(own_content(ego.method()));
+        let stream = stream_of(ego.method().own_content());
         let inbox = bus.limited_inbox(PLACES, MAX_TOPICS, options.inbox);
         stop.on_request({
             let inbox = Arc::clone(&inbox);
@@ -147,7 +147,7 @@ impl<'a> Node<'a> {
         let streams = if stream == Stream::Bev { vec![Stream::Descriptor, stream] } else { vec![stream] };
         let own = streams.iter().map(|&stream| bus.subscribe(topic(stream), &inbox)).collect::<Result<_, _>>()?;
         // Alone, an ego has nothing to hear from others.
-        let neighbourhood = (ego.method() != Method::None)
+        let neighbourhood = (ego.method().exchange() != Exchange::Nothing)
             .then(|| Neighbourhood::watch(bus, cav, streams, options.over_link, options.neighbours.clone()))
             .transpose()?;
         Ok(Self {

@@ -5,8 +5,8 @@
 use std::hint::black_box;
 
 use criterion::{Criterion, Throughput, criterion_group, criterion_main};
+use fusion::MapMetadata;
 use fusion::Method;
-use fusion::ViewFacts;
 use fusion::model::CooperativeModel;
 use perception::model_config::DetectorConfig;
 use perception::pillars::batch::PillarBatch;
@@ -51,13 +51,13 @@ fn training_step(criterion: &mut Criterion) {
     let mut voxeliser = Voxeliser::for_detector(&config);
     let pillars: Vec<Pillars> = (0..AGENTS * SAMPLES).map(|_| voxeliser.voxelise(&sweep(&mut rng))).collect();
     let poses = [Pose::IDENTITY, Pose::from_xyz_yaw([12.0, 3.0, 0.0], 0.4), Pose::from_xyz_yaw([-20.0, 5.0, 0.0], 3.0)];
-    let facts: Vec<_> = poses.into_iter().enumerate().map(|(agent, pose)| ViewFacts::fresh(agent, pose)).collect();
+    let facts: Vec<_> = poses.into_iter().enumerate().map(|(agent, pose)| MapMetadata::fresh(agent, pose)).collect();
     let facts = vec![facts; SAMPLES];
     let mut group = criterion.benchmark_group("training_step/lean/2x3");
     group.sample_size(10).throughput(Throughput::Elements(SAMPLES as u64));
     for (name, precision) in [("f32", ComputePrecision::F32), ("bf16", ComputePrecision::Bf16)] {
         let mut model =
-            CooperativeModel::new(&config, Method::Attention, Device::Cpu).expect("lean is a valid configuration");
+            CooperativeModel::new(&config, Method::ATTENTION, Device::Cpu).expect("lean is a valid configuration");
         model.set_precision(precision);
         let mut optimizer = AdamW::new(&model.variables, AdamWConfig::default());
         let assigner = model.assigner().expect("lean has anchors");

@@ -7,9 +7,10 @@ use std::sync::Arc;
 use agent_offline::icp_map::{IcpMapPose, read_map};
 use dataset::pcd;
 use dataset::{self, LoadOptions};
-use ego_fuser_offline::alignment::compare::{self, BoxSource, PairOutcome};
-use ego_fuser_offline::alignment::table::Tally;
-use ego_fuser_offline::alignment::{Approach, BoxIcp, CloudIcp, FreeAlign, Measured, Poses};
+use ego_fuser_offline::alignment::free_align::FreeAlignConfig;
+use ego_fuser_offline::alignment::{AlignmentSpec, BoxIcp, CloudIcp, FreeAlign, Measured, Poses};
+use ego_fuser_offline::evaluation::alignment::table::Tally;
+use ego_fuser_offline::evaluation::alignment::{self, BoxSource, PairOutcome};
 use localization::pose_source::{PoseSource, RecordedPose};
 use localization::registration::icp::{self, IcpConfig, IcpSource, IcpTarget};
 use nalgebra::{Isometry3, Matrix4, Point3};
@@ -79,12 +80,12 @@ fn icp_follows_a_real_drive() {
     assert!(pairs >= 2, "{pairs}");
 }
 
-/// Outcomes of approaches on a folder, by name of the approach.
-fn outcomes(folder: &std::path::Path, approaches: &mut [Box<dyn Approach>]) -> Vec<PairOutcome> {
+/// Outcomes of methods on a folder.
+fn outcomes(folder: &std::path::Path, methods: &[AlignmentSpec]) -> Vec<PairOutcome> {
     let mut found = Vec::new();
     for scenario in dataset::open(folder).unwrap().scenarios {
         let ticks = 0..scenario.ticks.len();
-        compare::run(approaches, &mut BoxSource::Annotated, &scenario, ticks, &mut |outcome| found.push(outcome))
+        alignment::run(methods, &mut BoxSource::Annotated, &scenario, ticks, &mut |outcome| found.push(outcome))
             .unwrap();
     }
     found
@@ -102,21 +103,21 @@ fn approaches_meet_on_generated_scenes() {
     let map = Arc::new(read_map(&[&scenes], 1.0, &config).unwrap());
     assert!(map.planes() > 1000);
     let source = IcpMapPose::new(map, config.clone());
-    let mut approaches: Vec<Box<dyn Approach>> = vec![
-        Box::new(Poses::new("true", Measured::True, || Ok(Box::new(RecordedPose)))),
-        Box::new(Poses::new("gnss", Measured::Gnss, || Ok(Box::new(RecordedPose)))),
-        Box::new(Poses::new("icp-map", Measured::Gnss, move || Ok(Box::new(source.clone()) as Box<dyn PoseSource>))),
-        Box::new(CloudIcp::new(config.clone(), false)),
-        Box::new(CloudIcp::new(config, true)),
-        Box::new(BoxIcp),
-        Box::new(FreeAlign::default()),
+    let methods = [
+        Poses::spec("true", Measured::True, || Ok(Box::new(RecordedPose))),
+        Poses::spec("gnss", Measured::Gnss, || Ok(Box::new(RecordedPose))),
+        Poses::spec("icp-map", Measured::Gnss, move || Ok(Box::new(source.clone()) as Box<dyn PoseSource>)),
+        CloudIcp::spec(config.clone(), false),
+        CloudIcp::spec(config, true),
+        BoxIcp::spec(),
+        FreeAlign::spec(FreeAlignConfig::default()),
     ];
-    let found = outcomes(&scenes, &mut approaches);
-    let rows: Vec<_> = (approaches.iter().enumerate())
-        .map(|(number, approach)| {
+    let found = outcomes(&scenes, &methods);
+    let rows: Vec<_> = (methods.iter().enumerate())
+        .map(|(number, method)| {
             let mut tally = Tally::default();
-            found.iter().filter(|outcome| outcome.approach == number).for_each(|outcome| tally.add(outcome));
-            tally.row(approach.name())
+            found.iter().filter(|outcome| outcome.method == number).for_each(|outcome| tally.add(outcome));
+            tally.row(&method.name)
         })
         .collect();
     let [exact, gnss, map, icp, icp_gnss, box_icp, free_align] = &rows[..] else { panic!("{rows:?}") };

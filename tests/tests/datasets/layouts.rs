@@ -24,7 +24,7 @@ const LAYOUTS: [(SceneLayout, Layout); 7] = [
     (SceneLayout::Mars, Layout::Mars),
 ];
 /// Methods without and with messages.
-const METHODS: [Method; 2] = [Method::None, Method::Max];
+const METHODS: [Method; 2] = [Method::NONE, Method::MAX];
 /// Released weights, trained with other scenes.
 const WEIGHTS: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../deploy/weights");
 

@@ -12,7 +12,6 @@ use bus::{Event, Route};
 use dataset::{self, LoadOptions};
 use ego_fuser::ego::{Content, Ego, View};
 use ego_fuser::node as ego_node;
-use fusion::FusionConfig;
 use fusion::Method;
 use fusion::model::CooperativeModel;
 use localization::pose_source::RecordedPose;
@@ -43,8 +42,8 @@ fn topic(name: &str, stream: Stream) -> Topic {
 fn weights_file(folder: &Path, compress_ratio: Option<i64>) -> PathBuf {
     let lidar_range_m = [-25.6, -12.8, -3.0, 25.6, 12.8, 1.0];
     let config = DetectorConfig { lidar_range_m, compress_ratio, ..DetectorConfig::lean() };
-    let fusion = FusionConfig::for_detector(Method::Max, &config);
-    let model = CooperativeModel::with_fusion(&config, Method::Max, &fusion, Device::Cpu).unwrap();
+    let fusion = Method::MAX.default_fusion(&config);
+    let model = CooperativeModel::with_fusion(&config, Method::MAX, &fusion, Device::Cpu).unwrap();
     for (name, mut variable) in model.variables.variables() {
         // Values from the shape alone.
         let count = variable.numel() as i64;

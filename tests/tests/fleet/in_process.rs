@@ -13,7 +13,7 @@ use bus::bounded_queue::Taken;
 use bus::shutdown::Stop;
 use bus::{Bus, Event, Inbox, PublisherOptions, Route, Subscription, process_id};
 use dataset::{self, LoadOptions, Scenario};
-use ego_fuser::ego::{Content, Ego, View, own_content};
+use ego_fuser::ego::{Content, Ego, View};
 use ego_fuser::node as ego_node;
 use ego_fuser::pairing::PairingConfig;
 use fusion::Exchange;
@@ -78,7 +78,7 @@ fn agent(cav_id: &str) -> Agent {
 }
 
 fn published(method: Method) -> Stream {
-    match own_content(method) {
+    match method.own_content() {
         Exchange::Boxes => Stream::Boxes,
         Exchange::Points => Stream::Points,
         Exchange::Features | Exchange::Nothing => Stream::Bev,
@@ -139,7 +139,7 @@ fn listen<'scope>(
 
 /// Who has a part in a method: alone the ego needs nobody's maps but its own.
 fn taking_part(method: Method) -> &'static [&'static str] {
-    if method == Method::None { &AGENTS[..1] } else { &AGENTS }
+    if method == Method::NONE { &AGENTS[..1] } else { &AGENTS }
 }
 
 /// Plays the scene in step with the ego, whose neighbours keep within `rate`; gives what the ego told and everyone's books
@@ -231,7 +231,7 @@ fn to_recorder(method: Method, stream: Stream) -> Vec<Route> {
 fn a_recorded_run_replayed_gives_the_same_detections() {
     let folder = tempfile::tempdir().unwrap();
     scene::write(folder.path(), &AGENTS, TICKS);
-    for method in [Method::Max, Method::Late] {
+    for method in [Method::MAX, Method::LATE] {
         let file = folder.path().join(format!("{method}.mcap"));
         let (live, ledger) = play_and_record(folder.path(), method, RateConfig::default(), Some(&file));
         assert!(ledger.balance().is_exact(), "{method}: a recorder is in nobody's books");
@@ -264,7 +264,7 @@ fn play_offline(scenario: &Scenario, method: Method) -> Vec<(u64, Vec<Detection>
                     measured_pose: frame.world_from_lidar.as_ref(),
                 };
                 let output = agent.process(&input).unwrap();
-                let content = match own_content(method) {
+                let content = match method.own_content() {
                     Exchange::Boxes => Content::Boxes(output.perception.detections),
                     Exchange::Points => Content::Points(agent.detector().crop().without_own_body(&frame.points)),
                     Exchange::Features | Exchange::Nothing => {
@@ -317,7 +317,7 @@ fn maps_that_keep_within_a_limit_are_fused_and_booked_with_the_reason() {
     // Half of what the map takes at a byte per value.
     let limit = values as u64 / 2;
     let rate = RateConfig { message_bytes: Some(limit), ..RateConfig::default() };
-    let (live, ledger) = play_in_lockstep(folder.path(), Method::Max, rate);
+    let (live, ledger) = play_in_lockstep(folder.path(), Method::MAX, rate);
     assert!(live.iter().all(|(_, result)| result.fused.len() == AGENTS.len() - 1 && result.skipped.is_empty()));
     for fused in live.iter().flat_map(|(_, result)| &result.fused) {
         let bytes = fused.payload_bytes + protocol::HEADER_LEN as u64;
@@ -419,7 +419,7 @@ fn late_killed_and_lying_neighbours_are_named_and_the_ego_goes_on() {
                 keeps_running: true,
                 ..ego_node::NodeOptions::default()
             };
-            ego_node::run(&bus, &cav("10"), ego(Method::Max), &options, &stop).unwrap();
+            ego_node::run(&bus, &cav("10"), ego(Method::MAX), &options, &stop).unwrap();
             leave(bus)
         });
         fleet.iter().for_each(|puppet| puppet.wait_until_heard("ego-10"));
@@ -491,7 +491,7 @@ fn maps_of_a_network_that_a_neighbour_names_as_another_are_left_out() {
             let bus = router.join("ego-10", "10");
             // A frame that waited for what is left out would take for ever.
             let options = ego_node::NodeOptions { deadline: PATIENCE, keeps_running: true, ..Default::default() };
-            let report = ego_node::run(&bus, &cav("10"), ego(Method::Max), &options, &stop).unwrap();
+            let report = ego_node::run(&bus, &cav("10"), ego(Method::MAX), &options, &stop).unwrap();
             assert_eq!((report.frames, report.at_deadline), (4, 0));
             leave(bus)
         });

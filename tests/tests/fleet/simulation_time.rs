@@ -51,7 +51,7 @@ fn evaluate_with(
     tch::set_num_threads(1);
     let config = EvaluateConfig {
         weights: folder.join("weights.safetensors"),
-        method: Some(Method::Max),
+        method: Some(Method::MAX),
         pose_source: PoseSourceConfig::Recorded,
         codec,
         rate: RateConfig::default(),

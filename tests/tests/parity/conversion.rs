@@ -9,9 +9,9 @@ use ego_fuser::ego::Ego;
 use ego_fuser_offline::multi_scale::{MultiScaleNetwork, OfflineDetector, Placement};
 use fusion::FusionConfig;
 use fusion::Method;
-use fusion::cobevt::CobevtConfig;
 use fusion::disconet::DiscoNetConfig;
 use fusion::model::CooperativeModel;
+use fusion::swap_fusion::SwapFusionConfig;
 use fusion::v2vnet::{Aggregation, V2vNetConfig};
 use fusion::v2xvit::V2xVitConfig;
 use fusion::warp::coalign;
@@ -94,8 +94,8 @@ fn golden_converted_where2comm_of_one_scale_runs_live() {
     assert_eq!(config.shrink, Some(ShrinkConfig::DoubleConv { channels, stride }));
     let fusion: FusionConfig = weights.metadata_json("fusion").unwrap();
     let expected = Where2commConfig { aggregation: where2comm::Aggregation::Attention, missing: Missing::Zero };
-    assert_eq!(fusion, FusionConfig::Where2comm(expected));
-    assert_eq!(Ego::load(&path, None).unwrap().method(), Method::Where2comm);
+    assert_eq!(fusion, FusionConfig::new(expected));
+    assert_eq!(Ego::load(&path, None).unwrap().method(), Method::WHERE2COMM);
 }
 
 /// Two vehicles that see something of the same street.
@@ -227,16 +227,16 @@ fn fusions_with_parameters_come_back_with_every_one() {
         },
         "feed_forward": {"mlp_dim": 24}
     }}});
-    let cobevt = CobevtConfig { count_missing: true, hidden: 20, ..CobevtConfig::lean(16) };
+    let cobevt = SwapFusionConfig { count_missing: true, hidden: 20, ..SwapFusionConfig::lean(16) };
     let cobevt_args = json!({"fax_fusion": {
         "mask": true, "depth": cobevt.depth, "agent_size": cobevt.slots, "window_size": cobevt.window,
         "dim_head": cobevt.head_channels, "mlp_dim": 20, "drop_out": cobevt.dropout
     }});
     for (method, fusion, hypes) in [
-        (Method::V2xVit, FusionConfig::V2xVit(v2xvit), hypes("point_pillar_transformer", v2xvit_args)),
-        (Method::Cobevt, FusionConfig::Cobevt(cobevt), hypes("point_pillar_cobevt", cobevt_args)),
-        (Method::V2vNet, FusionConfig::V2vNet(v2vnet), hypes("point_pillar_v2vnet", v2vnet_args)),
-        (Method::DiscoNet, FusionConfig::DiscoNet(disconet), hypes("point_pillar_disconet", json!({}))),
+        (Method::V2XVIT, FusionConfig::new(v2xvit), hypes("point_pillar_transformer", v2xvit_args)),
+        (Method::COBEVT, FusionConfig::new(cobevt), hypes("point_pillar_cobevt", cobevt_args)),
+        (Method::V2VNET, FusionConfig::new(v2vnet), hypes("point_pillar_v2vnet", v2vnet_args)),
+        (Method::DISCONET, FusionConfig::new(disconet), hypes("point_pillar_disconet", json!({}))),
     ] {
         let (state, variables) = state_of(folder.path(), method, &fusion);
         let config = folder.path().join("config.json");

@@ -5,7 +5,7 @@ use ::training::loss::{LabelTensors, LossConfig, Unassigned, detection_loss};
 use fusion::targets::{BOX_CODE, Labels, Positive, TargetAssigner, TargetRule};
 use fusion::warp::opencood::{self, Interpolation};
 use fusion::warp::{coalign, warp_to_ego};
-use fusion::{AlignedViews, AttentionFusion, Fusion, MaxFusion, ViewFacts, regroup};
+use fusion::{AlignedMaps, AttentionFusion, Fusion, MapMetadata, MaxFusion, regroup};
 use protocol::rotated_iou::Polygon;
 use protocol::{BevGrid, Box3d, Pose};
 use tch::{Device, Kind, Tensor};
@@ -268,19 +268,11 @@ fn check_fusion(golden: &Golden, name: &str, fusion: &dyn Fusion, features: &Ten
         .map(|features| {
             let [views, _, height, width] = features.size()[..] else { panic!("features have four dimensions") };
             let mask = Tensor::ones([views, 1, height, width], (Kind::Float, Device::Cpu));
-            let facts: Vec<_> = (0..views as usize).map(|agent| ViewFacts::fresh(agent, Pose::IDENTITY)).collect();
+            let facts: Vec<_> = (0..views as usize).map(|agent| MapMetadata::fresh(agent, Pose::IDENTITY)).collect();
             let [width, height] = [width, height].map(|size| size as u32);
             let grid = BevGrid { x_min_m: 0.0, y_min_m: 0.0, cell_m: 0.4, width, height };
-            let views = AlignedViews {
-                features,
-                mask: &mask,
-                own_frame: features,
-                sent: None,
-                grid: &grid,
-                facts: &facts,
-                earlier: None,
-            };
-            fusion.fuse(&views, false).unwrap()
+            let maps = AlignedMaps::newest(features, &mask, &facts, &grid);
+            fusion.fuse(&maps).unwrap().map
         })
         .collect();
     assert_close(name, &values(&Tensor::stack(&fused, 0)), &golden.f32(name).1, 1e-4, 0.0);

@@ -5,7 +5,7 @@ use fusion::disconet::{DiscoNet, DiscoNetConfig};
 use fusion::v2vnet::{self, Incoming, V2vNet, V2vNetConfig};
 use fusion::warp::{coalign, opencood};
 use fusion::where2comm::{Aggregation, Communication, CommunicationConfig, Missing, Where2comm, Where2commConfig};
-use fusion::{AlignedViews, Fusion, ViewFacts};
+use fusion::{AlignedMaps, Fusion, MapMetadata};
 use perception::layers::backbone::BevBackbone;
 use perception::model_config::{BlockKind, DetectorConfig, ShrinkConfig};
 use perception::pillars::batch::PillarBatch;
@@ -313,18 +313,10 @@ fn check_heads(golden: &Golden, network: &MultiScaleNetwork, samples: &[Placemen
 fn fuse(fusion: &dyn Fusion, maps: &Tensor) -> Tensor {
     let (agents, _, height, width) = maps.size4().unwrap();
     let mask = Tensor::ones([agents, 1, height, width], (Kind::Float, Device::Cpu));
-    let facts: Vec<_> = (0..agents as usize).map(|agent| ViewFacts::fresh(agent, Pose::IDENTITY)).collect();
+    let facts: Vec<_> = (0..agents as usize).map(|agent| MapMetadata::fresh(agent, Pose::IDENTITY)).collect();
     let grid = BevGrid { x_min_m: 0.0, y_min_m: 0.0, cell_m: 0.4, width: width as u32, height: height as u32 };
-    let views = AlignedViews {
-        features: maps,
-        mask: &mask,
-        own_frame: maps,
-        sent: None,
-        grid: &grid,
-        facts: &facts,
-        earlier: None,
-    };
-    no_grad(|| fusion.fuse(&views, false)).unwrap()
+    let maps = AlignedMaps::newest(maps, &mask, &facts, &grid);
+    no_grad(|| fusion.fuse(&maps)).unwrap().map
 }
 
 /// Where maps lie by the pairwise transforms of a case, `[height, width]` being the size of the map they are made for.

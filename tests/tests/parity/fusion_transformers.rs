@@ -1,7 +1,6 @@
 //! V2X-ViT and CoBEVT against the reference implementations.
 
-use fusion::cobevt::CobevtConfig;
-use fusion::swap_fusion::{Slots, SwapFusion};
+use fusion::swap_fusion::{Slots, SwapFusion, SwapFusionConfig};
 use fusion::v2xvit::{AgentAttention, Encoder, Merge, V2xVitConfig, WindowAttention, WindowConfig};
 use fusion::warp::{coalign, opencood};
 use fusion::{BlockOrder, layers::unseen};
@@ -153,7 +152,7 @@ fn check_swap_fusion(name: &str) {
     let config = golden.config();
     let size = |name: &str| integer(&config[name]);
     let masked = config["mask"].as_bool().expect("mask is true or false");
-    let cobevt = CobevtConfig {
+    let cobevt = SwapFusionConfig {
         channels: size("input_dim"),
         depth: size("depth") as usize,
         slots: size("agent_size"),

@@ -198,7 +198,7 @@ fn play(scenario: &Scenario, is_hostile: bool) -> (Vec<Vec<Detection>>, Counts, 
         let ego = scope.spawn(|| {
             let bus = bus;
             let options = NodeOptions { deadline: PATIENCE, keeps_running: true, ..NodeOptions::default() };
-            let ego = Ego::new(network(), Method::Max).unwrap();
+            let ego = Ego::new(network(), Method::MAX).unwrap();
             node::run(&bus, &cav("10"), ego, &options, &stop).unwrap();
             let books = bus.books().clone();
             bus.leave(PATIENCE).unwrap();

@@ -12,9 +12,8 @@ use agent::rate::RateConfig;
 use dataset::{self, IntensityScale, LoadOptions, Scenario};
 use deploy::experiment::table::{self, TableObserver, TableSpec};
 use ego_fuser_offline::evaluation::{EvaluateConfig, EvaluatedFrame, Evaluator};
-use fusion::FusionConfig;
 use fusion::Method;
-use fusion::pastat::Part;
+use fusion::pastat::{Part, ablated};
 use localization::pose_source::{CachedPoseConfig, NoiseMode, NoisyPoseConfig, PoseRow, PoseSourceConfig, PoseTable};
 use perception::weights::Weights;
 use protocol::{CodecConfig, Dtype, NoPoseReason, PoseEstimate};
@@ -29,7 +28,7 @@ const TICKS: usize = 7;
 fn begin(folder: &Path) -> (PathBuf, PathBuf) {
     let data = folder.join("data");
     scene::write(&data, &AGENTS, TICKS);
-    let summary = train::run(&config(&data, &folder.join("none"), Method::None, 5), &mut Ear::default()).unwrap();
+    let summary = train::run(&config(&data, &folder.join("none"), Method::NONE, 5), &mut Ear::default()).unwrap();
     (data, summary.trained.weights)
 }
 
@@ -41,7 +40,7 @@ fn pastat(folder: &Path, data: &Path, init: &Path, name: &str) -> TrainConfig {
         heading_std_deg: 0.5,
         ..Default::default()
     };
-    let mut config = config(data, &folder.join(name), Method::Pastat, 10);
+    let mut config = config(data, &folder.join(name), Method::PASTAT, 10);
     config.init = Some(init.to_owned());
     config.frozen_encoder = Some(KeptMaps {
         folder: folder.join("maps"),
@@ -58,7 +57,7 @@ fn evaluate(weights: &Path, data: &Path, poses: PoseSourceConfig, delay_nanos: u
     let codec = CodecConfig { dtype: Dtype::F16, ..CodecConfig::default() };
     let config = EvaluateConfig {
         weights: weights.to_owned(),
-        method: Some(Method::Pastat),
+        method: Some(Method::PASTAT),
         pose_source: poses,
         codec,
         rate: RateConfig::default(),
@@ -181,15 +180,15 @@ fn parts_are_left_out_by_the_configuration_and_stay_out() {
     let _generator = random_generator_lock();
     let folder = tempfile::tempdir().unwrap();
     let (data, init) = begin(folder.path());
-    let usual = FusionConfig::for_detector(Method::Pastat, &small());
+    let usual = Method::PASTAT.default_fusion(&small());
     let mut config = pastat(folder.path(), &data, &init, "ablation");
-    config.fusion = Some(usual.clone().ablated(&[Part::Ce, Part::Fsa, Part::Te], Some(1)).unwrap());
+    config.fusion = Some(ablated(&usual, &[Part::Ce, Part::Fsa, Part::Te], Some(1)).unwrap());
     let summary = train::run(&config, &mut Ear::default()).unwrap();
     let weights = Weights::load(&summary.trained.weights).unwrap();
     assert!(!weights.names().any(|name| name.contains(".fsa.") || name.contains(".ce.")));
     assert!(!evaluate(&summary.trained.weights, &data, PoseSourceConfig::Recorded, 0, false).is_empty());
-    let max = FusionConfig::for_detector(Method::Max, &small());
-    assert!(max.ablated(&[Part::Ce], None).unwrap_err().to_string().contains("pastat"));
+    let max = Method::MAX.default_fusion(&small());
+    assert!(ablated(&max, &[Part::Ce], None).unwrap_err().to_string().contains("pastat"));
 }
 
 /// A table of the true poses, but for one vehicle that does not know where it is at tick 3.

@@ -50,8 +50,12 @@ impl ModelCard {
 
     /// The configuration of the network.
     pub fn configuration(&mut self, config: &impl Serialize) {
-        let config = serde_json::to_string_pretty(config).unwrap_or_default();
-        self.paragraph(&format!("Configuration:\n\n```json\n{config}\n```"));
+        self.configuration_json(&serde_json::to_string_pretty(config).unwrap_or_default());
+    }
+
+    /// The same as JSON text.
+    pub fn configuration_json(&mut self, json: &str) {
+        self.paragraph(&format!("Configuration:\n\n```json\n{json}\n```"));
     }
 
     /// Writes it into the folder of the weights.

@@ -4,7 +4,6 @@ use std::fmt::Debug;
 
 use dataset::Scenario;
 use fusion::Exchange;
-use fusion::Method;
 use link::{CapacityConfig, DelayLaw, LinkConfig, LossLaw};
 
 use super::spec::{CodecSpec, Experiment, Grid, NoiseSpec};
@@ -118,7 +117,7 @@ fn contradictions(experiment: &Experiment, link: &LinkConfig) -> Result<(), Stri
         let names: Vec<&str> = grid.method.iter().map(|method| method.name()).collect();
         return Err(format!("grid.codec is how maps are written, but grid.method ({}) sends none", names.join(", ")));
     }
-    if grid.method.iter().all(|method| *method == Method::None) && grid.agents.is_some() {
+    if grid.method.iter().all(|method| method.exchange() == Exchange::Nothing) && grid.agents.is_some() {
         return Err("grid.agents varies who talks, but grid.method is none: nobody does".into());
     }
     let jitters = grid.jitter_ms.iter().flatten().any(|ms| *ms > 0.0);

@@ -204,9 +204,9 @@ mod tests {
         let grid = experiment("{method: [max, late], latency_ms: [0, 100], seed: [1, 2, 3]}").grid;
         let points = points(&grid);
         assert_eq!((points.len(), count(&grid)), (12, 12));
-        assert_eq!((points[0].method, points[0].latency_ms, points[0].seed), (Method::Max, Some(0.0), 1));
+        assert_eq!((points[0].method, points[0].latency_ms, points[0].seed), (Method::MAX, Some(0.0), 1));
         assert_eq!((points[1].latency_ms, points[1].seed), (Some(0.0), 2));
-        assert_eq!((points[11].method, points[11].latency_ms, points[11].seed), (Method::Late, Some(100.0), 3));
+        assert_eq!((points[11].method, points[11].latency_ms, points[11].seed), (Method::LATE, Some(100.0), 3));
     }
 
     #[test]

@@ -195,7 +195,7 @@ mod tests {
         FilledTable {
             name: "main".into(),
             columns: columns.iter().map(ToString::to_string).collect(),
-            rows: vec![row(Method::None, &[0.5]), row(Method::Pastat, &[0.6, 0.8])],
+            rows: vec![row(Method::NONE, &[0.5]), row(Method::PASTAT, &[0.6, 0.8])],
         }
     }
 

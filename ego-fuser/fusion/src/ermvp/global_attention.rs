@@ -3,9 +3,9 @@
 use tch::nn;
 use tch::{Kind, TchError, Tensor};
 
-use crate::cobevt::CobevtConfig;
 use crate::layers::{FeedForward, LayerNorm, Linear, attend, dropout};
 use crate::partition::{Partition, shape_error};
+use crate::swap_fusion::SwapFusionConfig;
 use crate::swap_fusion::{OffsetTable, Slots};
 
 /// Share of the channels inside a squeeze.
@@ -64,7 +64,7 @@ pub(super) struct GlobalHalf {
 
 impl GlobalHalf {
     /// Variables `WindowAttentionGlobal` and `windowGlobal_ffd` below `path`.
-    pub(super) fn new(path: &nn::Path<'_>, config: &CobevtConfig) -> Self {
+    pub(super) fn new(path: &nn::Path<'_>, config: &SwapFusionConfig) -> Self {
         let (attention, feed) = (path / "WindowAttentionGlobal", path / "windowGlobal_ffd");
         let inner = &attention / "fn";
         let channels = config.channels;

@@ -19,7 +19,7 @@ mod consensus;
 mod global_attention;
 mod sampling;
 
-use perception::model_config::ConfigError;
+use perception::model_config::{ConfigError, DetectorConfig};
 use serde::{Deserialize, Serialize};
 use tch::nn;
 use tch::{TchError, Tensor};
@@ -27,19 +27,32 @@ use tch::{TchError, Tensor};
 use self::consensus::Consensus;
 use self::global_attention::{GlobalHalf, REDUCTION};
 use self::sampling::Sampler;
-use super::cobevt::{CobevtConfig, nearest_first};
-use super::config::within;
+use super::bounds::within;
+use super::cobevt::nearest_first;
+use super::interface::{Fusion, FusionOutput};
+use super::maps::AlignedMaps;
 use super::padding::Padding;
 use super::partition::Partition;
-use super::swap_fusion::{HalfBlock, MeanHead, Slots};
-use super::{AlignedViews, Fusion};
+use super::settings::{FusionSettings, of_size};
+use super::spec::{Exchange, FusionSpec, MethodSpec};
+use super::swap_fusion::{HalfBlock, MeanHead, Slots, SwapFusionConfig};
+
+/// ERMVP.
+pub static METHOD: MethodSpec = MethodSpec {
+    name: "ermvp",
+    summary: "feature maps, the cells worth sending, poses corrected by agreement about them (ERMVP)",
+    exchange: Exchange::Features,
+    gate: None,
+    runs_with_weights_of: &[],
+    fusion: FusionSpec::of::<ErmvpConfig>(),
+};
 
 /// Sizes of ERMVP.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct ErmvpConfig {
     /// The layers; each has attention within windows twice, with local and with global queries.
-    pub layers: CobevtConfig,
+    pub layers: SwapFusionConfig,
     /// Share of a neighbour's cells that are kept.
     pub kept: f64,
     /// Cells that are compared to find out how a neighbour's map lies.
@@ -52,13 +65,13 @@ impl ErmvpConfig {
     /// The published sizes, for maps of `channels` (256 there).
     #[must_use]
     pub fn full(channels: i64) -> Self {
-        Self { layers: CobevtConfig::full(channels), kept: 0.2, compared: 128, search: 2 }
+        Self { layers: SwapFusionConfig::full(channels), kept: 0.2, compared: 128, search: 2 }
     }
 
     /// For live traffic on two cores; cells are half as large, so they are looked for twice as far.
     #[must_use]
     pub fn lean(channels: i64) -> Self {
-        Self { layers: CobevtConfig::lean(channels), search: 3, ..Self::full(channels) }
+        Self { layers: SwapFusionConfig::lean(channels), search: 3, ..Self::full(channels) }
     }
 
     /// Checks that a network can be built.
@@ -78,6 +91,18 @@ impl ErmvpConfig {
             return Err(ConfigError::Value { field: "fusion.kept", value, must: "a share above 0 and up to 1" });
         }
         Ok(())
+    }
+}
+
+impl FusionSettings for ErmvpConfig {
+    const KIND: &'static str = "ermvp";
+
+    fn for_detector(detector: &DetectorConfig) -> Self {
+        of_size(detector, Self::lean, Self::full)
+    }
+
+    fn build(&self, path: &nn::Path<'_>) -> Result<Box<dyn Fusion>, ConfigError> {
+        Ok(Box::new(Ermvp::new(path, self)?))
     }
 }
 
@@ -146,21 +171,21 @@ impl Ermvp {
 }
 
 impl Fusion for Ermvp {
-    fn fuse(&self, views: &AlignedViews<'_>, train: bool) -> Result<Tensor, TchError> {
-        let order = nearest_first(views);
-        let features = views.features.f_index_select(0, &order)?;
-        let mask = views.mask.f_index_select(0, &order)?;
+    fn fuse(&self, AlignedMaps { warped, metadata, is_training, .. }: &AlignedMaps) -> Result<FusionOutput, TchError> {
+        let order = nearest_first(metadata).to_device(warped.features.device());
+        let features = warped.features.f_index_select(0, &order)?;
+        let mask = warped.mask.f_index_select(0, &order)?;
         let padding = Padding::to_multiples(&features, self.window * REDUCTION)?;
         let maps = padding.maps(&features, 0)?.f_permute([0, 2, 3, 1])?.f_contiguous()?;
         let (maps, reach) = self.received(&maps, &padding.mask(&mask, 0)?.f_squeeze_dim(1)?)?;
         let slots = Slots { asked: reach.size()[0], reach: Some(&reach), count_missing: false };
         let mut x = maps;
         for layer in &self.layers {
-            let groups = layer.local.whole(&x, slots, self.window, train)?;
+            let groups = layer.local.whole(&x, slots, self.window, *is_training)?;
             x = Partition::Window.map(&groups, padding.size(), self.window)?;
-            x = layer.global.forward(&x, slots, train)?;
+            x = layer.global.forward(&x, slots, *is_training)?;
         }
-        padding.crop(&self.head.forward(&x, slots)?)
+        Ok(padding.crop(&self.head.forward(&x, slots)?)?.into())
     }
 }
 

@@ -1,9 +1,9 @@
-//! The numbers that define a PASTAT, and its switches.
+//! Sizes and switches of PASTAT.
 
 use perception::model_config::ConfigError;
 use serde::{Deserialize, Serialize};
 
-use super::correlation::PARTS;
+use super::spatial_alignment::correlation::PARTS;
 
 /// Which tokens ask in the attention over agents and time.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
@@ -25,19 +25,6 @@ pub enum Wavelengths {
     Usual,
 }
 
-/// A part that can be left out, for the ablation.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-pub enum Part {
-    /// Confidence Embedding.
-    Ce,
-    /// Feature Spatial Alignment.
-    Fsa,
-    /// Temporal Encoding.
-    Te,
-    /// The recall of earlier maps to the cell.
-    Recall,
-}
-
 /// Feature Spatial Alignment.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
@@ -53,8 +40,8 @@ pub struct FsaConfig {
     /// Largest turn of one look, radians.
     pub max_turn_rad: f64,
     /// The search for maps that are further away than all that; absent: such maps stay where they are.
-    #[serde(default)]
-    pub search: Option<SearchConfig>,
+    #[serde(default, rename = "search")]
+    pub alignment_search: Option<SearchConfig>,
 }
 
 /// The search for a map that lies far from where its pose puts it.
@@ -78,28 +65,29 @@ impl Default for FsaConfig {
             hidden: 64,
             max_shift_m: 3.0,
             max_turn_rad: 5.0_f64.to_radians(),
-            search: Some(SearchConfig { cells: 4, radius: 9, margin: 0.1 }),
+            alignment_search: Some(SearchConfig { cells: 4, radius: 9, margin: 0.1 }),
         }
     }
 }
 
-/// The recall of earlier maps, cell by cell.
+/// Temporal feature memory: earlier maps, blended in cell by cell.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
-pub struct RecallConfig {
+pub struct MemoryConfig {
     /// Channels from which it is told how much of an earlier map is taken.
     pub hidden: i64,
     /// In such a share of all tokens' patches, those where vehicles are most likely.
     pub share: f64,
 }
 
-impl Default for RecallConfig {
+impl Default for MemoryConfig {
     fn default() -> Self {
         Self { hidden: 24, share: 0.125 }
     }
 }
 
-/// A PASTAT from its tokens to its output. `ce`, `fsa`, `te`, `recall` and `frames` are the switches of the ablation.
+/// A PASTAT from its tokens to its output. `ce`, `fsa`, `te`, `temporal_memory` and `frames` are the switches of
+/// the ablation.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct PastatConfig {
@@ -120,11 +108,11 @@ pub struct PastatConfig {
     /// Which tokens ask.
     pub rows: Rows,
     /// Channels inside the two convolutions that sharpen the fused map; absent: there are none.
-    #[serde(default)]
-    pub refine: Option<i64>,
-    /// How earlier maps are blended into the newest; absent: they are heard through their tokens alone.
-    #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub recall: Option<RecallConfig>,
+    #[serde(default, rename = "refine")]
+    pub map_refinement: Option<i64>,
+    /// How earlier maps are blended into the newest; absent: they take part through their tokens alone.
+    #[serde(default, rename = "recall", skip_serializing_if = "Option::is_none")]
+    pub temporal_memory: Option<MemoryConfig>,
     /// Time steps wanted of every agent, the T of the paper.
     pub frames: usize,
     /// Along each edge so many cells of a map from before its agent's newest are taken together before it is moved: what
@@ -153,8 +141,8 @@ impl PastatConfig {
             mlp_ratio: 2,
             windows: vec![4, 8],
             rows: Rows::Ego,
-            refine: Some(96),
-            recall: Some(RecallConfig::default()),
+            map_refinement: Some(96),
+            temporal_memory: Some(MemoryConfig::default()),
             frames: 3,
             earlier_cells: 2,
             frame_secs: 0.1,
@@ -174,34 +162,21 @@ impl PastatConfig {
             depth: 3,
             windows: vec![4, 8],
             rows: Rows::All,
-            refine: Some(channels),
-            recall: None,
+            map_refinement: Some(channels),
+            temporal_memory: None,
             earlier_cells: 1,
             fsa: Some(FsaConfig { matching: 16, ..FsaConfig::default() }),
             ..Self::lean(channels)
         }
     }
 
-    /// The same without some parts.
-    #[must_use]
-    pub fn without(mut self, parts: &[Part]) -> Self {
-        for part in parts {
-            match part {
-                Part::Ce => self.ce = false,
-                Part::Fsa => self.fsa = None,
-                Part::Te => self.te = None,
-                Part::Recall => self.recall = None,
-            }
-        }
-        self
-    }
-
     /// Maps are padded to multiples of this many cells, so that tokens fill every window and cells every part that FSA
     /// compares.
     #[must_use]
     pub fn padding_cells(&self) -> i64 {
-        let larger =
-            |fsa: &FsaConfig| fsa.search.map_or(self.earlier_cells, |search| lcm(search.cells, self.earlier_cells));
+        let larger = |fsa: &FsaConfig| {
+            fsa.alignment_search.map_or(self.earlier_cells, |search| lcm(search.cells, self.earlier_cells))
+        };
         let parts = self.fsa.as_ref().map_or(1, |fsa| PARTS * larger(fsa));
         lcm(self.patch * self.windows.iter().copied().fold(1, lcm), parts)
     }
@@ -219,8 +194,8 @@ impl PastatConfig {
             ("pastat heads", self.heads, 64),
             ("pastat mlp_ratio", self.mlp_ratio, 16),
             ("pastat depth", i64::try_from(self.depth).unwrap_or(i64::MAX), 32),
-            ("pastat refine", self.refine.unwrap_or(1), 4096),
-            ("pastat recall hidden", self.recall.map_or(1, |recall| recall.hidden), 4096),
+            ("pastat refine", self.map_refinement.unwrap_or(1), 4096),
+            ("pastat recall hidden", self.temporal_memory.map_or(1, |memory| memory.hidden), 4096),
             ("pastat frames", i64::try_from(self.frames).unwrap_or(i64::MAX), 16),
         ] {
             if !(1..=most).contains(&value) {
@@ -241,18 +216,18 @@ impl PastatConfig {
         if !(1e-3..=10.0).contains(&self.frame_secs) {
             return error("pastat frame_secs", self.frame_secs.to_string(), "0.001 to 10 s");
         }
-        if let Some(cells) = self.fsa.as_ref().and_then(|fsa| fsa.search).map(|search| search.cells)
+        if let Some(cells) = self.fsa.as_ref().and_then(|fsa| fsa.alignment_search).map(|search| search.cells)
             && cells % self.earlier_cells != 0
         {
             return error("pastat fsa search cells", cells.to_string(), "a multiple of earlier_cells");
         }
-        if let Some(RecallConfig { share, .. }) = self.recall
+        if let Some(MemoryConfig { share, .. }) = self.temporal_memory
             && !(share > 0.0 && share <= 1.0)
         {
             return error("pastat recall share", share.to_string(), "above 0, up to 1");
         }
-        if self.recall.is_some() && self.frames < 2 {
-            return error("pastat frames", self.frames.to_string(), "2 or more, as earlier maps are recalled");
+        if self.temporal_memory.is_some() && self.frames < 2 {
+            return error("pastat frames", self.frames.to_string(), "2 or more, as earlier maps are blended in");
         }
         self.fsa.as_ref().map_or(Ok(()), FsaConfig::validate)
     }
@@ -275,7 +250,7 @@ impl FsaConfig {
             let value = format!("{} m, {} rad", self.max_shift_m, self.max_turn_rad);
             return error("pastat fsa bounds", value, "up to 50 m and 1.6 rad");
         }
-        if let Some(SearchConfig { cells, radius, margin }) = self.search
+        if let Some(SearchConfig { cells, radius, margin }) = self.alignment_search
             && !((1..=16).contains(&cells) && (1..=32).contains(&radius) && (0.0..=2.0).contains(&margin))
         {
             let value = format!("{cells}, {radius}, {margin}");
@@ -310,7 +285,7 @@ mod tests {
 
     #[test]
     fn what_cannot_be_built_is_named() {
-        let recall = |recall| PastatConfig { recall: Some(recall), ..PastatConfig::lean(64) };
+        let recall = |memory| PastatConfig { temporal_memory: Some(memory), ..PastatConfig::lean(64) };
         for (config, part) in [
             (PastatConfig { dim: 36, ..PastatConfig::lean(64) }, "dim is 36"),
             (PastatConfig { windows: vec![4, 8, 16], ..PastatConfig::lean(64) }, "windows is [4, 8, 16]"),
@@ -318,7 +293,7 @@ mod tests {
             (
                 PastatConfig {
                     fsa: Some(FsaConfig {
-                        search: Some(SearchConfig { cells: 3, radius: 9, margin: 0.1 }),
+                        alignment_search: Some(SearchConfig { cells: 3, radius: 9, margin: 0.1 }),
                         ..FsaConfig::default()
                     }),
                     ..PastatConfig::lean(64)
@@ -326,8 +301,8 @@ mod tests {
                 "search cells is 3",
             ),
             (PastatConfig { frames: 1, ..PastatConfig::lean(64) }, "frames is 1"),
-            (recall(RecallConfig { hidden: 0, ..RecallConfig::default() }), "recall hidden is 0"),
-            (recall(RecallConfig { share: f64::NAN, ..RecallConfig::default() }), "recall share is NaN"),
+            (recall(MemoryConfig { hidden: 0, ..MemoryConfig::default() }), "recall hidden is 0"),
+            (recall(MemoryConfig { share: f64::NAN, ..MemoryConfig::default() }), "recall share is NaN"),
             (PastatConfig { frames: 0, ..PastatConfig::lean(64) }, "frames is 0"),
             (PastatConfig { frame_secs: f64::NAN, ..PastatConfig::lean(64) }, "frame_secs is NaN"),
         ] {

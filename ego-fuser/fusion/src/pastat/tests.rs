@@ -2,26 +2,29 @@ use protocol::{BevGrid, Pose};
 use tch::nn::VarStore;
 use tch::{Device, Kind};
 
-use super::super::classes::Classes;
-use super::super::{EarlierViews, ViewFacts, WholeMap, WholeViews};
+use super::spatial_alignment::FineMaps;
 use super::*;
+use crate::classes::Classes;
+use crate::full_resolution::FullResolutionMap;
+use crate::maps::{EarlierMaps, MapMetadata, ReceivedMaps, larger_cells};
 use crate::test_data::{redraw, uniform};
+use crate::warp::WarpedMaps;
 
 const FLOAT: (Kind, Device) = (Kind::Float, Device::Cpu);
 const GRID: BevGrid = BevGrid { x_min_m: -10.0, y_min_m: -6.0, cell_m: 1.0, width: 20, height: 12 };
 
-/// Made-up entries: who made them, and when.
+/// Synthetic entries.
 struct Scene {
     features: Tensor,
     mask: Tensor,
-    facts: Vec<ViewFacts>,
+    facts: Vec<MapMetadata>,
 }
 
 impl Scene {
     fn new(agent: &[usize], age_secs: &[f64]) -> Self {
         tch::set_num_threads(1);
         let entries = agent.len() as i64;
-        let fact = |(&agent, &age_secs): (&usize, &f64)| ViewFacts {
+        let fact = |(&agent, &age_secs): (&usize, &f64)| MapMetadata {
             agent,
             // All stand where the ego does: where a map was made it is what it is on the ego's lattice.
             ego_from_cav: Pose::IDENTITY,
@@ -36,35 +39,41 @@ impl Scene {
     }
 
     fn fused(&self, pastat: &Pastat) -> Tensor {
-        self.seen_by(pastat, |views| pastat.fuse(&views, true).unwrap())
+        pastat.fuse(&self.aligned()).unwrap().map
     }
 
-    /// What `see` makes of it: the newest of each agent, and the rest with larger cells.
-    fn seen_by<T>(&self, pastat: &Pastat, see: impl FnOnce(AlignedViews<'_>) -> T) -> T {
+    /// The newest of each agent, and the rest with larger cells, those of `lean`.
+    fn aligned(&self) -> AlignedMaps {
+        self.aligned_with_cells_of(2)
+    }
+
+    fn aligned_with_cells_of(&self, cells: i64) -> AlignedMaps {
         let is_newest =
             |entry: &usize| self.facts[..*entry].iter().all(|facts| facts.agent != self.facts[*entry].agent);
         let (newest, earlier): (Vec<usize>, Vec<usize>) = (0..self.facts.len()).partition(is_newest);
         let (newest, earlier) = (self.only(&newest), self.only(&earlier));
-        let cells = pastat.config.earlier_cells;
+        let received = ReceivedMaps::new(newest.features.shallow_clone(), Some(newest.mask.shallow_clone()));
+        AlignedMaps {
+            received,
+            earlier: (!earlier.facts.is_empty()).then(|| earlier.pooled(cells)),
+            is_training: true,
+            ..AlignedMaps::newest(&newest.features, &newest.mask, &newest.facts, &GRID)
+        }
+    }
+
+    fn pooled(&self, cells: i64) -> EarlierMaps {
         let of = |tensor: &Tensor, entry: usize| tensor.narrow(0, entry as i64, 1);
-        let whole = |entry| WholeMap::of(&of(&earlier.features, entry), Some(&of(&earlier.mask, entry))).unwrap();
-        let whole: Vec<_> = (0..earlier.facts.len()).map(whole).collect();
+        let map = |entry| FullResolutionMap::of(&of(&self.features, entry), Some(&of(&self.mask, entry))).unwrap();
         let head = VarStore::new(Device::Cpu);
         let classes = Classes::under(&head.root(), [4, 2]);
         redraw(&head, &["cls_head"], 1.0);
-        let whole = WholeViews { maps: &whole, classes: &classes };
-        let maps = Maps { features: earlier.features, mask: earlier.mask }.with_cells_of(cells).unwrap();
-        let (features, mask) = (&maps.features, &maps.mask);
-        let before = EarlierViews { features, mask, facts: &earlier.facts, whole: Some(whole) };
-        see(AlignedViews {
-            features: &newest.features,
-            mask: &newest.mask,
-            own_frame: &newest.features,
-            sent: Some(&newest.mask),
-            grid: &GRID,
-            facts: &newest.facts,
-            earlier: (!earlier.facts.is_empty()).then_some(before),
-        })
+        let features = larger_cells(&self.features, cells).unwrap();
+        let mask = larger_cells(&self.mask, cells).unwrap().ceil();
+        EarlierMaps {
+            warped: WarpedMaps { features, mask },
+            metadata: self.facts.clone(),
+            full_resolution: Some(((0..self.facts.len()).map(map).collect(), classes)),
+        }
     }
 
     /// The same with these entries alone, in this order.
@@ -81,7 +90,7 @@ impl Scene {
 
 /// Without the search, in which maps without a meaning fit anywhere.
 fn small() -> PastatConfig {
-    let fsa = FsaConfig { search: None, ..FsaConfig::default() };
+    let fsa = FsaConfig { alignment_search: None, ..FsaConfig::default() };
     PastatConfig { dim: 16, windows: vec![2, 4], fsa: Some(fsa), ..PastatConfig::lean(4) }
 }
 
@@ -105,7 +114,8 @@ fn untrained_it_is_the_maximum_of_the_newest_maps() {
         let pastat = Pastat::new(&variables.root(), &config).unwrap();
         let scene = Scene::new(&[0, 1, 2, 0, 1], &[0.0, 0.1, 0.0, 0.1, 0.2]);
         let newest = scene.features.narrow(0, 0, 3).amax([0_i64].as_slice(), false);
-        assert!(distance(&scene.fused(&pastat), &newest) < 1e-4);
+        let fused = pastat.fuse(&scene.aligned_with_cells_of(config.earlier_cells)).unwrap().map;
+        assert!(distance(&fused, &newest) < 1e-4);
         let alone = Scene::new(&[0], &[0.0]);
         assert!(distance(&alone.fused(&pastat), &alone.features.get(0)) < 1e-6);
     }
@@ -174,6 +184,14 @@ fn every_parameter_gets_a_gradient() {
     }
 }
 
+/// The maps after FSA.
+fn fine(pastat: &Pastat, maps: &AlignedMaps) -> FineMaps {
+    let coarse = pastat.coarse_alignment.pick(maps).unwrap();
+    let confidences = pastat.confidence_embedding.embed(&coarse.origins).unwrap();
+    let patches = pastat.patches.flatten(&coarse).unwrap();
+    pastat.spatial_alignment.align(&coarse, patches, &confidences, &maps.grid, true).unwrap().0
+}
+
 #[test]
 fn fsa_learns_a_shift_from_the_maps_alone() {
     tch::manual_seed(7);
@@ -187,9 +205,9 @@ fn fsa_learns_a_shift_from_the_maps_alone() {
         let cells = uniform(step, &[1, 4, 12, 20]).gt(0.9).to_kind(Kind::Float) * 3.0;
         let shift = if step.is_multiple_of(2) { 1 } else { -1 };
         scene.features = Tensor::cat(&[&cells, &cells.roll([shift], [3])], 0);
-        let entries = scene.seen_by(&pastat, |views| pastat.align(&Shown::of(&views).unwrap(), &GRID, true).unwrap());
+        let fine = fine(&pastat, &scene.aligned_with_cells_of(1));
         let inside = |map: Tensor| map.narrow(1, 2, 8).narrow(2, 4, 12);
-        let difference = inside(entries.others.maps().features.get(0)) - inside(cells.get(0));
+        let difference = inside(fine.neighbours.maps().features.get(0)) - inside(cells.get(0));
         let loss = difference.square().mean(Kind::Float);
         if train {
             optimizer.zero_grad();
@@ -207,7 +225,7 @@ fn fsa_learns_a_shift_from_the_maps_alone() {
 }
 
 #[test]
-fn a_recall_takes_of_earlier_maps_where_they_show_something() {
+fn the_memory_takes_of_earlier_maps_where_they_show_something() {
     let (_store, pastat) = trained(&PastatConfig { fsa: None, ..small() });
     let scene = Scene::new(&[0, 1, 0, 1, 0], &[0.0, 0.0, 0.1, 0.1, 0.2]);
     let fused = scene.fused(&pastat);
@@ -218,5 +236,5 @@ fn a_recall_takes_of_earlier_maps_where_they_show_something() {
     let _ = scene.features.get(4).fill_(9.0);
     assert!(distance(&scene.fused(&pastat), &without) < 1e-4);
     assert!(distance(&scene.only(&[0, 1, 2, 3]).fused(&pastat), &without) < 1e-4);
-    assert!(scene.only(&[0, 1]).fused(&pastat).isfinite().all().int64_value(&[]) == 1, "nothing to recall");
+    assert!(scene.only(&[0, 1]).fused(&pastat).isfinite().all().int64_value(&[]) == 1, "nothing to remember");
 }

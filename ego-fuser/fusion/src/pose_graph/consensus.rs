@@ -2,7 +2,7 @@
 
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
 
-use super::PoseGraphConfig;
+use super::config::PoseGraphConfig;
 use crate::planar_fit;
 
 /// Two boxes nearer than this fix no heading, metres.

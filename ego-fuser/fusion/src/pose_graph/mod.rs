@@ -9,62 +9,16 @@
 //! ours does not, and it is taken from score and distance. Agents stay near their own poses by a weak prior, so that one
 //! with few boxes in common is not turned about by them; and corrections smaller than boxes are exact are left undone.
 
+mod config;
 mod consensus;
 mod optimise;
 
 use nalgebra::{Isometry3, UnitQuaternion, Vector3};
 use protocol::{Detection, Pose};
-use serde::{Deserialize, Serialize};
 
+pub use config::PoseGraphConfig;
 use consensus::consensus;
 use optimise::{Graph, Node, Observation};
-
-/// Settings of the correction.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct PoseGraphConfig {
-    /// At most so many boxes of each agent, the surest.
-    pub max_boxes: usize,
-    /// Boxes below this score are not looked at.
-    pub min_score: f32,
-    /// Fewest objects that an agent must share with those that are aligned already; below, its pose stays.
-    pub min_shared: usize,
-    /// How far apart two boxes of one object may lie by the poses as they came, metres.
-    pub search_m: f64,
-    /// How much an agent may have to be turned, degrees.
-    pub max_turn_deg: f64,
-    /// How far apart two boxes of one object may lie after the agent was moved, metres.
-    pub fit_tolerance_m: f64,
-    /// Standard deviation of the centre of a sure box nearby, metres.
-    pub box_std_m: f64,
-    /// The same of its heading, degrees.
-    pub box_std_deg: f64,
-    /// An agent whose boxes would be moved by less than this on average stays where it was, metres: boxes are not as exact
-    /// as a good pose.
-    pub dead_zone_m: f64,
-    /// Standard deviation of the poses as they came, metres.
-    pub pose_std_m: f64,
-    /// The same of their heading, degrees.
-    pub pose_std_deg: f64,
-}
-
-impl Default for PoseGraphConfig {
-    fn default() -> Self {
-        Self {
-            max_boxes: 40,
-            min_score: 0.25,
-            min_shared: 3,
-            search_m: 6.0,
-            max_turn_deg: 6.0,
-            fit_tolerance_m: 1.0,
-            box_std_m: 0.3,
-            box_std_deg: 4.0,
-            dead_zone_m: 0.4,
-            pose_std_m: 3.0,
-            pose_std_deg: 3.0,
-        }
-    }
-}
 
 /// An agent with what it sees.
 #[derive(Debug, Clone, Copy)]

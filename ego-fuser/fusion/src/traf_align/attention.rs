@@ -3,7 +3,7 @@
 use tch::nn::{self, Init};
 use tch::{TchError, Tensor};
 
-use super::TrafAlignConfig;
+use super::config::TrafAlignConfig;
 use crate::layers::{LayerNorm, Linear};
 use crate::warp::{BILINEAR, PADDING_ZEROS};
 

@@ -4,7 +4,7 @@ use perception::layers::convolution::ConvLayer;
 use tch::nn::{self, Init};
 use tch::{Kind, TchError, Tensor};
 
-use super::TrafAlignConfig;
+use super::config::TrafAlignConfig;
 
 /// Channels of the U-Net: at full and at half resolution.
 const WIDTHS: [i64; 2] = [16, 32];

@@ -17,72 +17,48 @@
 //! - `lean` works on tokens of 2 x 2 cells.
 
 mod attention;
+mod config;
 mod field;
 
 use perception::layers::convolution::ConvLayer;
-use perception::model_config::ConfigError;
-use serde::{Deserialize, Serialize};
+use perception::model_config::{ConfigError, DetectorConfig};
 use tch::nn::{self, Init};
 use tch::{Kind, TchError, Tensor};
 
+pub use config::TrafAlignConfig;
+
 use self::attention::TrajectoryAttention;
 use self::field::Trajectories;
-use super::config::within;
+use super::interface::{Fusion, FusionOutput};
+use super::maps::{AlignedMaps, MapMetadata, present};
 use super::padding::Padding;
-use super::{AlignedViews, Fusion, present};
+use super::settings::{FusionSettings, HistorySpec, Requirements, of_size};
+use super::spec::{Exchange, FusionSpec, MethodSpec};
 
-/// Sizes of [`TrafAlign`].
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct TrafAlignConfig {
-    /// Channels of the maps.
-    pub channels: i64,
-    /// Cells along each edge of a token.
-    pub patch: i64,
-    /// Channels of a token.
-    pub dim: i64,
-    /// Heads of the attention.
-    pub heads: i64,
-    /// Points that a token looks at: a square of so many along each edge, moved by offsets.
-    pub kernel: i64,
-    /// Layers of attention, all along the same points.
-    pub layers: usize,
-    /// Channels of the trajectory field.
-    pub field: i64,
-    /// Time steps wanted of every agent.
-    pub frames: usize,
-    /// Time from one step to the next, seconds.
-    pub frame_secs: f64,
-}
+/// TraF-Align.
+pub static METHOD: MethodSpec = MethodSpec {
+    name: "traf_align",
+    summary: "feature maps with history, attention along trajectories (TraF-Align)",
+    exchange: Exchange::Features,
+    gate: None,
+    runs_with_weights_of: &[],
+    fusion: FusionSpec::of::<TrafAlignConfig>(),
+};
 
-impl TrafAlignConfig {
-    /// Sized for one core and live traffic.
-    #[must_use]
-    pub fn lean(channels: i64) -> Self {
-        let (patch, dim, heads, kernel, layers, field) = (2, 32, 2, 3, 1, 3);
-        Self { channels, patch, dim, heads, kernel, layers, field, frames: 3, frame_secs: 0.1 }
+impl FusionSettings for TrafAlignConfig {
+    const KIND: &'static str = "traf_align";
+
+    fn for_detector(detector: &DetectorConfig) -> Self {
+        of_size(detector, Self::lean, Self::full)
     }
 
-    /// About the published sizes.
-    #[must_use]
-    pub fn full(channels: i64) -> Self {
-        Self { patch: 1, dim: channels, heads: 4, layers: 2, frames: 4, ..Self::lean(channels) }
+    fn build(&self, path: &nn::Path<'_>) -> Result<Box<dyn Fusion>, ConfigError> {
+        Ok(Box::new(TrafAlign::new(path, self)?))
     }
 
-    /// Checks that a network can be built.
-    ///
-    /// # Errors
-    /// [`ConfigError`] names the field.
-    pub fn validate(&self) -> Result<(), ConfigError> {
-        within("fusion channels", self.channels, 1..=4096)?;
-        within("fusion patch", self.patch, 1..=8)?;
-        within("fusion dim", self.dim, 2..=4096)?;
-        within("fusion heads", if self.dim % self.heads.max(1) == 0 { self.heads } else { 0 }, 1..=64)?;
-        within("fusion kernel", self.kernel, 1..=9)?;
-        within("fusion layers", self.layers as i64, 1..=16)?;
-        within("fusion field", self.field, 1..=64)?;
-        within("fusion frames", self.frames as i64, 1..=16)?;
-        within("fusion frame_secs in ms", (self.frame_secs * 1e3) as i64, 1..=60_000)
+    fn requirements(&self) -> Requirements {
+        let history = HistorySpec { frames: self.frames, ..HistorySpec::default() };
+        Requirements { history, ..Requirements::default() }
     }
 }
 
@@ -175,8 +151,8 @@ struct Agents {
 }
 
 impl Agents {
-    fn new(views: &AlignedViews<'_>, entries: &[i64]) -> Self {
-        let facts: Vec<_> = entries.iter().map(|&entry| views.facts[entry as usize]).collect();
+    fn new(metadata: &[MapMetadata], entries: &[i64]) -> Self {
+        let facts: Vec<_> = entries.iter().map(|&entry| metadata[entry as usize]).collect();
         let mut names: Vec<usize> = Vec::new();
         let owner: Vec<i64> = (facts.iter())
             .map(|facts| {
@@ -197,17 +173,13 @@ impl Agents {
 }
 
 impl Fusion for TrafAlign {
-    fn fuse(&self, views: &AlignedViews<'_>, train: bool) -> Result<Tensor, TchError> {
-        let entries = present(views.mask)?;
-        let agents = Agents::new(views, &entries);
-        let index = Tensor::f_from_slice(&entries)?.f_to_device(views.features.device())?;
+    fn fuse(&self, AlignedMaps { warped, metadata, is_training, .. }: &AlignedMaps) -> Result<FusionOutput, TchError> {
+        let entries = present(&warped.mask)?;
+        let agents = Agents::new(metadata, &entries);
+        let index = Tensor::f_from_slice(&entries)?.f_to_device(warped.features.device())?;
         let pick = |tensor: &Tensor| tensor.f_index_select(0, &index)?.f_to_kind(Kind::Float);
-        let fused = self.fuse_present(&pick(views.features)?, &pick(views.mask)?, &agents, train)?;
-        fused.f_to_kind(views.features.kind())
-    }
-
-    fn frames(&self) -> usize {
-        self.config.frames
+        let fused = self.fuse_present(&pick(&warped.features)?, &pick(&warped.mask)?, &agents, *is_training)?;
+        Ok(fused.f_to_kind(warped.features.kind())?.into())
     }
 }
 

@@ -3,7 +3,7 @@ use tch::nn::{OptimizerConfig, VarStore};
 use tch::{Device, no_grad};
 
 use super::*;
-use crate::{MaxFusion, ViewFacts};
+use crate::{MapMetadata, MaxFusion};
 
 const FLOAT: (Kind, Device) = (Kind::Float, Device::Cpu);
 const GRID: BevGrid = BevGrid { x_min_m: 0.0, y_min_m: 0.0, cell_m: 0.8, width: 22, height: 18 };
@@ -16,18 +16,15 @@ fn network() -> (VarStore, TrafAlign) {
     (variables, network)
 }
 
-fn fuse(fusion: &dyn Fusion, features: &Tensor, facts: &[ViewFacts], train: bool) -> Tensor {
+fn fuse(fusion: &dyn Fusion, features: &Tensor, facts: &[MapMetadata], train: bool) -> Tensor {
     let mask = Tensor::ones([features.size()[0], 1, 18, 22], FLOAT);
-    fusion
-        .fuse(
-            &AlignedViews { features, mask: &mask, own_frame: features, sent: None, grid: &GRID, facts, earlier: None },
-            train,
-        )
-        .unwrap()
+    let maps = AlignedMaps { is_training: train, ..AlignedMaps::newest(features, &mask, facts, &GRID) };
+    fusion.fuse(&maps).unwrap().map
 }
 
-fn facts(agents_and_ages: &[(usize, f64)]) -> Vec<ViewFacts> {
-    let facts = |&(agent, age_secs): &(usize, f64)| ViewFacts { age_secs, ..ViewFacts::fresh(agent, Pose::IDENTITY) };
+fn facts(agents_and_ages: &[(usize, f64)]) -> Vec<MapMetadata> {
+    let facts =
+        |&(agent, age_secs): &(usize, f64)| MapMetadata { age_secs, ..MapMetadata::fresh(agent, Pose::IDENTITY) };
     agents_and_ages.iter().map(facts).collect()
 }
 

@@ -10,7 +10,7 @@ mod encoder;
 mod temporal_encoding;
 mod window_attention;
 
-use perception::model_config::ConfigError;
+use perception::model_config::{ConfigError, DetectorConfig};
 use tch::nn;
 use tch::{TchError, Tensor};
 
@@ -21,12 +21,37 @@ pub use temporal_encoding::{ROW_SECS, TemporalEncoding};
 pub use window_attention::{WindowAttention, WindowBranch};
 
 use super::block_order::BlockOrder;
+use super::interface::{Fusion, FusionOutput};
 use super::layers::unseen;
+use super::maps::AlignedMaps;
 use super::padding::Padding;
-use super::{AlignedViews, Fusion};
+use super::settings::{FusionSettings, of_size};
+use super::spec::{Exchange, FusionSpec, MethodSpec};
+
+/// V2X-ViT.
+pub static METHOD: MethodSpec = MethodSpec {
+    name: "v2xvit",
+    summary: "feature maps, attention over agents and windows of several sizes (V2X-ViT)",
+    exchange: Exchange::Features,
+    gate: None,
+    runs_with_weights_of: &[],
+    fusion: FusionSpec::of::<V2xVitConfig>(),
+};
 
 /// All agents are vehicles; the second type of the reference is infrastructure.
 const VEHICLE: usize = 0;
+
+impl FusionSettings for V2xVitConfig {
+    const KIND: &'static str = "v2xvit";
+
+    fn for_detector(detector: &DetectorConfig) -> Self {
+        of_size(detector, Self::lean, Self::full)
+    }
+
+    fn build(&self, path: &nn::Path<'_>) -> Result<Box<dyn Fusion>, ConfigError> {
+        Ok(Box::new(V2xVit::new(path, self)?))
+    }
+}
 
 /// The method behind the common interface.
 #[derive(Debug)]
@@ -47,27 +72,29 @@ impl V2xVit {
     }
 
     /// The features with the code of each map's age where the map reaches.
-    fn with_age(&self, views: &AlignedViews<'_>) -> Result<Tensor, TchError> {
-        let Some(temporal) = self.encoder.temporal() else { return Ok(views.features.shallow_clone()) };
-        let rows: Vec<f64> = views.facts.iter().map(|facts| facts.age_secs / ROW_SECS).collect();
+    fn with_age(&self, AlignedMaps { warped, metadata, .. }: &AlignedMaps) -> Result<Tensor, TchError> {
+        let Some(temporal) = self.encoder.temporal() else { return Ok(warped.features.shallow_clone()) };
+        let rows: Vec<f64> = metadata.iter().map(|map| map.age_secs / ROW_SECS).collect();
         let code = temporal.encode(&rows)?.f_unsqueeze(-1)?.f_unsqueeze(-1)?;
         // The reference adds it before the warp, which leaves zeros where a map does not reach.
-        views.features.f_addcmul(&code, views.mask)
+        warped.features.f_addcmul(&code, &warped.mask)
     }
 }
 
 impl Fusion for V2xVit {
-    fn fuse(&self, views: &AlignedViews<'_>, train: bool) -> Result<Tensor, TchError> {
-        let padding = Padding::to_multiples(views.features, self.order.largest())?;
-        let tokens = self.order.tokens(&padding.maps(&self.with_age(views)?, 0)?)?;
-        let sees_all = views.mask.f_min()?.f_double_value(&[])? > 0.0;
+    fn fuse(&self, maps: &AlignedMaps) -> Result<FusionOutput, TchError> {
+        let mask = &maps.warped.mask;
+        let padding = Padding::to_multiples(&maps.warped.features, self.order.largest())?;
+        let tokens = self.order.tokens(&padding.maps(&self.with_age(maps)?, 0)?)?;
+        let sees_all = mask.f_min()?.f_double_value(&[])? > 0.0;
         let unseen = if sees_all && padding.is_empty() {
             None
         } else {
-            Some(self.order.tokens(&unseen(&padding.mask(views.mask, 0)?)?)?.f_squeeze_dim(2)?)
+            Some(self.order.tokens(&unseen(&padding.mask(mask, 0)?)?)?.f_squeeze_dim(2)?)
         };
-        let fused = self.encoder.forward(&tokens, unseen.as_ref(), &vec![VEHICLE; views.facts.len()], train)?;
+        let types = vec![VEHICLE; maps.metadata.len()];
+        let fused = self.encoder.forward(&tokens, unseen.as_ref(), &types, maps.is_training)?;
         let [height, width] = padding.size();
-        padding.crop(&self.order.maps(&fused.f_unsqueeze(0)?, height, width)?.f_get(0)?)
+        Ok(padding.crop(&self.order.maps(&fused.f_unsqueeze(0)?, height, width)?.f_get(0)?)?.into())
     }
 }

@@ -49,12 +49,25 @@ pub enum WarpError {
 
 /// Maps on the ego lattice.
 #[derive(Debug)]
-pub struct Warped {
+pub struct WarpedMaps {
     /// `[N, C, H, W]`, zero wherever the mask is.
     pub features: Tensor,
     /// `[N, 1, H, W]` of the same kind: 1 where the ego's cell centre lies on a cell that the CAV
     /// sent, else 0.
     pub mask: Tensor,
+}
+
+impl WarpedMaps {
+    /// How many.
+    pub(crate) fn count(&self) -> Result<i64, TchError> {
+        Ok(self.features.size4()?.0)
+    }
+
+    /// The entries from `first` up to `end`.
+    pub(crate) fn only(&self, first: i64, end: i64) -> Result<Self, TchError> {
+        let of = |tensor: &Tensor| tensor.f_narrow(0, first, end - first);
+        Ok(Self { features: of(&self.features)?, mask: of(&self.mask)? })
+    }
 }
 
 /// Resamples BEV features of CAVs onto the ego lattice, bilinearly between cell centres.
@@ -77,7 +90,7 @@ pub fn warp_to_ego(
     sent: Option<&Tensor>,
     ego_from_cav: &[Pose],
     grid: &BevGrid,
-) -> Result<Warped, WarpError> {
+) -> Result<WarpedMaps, WarpError> {
     warp_in_order(features, sent, ego_from_cav, grid, Order::Planes)
 }
 
@@ -88,7 +101,7 @@ pub(crate) fn warp_in_order(
     ego_from_cav: &[Pose],
     grid: &BevGrid,
     order: Order,
-) -> Result<Warped, WarpError> {
+) -> Result<WarpedMaps, WarpError> {
     let size = features.size();
     let &[maps, _, height, width] = size.as_slice() else { return Err(shape_error(size, grid)) };
     if (height, width) != (i64::from(grid.height), i64::from(grid.width)) {
@@ -104,7 +117,7 @@ pub(crate) fn warp_in_order(
     };
     let affine: Vec<_> = ego_from_cav.iter().map(|pose| cav_from_ego_normalized(pose, grid)).collect();
     if affine.iter().all(|&affine| affine == UNMOVED) {
-        return Ok(Warped { features: features.shallow_clone(), mask: sent.f_to_kind(features.kind())? });
+        return Ok(WarpedMaps { features: features.shallow_clone(), mask: sent.f_to_kind(features.kind())? });
     }
     let mut moved = Vec::with_capacity(ego_from_cav.len());
     let mut masks = Vec::with_capacity(ego_from_cav.len());
@@ -128,7 +141,7 @@ pub(crate) fn warp_in_order(
         Order::Cells => one_after_another(&moved)?,
         Order::Planes => Tensor::f_cat(&moved, 0)?,
     };
-    Ok(Warped { features, mask: Tensor::f_cat(&masks, 0)? })
+    Ok(WarpedMaps { features, mask: Tensor::f_cat(&masks, 0)? })
 }
 
 /// Where an affine map of normalised coordinates puts the cells of a lattice, `[1, h, w, 2]` for `grid_sampler`.

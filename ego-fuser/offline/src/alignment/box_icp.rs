@@ -3,7 +3,7 @@
 use nalgebra::{Isometry3, Vector3};
 use protocol::Box3d;
 
-use super::NoAlignment;
+use super::free_align::NoAlignment;
 use fusion::planar_fit;
 
 /// Fewest boxes of each vehicle.

@@ -1,11 +1,12 @@
-//! Approaches that exchange boxes.
+//! Alignment methods that exchange boxes.
 
 use nalgebra::Isometry3;
 use protocol::message::{Boxes, Message};
 use protocol::{Box3d, Detection, NoPoseReason, PoseEstimate};
 
+use super::box_icp;
 use super::free_align::{self, FreeAlignConfig};
-use super::{AlignError, Approach, NotAligned, Vehicle, box_icp};
+use super::method::{AlignError, AlignmentMethod, AlignmentSpec, NotAligned, Vehicle};
 
 /// Nobody knows where it is: that is the point.
 const NO_POSE: PoseEstimate = PoseEstimate::NoPose { reason: NoPoseReason::NoSource, inlier_count: 0 };
@@ -17,15 +18,15 @@ pub struct FreeAlign {
     pub config: FreeAlignConfig,
 }
 
-impl Approach for FreeAlign {
-    fn name(&self) -> &str {
-        "free-align"
+impl FreeAlign {
+    /// The method with some settings.
+    #[must_use]
+    pub fn spec(config: FreeAlignConfig) -> AlignmentSpec {
+        AlignmentSpec::new("free-align", true, move || Self { config: config.clone() })
     }
+}
 
-    fn needs_boxes(&self) -> bool {
-        true
-    }
-
+impl AlignmentMethod for FreeAlign {
     fn prepare(&mut self, vehicle: &Vehicle<'_>) -> Result<Message, AlignError> {
         Ok(message(&vehicle.boxes[..vehicle.boxes.len().min(self.config.max_boxes)]))
     }
@@ -40,15 +41,15 @@ impl Approach for FreeAlign {
 #[derive(Debug, Clone, Copy, Default)]
 pub struct BoxIcp;
 
-impl Approach for BoxIcp {
-    fn name(&self) -> &str {
-        "box-icp"
+impl BoxIcp {
+    /// The method, which has no settings.
+    #[must_use]
+    pub fn spec() -> AlignmentSpec {
+        AlignmentSpec::new("box-icp", true, || Self)
     }
+}
 
-    fn needs_boxes(&self) -> bool {
-        true
-    }
-
+impl AlignmentMethod for BoxIcp {
     fn prepare(&mut self, vehicle: &Vehicle<'_>) -> Result<Message, AlignError> {
         Ok(message(vehicle.boxes))
     }

@@ -1,11 +1,11 @@
-//! The approach that exchanges sweeps: ICP of the neighbour's against the ego's.
+//! Alignment by sweeps: ICP of the neighbour's against the ego's.
 
 use localization::registration::icp::{self, IcpConfig, IcpSource, IcpTarget};
 use nalgebra::Isometry3;
 use protocol::message::{Message, Points};
 use protocol::{NoPoseReason, PointCloud, PoseEstimate};
 
-use super::{AlignError, Approach, NotAligned, Vehicle};
+use super::method::{AlignError, AlignmentMethod, AlignmentSpec, NotAligned, Vehicle};
 
 /// Registers the neighbour's thinned sweep against the ego's own.
 #[derive(Debug, Clone)]
@@ -17,8 +17,9 @@ pub struct CloudIcp {
 impl CloudIcp {
     /// Begins as if both stood at one place, or (`starts_at_gnss`) where both receivers say they are.
     #[must_use]
-    pub fn new(config: IcpConfig, starts_at_gnss: bool) -> Self {
-        Self { config, starts_at_gnss }
+    pub fn spec(config: IcpConfig, starts_at_gnss: bool) -> AlignmentSpec {
+        let name = if starts_at_gnss { "icp-gnss" } else { "icp" };
+        AlignmentSpec::new(name, false, move || Self { config: config.clone(), starts_at_gnss })
     }
 
     fn start(&self, own: &PoseEstimate, received: &PoseEstimate) -> Result<Isometry3<f64>, NotAligned> {
@@ -30,11 +31,7 @@ impl CloudIcp {
     }
 }
 
-impl Approach for CloudIcp {
-    fn name(&self) -> &str {
-        if self.starts_at_gnss { "icp-gnss" } else { "icp" }
-    }
-
+impl AlignmentMethod for CloudIcp {
     fn prepare(&mut self, vehicle: &Vehicle<'_>) -> Result<Message, AlignError> {
         let thinned = IcpSource::of_sweep(&vehicle.frame.points.xyzi, &self.config);
         let xyzi = thinned.points_m().iter().map(|p| [p.x as f32, p.y as f32, p.z as f32, 0.0]).collect();

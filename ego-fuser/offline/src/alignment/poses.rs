@@ -1,14 +1,15 @@
-//! The approach of the paper: every vehicle finds its own pose, and poses are all that is exchanged.
+//! The method of the paper: every vehicle finds its own pose, and poses are all that is exchanged.
 
 use std::collections::BTreeMap;
 use std::fmt;
+use std::rc::Rc;
 
 use localization::pose_source::{PoseInput, PoseSource, PoseSourceError};
 use nalgebra::Isometry3;
 use protocol::CavId;
 use protocol::message::Message;
 
-use super::{AlignError, Approach, NotAligned, Vehicle};
+use super::method::{AlignError, AlignmentMethod, AlignmentSpec, NotAligned, Vehicle};
 
 /// Which pose of the recording a source is shown as measured.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
@@ -19,43 +20,35 @@ pub enum Measured {
     Gnss,
 }
 
-type Build = Box<dyn Fn() -> Result<Box<dyn PoseSource>, PoseSourceError>>;
+type Build = dyn Fn() -> Result<Box<dyn PoseSource>, PoseSourceError>;
 
 /// Aligns by the difference of both vehicles' poses.
 pub struct Poses {
-    name: String,
-    build: Build,
+    build: Rc<Build>,
     measured: Measured,
     /// A source for each vehicle: some remember where it was.
     sources: BTreeMap<CavId, Box<dyn PoseSource>>,
 }
 
 impl Poses {
-    /// An approach over any pose source; `build` makes one for each vehicle of a scene.
-    pub fn new(
+    /// A method over any pose source; `build` makes one for each vehicle of a scene.
+    pub fn spec(
         name: impl Into<String>,
         measured: Measured,
         build: impl Fn() -> Result<Box<dyn PoseSource>, PoseSourceError> + 'static,
-    ) -> Self {
-        Self { name: name.into(), build: Box::new(build), measured, sources: BTreeMap::new() }
+    ) -> AlignmentSpec {
+        let build: Rc<Build> = Rc::new(build);
+        AlignmentSpec::new(name, false, move || Self { build: Rc::clone(&build), measured, sources: BTreeMap::new() })
     }
 }
 
 impl fmt::Debug for Poses {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
-        f.debug_struct("Poses").field("name", &self.name).field("measured", &self.measured).finish_non_exhaustive()
+        f.debug_struct("Poses").field("measured", &self.measured).finish_non_exhaustive()
     }
 }
 
-impl Approach for Poses {
-    fn name(&self) -> &str {
-        &self.name
-    }
-
-    fn begin(&mut self) {
-        self.sources.clear();
-    }
-
+impl AlignmentMethod for Poses {
     fn prepare(&mut self, vehicle: &Vehicle<'_>) -> Result<Message, AlignError> {
         let frame = vehicle.frame;
         let measured = match self.measured {

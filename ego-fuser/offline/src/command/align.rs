@@ -1,4 +1,4 @@
-//! `ego-fuser align`: approaches to alignment without GNSS, side by side.
+//! `ego-fuser align`: alignment methods without GNSS, side by side.
 
 use std::path::PathBuf;
 use std::str::FromStr;
@@ -9,9 +9,10 @@ use agent_offline::icp_map::{IcpMapPose, read_map};
 use anyhow::{Context, Result};
 use clap::ValueEnum;
 use dataset::{IntensityScale, Scenario};
-use ego_fuser_offline::alignment::compare::{self, BoxSource};
-use ego_fuser_offline::alignment::table::{Row, Tally, markdown};
-use ego_fuser_offline::alignment::{Approach, BoxIcp, CloudIcp, FreeAlign, Measured, Poses};
+use ego_fuser_offline::alignment::free_align::FreeAlignConfig;
+use ego_fuser_offline::alignment::{AlignmentSpec, BoxIcp, CloudIcp, FreeAlign, Measured, Poses};
+use ego_fuser_offline::evaluation::alignment::table::{Row, Tally, markdown};
+use ego_fuser_offline::evaluation::alignment::{self, BoxSource};
 use localization::pose_source::{PoseSource, PoseSourceConfig, RecordedPose};
 use localization::registration::icp::IcpConfig;
 use perception::detector::Detector;
@@ -34,10 +35,10 @@ pub(crate) struct Arguments {
     /// Number that stored intensities are divided by [default: auto; `sim-replay inspect --help` says by what].
     #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
     intensity_scale: IntensityScale,
-    /// Approaches; none named: all but icp-map.
+    /// Methods; none named: all but icp-map.
     #[arg(long, num_args = 1.., value_enum)]
     method: Vec<Method>,
-    /// One more approach: the poses of a source, described as in a scenario file. May be repeated.
+    /// One more method: the poses of a source, described as in a scenario file. May be repeated.
     #[arg(long, value_name = "NAME=FILE.yaml")]
     pose_source: Vec<NamedSource>,
     /// Where boxes come from.
@@ -66,7 +67,7 @@ pub(crate) struct Arguments {
     json: bool,
 }
 
-/// A built-in approach.
+/// A built-in method.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, ValueEnum)]
 enum Method {
     /// The difference of what both GNSS and IMU filters believe.
@@ -117,9 +118,9 @@ impl Arguments {
     pub(crate) fn run(self) -> Result<()> {
         tch::set_num_threads(i32::from(self.threads.max(1)));
         let scenarios = scenarios(&self.data, self.intensity_scale)?;
-        let mut approaches = self.approaches()?;
-        let mut boxes = self.box_source(&approaches)?;
-        let rows = self.compare(&mut approaches, &mut boxes, &scenarios)?;
+        let methods = self.methods()?;
+        let mut boxes = self.box_source(&methods)?;
+        let rows = self.compare(&methods, &mut boxes, &scenarios)?;
         if self.json {
             output::line(serde_json::to_string_pretty(&rows)?)?;
         } else {
@@ -128,7 +129,7 @@ impl Arguments {
         Ok(())
     }
 
-    fn approaches(&self) -> Result<Vec<Box<dyn Approach>>> {
+    fn methods(&self) -> Result<Vec<AlignmentSpec>> {
         use Method::{BoxIcp as BoxIcpMethod, FreeAlign as FreeAlignMethod, Gnss, Icp, IcpGnss};
         let all = [Gnss, Icp, IcpGnss, BoxIcpMethod, FreeAlignMethod];
         let named = if self.method.is_empty() { &all[..] } else { &self.method };
@@ -136,18 +137,18 @@ impl Arguments {
         built_in.chain(self.pose_source.iter().map(from_source)).collect()
     }
 
-    fn built_in(&self, method: Method) -> Result<Box<dyn Approach>> {
+    fn built_in(&self, method: Method) -> Result<AlignmentSpec> {
         Ok(match method {
-            Method::Gnss => Box::new(Poses::new("gnss", Measured::Gnss, || Ok(Box::new(RecordedPose)))),
-            Method::Icp => Box::new(CloudIcp::new(IcpConfig::default(), false)),
-            Method::IcpGnss => Box::new(CloudIcp::new(IcpConfig::default(), true)),
+            Method::Gnss => Poses::spec("gnss", Measured::Gnss, || Ok(Box::new(RecordedPose))),
+            Method::Icp => CloudIcp::spec(IcpConfig::default(), false),
+            Method::IcpGnss => CloudIcp::spec(IcpConfig::default(), true),
             Method::IcpMap => self.icp_map()?,
-            Method::BoxIcp => Box::new(BoxIcp),
-            Method::FreeAlign => Box::new(FreeAlign::default()),
+            Method::BoxIcp => BoxIcp::spec(),
+            Method::FreeAlign => FreeAlign::spec(FreeAlignConfig::default()),
         })
     }
 
-    fn icp_map(&self) -> Result<Box<dyn Approach>> {
+    fn icp_map(&self) -> Result<AlignmentSpec> {
         if self.map.is_empty() || self.map_spacing.is_nan() || self.map_spacing < 0.0 {
             return Err(BadInput::new("icp-map needs --map DIR, and a spacing that is not negative").into());
         }
@@ -156,11 +157,11 @@ impl Arguments {
         tracing::info!(planes = map.planes(), "map");
         let source = IcpMapPose::new(Arc::new(map), config);
         let build = move || Ok(Box::new(source.clone()) as Box<dyn PoseSource>);
-        Ok(Box::new(Poses::new("icp-map", Measured::Gnss, build)))
+        Ok(Poses::spec("icp-map", Measured::Gnss, build))
     }
 
-    fn box_source(&self, approaches: &[Box<dyn Approach>]) -> Result<BoxSource> {
-        if self.boxes == Boxes::Annotated || !approaches.iter().any(|approach| approach.needs_boxes()) {
+    fn box_source(&self, methods: &[AlignmentSpec]) -> Result<BoxSource> {
+        if self.boxes == Boxes::Annotated || !methods.iter().any(|method| method.needs_boxes) {
             return Ok(BoxSource::Annotated);
         }
         let Some(weights) = &self.weights else {
@@ -171,30 +172,25 @@ impl Arguments {
         Ok(BoxSource::Detected(Box::new(Agent::new(cav, Box::new(RecordedPose), detector))))
     }
 
-    fn compare(
-        &self,
-        approaches: &mut [Box<dyn Approach>],
-        boxes: &mut BoxSource,
-        scenarios: &[Scenario],
-    ) -> Result<Vec<Row>> {
+    fn compare(&self, methods: &[AlignmentSpec], boxes: &mut BoxSource, scenarios: &[Scenario]) -> Result<Vec<Row>> {
         let bar = progress::bar(scenarios.len(), "scenes");
-        let mut tallies = vec![Tally::default(); approaches.len()];
+        let mut tallies = vec![Tally::default(); methods.len()];
         for scenario in scenarios {
             let ticks = (0..scenario.ticks.len()).step_by(self.every as usize).take(self.frames.unwrap_or(usize::MAX));
-            compare::run(approaches, boxes, scenario, ticks, &mut |outcome| tallies[outcome.approach].add(&outcome))?;
+            alignment::run(methods, boxes, scenario, ticks, &mut |outcome| tallies[outcome.method].add(&outcome))?;
             bar.inc(1);
         }
         bar.finish_and_clear();
-        Ok(tallies.iter().zip(approaches).map(|(tally, approach)| tally.row(approach.name())).collect())
+        Ok(tallies.iter().zip(methods).map(|(tally, method)| tally.row(&method.name)).collect())
     }
 }
 
-fn from_source(source: &NamedSource) -> Result<Box<dyn Approach>> {
+fn from_source(source: &NamedSource) -> Result<AlignmentSpec> {
     let NamedSource { name, file } = source;
     let bad = |error: &dyn std::fmt::Display| BadInput::new(format!("{}: {error}", file.display()));
     let text = std::fs::read_to_string(file).map_err(|error| bad(&error))?;
     let config: PoseSourceConfig = serde_saphyr::from_str(&text).map_err(|error| bad(&error))?;
     // Once in vain, so that a missing file is found before the first scene.
     config.build().map_err(|error| bad(&error))?;
-    Ok(Box::new(Poses::new(name.clone(), Measured::True, move || config.build())))
+    Ok(Poses::spec(name.clone(), Measured::True, move || config.build()))
 }

@@ -6,10 +6,11 @@ use std::sync::Arc;
 use anyhow::{Context, Result};
 use dataset::evaluation_protocol::ProtocolConfig;
 use dataset::{IntensityScale, Layout, OpenOptions};
+use fusion::Exchange;
 use fusion::FusionConfig;
 use fusion::Method;
 use fusion::model::ModelError;
-use fusion::pastat::Part;
+use fusion::pastat::{Part, ablated};
 use localization::pose_source::{NoiseMode, NoisyPoseConfig, PoseTable};
 use perception::model_config::DetectorConfig;
 use perception::train::{AdamWConfig, DataListing, RunConfig, TrainingBar, TrainingOptions};
@@ -35,7 +36,7 @@ pub(crate) struct Arguments {
     #[arg(long, value_name = "auto|1|255|NUMBER", default_value_t, hide_default_value = true)]
     intensity_scale: IntensityScale,
     /// Method: none, early or one that exchanges feature maps; `ego-fuser methods` lists them.
-    #[arg(long, default_value = "none")]
+    #[arg(long, default_value_t = Method::NONE)]
     method: Method,
     /// Network: lean or full; --init overrides it.
     #[arg(long, default_value = "lean", value_parser = parse_config)]
@@ -144,7 +145,7 @@ impl Arguments {
     /// What is faster where a training from scratch was not meant.
     fn hint(&self) -> Option<&'static str> {
         // Merged points are encoded together, by an encoder that learns with the rest.
-        (self.init.is_none() && self.method != Method::Early).then_some(
+        (self.init.is_none() && self.method.exchange() != Exchange::Points).then_some(
             "training from scratch, encoder and all; --init deploy/weights/lean-max.safetensors --freeze-encoder learns \
              fusion and head alone, several times faster",
         )
@@ -232,7 +233,7 @@ impl Arguments {
             }
             None => self.config.clone(),
         };
-        let fusion = FusionConfig::for_detector(self.method, &detector).ablated(&self.without, self.frames);
+        let fusion = ablated(&self.method.default_fusion(&detector), &self.without, self.frames);
         Ok(Some(fusion.map_err(BadInput::of)?))
     }
 }

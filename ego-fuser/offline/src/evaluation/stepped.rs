@@ -30,9 +30,9 @@ use super::sent::{Sent, stamp, view};
 use super::sweeps::Sweep;
 use super::{EvaluateError, EvaluatedFrame, Evaluator, of_the_ego};
 use delayed_delivery::{Arrived, Courier, Letter};
-use ego_fuser::ego::{Skipped, View, own_content};
+use ego_fuser::ego::{Skipped, View};
 use ego_fuser::pairing::{Paired, Pairing, PairingConfig};
-use fusion::method::{Exchange, Method};
+use fusion::method::Exchange;
 
 /// A fleet in virtual time.
 #[derive(Debug, Clone)]
@@ -202,7 +202,7 @@ impl<'a> Run<'a> {
         let places: Vec<usize> = self.crew.iter().map(|member| member.place).collect();
         let ego_place = places.first().copied();
         // Without an exchange, neighbours have nothing to encode; where they are is still asked.
-        let is_needed = |place: usize| Some(place) == ego_place || method != Method::None;
+        let is_needed = |place: usize| Some(place) == ego_place || method.exchange() != Exchange::Nothing;
         let is_here = self.evaluator.remote.is_none();
         let with_maps = |place| is_here && is_needed(place);
         let sweeps = self.evaluator.sweeps(self.scenario, tick, &places, &load, with_maps)?;
@@ -217,7 +217,7 @@ impl<'a> Run<'a> {
             poses.push(sent.pose);
             if place == 0 {
                 own = sent.view();
-            } else if sent.content.is_some() && method != Method::None {
+            } else if sent.content.is_some() && method.exchange() != Exchange::Nothing {
                 senders.push(sent.cav.clone());
                 let distance_m = distance_m(&frames[0], &frames[place]);
                 post(&mut self.courier, &self.config.compute, tick, sent, distance_m);
@@ -240,8 +240,8 @@ impl<'a> Run<'a> {
         let method = self.evaluator.ego.method();
         let mut all: Vec<Sent> = Vec::with_capacity(sweeps.len());
         for Sweep { place, frame, map } in sweeps {
-            let is_needed = all.is_empty() || method != Method::None;
-            let exchange = is_needed.then(|| own_content(method));
+            let is_needed = all.is_empty() || method.exchange() != Exchange::Nothing;
+            let exchange = is_needed.then(|| method.own_content());
             let Some(member) = self.crew.iter_mut().find(|member| member.place == *place) else { continue };
             if let Pipeline::Here(participant, codec) = &mut member.pipeline {
                 participant.overhear(all.last());
@@ -305,7 +305,7 @@ impl<'a> Run<'a> {
 
     /// When the last of the senders' messages of a tick had come; none where one is missing.
     fn complete_nanos(&self, capture_nanos: u64, senders: &[CavId]) -> Option<u64> {
-        if self.evaluator.ego.method() == Method::None {
+        if self.evaluator.ego.method().exchange() == Exchange::Nothing {
             return Some(capture_nanos);
         }
         let of_tick = |(time, _): &&(u64, u64)| time.abs_diff(capture_nanos) <= self.config.pairing.max_lead_nanos;
@@ -338,7 +338,7 @@ impl<'a> Run<'a> {
             }
         }
         let mut result = self.evaluator.report(tick - self.config.ticks.start, own, &views, &bytes, output);
-        if self.evaluator.ego.method() != Method::None {
+        if self.evaluator.ego.method().exchange() != Exchange::Nothing {
             for cav in senders.iter().filter(|cav| views.iter().all(|view| view.cav != **cav)) {
                 let reason = dropped.iter().rev().find(|lost| lost.cav == *cav).map(|lost| lost.reason);
                 result.skipped.push(SkippedNeighbour { cav: cav.clone(), reason });

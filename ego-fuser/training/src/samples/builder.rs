@@ -12,10 +12,13 @@ use protocol::{Box3d, NoPoseReason, Pose, PoseEstimate};
 use rand::Rng;
 use tch::Tensor;
 
-use super::poses::DrawnError;
-use super::{Augmentation, Moments, Offset, SampleError, SamplePoses, SceneSet, TickRef, ViewAugment};
+use super::augment::{Augmentation, ViewAugment};
+use super::error::SampleError;
+use super::moments::Moments;
+use super::poses::{DrawnError, Offset, SamplePoses};
+use super::scenes::{SceneSet, TickRef};
 use crate::feature_store::MapSource;
-use fusion::ViewFacts;
+use fusion::MapMetadata;
 use fusion::points::merge_points;
 use fusion::targets::{Labels, TargetAssigner};
 
@@ -90,7 +93,7 @@ pub struct Sample {
     /// Every view, the ego's newest first, then the neighbours' newest, then older ones.
     pub views: SampleViews,
     /// What is known of every view, the ego's pose being the identity.
-    pub facts: Vec<ViewFacts>,
+    pub facts: Vec<MapMetadata>,
     /// How far each view's pose is off by what was put on top of it.
     pub offsets: Vec<Offset>,
     /// True boxes in the ego frame with their centre on the lattice.
@@ -253,7 +256,7 @@ impl SampleBuilder {
         scenario: usize,
         entries: &[Entry],
         changes: &[ViewAugment],
-        facts: &mut Vec<ViewFacts>,
+        facts: &mut Vec<MapMetadata>,
     ) -> Result<Vec<Pillars>, SampleError> {
         let mut clouds = Vec::with_capacity(entries.len());
         for (entry, change) in entries.iter().zip(changes) {
@@ -321,13 +324,13 @@ impl SampleBuilder {
 }
 
 /// What is told of the views, and how far that is off; both after the changes of the scene.
-fn told(entries: &[Entry], changes: &[ViewAugment]) -> (Vec<ViewFacts>, Vec<Offset>) {
+fn told(entries: &[Entry], changes: &[ViewAugment]) -> (Vec<MapMetadata>, Vec<Offset>) {
     let relative = |ego: &Pose, cav: &Pose, change: &ViewAugment| changes[0].pose(&ego.from_world(cav), change);
     let of_entry = |(entry, change): (&Entry, &ViewAugment)| {
         let Entry { place: agent, confidence, age_secs, .. } = *entry;
         let ego_from_cav = relative(&entries[0].world_from_cav, &entry.world_from_cav, change);
         let real = relative(&entries[0].found, &entry.found, change);
-        (ViewFacts { agent, ego_from_cav, confidence, age_secs }, Offset::between(&ego_from_cav, &real))
+        (MapMetadata { agent, ego_from_cav, confidence, age_secs }, Offset::between(&ego_from_cav, &real))
     };
     entries.iter().zip(changes).map(of_entry).unzip()
 }

@@ -7,8 +7,11 @@ use rand::seq::SliceRandom;
 use rand_chacha::ChaCha8Rng;
 use tch::Tensor;
 
-use super::{Offset, Sample, SampleBuilder, SampleError, SampleViews, TickRef};
-use fusion::ViewFacts;
+use super::builder::{Sample, SampleBuilder, SampleViews};
+use super::error::SampleError;
+use super::poses::Offset;
+use super::scenes::TickRef;
+use fusion::MapMetadata;
 use fusion::model::{CooperativeModel, CooperativeOutput, ModelError};
 use fusion::targets::Labels;
 
@@ -27,7 +30,7 @@ pub struct Batch {
     /// All views of all samples.
     pub views: BatchViews,
     /// What is known of the views of each sample, ego first.
-    pub facts: Vec<Vec<ViewFacts>>,
+    pub facts: Vec<Vec<MapMetadata>>,
     /// How far the poses of the views of each sample are off, by what was put on top of them.
     pub offsets: Vec<Vec<Offset>>,
     /// Targets of each sample.

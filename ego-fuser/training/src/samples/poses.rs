@@ -8,7 +8,7 @@ use localization::pose_source::{NoiseMode, NoisyPose, NoisyPoseConfig, PoseSourc
 use protocol::{CavId, Pose, PoseEstimate};
 use rand::Rng;
 
-use super::SampleError;
+use super::error::SampleError;
 
 /// Poses of samples: the recording's, or those that a pose generator found; some samples with an error on top.
 #[derive(Debug, Clone, Default)]

@@ -10,7 +10,7 @@ use dataset::{self, LoadOptions, OpenOptions, Scenario};
 use perception::train::DataListing;
 use protocol::PointCloud;
 
-use super::SampleError;
+use super::error::SampleError;
 
 /// A tick of a [`SceneSet`].
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash)]

@@ -2,7 +2,9 @@
 
 use perception::train::ModelCard;
 
-use super::{Summary, TrainConfig};
+use super::config::TrainConfig;
+use super::frozen::sample_config;
+use super::observer::Summary;
 use crate::samples::{SampleConfig, SceneSet};
 use fusion::model::CooperativeModel;
 
@@ -21,7 +23,7 @@ pub(super) fn card(config: &TrainConfig, model: &CooperativeModel, scenes: &Scen
         format_args!("{:e}, weight decay {:e}", run.learning_rate, run.optimizer.weight_decay),
     );
     card.row("anchors between the thresholds", format_args!("{:?}", config.loss.unassigned));
-    let samples = super::frozen::sample_config(config, model);
+    let samples = sample_config(config, model);
     let SampleConfig { augmentation, drop_neighbour, poses, moments, max_agents, comm_range_m, merged_truth, .. } =
         &samples;
     card.row(
@@ -86,6 +88,6 @@ pub(super) fn card(config: &TrainConfig, model: &CooperativeModel, scenes: &Scen
         ));
     }
     card.configuration(detector);
-    card.configuration(model.fusion().config());
+    card.configuration_json(&model.fusion().config().to_json_pretty());
     card
 }

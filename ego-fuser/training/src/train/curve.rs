@@ -5,8 +5,9 @@ use figures::{self, Axis, Chart, Mark, Series};
 use perception::train::{Curve, Trainer, TrainingError};
 use support::csv_file;
 
-use super::validation::Accuracy;
-use super::{StepReport, TrainError};
+use super::accuracy::Accuracy;
+use super::error::TrainError;
+use super::observer::StepReport;
 
 const HEADER: &str =
     "step,epoch,seconds,learning_rate,loss,score_loss,box_loss,samples_per_second,waiting,ap_30,ap_50,ap_70";

@@ -4,7 +4,9 @@ use std::sync::Arc;
 
 use perception::weights::Weights;
 
-use super::{Observer, TrainConfig, TrainError};
+use super::config::TrainConfig;
+use super::error::TrainError;
+use super::observer::Observer;
 use crate::feature_store::{FeatureStore, FeatureStoreError, KeptMaps, MapSource, is_encoder};
 use crate::samples::{Augmentation, SampleConfig, SampleError, SceneSet};
 use fusion::model::{CooperativeModel, ModelError};
@@ -41,7 +43,7 @@ impl<'a> FrozenEncoder<'a> {
 /// How samples are made for a model: as many time steps as its fusion asks for, and unturned where maps are kept.
 pub(super) fn sample_config(config: &TrainConfig, model: &CooperativeModel) -> SampleConfig {
     let mut samples = config.samples.clone();
-    samples.moments.frames = model.fusion().frames();
+    samples.moments.frames = model.fusion().requirements().history.frames;
     if config.frozen_encoder.is_some() {
         samples.augmentation = Augmentation::OFF;
     }

@@ -2,6 +2,7 @@
 //!
 //! [`run`] does no output of its own but files: whoever calls it hears of every step through [`Observer`].
 
+mod accuracy;
 mod card;
 mod config;
 mod curve;
@@ -16,10 +17,11 @@ use std::time::{Duration, Instant};
 use perception::train::{ComputePrecision, Trainer};
 use perception::weights::Weights;
 
+pub use accuracy::Accuracy;
 pub use config::TrainConfig;
 pub use error::TrainError;
 pub use observer::{Observer, StepReport, Summary};
-pub use validation::{Accuracy, Validator};
+pub use validation::Validator;
 
 use self::curve::DetectorCurve;
 use crate::loss::{LabelTensors, alignment_loss, detection_loss};
@@ -235,16 +237,20 @@ mod tests {
 
     #[test]
     fn merged_points_are_not_learnt_from_behind_a_frozen_encoder() {
-        assert!(matches!(sample_kind(Method::Early, true, false), Err(TrainError::NothingToKeep(Method::Early))));
-        assert_eq!(sample_kind(Method::Early, false, false).unwrap(), SampleKind::Merged);
-        assert_eq!(sample_kind(Method::Max, true, false).unwrap(), SampleKind::Cooperative);
+        assert!(
+            matches!(sample_kind(Method::EARLY, true, false), Err(TrainError::NothingToKeep(method)) if method == Method::EARLY)
+        );
+        assert_eq!(sample_kind(Method::EARLY, false, false).unwrap(), SampleKind::Merged);
+        assert_eq!(sample_kind(Method::MAX, true, false).unwrap(), SampleKind::Cooperative);
     }
 
     #[test]
     fn alone_every_method_that_is_trained_learns_from_single_vehicles() {
-        for method in [Method::None, Method::Early, Method::Max, Method::Pastat] {
+        for method in [Method::NONE, Method::EARLY, Method::MAX, Method::PASTAT] {
             assert_eq!(sample_kind(method, false, true).unwrap(), SampleKind::Single, "{method}");
         }
-        assert!(matches!(sample_kind(Method::Late, false, true), Err(TrainError::NotTrained(Method::Late))));
+        assert!(
+            matches!(sample_kind(Method::LATE, false, true), Err(TrainError::NotTrained(method)) if method == Method::LATE)
+        );
     }
 }

@@ -2,7 +2,7 @@
 
 use perception::train::{DataListing, Trained};
 
-use super::Accuracy;
+use super::accuracy::Accuracy;
 
 /// What happened in some steps.
 #[derive(Debug, Clone, Copy, PartialEq)]

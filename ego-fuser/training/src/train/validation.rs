@@ -6,26 +6,14 @@ use perception::boxes::postprocess::is_within;
 use protocol::Box3d;
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
-use serde::Serialize;
 use tch::no_grad;
 
-use super::TrainError;
+use super::accuracy::Accuracy;
+use super::error::TrainError;
 use crate::average_precision::{Ordering, Scorer};
 use crate::feature_store::MapSource;
-use fusion::model::CooperativeModel;
-
 use crate::samples::{Augmentation, Batch, Moments, SampleBuilder, SampleConfig, SampleError, SceneSet, TickRef};
-
-/// AP over the frames of a validation.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize)]
-pub struct Accuracy {
-    /// Frames.
-    pub frames: usize,
-    /// AP at 0.3, 0.5 and 0.7, sorted over all frames.
-    pub ap_global: [f64; 3],
-    /// The same in the order of frames.
-    pub ap_frame_order: [f64; 3],
-}
+use fusion::model::CooperativeModel;
 
 /// Measures AP on a fixed choice of frames, each seen from a fixed vehicle, with nobody missing or late and no error on top
 /// of poses.

@@ -9,7 +9,6 @@ use support::nanos;
 use support::statistics::median;
 
 use super::super::{EvaluateError, Evaluator, view};
-use ego_fuser::ego::own_content;
 
 /// Ticks that times are measured over.
 const MEASURED_TICKS: usize = 5;
@@ -71,7 +70,7 @@ impl Evaluator {
     /// # Errors
     /// [`EvaluateError`] when a frame cannot be read or computed.
     pub fn measure(&mut self, scenario: &Scenario) -> Result<ComputeTimes, EvaluateError> {
-        let exchange = own_content(self.ego.method());
+        let exchange = self.ego.method().own_content();
         let vehicles = scenario.agents.iter().take(MEASURED_VEHICLES);
         let mut participants = vehicles
             .map(|cav| self.participant(scenario, cav, true, None))

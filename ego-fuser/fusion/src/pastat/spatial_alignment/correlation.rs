@@ -3,12 +3,12 @@
 use tch::{Kind, TchError, Tensor};
 
 /// Parts of the lattice along each edge: enough to tell a turn from a shift.
-pub(super) const PARTS: i64 = 4;
+pub(crate) const PARTS: i64 = 4;
 /// Keeps the length of an empty part from being divided by.
 const EPSILON: f64 = 1e-6;
 
 /// How alike maps are, by shift.
-pub(super) struct Correlation {
+pub(crate) struct Correlation {
     /// `[parts^2, N, K]`: -1..1, of each part.
     pub parts: Tensor,
     /// `[parts^2, N]`: how much there is to see in both maps.
@@ -19,7 +19,7 @@ pub(super) struct Correlation {
 
 /// The shifts in the order of [`Correlation`], `[K, 2]`: cells along x and y that lead from a cell of a neighbour's map to
 /// the cell of the ego's that it is compared with.
-pub(super) fn shifts(radius: i64) -> Result<Tensor, TchError> {
+pub(crate) fn shifts(radius: i64) -> Result<Tensor, TchError> {
     let steps = || -radius..=radius;
     let all: Vec<f32> = steps().flat_map(|row| steps().flat_map(move |column| [column as f32, row as f32])).collect();
     Tensor::f_from_slice(&all)?.f_view([-1, 2])
@@ -27,7 +27,7 @@ pub(super) fn shifts(radius: i64) -> Result<Tensor, TchError> {
 
 /// The ego's map at every shift, part by part: made once for all that is compared with it.
 #[derive(Debug)]
-pub(super) struct Shifted {
+pub(crate) struct Shifted {
     /// `[parts^2, K, M * H/parts * W/parts]`.
     maps: Tensor,
     /// `[parts^2]`: sums of the squares of the map where it is.
@@ -38,7 +38,7 @@ pub(super) struct Shifted {
 impl Shifted {
     /// `ego` `[1, M, H, W]`, `H` and `W` multiples of `parts`, moved by up to `radius` cells, in `parts` parts along each
     /// edge. No gradient flows into it: what it is compared with learns the same.
-    pub(super) fn new(ego: &Tensor, radius: i64, parts: i64) -> Result<Self, TchError> {
+    pub(crate) fn new(ego: &Tensor, radius: i64, parts: i64) -> Result<Self, TchError> {
         let (_, channels, height, width) = ego.size4()?;
         let (rows, columns, edge) = (height / parts, width / parts, 2 * radius + 1);
         let around = ego.f_detach()?.f_constant_pad_nd([radius; 4])?.f_squeeze_dim(0)?;
@@ -54,7 +54,7 @@ impl Shifted {
     }
 
     /// Compares it with the maps of `others`, `[N, M, H, W]`.
-    pub(super) fn correlate(&self, others: &Tensor) -> Result<Correlation, TchError> {
+    pub(crate) fn correlate(&self, others: &Tensor) -> Result<Correlation, TchError> {
         let (count, channels, height, width) = others.size4()?;
         let parts = self.parts;
         let others = others
@@ -76,7 +76,7 @@ impl Shifted {
 }
 
 /// The shift at which correlations `[.., K]` are highest, `[.., 2]`, as a mean weighted by `exp(sharpness * correlation)`.
-pub(super) fn peaks(correlation: &Tensor, sharpness: &Tensor, shifts: &Tensor) -> Result<Tensor, TchError> {
+pub(crate) fn peaks(correlation: &Tensor, sharpness: &Tensor, shifts: &Tensor) -> Result<Tensor, TchError> {
     (correlation * sharpness).f_softmax(-1, None)?.f_matmul(shifts)
 }
 

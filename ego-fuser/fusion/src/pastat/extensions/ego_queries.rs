@@ -1,5 +1,8 @@
-//! What the ego gathers at each cell from the tokens of all entries: attention in one walk over the tokens, where tensor
-//! operations pass over all of them a dozen times. Numbers only: on the CPU, without gradients.
+//! Ego queries, an extension: only the tokens of the ego's newest map ask in the attention over agents and time (`rows: ego`;
+//! `all`: off), since only they are kept in the end.
+//!
+//! Attention is then one pass over the tokens, where tensor operations pass over all of them a dozen times. Numbers only: on the
+//! CPU, without gradients. Measured gain: not measured alone; every training that is in the tables has it.
 
 use tch::{TchError, Tensor};
 
@@ -11,7 +14,7 @@ const STRIP: usize = 64;
 const EPSILON: f32 = 1e-5;
 
 /// The tokens of all entries but the ego's newest, and which of all count.
-pub(super) struct Others {
+pub(crate) struct Others {
     /// `[N - 1, D, cells]`.
     tokens: Vec<f32>,
     /// `[N, cells]`, 0 for tokens that do not count; the ego's newest first.
@@ -22,7 +25,7 @@ pub(super) struct Others {
 
 impl Others {
     /// Of the tokens of all `[N, D, h, w]`, of which `valid` `[N, h, w]` count.
-    pub(super) fn of(tokens: &Tensor, valid: &Tensor) -> Result<Self, TchError> {
+    pub(crate) fn of(tokens: &Tensor, valid: &Tensor) -> Result<Self, TchError> {
         let (entries, dim, height, width) = tokens.size4()?;
         let others = tokens.f_narrow(0, 1, entries - 1)?;
         let [dim, cells] = [dim, height * width].map(|size| size as usize);
@@ -35,7 +38,7 @@ impl Others {
     /// # Shapes
     /// - `asked`: `[heads, D, cells]`: a token's product with it is its score
     /// - `ego`: `[D, cells]`, the tokens of the ego's newest
-    pub(super) fn gather(&self, asked: &[f32], ego: &[f32]) -> Vec<f32> {
+    pub(crate) fn gather(&self, asked: &[f32], ego: &[f32]) -> Vec<f32> {
         let size = self.dim * self.cells;
         let entries: Vec<&[f32]> = std::iter::once(ego).chain(self.tokens.chunks_exact(size)).collect();
         let mut gathered = vec![0.0; asked.len()];

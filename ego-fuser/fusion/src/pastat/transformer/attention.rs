@@ -3,8 +3,8 @@
 use tch::nn::{self, Init, Module};
 use tch::{Kind, TchError, Tensor};
 
-use super::gather::Others;
 use crate::f64_tensor::numbers;
+use crate::pastat::extensions::ego_queries::Others;
 
 /// What a masked score is set to: low enough for no weight, and finite, so that rows with nothing valid stay numbers.
 const MASKED: f64 = -1e9;

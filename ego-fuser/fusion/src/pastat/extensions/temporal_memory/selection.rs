@@ -1,4 +1,4 @@
-//! The cells of a lattice that are recalled.
+//! Selection of the cells in which earlier maps are blended in.
 
 use tch::{Kind, TchError, Tensor};
 
@@ -12,7 +12,7 @@ const BESIDE: [[usize; 2]; AROUND as usize] = [[0, 0], [0, 1], [0, 2], [1, 0], [
 
 /// The cells of a few patches, patch by patch and row by row, and what lies beside them.
 #[derive(Debug)]
-pub(super) struct Chosen {
+pub(super) struct Selection {
     /// `K`: their patches, counted row by row.
     pub(super) patches: Vec<i64>,
     /// `P`: the cells of those, counted row by row.
@@ -23,7 +23,7 @@ pub(super) struct Chosen {
     pub(super) around: Vec<i64>,
 }
 
-impl Chosen {
+impl Selection {
     /// A `share` of all patches of `patch` cells along each edge, at least one: those in or close to which a vehicle is most
     /// likely, which `likely` `[1, 1, H, W]` tells. H and W are multiples of `patch`.
     pub(super) fn most_likely(likely: &Tensor, patch: i64, share: f64) -> Result<Self, TchError> {
@@ -81,30 +81,30 @@ mod tests {
         let likely = Tensor::zeros([1, 1, 16, 24], (Kind::Float, Device::Cpu));
         let _ = likely.get(0).get(0).get(7).get(11).fill_(1.0);
         // Four cells along each edge: within two cells of it lie the patches in rows 1 and 2, columns 2 and 3.
-        let chosen = Chosen::most_likely(&likely, 4, 4.0 / 24.0).unwrap();
-        assert_eq!(chosen.patches, [8, 9, 14, 15]);
-        assert_eq!((chosen.cells.len(), chosen.around.len()), (64, 64 * 9));
-        assert_eq!(&chosen.cells[..6], [4 * 24 + 8, 4 * 24 + 9, 4 * 24 + 10, 4 * 24 + 11, 5 * 24 + 8, 5 * 24 + 9]);
+        let selection = Selection::most_likely(&likely, 4, 4.0 / 24.0).unwrap();
+        assert_eq!(selection.patches, [8, 9, 14, 15]);
+        assert_eq!((selection.cells.len(), selection.around.len()), (64, 64 * 9));
+        assert_eq!(&selection.cells[..6], [4 * 24 + 8, 4 * 24 + 9, 4 * 24 + 10, 4 * 24 + 11, 5 * 24 + 8, 5 * 24 + 9]);
         // One cell more on each side.
-        assert_eq!(chosen.near.len(), 100);
-        assert_eq!((chosen.near[0], chosen.near[99]), ([3, 7], [12, 16]));
-        assert_eq!(chosen.around[..9], [0, 1, 2, 10, 11, 12, 20, 21, 22]);
+        assert_eq!(selection.near.len(), 100);
+        assert_eq!((selection.near[0], selection.near[99]), ([3, 7], [12, 16]));
+        assert_eq!(selection.around[..9], [0, 1, 2, 10, 11, 12, 20, 21, 22]);
     }
 
     #[test]
     fn beyond_the_edges_is_nothing() {
-        let chosen = Chosen::of(&[0, 5], 2, [4, 6]);
-        assert_eq!(chosen.near.len(), 3 * 3 + 3 * 3);
-        let beyond = chosen.near.len() as i64;
-        assert_eq!(chosen.around[..9], [beyond, beyond, beyond, beyond, 0, 1, beyond, 3, 4]);
-        assert_eq!(chosen.around[7 * 9..], [13, 14, beyond, 16, 17, beyond, beyond, beyond, beyond]);
+        let selection = Selection::of(&[0, 5], 2, [4, 6]);
+        assert_eq!(selection.near.len(), 3 * 3 + 3 * 3);
+        let beyond = selection.near.len() as i64;
+        assert_eq!(selection.around[..9], [beyond, beyond, beyond, beyond, 0, 1, beyond, 3, 4]);
+        assert_eq!(selection.around[7 * 9..], [13, 14, beyond, 16, 17, beyond, beyond, beyond, beyond]);
     }
 
     #[test]
     fn there_is_always_one_and_never_more_than_all() {
         let likely = Tensor::full([1, 1, 4, 4], f64::NAN, (Kind::Float, Device::Cpu));
         for (share, count) in [(0.0, 1), (0.3, 2), (1.0, 4), (9.0, 4), (f64::NAN, 1)] {
-            assert_eq!(Chosen::most_likely(&likely, 2, share).unwrap().patches.len(), count);
+            assert_eq!(Selection::most_likely(&likely, 2, share).unwrap().patches.len(), count);
         }
     }
 }

@@ -4,8 +4,8 @@ use tch::nn::{self, Module};
 use tch::{TchError, Tensor};
 
 use super::attention::{AgentAttention, WindowAttention};
-use super::config::PastatConfig;
-use super::gather::Others;
+use crate::pastat::config::PastatConfig;
+use crate::pastat::extensions::ego_queries::Others;
 
 /// One block: over agents and time at each cell, across cells within windows, then cell by cell.
 #[derive(Debug)]

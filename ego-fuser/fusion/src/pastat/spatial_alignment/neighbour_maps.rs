@@ -1,74 +1,73 @@
-//! Neighbours' maps that FSA may have moved, and the maximum over them and the ego's.
+//! Neighbours' newest maps after FSA, and the maximum over them and the ego's.
 
 use tch::{TchError, Tensor};
 
 use super::area::resample;
-use super::entries::Maps;
 use crate::f64_tensor::{self, are_numbers};
-use crate::warp::Cells;
+use crate::warp::{Cells, WarpedMaps};
 
-/// Maps; FSA may have said that they lie elsewhere than their poses do. Then they are read anew where they were made, as
-/// reading what was read before would blur it, and what a wrong pose has put beyond the ego's edges would be lost. Where no
-/// gradient flows that is done only when the maximum over them is wanted, once and cell by cell.
-pub(super) struct MovedMaps {
-    maps: Maps,
+/// Maps on the ego's grid. Where FSA has corrected their poses they are sampled anew from the maps as received: sampling what was
+/// sampled before would blur it, and what a wrong pose has put beyond the ego's edges would be lost. Where no gradient flows that
+/// is done when the maximum over them is taken, once and cell by cell.
+pub(crate) struct NeighbourMaps {
+    maps: WarpedMaps,
     /// `[M, H, W, 2]`: where on the maps the ego's cells lie, for `grid_sampler`; absent: maps lie where they belong.
     places: Option<Tensor>,
 }
 
-impl MovedMaps {
+impl NeighbourMaps {
     /// Of maps that lie where they belong.
-    pub(super) fn still(maps: Maps) -> Self {
+    pub(crate) fn still(maps: WarpedMaps) -> Self {
         Self { maps, places: None }
     }
 
     /// How many.
-    pub(super) fn count(&self) -> Result<i64, TchError> {
+    pub(crate) fn count(&self) -> Result<i64, TchError> {
         self.maps.count()
     }
 
     /// The maps, where they lie by now.
     #[cfg(test)]
-    pub(super) fn maps(&self) -> &Maps {
+    pub(crate) fn maps(&self) -> &WarpedMaps {
         assert!(self.places.is_none(), "they are not read yet");
         &self.maps
     }
 
     /// Of maps where they were made, to be read at `places`.
-    pub(super) fn at(maps: Maps, places: Tensor) -> Result<Self, TchError> {
+    pub(crate) fn at(maps: WarpedMaps, places: Tensor) -> Result<Self, TchError> {
         if are_numbers(&maps.features) && are_numbers(&places) {
             return Ok(Self { maps, places: Some(places) });
         }
         let (features, mask) = resample(&maps.features, &maps.mask, &places)?;
-        Ok(Self::still(Maps { features, mask }))
+        Ok(Self::still(WarpedMaps { features, mask }))
     }
 
-    /// The maximum `[1, C, H, W]` of the ego's map `[C, H, W]` and these, times `trust` `[M, 1, H, W]`, where they reach.
-    pub(super) fn strongest_with(&self, own: &Tensor, trust: &Tensor) -> Result<Tensor, TchError> {
+    /// The maximum `[1, C, H, W]` of the ego's map `[C, H, W]` and these, times `weight` `[M, 1, H, W]`, where they reach.
+    pub(crate) fn maximum_with(&self, own: &Tensor, weight: &Tensor) -> Result<Tensor, TchError> {
         if let Some(places) = &self.places {
-            let mut strongest = f64_tensor::cells(own)?;
+            let mut maximum = f64_tensor::cells(own)?;
             for map in 0..self.count()? {
-                self.raise(&mut strongest, map, [places, trust])?;
+                self.raise(&mut maximum, map, [places, weight])?;
             }
             let (channels, height, width) = own.size3()?;
-            return Tensor::f_from_slice(&strongest)?.f_view([1, height, width, channels])?.f_permute([0, 3, 1, 2]);
+            return Tensor::f_from_slice(&maximum)?.f_view([1, height, width, channels])?.f_permute([0, 3, 1, 2]);
         }
-        let Maps { features, mask } = &self.maps;
-        // Out of reach nothing is the strongest.
+        let WarpedMaps { features, mask } = &self.maps;
+        // A map has no part out of its reach.
         let reach = mask.f_zeros_like()?.f_masked_fill(&mask.f_eq(0.0)?, f64::NEG_INFINITY)?;
-        let mut strongest = own.shallow_clone();
+        let mut maximum = own.shallow_clone();
         for index in 0..self.count()? {
-            let [map, trust, reach] = [features, trust, &reach].map(|tensor| tensor.f_get(index));
-            strongest = strongest.f_maximum(&reach?.f_addcmul(&map?, &trust?)?)?;
+            let [map, weight, reach] = [features, weight, &reach].map(|tensor| tensor.f_get(index));
+            maximum = maximum.f_maximum(&reach?.f_addcmul(&map?, &weight?)?)?;
         }
-        f64_tensor::by_cell(&strongest)
+        f64_tensor::by_cell(&maximum)
     }
 
-    /// Raises `strongest` `[H * W, C]` to what a map shows at `places`, times `shares` `[M, 1, H, W]`.
-    fn raise(&self, strongest: &mut [f32], map: i64, [places, shares]: [&Tensor; 2]) -> Result<(), TchError> {
+    /// Raises `maximum` `[H * W, C]` to what a map shows at `places`, times `shares` `[M, 1, H, W]`.
+    fn raise(&self, maximum: &mut [f32], map: i64, [places, shares]: [&Tensor; 2]) -> Result<(), TchError> {
         let of = |tensor: &Tensor| tensor.f_get(map);
         let [valid, shares] = [&self.maps.mask, shares].map(|tensor| of(tensor)?.f_squeeze_dim(0));
-        Cells::of(&of(&self.maps.features)?)?.raise(strongest, [&valid?, &of(places)?, &shares?])
+        Cells::of(&of(&self.maps.features)?)?.raise(maximum, [&valid?, &of(places)?, &shares?])
     }
 }
 
@@ -90,12 +89,12 @@ mod tests {
         let places = own_lattice(&deltas, &poses, [&area, &area]).unwrap();
         let mask = uniform(4, &[2, 1, 16, 32]).gt(0.2).to_kind(Kind::Float);
         let features = (uniform(5, &[2, 3, 16, 32]) - 0.3) * &mask;
-        let (own, trust) = (uniform(6, &[3, 16, 32]) - 0.5, uniform(7, &[2, 1, 16, 32]) * 2.0);
+        let (own, weight) = (uniform(6, &[3, 16, 32]) - 0.5, uniform(7, &[2, 1, 16, 32]) * 2.0);
         let found = |with_gradient| {
-            let maps = Maps { features: features.shallow_clone(), mask: mask.shallow_clone() };
-            let moved = MovedMaps::at(maps, places.copy().set_requires_grad(with_gradient)).unwrap();
+            let maps = WarpedMaps { features: features.shallow_clone(), mask: mask.shallow_clone() };
+            let moved = NeighbourMaps::at(maps, places.copy().set_requires_grad(with_gradient)).unwrap();
             assert_eq!(moved.places.is_none(), with_gradient);
-            moved.strongest_with(&own, &trust).unwrap()
+            moved.maximum_with(&own, &weight).unwrap()
         };
         let (numbers, tensors) = (found(false), found(true));
         assert_ne!(numbers, own.unsqueeze(0));

@@ -1,4 +1,4 @@
-//! What the outcomes of an approach add up to: the columns of the paper's alignment table, and a few more.
+//! Totals of an alignment method: the columns of the paper's alignment table, and a few more.
 
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -6,12 +6,12 @@ use std::fmt::Write as _;
 use serde::Serialize;
 use support::statistics::{mean, median};
 
-use super::compare::{AlignmentError, PairOutcome};
+use super::{AlignmentError, PairOutcome};
 
-/// One approach over all pairs.
+/// One method over all pairs.
 #[derive(Debug, Clone, PartialEq, Serialize)]
 pub struct Row {
-    /// The approach.
+    /// Name of the method.
     pub method: String,
     /// Pairs of ego and neighbour, every moment anew.
     pub pairs: usize,
@@ -39,7 +39,7 @@ pub struct Row {
     pub reasons: BTreeMap<&'static str, usize>,
 }
 
-/// Collects outcomes of one approach.
+/// Collects outcomes of one method.
 #[derive(Debug, Clone, Default)]
 pub struct Tally {
     seconds: f64,
@@ -129,7 +129,7 @@ mod tests {
 
     fn outcome(result: Result<(f64, f64), NotAligned>) -> PairOutcome {
         let result = result.map(|(metres, degrees)| AlignmentError { metres, degrees });
-        PairOutcome { approach: 0, bytes: 64, time: Duration::from_millis(20), result }
+        PairOutcome { method: 0, bytes: 64, time: Duration::from_millis(20), result }
     }
 
     #[test]

@@ -1,15 +1,68 @@
 //! TE, Temporal Encoding (Eq. 10-12), of the true age of a map.
 
+use tch::{Device, Kind, TchError, Tensor, nn};
+
+use super::confidence_embedding::Confidences;
 use super::config::{PastatConfig, Wavelengths};
+use super::spatial_alignment::AlignedTokens;
 
 /// Ages beyond this are no ages, seconds.
 const MAX_AGE_SECS: f64 = 10.0;
 
-/// `E_t` of a map of this age, `D` values.
+/// Adds to the tokens of each map what is known of it.
+#[derive(Debug)]
+pub(super) struct TemporalEncoding {
+    config: PastatConfig,
+    device: Device,
+}
+
+/// Tokens as the transformer gets them.
+#[derive(Debug)]
+pub(super) struct Tokens {
+    /// `[N, D, h, w]`: `z^(0)`, the ego's newest first.
+    pub(super) values: Tensor,
+    /// `[N, h, w]`, 1 for tokens that count.
+    pub(super) valid: Tensor,
+}
+
+impl TemporalEncoding {
+    /// It has no variables; `path` is that of the module.
+    pub(super) fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Self {
+        Self { config: config.clone(), device: path.device() }
+    }
+
+    /// Eq. 10: `z^(0) = Flatten(F) + E_t`, with the part of the confidence (Eq. 7) and of how well FSA has found each map to fit.
+    pub(super) fn encode(
+        &self,
+        aligned: AlignedTokens,
+        confidences: &Confidences,
+        age_secs: &[f64],
+    ) -> Result<Tokens, TchError> {
+        let AlignedTokens { values, valid, fit } = aligned;
+        let mut of_map = self.of_ages(age_secs)?;
+        if let Some(of_confidence) = &confidences.of_tokens {
+            of_map = of_map.f_add(of_confidence)?;
+        }
+        if let Some(fit) = fit {
+            of_map = of_map.f_add(&fit)?;
+        }
+        Ok(Tokens { values: values + of_map.f_unsqueeze(2)?.f_unsqueeze(3)?, valid })
+    }
+
+    /// `[N, D]`: `E_t` of each map; zeros without the encoding, for the ablation.
+    fn of_ages(&self, age_secs: &[f64]) -> Result<Tensor, TchError> {
+        let size = [age_secs.len() as i64, self.config.dim];
+        let Some(wavelengths) = self.config.te else { return Tensor::f_zeros(size, (Kind::Float, self.device)) };
+        let values: Vec<f32> = age_secs.iter().flat_map(|&age| encoding(age, &self.config, wavelengths)).collect();
+        Tensor::f_from_slice(&values)?.f_view(size)?.f_to_device(self.device)
+    }
+}
+
+/// Eq. 11 and 12: `E_t` of a map of this age, `D` values.
 ///
 /// The paper counts time steps from 1, the oldest, to T, the newest. A map between two steps lies between them: `t` is
 /// no slot but T less the age in steps, so a late message is not taken for a fresh one.
-pub(super) fn encoding(age_secs: f64, config: &PastatConfig, wavelengths: Wavelengths) -> Vec<f32> {
+fn encoding(age_secs: f64, config: &PastatConfig, wavelengths: Wavelengths) -> Vec<f32> {
     let t = config.frames as f64 - age_secs.clamp(-MAX_AGE_SECS, MAX_AGE_SECS) / config.frame_secs;
     let dim = config.dim as f64;
     (0..config.dim)

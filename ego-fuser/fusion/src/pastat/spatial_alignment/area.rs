@@ -8,7 +8,7 @@ use crate::warp::{BILINEAR, NEAREST, PADDING_ZEROS};
 
 /// The area of a padded map, metres.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Area {
+pub(crate) struct Area {
     middle_m: [f64; 2],
     half_m: [f64; 2],
     /// Rows and columns.
@@ -22,7 +22,7 @@ pub(super) struct Area {
 
 impl Area {
     /// The area of `height` x `width` cells that begin where `grid` begins; maps are compared up to `radius` cells away.
-    pub(super) fn new(grid: &BevGrid, [height, width]: [i64; 2], radius: i64) -> Self {
+    pub(crate) fn new(grid: &BevGrid, [height, width]: [i64; 2], radius: i64) -> Self {
         let half_m = [width as f64 * grid.cell_m / 2.0, height as f64 * grid.cell_m / 2.0];
         Self {
             middle_m: [grid.x_min_m + half_m[0], grid.y_min_m + half_m[1]],
@@ -35,36 +35,36 @@ impl Area {
     }
 
     /// The same with cells of `cells` by `cells`, compared up to about as many metres away.
-    pub(super) fn with_cells_of(self, cells: i64) -> Self {
+    pub(crate) fn with_cells_of(self, cells: i64) -> Self {
         let (cell_m, radius) = (self.cell_m * cells as f64, (self.radius + cells - 1) / cells);
         let size = self.size.map(|count| count / cells);
         Self { size, cell_m, cells: self.cells * cells, radius, ..self }
     }
 
     /// Edge of a cell, metres.
-    pub(super) fn cell_m(&self) -> f64 {
+    pub(crate) fn cell_m(&self) -> f64 {
         self.cell_m
     }
 
     /// Cells of the ego's lattice along each edge of a cell.
-    pub(super) fn cells(&self) -> i64 {
+    pub(crate) fn cells(&self) -> i64 {
         self.cells
     }
 
     /// Where vehicles are, metres from the middle of the area, `[N, 2]`.
-    pub(super) fn places_of(&self, ego_from_cav: &[Pose]) -> Result<Tensor, TchError> {
+    pub(crate) fn places_of(&self, ego_from_cav: &[Pose]) -> Result<Tensor, TchError> {
         let place = |pose: &Pose| [0, 1].map(|axis| (pose.translation_m[axis] - self.middle_m[axis]) as f32);
         let places: Vec<f32> = ego_from_cav.iter().flat_map(place).collect();
         Tensor::f_from_slice(&places)?.f_view([-1, 2])
     }
 
     /// Cells are compared with those of the ego up to so many cells away.
-    pub(super) fn radius(&self) -> i64 {
+    pub(crate) fn radius(&self) -> i64 {
         self.radius
     }
 
     /// `[PARTS^2, 2]`: the middles of the parts that maps are compared by, metres from the middle of the area.
-    pub(super) fn middles_of_parts(&self) -> Result<Tensor, TchError> {
+    pub(crate) fn middles_of_parts(&self) -> Result<Tensor, TchError> {
         let along = |part: i64, half_m: f64| (((2 * part + 1) as f64 / PARTS as f64 - 1.0) * half_m) as f32;
         let [half_x, half_y] = self.half_m;
         let middles: Vec<f32> = (0..PARTS)
@@ -78,7 +78,7 @@ impl Area {
 ///
 /// A map is turned about the place of the vehicle that made it and then shifted, both in the ego's frame, so that an
 /// error of its pose's heading is one number and not three.
-pub(super) fn lattice(deltas: &Tensor, ego_from_cav: &[Pose], area: &Area, size: [i64; 2]) -> Result<Tensor, TchError> {
+pub(crate) fn lattice(deltas: &Tensor, ego_from_cav: &[Pose], area: &Area, size: [i64; 2]) -> Result<Tensor, TchError> {
     let senders = said(ego_from_cav)?.f_to_device(deltas.device())?.f_narrow(1, 0, 2)?;
     // p_map = v + R^T (p_ego - v - d), with v the vehicle's place and d the shift.
     let moved = senders.f_constant_pad_nd([0, 1])? + deltas;
@@ -87,7 +87,7 @@ pub(super) fn lattice(deltas: &Tensor, ego_from_cav: &[Pose], area: &Area, size:
 
 /// Where the cells of the ego's lattice, that of `area`, lie on maps that are still where they were made, on `own`, given that
 /// their senders are `deltas` `[N, 3]` from where they say: `[N, H, W, 2]`.
-pub(super) fn own_lattice(deltas: &Tensor, ego_from_cav: &[Pose], [area, own]: [&Area; 2]) -> Result<Tensor, TchError> {
+pub(crate) fn own_lattice(deltas: &Tensor, ego_from_cav: &[Pose], [area, own]: [&Area; 2]) -> Result<Tensor, TchError> {
     let moved = said(ego_from_cav)?.f_to_device(deltas.device())? + deltas;
     // p_cav = R^T (p_ego - v - d).
     places(&moved, &moved.f_narrow(1, 0, 2)?.f_zeros_like()?, [area, own], area.size)
@@ -118,14 +118,14 @@ fn places(pose: &Tensor, origin: &Tensor, [area, on]: [&Area; 2], size: [i64; 2]
 }
 
 /// Where a vehicle was by a `delta`, see [`lattice`].
-pub(super) fn moved(ego_from_cav: &Pose, delta: &[f64]) -> Pose {
+pub(crate) fn moved(ego_from_cav: &Pose, delta: &[f64]) -> Pose {
     let [x, y, z] = ego_from_cav.translation_m;
     Pose::from_xyz_yaw([x + delta[0], y + delta[1], z], ego_from_cav.yaw_rad() + delta[2])
 }
 
 /// Maps `[N, C, H, W]` and what is valid of them `[N, 1, H, W]`, read at `lattice`. Nothing is valid beyond their edges; maps
 /// are not zero where nothing is valid.
-pub(super) fn resample(maps: &Tensor, valid: &Tensor, lattice: &Tensor) -> Result<(Tensor, Tensor), TchError> {
+pub(crate) fn resample(maps: &Tensor, valid: &Tensor, lattice: &Tensor) -> Result<(Tensor, Tensor), TchError> {
     let valid = valid.f_grid_sampler(&lattice.f_detach()?, NEAREST, PADDING_ZEROS, false)?.f_to_kind(Kind::Float)?;
     Ok((maps.f_grid_sampler(lattice, BILINEAR, PADDING_ZEROS, false)?, valid))
 }

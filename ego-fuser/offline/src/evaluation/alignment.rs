@@ -1,4 +1,6 @@
-//! Approaches over scenes: the ego, which is a scenario's first agent, with every neighbour in range, at every moment.
+//! Comparison of alignment methods over scenes: the ego, which is a scenario's first agent, with every neighbour in range, at every moment.
+
+pub mod table;
 
 use std::time::{Duration, Instant};
 
@@ -11,7 +13,7 @@ use nalgebra::Isometry3;
 use protocol::message::Message;
 use protocol::{Box3d, HEADER_LEN, Stamp, wire};
 
-use super::{AlignError, Approach, NotAligned, Vehicle};
+use crate::alignment::{AlignError, AlignmentMethod, AlignmentSpec, NotAligned, Vehicle};
 use ego_fuser::ego::Ego;
 
 /// Where boxes come from.
@@ -23,11 +25,11 @@ pub enum BoxSource {
     Annotated,
 }
 
-/// One approach on one pair at one moment.
+/// One method on one pair at one moment.
 #[derive(Debug, Clone, PartialEq)]
 pub struct PairOutcome {
-    /// Place of the approach in the list that was compared.
-    pub approach: usize,
+    /// Place of the method in the list that was compared.
+    pub method: usize,
     /// Payload that the neighbour sends for it, metadata and body, bytes.
     pub bytes: u64,
     /// Until the ego knows: what a vehicle prepares (both at the same time) and the alignment itself. Boxes are there
@@ -53,24 +55,26 @@ impl AlignmentError {
     }
 }
 
-/// Compares approaches on the moments of a scenario that `ticks` names; tells of every pair as it is done.
+/// Compares methods on the moments of a scenario that `ticks` names; tells of every pair as it is done.
 ///
 /// # Errors
 /// [`AlignError`] at the first frame that cannot be read or has no true pose.
 pub fn run(
-    approaches: &mut [Box<dyn Approach>],
+    specs: &[AlignmentSpec],
     box_source: &mut BoxSource,
     scenario: &Scenario,
     ticks: impl Iterator<Item = usize>,
     on_outcome: &mut dyn FnMut(PairOutcome),
 ) -> Result<(), AlignError> {
-    approaches.iter_mut().for_each(|approach| approach.begin());
+    let mut methods: Vec<_> = specs.iter().map(AlignmentSpec::for_scene).collect();
+    let needs_boxes = specs.iter().any(|spec| spec.needs_boxes);
     for tick in ticks {
         let frames = (scenario.present_agents(tick))
             .map(|agent| Ok(scenario.load(agent, tick, &LoadOptions::default())?))
             .collect::<Result<Vec<Frame>, AlignError>>()?;
         let truth = (frames.iter().map(|frame| true_pose(frame, scenario, tick))).collect::<Result<Vec<_>, _>>()?;
-        moment(approaches, box_source, &frames, &truth, on_outcome)?;
+        let boxes = needs_boxes.then_some(&mut *box_source);
+        moment(&mut methods, boxes, &frames, &truth, on_outcome)?;
     }
     Ok(())
 }
@@ -85,8 +89,8 @@ fn true_pose(frame: &Frame, scenario: &Scenario, tick: usize) -> Result<Isometry
 
 /// All pairs of one moment; the ego comes first.
 fn moment(
-    approaches: &mut [Box<dyn Approach>],
-    box_source: &mut BoxSource,
+    methods: &mut [Box<dyn AlignmentMethod>],
+    mut box_source: Option<&mut BoxSource>,
     frames: &[Frame],
     truth: &[Isometry3<f64>],
     on_outcome: &mut dyn FnMut(PairOutcome),
@@ -96,22 +100,22 @@ fn moment(
         (0..frames.len()).filter(|&index| ego_from(index).translation.vector.norm() <= Ego::COMM_RANGE_M).collect();
     let boxes = near
         .iter()
-        .map(|&index| match approaches.iter().any(|approach| approach.needs_boxes()) {
-            true => boxes(box_source, &frames[index], &truth[index]),
-            false => Ok(Vec::new()),
+        .map(|&index| match &mut box_source {
+            Some(source) => boxes(source, &frames[index], &truth[index]),
+            None => Ok(Vec::new()),
         })
         .collect::<Result<Vec<_>, _>>()?;
     let vehicles: Vec<Vehicle<'_>> =
         near.iter().zip(&boxes).map(|(&index, boxes)| Vehicle { frame: &frames[index], boxes }).collect();
-    for (number, approach) in approaches.iter_mut().enumerate() {
+    for (number, method) in methods.iter_mut().enumerate() {
         let prepared =
-            vehicles.iter().map(|vehicle| prepare(approach.as_mut(), vehicle)).collect::<Result<Vec<_>, _>>()?;
+            vehicles.iter().map(|vehicle| prepare(method.as_mut(), vehicle)).collect::<Result<Vec<_>, _>>()?;
         let Some((own, neighbours)) = prepared.split_first() else { continue };
         for (received, &index) in neighbours.iter().zip(&near[1..]) {
             let start = Instant::now();
-            let found = approach.align(&vehicles[0], &own.message, &received.message);
+            let found = method.align(&vehicles[0], &own.message, &received.message);
             on_outcome(PairOutcome {
-                approach: number,
+                method: number,
                 bytes: received.bytes,
                 time: own.time.max(received.time) + start.elapsed(),
                 result: found.map(|found| AlignmentError::between(&ego_from(index), &found)),
@@ -128,9 +132,9 @@ struct Prepared {
     time: Duration,
 }
 
-fn prepare(approach: &mut dyn Approach, vehicle: &Vehicle<'_>) -> Result<Prepared, AlignError> {
+fn prepare(method: &mut dyn AlignmentMethod, vehicle: &Vehicle<'_>) -> Result<Prepared, AlignError> {
     let start = Instant::now();
-    let message = approach.prepare(vehicle)?;
+    let message = method.prepare(vehicle)?;
     let time = start.elapsed();
     let Frame { cav, capture_nanos, .. } = vehicle.frame;
     let stamp =

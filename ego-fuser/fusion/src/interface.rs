@@ -1,0 +1,33 @@
+//! Interface of a fusion: aligned maps in, one map out.
+
+use std::fmt::Debug;
+
+use tch::{TchError, Tensor};
+
+use super::maps::AlignedMaps;
+
+/// A way to fuse aligned feature maps.
+pub trait Fusion: Debug + Send {
+    /// Fuses the maps of one sample.
+    ///
+    /// # Errors
+    /// [`TchError`] when the shapes of features and mask do not fit.
+    fn fuse(&self, maps: &AlignedMaps) -> Result<FusionOutput, TchError>;
+}
+
+/// Result of a fusion.
+#[derive(Debug)]
+pub struct FusionOutput {
+    /// `[C, H, W]` in the frame of the ego.
+    pub map: Tensor,
+    /// `[N - 1, 3]`: shift of each entry but the first beyond its pose, those of [`AlignedMaps::earlier`] last: along x and y
+    /// of the ego, metres, and about the entry's sender, radians. Absent for methods that take poses as they are, and where
+    /// there is one entry.
+    pub corrections: Option<Tensor>,
+}
+
+impl From<Tensor> for FusionOutput {
+    fn from(map: Tensor) -> Self {
+        Self { map, corrections: None }
+    }
+}

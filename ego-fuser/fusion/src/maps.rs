@@ -1,0 +1,217 @@
+//! Maps on their way to a fusion: as received, warped onto the ego's grid ([`WarpedMaps`]), and aligned with their metadata.
+
+use protocol::{BevGrid, Pose};
+use tch::{TchError, Tensor};
+
+use super::classes::Classes;
+use super::full_resolution::FullResolutionMap;
+use crate::warp::WarpedMaps;
+
+/// Origin of one map.
+#[derive(Debug, Clone, Copy, PartialEq)]
+pub struct MapMetadata {
+    /// Agent that it is of, 0 being the ego. With history an agent has several maps.
+    pub agent: usize,
+    /// Pose of its sender when it was made, in the frame of the ego now.
+    pub ego_from_cav: Pose,
+    /// Confidence of its sender's pose, 0..1.
+    pub confidence: f64,
+    /// Its age relative to the ego's newest map, seconds.
+    pub age_secs: f64,
+}
+
+impl MapMetadata {
+    /// A map without delay whose pose has full confidence.
+    #[must_use]
+    pub fn fresh(agent: usize, ego_from_cav: Pose) -> Self {
+        Self { agent, ego_from_cav, confidence: 1.0, age_secs: 0.0 }
+    }
+}
+
+/// Maps in the frames of their senders.
+#[derive(Debug)]
+pub struct ReceivedMaps {
+    /// `[N, C, H, W]`.
+    pub maps: Tensor,
+    /// `[N, 1, H, W]`, 1 where a cell was sent; absent: everywhere.
+    pub sent: Option<Tensor>,
+    /// The same maps at full resolution, where a fusion needs earlier maps at both; else none.
+    pub(crate) full_resolution: Vec<FullResolutionMap>,
+}
+
+impl ReceivedMaps {
+    /// Maps `[N, C, H, W]`, of which `sent` `[N, 1, H, W]` is 1 for cells that were sent; absent: all.
+    #[must_use]
+    pub fn new(maps: Tensor, sent: Option<Tensor>) -> Self {
+        Self { maps, sent, full_resolution: Vec::new() }
+    }
+
+    /// The entries from `first` up to `end`, without their copies at full resolution.
+    ///
+    /// # Errors
+    /// [`TchError`] when there are fewer.
+    pub fn only(&self, first: i64, end: i64) -> Result<Self, TchError> {
+        let of = |tensor: &Tensor| tensor.f_narrow(0, first, end - first);
+        Ok(Self::new(of(&self.maps)?, self.sent.as_ref().map(of).transpose()?))
+    }
+
+    /// Maps of one size, one after another.
+    ///
+    /// # Errors
+    /// [`TchError`] when there are none, or of several sizes.
+    pub fn together(all: &[&Self]) -> Result<Self, TchError> {
+        let maps: Vec<&Tensor> = all.iter().map(|maps| &maps.maps).collect();
+        // Where one of them was sent as a whole, its mask has to be written out.
+        let sent = all.iter().any(|maps| maps.sent.is_some()).then(|| {
+            let cells = |maps: &&Self| match &maps.sent {
+                Some(sent) => Ok(sent.shallow_clone()),
+                None => maps.maps.f_narrow(1, 0, 1)?.f_ones_like(),
+            };
+            Tensor::f_cat(&all.iter().map(cells).collect::<Result<Vec<_>, _>>()?, 0)
+        });
+        Ok(Self {
+            maps: Tensor::f_cat(&maps, 0)?,
+            sent: sent.transpose()?,
+            full_resolution: all
+                .iter()
+                .flat_map(|maps| &maps.full_resolution)
+                .map(FullResolutionMap::shallow_clone)
+                .collect(),
+        })
+    }
+}
+
+/// The maps of one sample on the ego's grid: the input of a fusion. The first is the ego's newest.
+///
+/// Missing agents are either not in it or have a mask of zeros: both mean the same to every method.
+#[derive(Debug)]
+pub struct AlignedMaps {
+    /// `N` maps on the ego's grid; the mask is 1 everywhere for the ego.
+    pub warped: WarpedMaps,
+    /// The same maps in the frames of their senders but in the axes of the ego, for methods that warp them themselves.
+    pub received: ReceivedMaps,
+    /// `N`: their origins.
+    pub metadata: Vec<MapMetadata>,
+    /// The grid of all maps, each in the frame of its vehicle.
+    pub grid: BevGrid,
+    /// Maps from before each agent's newest, for a method that needs them with larger cells, see
+    /// [`HistorySpec`](super::HistorySpec).
+    pub earlier: Option<EarlierMaps>,
+    /// Whether parameters are learnt from this pass: some values are left out at random then.
+    pub is_training: bool,
+}
+
+impl AlignedMaps {
+    /// The newest maps of all agents, outside of training: `features` `[N, C, H, W]` and `mask` `[N, 1, H, W]` on the ego's
+    /// grid, which count as received there too.
+    #[must_use]
+    pub fn newest(features: &Tensor, mask: &Tensor, metadata: &[MapMetadata], grid: &BevGrid) -> Self {
+        Self {
+            warped: WarpedMaps { features: features.shallow_clone(), mask: mask.shallow_clone() },
+            received: ReceivedMaps::new(features.shallow_clone(), None),
+            metadata: metadata.to_vec(),
+            grid: *grid,
+            earlier: None,
+            is_training: false,
+        }
+    }
+
+    /// How many agents have a newest map here, or maps of any age where earlier ones are not apart.
+    ///
+    /// # Errors
+    /// [`TchError`] when the features have not four dimensions.
+    pub fn count(&self) -> Result<i64, TchError> {
+        Ok(self.warped.features.size4()?.0)
+    }
+}
+
+/// Aligned maps from before the newest of their agents.
+#[derive(Debug)]
+pub struct EarlierMaps {
+    /// `O` maps on a grid of the ego with larger cells.
+    pub warped: WarpedMaps,
+    /// `O`: their origins.
+    pub metadata: Vec<MapMetadata>,
+    /// The same at full resolution and not warped yet, and the head that says where on a map vehicles may be.
+    pub(crate) full_resolution: Option<(Vec<FullResolutionMap>, Classes)>,
+}
+
+/// Maps `[N, C, H, W]` with cells of `cells` by `cells`, each their mean; those at the edges of fewer.
+pub(crate) fn larger_cells(maps: &Tensor, cells: i64) -> Result<Tensor, TchError> {
+    let (.., height, width) = maps.size4()?;
+    if cells == 1 {
+        return Ok(maps.shallow_clone());
+    }
+    if height % cells != 0 || width % cells != 0 {
+        return maps.f_avg_pool2d([cells, cells], [cells, cells], [0_i64, 0], true, false, None::<i64>);
+    }
+    // The tensor library's pooling takes three times as long.
+    let rows = sum_of_every(maps, 2, cells)?;
+    Ok(sum_of_every(&rows, 3, cells)? / (cells * cells) as f64)
+}
+
+/// The sums of each `count` neighbours along `dim`.
+fn sum_of_every(maps: &Tensor, dim: i64, count: i64) -> Result<Tensor, TchError> {
+    let every = |first: i64| maps.f_slice(dim, first, None, count);
+    (1..count).try_fold(every(0)?, |sum, first| sum.f_add(&every(first)?))
+}
+
+/// The grid of such maps.
+pub(crate) fn with_cells_of(grid: &BevGrid, cells: i64) -> BevGrid {
+    let cells = cells as u32;
+    let (width, height) = (grid.width.div_ceil(cells), grid.height.div_ceil(cells));
+    BevGrid { cell_m: grid.cell_m * f64::from(cells), width, height, ..*grid }
+}
+
+/// The entries of `mask` `[N, 1, H, W]` that reach any cell, and the ego's, the first.
+pub(crate) fn present(mask: &Tensor) -> Result<Vec<i64>, TchError> {
+    let most = mask.f_amax([1i64, 2, 3].as_slice(), false)?.f_to_kind(tch::Kind::Float)?;
+    let most = Vec::<f32>::try_from(most.f_to_device(tch::Device::Cpu)?)?;
+    Ok((0i64..).zip(most).filter(|(entry, most)| *entry == 0 || *most > 0.0).map(|(entry, _)| entry).collect())
+}
+
+/// Splits agents of all samples into padded samples: `[sum(agents), ...]` to `[B, longest, ...]` and a mask `[B, longest]`.
+///
+/// # Errors
+/// [`TchError`] when the counts do not add up to the first size, or one is above `longest`.
+pub fn regroup(features: &Tensor, agents: &[i64], longest: i64) -> Result<(Tensor, Tensor), TchError> {
+    let mut samples = Vec::with_capacity(agents.len());
+    let mut masks = Vec::with_capacity(agents.len());
+    for (sample, &count) in features.f_split_with_sizes(agents, 0)?.into_iter().zip(agents) {
+        let mut padding = sample.size();
+        padding[0] = longest - count;
+        let empty = Tensor::f_zeros(padding, (sample.kind(), sample.device()))?;
+        samples.push(Tensor::f_cat(&[sample, empty], 0)?);
+        masks.push(Tensor::f_arange(longest, (tch::Kind::Int64, features.device()))?.f_lt(count)?);
+    }
+    Ok((Tensor::f_stack(&samples, 0)?, Tensor::f_stack(&masks, 0)?))
+}
+
+#[cfg(test)]
+mod tests {
+    use tch::{Device, Kind};
+
+    use super::*;
+
+    const FLOAT: (Kind, Device) = (Kind::Float, Device::Cpu);
+
+    #[test]
+    fn larger_cells_are_means_at_the_edges_too() {
+        let maps = Tensor::arange(24, FLOAT).view([1, 1, 4, 6]);
+        let pooled = |maps: &Tensor| maps.avg_pool2d([2, 2], [2, 2], [0, 0], true, false, None);
+        assert_eq!(larger_cells(&maps, 1).unwrap(), maps);
+        assert_eq!(larger_cells(&maps, 2).unwrap(), pooled(&maps));
+        let odd = maps.narrow(3, 0, 5);
+        assert_eq!(larger_cells(&odd, 2).unwrap(), pooled(&odd));
+        assert_eq!(larger_cells(&odd, 2).unwrap().double_value(&[0, 0, 0, 2]), 7.0);
+    }
+
+    #[test]
+    fn regroup_pads_with_nothing() {
+        let features = Tensor::arange(3, FLOAT).view([3, 1]) + 1.0;
+        let (groups, mask) = regroup(&features, &[2, 1], 3).unwrap();
+        assert_eq!(Vec::<f32>::try_from(groups.view(-1)).unwrap(), [1.0, 2.0, 0.0, 3.0, 0.0, 0.0]);
+        assert_eq!(Vec::<bool>::try_from(mask.view(-1)).unwrap(), [true, true, false, true, false, false]);
+        assert!(regroup(&features, &[2, 2], 3).is_err());
+    }
+}

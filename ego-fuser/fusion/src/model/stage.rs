@@ -1,0 +1,317 @@
+//! From the maps of several vehicles to one: orientation-conditioned mixing of channels, warp (Eq. 2), fusion. Training and the
+//! ego run the same lines.
+
+use std::borrow::Cow;
+
+use perception::model_config::{ConfigError, DetectorConfig, YAxis};
+use perception::weights::{Weights, WeightsError};
+use protocol::{BevGrid, Pose};
+use tch::nn::{self, VarStore};
+use tch::{Device, TchError, Tensor};
+
+use crate::channel_mixing::{self, Steering};
+use crate::classes::Classes;
+use crate::f64_tensor::are_numbers;
+use crate::full_resolution::FullResolutionMap;
+use crate::maps::{AlignedMaps, EarlierMaps, MapMetadata, ReceivedMaps, larger_cells, with_cells_of};
+use crate::method::{Exchange, Method};
+use crate::settings::{FUSION_KEY, FusionConfig, Requirements};
+use crate::warp::{Order, WarpError, WarpedMaps, warp_in_order};
+use crate::{Fusion, FusionOutput};
+
+/// Where the fusion's variables lie in a weights file.
+pub(crate) const FUSION_PREFIX: &str = "fusion.";
+
+/// Why a fusion cannot be read from a weights file.
+#[derive(Debug, thiserror::Error)]
+pub enum StageError {
+    /// Its configuration is none.
+    #[error(transparent)]
+    Config(#[from] ConfigError),
+    /// The weights do not fit.
+    #[error(transparent)]
+    Weights(#[from] WeightsError),
+}
+
+/// Channel mixing, warp and fusion of one network.
+#[derive(Debug)]
+pub struct FusionStage {
+    config: FusionConfig,
+    requirements: Requirements,
+    fusion: Box<dyn Fusion>,
+    steering: Option<Steering>,
+    /// For a fusion that needs earlier maps at full resolution.
+    classes: Option<Classes>,
+    grid: BevGrid,
+    /// In which world the maps are.
+    y_axis: YAxis,
+}
+
+impl FusionStage {
+    /// The fusion of `method` with random parameters below `path`: `fusion.*`, where maps are exchanged `steering.weight` and,
+    /// where earlier maps are needed at full resolution, the detector's `cls_head.*` unless that has made them.
+    ///
+    /// # Errors
+    /// [`ConfigError`] names the field that no fusion can be built from.
+    pub fn new(
+        path: &nn::Path<'_>,
+        config: &FusionConfig,
+        method: Method,
+        detector: &DetectorConfig,
+    ) -> Result<Self, ConfigError> {
+        let shares_maps = method.exchange() == Exchange::Features;
+        let steering = shares_maps.then(|| Steering::new(path, detector.feature_channels()));
+        let fusion = config.build(&(path / "fusion"))?;
+        let sizes = [detector.feature_channels(), detector.anchors.yaws_deg.len() as i64];
+        let requirements = config.requirements();
+        let classes = requirements.history.full_resolution.then(|| Classes::under(path, sizes));
+        let (grid, y_axis) = (detector.feature_grid(), detector.y_axis);
+        Ok(Self { config: config.clone(), requirements, fusion, steering, classes, grid, y_axis })
+    }
+
+    /// The fusion of a weights file, or the one of `method` where it is another and has no parameters.
+    ///
+    /// # Errors
+    /// [`StageError`] names the file and the first parameter that is missing or of another shape.
+    pub fn from_weights(weights: &Weights, method: Method, detector: &DetectorConfig) -> Result<Self, StageError> {
+        let variables = VarStore::new(Device::Cpu);
+        let config = stored_config(weights, method, detector)?;
+        let mut stage = Self::new(&variables.root(), &config, method, detector)?;
+        weights.copy_some_into(&variables, |name| name != channel_mixing::WEIGHT || weights.contains(name))?;
+        if !weights.contains(channel_mixing::WEIGHT) {
+            stage.steering = None;
+        }
+        Ok(stage)
+    }
+
+    /// The fusion of `method` around a network without weights of its own: its parameters are random, channels stay as
+    /// they come.
+    ///
+    /// # Errors
+    /// [`ConfigError`] names the field that no fusion can be built from.
+    pub fn untrained(method: Method, detector: &DetectorConfig) -> Result<Self, ConfigError> {
+        let variables = VarStore::new(Device::Cpu);
+        let config = method.default_fusion(detector);
+        Ok(Self { steering: None, ..Self::new(&variables.root(), &config, method, detector)? })
+    }
+
+    /// What the fusion was built from.
+    #[must_use]
+    pub fn config(&self) -> &FusionConfig {
+        &self.config
+    }
+
+    /// Inputs that the fusion needs beyond the newest map of every agent.
+    #[must_use]
+    pub fn requirements(&self) -> &Requirements {
+        &self.requirements
+    }
+
+    /// Warps maps onto the ego's grid: `received` are `N`, each in the axes of its sender, as are `metadata`: the ego's newest
+    /// first, then the newest of all others, then earlier ones.
+    ///
+    /// # Errors
+    /// [`WarpError`] when the maps do not lie on the grid or metadata are missing.
+    pub fn align(&self, received: &ReceivedMaps, metadata: &[MapMetadata]) -> Result<AlignedMaps, WarpError> {
+        let (count, newest) = (received.maps.size4()?.0, newest(metadata) as i64);
+        if count == newest {
+            return self.align_with(received, None, metadata);
+        }
+        let earlier = received.only(newest, count)?;
+        let then = then_from_cav(&self.of_network(metadata), newest as usize);
+        let earlier = self.kept(&earlier, &self.turned(&earlier.maps, &then)?)?;
+        self.align_with(&received.only(0, newest.min(count))?, Some(earlier), metadata)
+    }
+
+    /// The form of maps in which they are kept for later frames, given the same maps in the axes of the ego, `turned`
+    /// `[N, C, H, W]`.
+    ///
+    /// # Errors
+    /// [`TchError`] when the maps have not four dimensions.
+    pub fn kept(&self, received: &ReceivedMaps, turned: &Tensor) -> Result<ReceivedMaps, TchError> {
+        let ReceivedMaps { maps, sent, .. } = received;
+        let history = self.requirements.history;
+        let kept = match history.earlier_cells {
+            Some(cells) => ReceivedMaps::new(
+                cell_by_cell(&larger_cells(maps, cells)?)?,
+                // A larger cell was sent where any of its cells was.
+                sent.as_ref().map(|sent| larger_cells(sent, cells)?.f_ceil()).transpose()?,
+            ),
+            None => ReceivedMaps::new(maps.shallow_clone(), sent.as_ref().map(Tensor::shallow_clone)),
+        };
+        let full_resolution = |map: i64| {
+            let of = |tensor: &Tensor| tensor.f_narrow(0, map, 1);
+            FullResolutionMap::of(&of(turned)?, sent.as_ref().map(of).transpose()?.as_ref())
+        };
+        let count = if history.full_resolution { maps.size4()?.0 } else { 0 };
+        Ok(ReceivedMaps { full_resolution: (0..count).map(full_resolution).collect::<Result<_, TchError>>()?, ..kept })
+    }
+
+    /// Maps in the axes of the ego.
+    fn turned(&self, maps: &Tensor, poses: &[Pose]) -> Result<Tensor, TchError> {
+        match &self.steering {
+            Some(steering) => steering.turn(maps, poses),
+            None => Ok(maps.shallow_clone()),
+        }
+    }
+
+    /// [`Self::align`] with earlier maps as they were [`Self::kept`].
+    ///
+    /// # Errors
+    /// [`WarpError`] when the maps do not lie on the grid or metadata are missing.
+    pub fn align_with(
+        &self,
+        newest: &ReceivedMaps,
+        earlier: Option<ReceivedMaps>,
+        metadata: &[MapMetadata],
+    ) -> Result<AlignedMaps, WarpError> {
+        let mut metadata = self.of_network(metadata).into_owned();
+        let count = newest.maps.size4()?.0;
+        let maps = count + earlier.as_ref().map_or(Ok(0), |earlier| earlier.maps.size4().map(|size| size.0))?;
+        if maps != metadata.len() as i64 {
+            return Err(WarpError::PoseCount { maps, poses: metadata.len() });
+        }
+        let cells = self.requirements.history.earlier_cells;
+        // A fusion that needs earlier maps with larger cells takes the maximum over the newest, cell by cell.
+        let order = if cells.is_some() { Order::Cells } else { Order::Planes };
+        let earlier = match (cells, earlier) {
+            (Some(cells), Some(earlier)) => {
+                let metadata = metadata.split_off(count as usize);
+                let (_, warped) = self.warped(&earlier, &metadata, &with_cells_of(&self.grid, cells), order)?;
+                let classes = self.classes.as_ref().map(Classes::shallow_clone);
+                let full_resolution = classes.map(|classes| (earlier.full_resolution, classes));
+                Some(EarlierMaps { warped, metadata, full_resolution })
+            }
+            (None, Some(earlier)) => {
+                return self.aligned(&ReceivedMaps::together(&[newest, &earlier])?, None, metadata, order);
+            }
+            (_, None) => None,
+        };
+        self.aligned(newest, earlier, metadata, order)
+    }
+
+    fn aligned(
+        &self,
+        received: &ReceivedMaps,
+        earlier: Option<EarlierMaps>,
+        metadata: Vec<MapMetadata>,
+        order: Order,
+    ) -> Result<AlignedMaps, WarpError> {
+        let (received, warped) = self.warped(received, &metadata, &self.grid, order)?;
+        Ok(AlignedMaps { warped, received, metadata, grid: self.grid, earlier, is_training: false })
+    }
+
+    /// Maps in the axes of the ego, and the same warped onto the ego's `grid`.
+    fn warped(
+        &self,
+        ReceivedMaps { maps, sent, .. }: &ReceivedMaps,
+        metadata: &[MapMetadata],
+        grid: &BevGrid,
+        order: Order,
+    ) -> Result<(ReceivedMaps, WarpedMaps), WarpError> {
+        let poses: Vec<Pose> = metadata.iter().map(|map| map.ego_from_cav).collect();
+        let maps = self.turned(maps, &poses)?;
+        let warped = warp_in_order(&maps, sent.as_ref(), &poses, grid, order)?;
+        Ok((ReceivedMaps::new(maps, sent.as_ref().map(Tensor::shallow_clone)), warped))
+    }
+
+    /// Fuses aligned maps into one in the frame of the ego.
+    ///
+    /// # Errors
+    /// [`WarpError::Torch`] when the tensor library refuses.
+    pub fn fuse(&self, maps: &AlignedMaps) -> Result<FusionOutput, WarpError> {
+        Ok(self.fusion.fuse(maps)?)
+    }
+
+    /// Metadata in the world of the network: a mirrored one has mirrored poses.
+    fn of_network<'a>(&self, metadata: &'a [MapMetadata]) -> Cow<'a, [MapMetadata]> {
+        if self.y_axis == YAxis::Left {
+            return Cow::Borrowed(metadata);
+        }
+        let mirrored = metadata.iter().map(|map| MapMetadata { ego_from_cav: map.ego_from_cav.mirrored_y(), ..*map });
+        Cow::Owned(mirrored.collect())
+    }
+}
+
+/// How many of the first entries are the newest of their agents.
+fn newest(facts: &[MapMetadata]) -> usize {
+    let is_first = |(entry, of): &(usize, &MapMetadata)| facts[..*entry].iter().all(|before| before.agent != of.agent);
+    facts.iter().enumerate().take_while(is_first).count()
+}
+
+/// Poses of the entries from `newest` on in the frame that the ego had when they were the newest of their agents: its own
+/// entry as many steps back tells of it, and where there is none it counts as standing still.
+fn then_from_cav(facts: &[MapMetadata], newest: usize) -> Vec<Pose> {
+    let step = |entry: usize| facts[..entry].iter().filter(|before| before.agent == facts[entry].agent).count();
+    let ego_of = |wanted: usize| (0..facts.len()).find(|&entry| facts[entry].agent == 0 && step(entry) == wanted);
+    let of_entry = |entry: usize| {
+        if facts[entry].agent == 0 {
+            return Pose::IDENTITY;
+        }
+        let ego = ego_of(step(entry)).map_or(Pose::IDENTITY, |ego| facts[ego].ego_from_cav);
+        ego.from_world(&facts[entry].ego_from_cav)
+    };
+    (newest..facts.len()).map(of_entry).collect()
+}
+
+/// Maps with the channels of a cell side by side in memory, where no gradient flows.
+fn cell_by_cell(maps: &Tensor) -> Result<Tensor, TchError> {
+    match are_numbers(maps) {
+        true => maps.f_permute([0, 2, 3, 1])?.f_contiguous()?.f_permute([0, 3, 1, 2]),
+        false => Ok(maps.shallow_clone()),
+    }
+}
+
+/// The configuration that a weights file names, as long as it belongs to `method`.
+pub(crate) fn stored_config(
+    weights: &Weights,
+    method: Method,
+    detector: &DetectorConfig,
+) -> Result<FusionConfig, WeightsError> {
+    let usual = method.default_fusion(detector);
+    if weights.metadata(FUSION_KEY).is_none() {
+        return Ok(usual);
+    }
+    let stored: FusionConfig = weights.metadata_json(FUSION_KEY)?;
+    Ok(if method.has_fusion(&stored) { stored } else { usual })
+}
+
+#[cfg(test)]
+mod tests {
+    use tch::Kind;
+
+    use super::*;
+
+    /// A network of a mirrored world gets mirrored maps and answers with a mirrored one.
+    #[test]
+    fn a_mirrored_world_is_fused_like_this_one() {
+        tch::set_num_threads(1);
+        let plain = DetectorConfig::lean();
+        let mirrored = DetectorConfig { y_axis: YAxis::Right, ..DetectorConfig::lean() };
+        let grid = plain.feature_grid();
+        let size = [3, plain.feature_channels(), i64::from(grid.height), i64::from(grid.width)];
+        let maps = Tensor::rand(size, (Kind::Float, Device::Cpu));
+        let poses =
+            [Pose::IDENTITY, Pose::from_xyz_yaw([8.0, 3.0, 0.0], 0.4), Pose::from_xyz_yaw([-5.0, 9.0, 0.0], -2.0)];
+        let facts: Vec<MapMetadata> = (0..3).map(|agent| MapMetadata::fresh(agent, poses[agent])).collect();
+        let fused = |detector: &DetectorConfig, maps: &Tensor| {
+            let stage = FusionStage::untrained(Method::ATTENTION, detector).unwrap();
+            let received = ReceivedMaps::new(maps.shallow_clone(), None);
+            stage.fuse(&stage.align(&received, &facts).unwrap()).unwrap().map
+        };
+        let here = fused(&plain, &maps);
+        let there = fused(&mirrored, &maps.flip([2])).flip([1]);
+        assert!(here.allclose(&there, 1e-3, 1e-3, false));
+    }
+
+    #[test]
+    fn earlier_maps_are_turned_as_when_they_were_the_newest() {
+        let turned = |yaw_rad: f64| Pose::from_xyz_yaw([1.0, 2.0, 0.0], yaw_rad);
+        let fact = |agent: usize, yaw_rad: f64| MapMetadata::fresh(agent, turned(yaw_rad));
+        // The ego has turned by 0.1 since; of a third time step it has no map.
+        let facts = [MapMetadata::fresh(0, Pose::IDENTITY), fact(1, 0.7), fact(0, -0.1), fact(1, 0.5), fact(1, 0.4)];
+        let yaws: Vec<f64> = then_from_cav(&facts, 2).iter().map(Pose::yaw_rad).collect();
+        assert!(yaws.iter().zip([0.0, 0.6, 0.4]).all(|(found, expected)| (found - expected).abs() < 1e-9), "{yaws:?}");
+        assert_eq!(then_from_cav(&facts, 2)[0], Pose::IDENTITY);
+    }
+}

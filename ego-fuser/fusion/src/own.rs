@@ -1,0 +1,67 @@
+//! Methods without fusion of feature maps: the ego alone, boxes and points.
+
+use perception::model_config::{ConfigError, DetectorConfig};
+use serde::{Deserialize, Serialize};
+use tch::{TchError, nn};
+
+use super::interface::{Fusion, FusionOutput};
+use super::maps::AlignedMaps;
+use super::settings::FusionSettings;
+use super::spec::{Exchange, FusionSpec, MethodSpec};
+
+/// The ego alone: the baseline that every exchange must beat.
+pub static NONE: MethodSpec = MethodSpec {
+    name: "none",
+    summary: "the ego alone",
+    exchange: Exchange::Nothing,
+    gate: None,
+    runs_with_weights_of: &[],
+    fusion: FusionSpec::of::<OwnConfig>(),
+};
+
+/// Late fusion: boxes are exchanged and merged by NMS.
+pub static LATE: MethodSpec = MethodSpec {
+    name: "late",
+    summary: "boxes, merged by rotated NMS",
+    exchange: Exchange::Boxes,
+    gate: None,
+    runs_with_weights_of: &["none"],
+    fusion: FusionSpec::of::<OwnConfig>(),
+};
+
+/// Early fusion: points are exchanged and encoded together in the ego frame.
+pub static EARLY: MethodSpec = MethodSpec {
+    name: "early",
+    summary: "points, encoded together in the ego frame",
+    exchange: Exchange::Points,
+    gate: None,
+    runs_with_weights_of: &["early", "none"],
+    fusion: FusionSpec::of::<OwnConfig>(),
+};
+
+/// Settings of [`NoFusion`]: none.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct OwnConfig {}
+
+impl FusionSettings for OwnConfig {
+    const KIND: &'static str = "own";
+
+    fn for_detector(_detector: &DetectorConfig) -> Self {
+        Self {}
+    }
+
+    fn build(&self, _path: &nn::Path<'_>) -> Result<Box<dyn Fusion>, ConfigError> {
+        Ok(Box::new(NoFusion))
+    }
+}
+
+/// The ego's own map, whatever the others have.
+#[derive(Debug, Clone, Copy, Default)]
+pub struct NoFusion;
+
+impl Fusion for NoFusion {
+    fn fuse(&self, maps: &AlignedMaps) -> Result<FusionOutput, TchError> {
+        Ok(maps.warped.features.f_get(0)?.into())
+    }
+}

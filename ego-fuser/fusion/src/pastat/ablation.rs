@@ -1,0 +1,49 @@
+//! Ablation of PASTAT: settings without some of its parts.
+
+use perception::model_config::ConfigError;
+
+use super::config::PastatConfig;
+use crate::FusionConfig;
+
+/// A part that can be left out, for the ablation.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub enum Part {
+    /// Confidence Embedding.
+    Ce,
+    /// Feature Spatial Alignment.
+    Fsa,
+    /// Temporal Encoding.
+    Te,
+    /// Temporal feature memory.
+    TemporalMemory,
+}
+
+/// Settings without some parts, or with another number of time steps; other methods have no such parts.
+///
+/// # Errors
+/// [`ConfigError`] where there is nothing to leave out.
+pub fn ablated(fusion: &FusionConfig, without: &[Part], frames: Option<usize>) -> Result<FusionConfig, ConfigError> {
+    let Some(config) = fusion.settings::<PastatConfig>() else {
+        if without.is_empty() && frames.is_none() {
+            return Ok(fusion.clone());
+        }
+        let value = format!("without {without:?}, {frames:?} frames");
+        return Err(ConfigError::Value { field: "fusion", value, must: "as it is but for pastat" });
+    };
+    let mut config = without.iter().fold(config.clone(), |config, &part| without_part(config, part));
+    config.frames = frames.unwrap_or(config.frames);
+    // One time step leaves nothing to remember.
+    if config.frames == 1 {
+        config = without_part(config, Part::TemporalMemory);
+    }
+    Ok(FusionConfig::new(config))
+}
+
+fn without_part(config: PastatConfig, part: Part) -> PastatConfig {
+    match part {
+        Part::Ce => PastatConfig { ce: false, ..config },
+        Part::Fsa => PastatConfig { fsa: None, ..config },
+        Part::Te => PastatConfig { te: None, ..config },
+        Part::TemporalMemory => PastatConfig { temporal_memory: None, ..config },
+    }
+}

@@ -1,0 +1,157 @@
+//! Coarse alignment (the A of Eq. 2): maps warped onto the ego's grid by the poses of their senders.
+//!
+//! The warp itself is that of all methods ([`crate::warp`]). Here the entries are picked that reach any cell, so nothing is
+//! padded over agents or time, and their grids are padded to what attention windows and FSA divide them into.
+
+use protocol::Pose;
+use tch::{Kind, TchError, Tensor};
+
+use super::config::PastatConfig;
+use crate::maps::{AlignedMaps, MapMetadata};
+use crate::padding::Padding;
+use crate::warp::WarpedMaps;
+
+/// Picks and pads the entries of a sample.
+#[derive(Debug)]
+pub(super) struct CoarseAlignment {
+    /// Cells that the newest maps' rows and columns are multiples of.
+    padding_cells: i64,
+    /// The same of earlier maps.
+    earlier_padding_cells: i64,
+}
+
+/// Coarsely aligned maps: the entries of a sample that reach any cell. A map that reaches none takes no part and has no share
+/// of the confidence either.
+#[derive(Debug)]
+pub(super) struct CoarseMaps {
+    /// The newest map of each agent, the ego's first, on the padded grid of the ego.
+    pub(super) newest: WarpedMaps,
+    /// The same in the frames of their senders, not padded; the mask says which cells were sent.
+    pub(super) received: WarpedMaps,
+    /// Earlier maps with larger cells, on a padded grid of the ego.
+    pub(super) earlier: Option<WarpedMaps>,
+    /// Places of these among [`AlignedMaps::earlier`].
+    pub(super) earlier_entries: Vec<usize>,
+    /// Origins of the newest and of the earlier maps, in this order.
+    pub(super) origins: Origins,
+    /// Places of all entries in the input, and how many there are.
+    places: Vec<i64>,
+    all: i64,
+}
+
+/// Origins of the entries, by property.
+#[derive(Debug)]
+pub(super) struct Origins {
+    pub(super) agent: Vec<usize>,
+    pub(super) ego_from_cav: Vec<Pose>,
+    /// Confidence of the sender's pose, 0..1.
+    pub(super) confidence: Vec<f64>,
+    pub(super) age_secs: Vec<f64>,
+    /// Places among the maps of the same agent, 0 for the newest.
+    pub(super) steps_back: Vec<usize>,
+}
+
+impl CoarseAlignment {
+    pub(super) fn new(config: &PastatConfig) -> Self {
+        let padding_cells = config.padding_cells();
+        Self { padding_cells, earlier_padding_cells: padding_cells / config.earlier_cells }
+    }
+
+    /// The entries of `maps` that reach any cell; the ego's newest is always one.
+    pub(super) fn pick(&self, maps: &AlignedMaps) -> Result<CoarseMaps, TchError> {
+        let AlignedMaps { warped, received, metadata, earlier, .. } = maps;
+        let newest = reaching(&warped.mask, true)?;
+        let sent = match &received.sent {
+            Some(sent) => sent.shallow_clone(),
+            None => warped.mask.f_ones_like()?,
+        };
+        let earlier_entries = match earlier {
+            Some(earlier) => reaching(&earlier.warped.mask, false)?,
+            None => Vec::new(),
+        };
+        let first = metadata.len() as i64;
+        let metadata: Vec<MapMetadata> =
+            metadata.iter().chain(earlier.iter().flat_map(|earlier| &earlier.metadata)).copied().collect();
+        let places: Vec<i64> =
+            newest.iter().copied().chain(earlier_entries.iter().map(|entry| entry + first)).collect();
+        let picked: Vec<MapMetadata> = places.iter().map(|&place| metadata[place as usize]).collect();
+        Ok(CoarseMaps {
+            newest: padded(&rows_of(&warped.features, &warped.mask, &newest)?, self.padding_cells)?,
+            received: rows_of(&received.maps, &sent, &newest)?,
+            earlier: match earlier.as_ref().filter(|_| !earlier_entries.is_empty()) {
+                Some(earlier) => {
+                    let WarpedMaps { features, mask } = &earlier.warped;
+                    Some(padded(&rows_of(features, mask, &earlier_entries)?, self.earlier_padding_cells)?)
+                }
+                None => None,
+            },
+            earlier_entries: earlier_entries.iter().map(|&entry| entry as usize).collect(),
+            origins: Origins::of(&picked),
+            places,
+            all: metadata.len() as i64,
+        })
+    }
+}
+
+impl CoarseMaps {
+    /// `[N - 1, 3]` of all entries of the input but the first, given `corrections` of those that are here: others have none.
+    pub(super) fn among_all(&self, corrections: &Tensor) -> Result<Tensor, TchError> {
+        if self.places.len() as i64 == self.all {
+            return Ok(corrections.shallow_clone());
+        }
+        let all = Tensor::f_zeros([self.all - 1, 3], (corrections.kind(), corrections.device()))?;
+        let places: Vec<i64> = self.places[1..].iter().map(|place| place - 1).collect();
+        all.f_index_copy(0, &Tensor::f_from_slice(&places)?.f_to_device(corrections.device())?, corrections)
+    }
+}
+
+impl Origins {
+    pub(super) fn of(metadata: &[MapMetadata]) -> Self {
+        let agent: Vec<usize> = metadata.iter().map(|map| map.agent).collect();
+        let age_secs: Vec<f64> = metadata.iter().map(|map| map.age_secs).collect();
+        Self {
+            steps_back: steps_back(&agent, &age_secs),
+            ego_from_cav: metadata.iter().map(|map| map.ego_from_cav).collect(),
+            confidence: metadata.iter().map(|map| map.confidence).collect(),
+            agent,
+            age_secs,
+        }
+    }
+
+    /// How many entries there are.
+    pub(super) fn count(&self) -> usize {
+        self.agent.len()
+    }
+}
+
+/// The place of every entry among those of its agent, 0 for the newest; of two of one age the first is the newer.
+pub(super) fn steps_back(agent: &[usize], age_secs: &[f64]) -> Vec<usize> {
+    let is_newer = |a: usize, b: usize| age_secs[a] < age_secs[b] || (age_secs[a] == age_secs[b] && a < b);
+    (0..agent.len())
+        .map(|entry| (0..agent.len()).filter(|&other| agent[other] == agent[entry] && is_newer(other, entry)).count())
+        .collect()
+}
+
+/// Some entries, as floats.
+fn rows_of(features: &Tensor, mask: &Tensor, entries: &[i64]) -> Result<WarpedMaps, TchError> {
+    let index = Tensor::f_from_slice(entries)?.f_to_device(features.device())?;
+    let is_all = entries.len() as i64 == features.size()[0];
+    let pick = |tensor: &Tensor| match is_all {
+        true => tensor.f_to_kind(Kind::Float),
+        false => tensor.f_index_select(0, &index)?.f_to_kind(Kind::Float),
+    };
+    Ok(WarpedMaps { features: pick(features)?, mask: pick(mask)? })
+}
+
+/// With rows below and columns to the right that reach nothing, so that both counts are multiples of `cells`.
+fn padded(maps: &WarpedMaps, cells: i64) -> Result<WarpedMaps, TchError> {
+    let padded = |maps: &Tensor| Padding::to_multiples_of(cells, maps);
+    Ok(WarpedMaps { features: padded(&maps.features)?, mask: padded(&maps.mask)? })
+}
+
+/// The entries of `mask` `[N, 1, H, W]` that reach any cell; `with_ego`: the first is always one.
+fn reaching(mask: &Tensor, with_ego: bool) -> Result<Vec<i64>, TchError> {
+    let reach: Vec<f32> = Vec::try_from(mask.f_amax([1_i64, 2, 3].as_slice(), false)?.f_to_kind(Kind::Float)?)?;
+    let counts = |(entry, reach): &(i64, f32)| (with_ego && *entry == 0) || *reach > 0.0;
+    Ok((0..).zip(reach).filter(counts).map(|(entry, _)| entry).collect())
+}

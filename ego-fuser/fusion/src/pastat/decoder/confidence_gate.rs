@@ -1,0 +1,38 @@
+//! Weight of a neighbour's map, token by token.
+
+use tch::nn::{self, Init, Module};
+use tch::{TchError, Tensor};
+
+use crate::pastat::config::PastatConfig;
+
+/// How much of a neighbour's newest map is taken, token by token: 1 before it is trained, 0 to 2 after.
+#[derive(Debug)]
+pub(super) struct ConfidenceGate {
+    hidden: nn::Linear,
+    out: nn::Linear,
+    patch: i64,
+}
+
+impl ConfidenceGate {
+    pub(super) fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Self {
+        let neutral = nn::LinearConfig { ws_init: Init::Const(0.0), bs_init: Some(Init::Const(0.0)), bias: true };
+        Self {
+            hidden: nn::linear(path / "hidden", 2 * config.dim, config.dim, nn::LinearConfig::default()),
+            out: nn::linear(path / "out", config.dim, 1, neutral),
+            patch: config.patch,
+        }
+    }
+
+    /// `[M, 1, H, W]` from the neighbours' tokens `[M, h, w, D]` and the ego's after the transformer `[1, h, w, D]`.
+    pub(super) fn forward(&self, others: &Tensor, ego: &Tensor) -> Result<Tensor, TchError> {
+        // A layer of both, side by side; the ego's part is the same for all others.
+        let dim = ego.size4()?.3;
+        let part = |first: i64| self.hidden.ws.f_narrow(1, first, dim);
+        let hidden =
+            others.f_linear(&part(0)?, None::<&Tensor>)? + ego.f_linear(&part(dim)?, self.hidden.bs.as_ref())?;
+        let weight = self.out.forward(&hidden.f_relu()?).f_sigmoid()? * 2.0;
+        let (maps, rows, columns, _) = weight.size4()?;
+        let weight = weight.f_view([maps, 1, rows, columns])?;
+        weight.f_upsample_nearest2d([rows * self.patch, columns * self.patch], None, None)
+    }
+}

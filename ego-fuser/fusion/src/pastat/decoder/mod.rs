@@ -1,0 +1,71 @@
+//! Decoder: the context of the transformer and the aligned maps become one map, which the detection head of Eq. 3 reads.
+
+mod confidence_gate;
+
+use tch::nn::{self, Init, Module};
+use tch::{Kind, TchError, Tensor};
+
+use self::confidence_gate::ConfidenceGate;
+use super::config::PastatConfig;
+use super::patches::channels_last;
+use super::spatial_alignment::FineMaps;
+use super::temporal_encoding::Tokens;
+use crate::f64_tensor;
+
+/// Tokens back to cells. The context of the transformer comes back in two ways: as a weight of each neighbour's newest map, of
+/// which the maximum is taken, and as a change of that; neutral before it is trained.
+#[derive(Debug)]
+pub(super) struct Decoder {
+    gate: ConfidenceGate,
+    norm: nn::LayerNorm,
+    cells: nn::Linear,
+    channels: i64,
+    patch: i64,
+}
+
+impl Decoder {
+    /// Its variables are `gate.*` and `decoder.*` below `path`.
+    pub(super) fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Self {
+        let PastatConfig { channels, dim, patch, .. } = *config;
+        let neutral = nn::LinearConfig { ws_init: Init::Const(0.0), bs_init: Some(Init::Const(0.0)), bias: true };
+        let gate = ConfidenceGate::new(&(path / "gate"), config);
+        let path = path / "decoder";
+        Self {
+            gate,
+            norm: nn::layer_norm(&path / "norm", vec![dim], nn::LayerNormConfig::default()),
+            cells: nn::linear(&path / "cells", dim, channels * patch * patch, neutral),
+            channels,
+            patch,
+        }
+    }
+
+    /// `[1, C, H, W]`: the maximum of the ego's map and its neighbours' newest ones, these by the weights of the gate.
+    ///
+    /// # Shapes
+    /// - `tokens`: of all entries, as the transformer got them
+    /// - `context`: `[1, h, w, D]`, the ego's tokens after the transformer
+    pub(super) fn maximum(&self, maps: &FineMaps, tokens: &Tokens, context: &Tensor) -> Result<Tensor, TchError> {
+        let FineMaps { own, neighbours, .. } = maps;
+        let count = neighbours.count()?;
+        if count == 0 {
+            return f64_tensor::by_cell(own);
+        }
+        let weight = self.gate.forward(&channels_last(&tokens.values.f_narrow(0, 1, count)?)?, context)?;
+        neighbours.maximum_with(own, &weight)
+    }
+
+    /// What the context adds to a map: `[1, C, H, W]` of tokens `[1, h, w, D]`, the channels of a cell side by side in memory.
+    pub(super) fn change(&self, ego: &Tensor) -> Result<Tensor, TchError> {
+        let (_, rows, columns, dim) = ego.size4()?;
+        let Self { channels, patch, .. } = *self;
+        // Weights are kept by channel and then by cell; few as they are, they are cheaper to turn than what they make.
+        let by_cell = |weights: &Tensor, each: i64| {
+            weights.f_view([channels, patch * patch, each])?.f_transpose(0, 1)?.f_reshape([-1, each])
+        };
+        let bias = self.cells.bs.as_ref().map(|bias| by_cell(bias, 1)?.f_squeeze_dim(1)).transpose()?;
+        let cells = self.norm.forward(ego).f_linear(&by_cell(&self.cells.ws, dim)?, bias.as_ref())?;
+        let cells = cells.f_to_kind(Kind::Float)?.f_view([1, rows, columns, patch, patch, channels].as_slice())?;
+        let cells = cells.f_permute([0, 1, 3, 2, 4, 5])?.f_reshape([1, rows * patch, columns * patch, channels])?;
+        cells.f_permute([0, 3, 1, 2])
+    }
+}

@@ -1,0 +1,16 @@
+//! Extensions of PASTAT: steps that are not in the paper. Each can be switched off in the configuration, and each file says what
+//! it has gained where that was measured.
+//!
+//! | step | setting | off |
+//! | --- | --- | --- |
+//! | [`alignment_search`] | `fsa.search` | absent |
+//! | [`pooled_history`] | `earlier_cells` | 1 |
+//! | [`ego_queries`] | `rows` | `all` |
+//! | [`temporal_memory`] | `recall` | absent, `--without temporal-memory` |
+//! | [`map_refinement`] | `refine` | absent |
+
+pub(super) mod alignment_search;
+pub(super) mod ego_queries;
+pub(super) mod map_refinement;
+pub(super) mod pooled_history;
+pub(super) mod temporal_memory;

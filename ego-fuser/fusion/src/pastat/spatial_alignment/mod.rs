@@ -1,0 +1,150 @@
+//! FSA, Feature Spatial Alignment: corrects where poses have put maps, by what the maps show.
+//!
+//! Every map but the ego's newest is compared with that. The network predicts `(dx, dy, theta)` per map; the map and its tokens
+//! are moved by it, and the tokens get how well the map fits. Identity before it is trained.
+
+pub(super) mod area;
+pub(super) mod correlation;
+pub(super) mod neighbour_maps;
+pub(super) mod network;
+pub(super) mod pairs;
+
+use protocol::BevGrid;
+use tch::{TchError, Tensor, nn};
+
+use self::area::{Area, lattice, own_lattice, resample};
+use self::neighbour_maps::NeighbourMaps;
+use self::network::AlignmentNetwork;
+use self::pairs::Displacements;
+use super::coarse_alignment::{CoarseMaps, Origins};
+use super::confidence_embedding::Confidences;
+use super::config::PastatConfig;
+use super::extensions::alignment_search::AlignmentSearch;
+use super::extensions::pooled_history::pooled;
+use super::patches::PatchTokens;
+use crate::warp::WarpedMaps;
+
+/// Feature Spatial Alignment.
+#[derive(Debug)]
+pub(super) struct SpatialAlignment {
+    /// Absent, maps stay where poses put them, for the ablation.
+    network: Option<AlignmentNetwork>,
+    search: AlignmentSearch,
+    /// Cells along each edge of a cell of earlier maps.
+    earlier_cells: i64,
+}
+
+/// Finely aligned maps.
+pub(super) struct FineMaps {
+    /// `[C, H, W]`: the ego's newest map.
+    pub(super) own: Tensor,
+    /// The newest maps of all others.
+    pub(super) neighbours: NeighbourMaps,
+    /// `[N - 1, 3]`: corrections of all entries but the ego's newest, metres and radians; absent: none was looked for.
+    pub(super) corrections: Option<Tensor>,
+}
+
+/// Tokens of all entries after the alignment.
+pub(super) struct AlignedTokens {
+    /// `[N, D, h, w]`.
+    pub(super) values: Tensor,
+    /// `[N, h, w]`.
+    pub(super) valid: Tensor,
+    /// `[N, D]`: how well each map fits; absent: not known.
+    pub(super) fit: Option<Tensor>,
+}
+
+impl SpatialAlignment {
+    /// Its variables are `fsa.*` below `path`.
+    pub(super) fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Self {
+        let network = |fsa| AlignmentNetwork::new(&(path / "fsa"), [config.channels, config.dim], fsa);
+        Self {
+            network: config.fsa.as_ref().map(network),
+            search: AlignmentSearch::new(config.fsa.as_ref().and_then(|fsa| fsa.alignment_search)),
+            earlier_cells: config.earlier_cells,
+        }
+    }
+
+    /// Moves all entries but the ego's newest to where they fit that; `is_training`: by the network alone.
+    pub(super) fn align(
+        &self,
+        coarse: &CoarseMaps,
+        tokens: PatchTokens,
+        confidences: &Confidences,
+        grid: &BevGrid,
+        is_training: bool,
+    ) -> Result<(FineMaps, AlignedTokens), TchError> {
+        let (own, count) = (coarse.newest.features.f_get(0)?, coarse.newest.count()?);
+        let PatchTokens { values, valid } = tokens;
+        let Some(network) = self.network.as_ref().filter(|_| coarse.origins.count() > 1) else {
+            let neighbours = NeighbourMaps::still(coarse.newest.only(1, count)?);
+            return Ok((FineMaps { own, neighbours, corrections: None }, AlignedTokens { values, valid, fit: None }));
+        };
+        let (_, height, width) = own.size3()?;
+        let area = Area::new(grid, [height, width], network.radius());
+        let Displacements { deltas, fit, .. } =
+            self.compare(network, coarse, &confidences.of_maps, &area, is_training)?;
+        let (values, valid) = moved_tokens(&values, &valid, &deltas, &coarse.origins, &area)?;
+        let neighbours = moved_maps(coarse, &deltas, &area, grid)?;
+        // The ego's newest, which fits itself, gets nothing.
+        let fit = Some(fit.f_constant_pad_nd([0, 0, 1, 0])?);
+        Ok((FineMaps { own, neighbours, corrections: Some(deltas) }, AlignedTokens { values, valid, fit }))
+    }
+
+    /// Displacements of all entries from the ego's newest.
+    fn compare(
+        &self,
+        network: &AlignmentNetwork,
+        CoarseMaps { newest, earlier, origins, .. }: &CoarseMaps,
+        confidences: &Tensor,
+        area: &Area,
+        is_training: bool,
+    ) -> Result<Displacements, TchError> {
+        let (newest, agents, poses) = (network.reduced(newest)?, newest.count()?, &origins.ego_from_cav);
+        let ego = newest.only(0, 1)?;
+        let mut found = Vec::with_capacity(2);
+        let mut add = |maps: [&WarpedMaps; 2], first: i64, end: i64, area: &Area| {
+            let confidences = confidences.f_narrow(0, first, end - first)?;
+            let pairs = network.pairs(maps, &confidences, &poses[first as usize..end as usize], area)?;
+            found.push(self.search.displacements(network, &pairs, area, is_training)?);
+            Ok::<_, TchError>(())
+        };
+        if agents > 1 {
+            add([&ego, &newest.only(1, agents)?], 1, agents, area)?;
+        }
+        if let Some(earlier) = earlier {
+            // Means of reduced maps are reduced means of maps.
+            let (ego, area) = (pooled(&ego, self.earlier_cells)?, area.with_cells_of(self.earlier_cells));
+            add([&ego, &network.reduced(earlier)?], agents, poses.len() as i64, &area)?;
+        }
+        Displacements::all(&found)
+    }
+}
+
+/// Tokens `[N, D, h, w]` and which of them count `[N, h, w]`, all but the first entry's moved by `deltas` `[N - 1, 3]`.
+fn moved_tokens(
+    values: &Tensor,
+    valid: &Tensor,
+    deltas: &Tensor,
+    origins: &Origins,
+    area: &Area,
+) -> Result<(Tensor, Tensor), TchError> {
+    let (entries, _, rows, columns) = values.size4()?;
+    let after_first = |tensor: &Tensor| tensor.f_narrow(0, 1, entries - 1);
+    let with_first = |first: &Tensor, after: Tensor| Tensor::f_cat(&[first.f_narrow(0, 0, 1)?, after], 0);
+    let places = lattice(deltas, &origins.ego_from_cav[1..], area, [rows, columns])?;
+    let (after, after_valid) = resample(&after_first(values)?, &after_first(valid)?.f_unsqueeze(1)?, &places)?;
+    Ok((with_first(values, after)?, with_first(valid, after_valid.f_squeeze_dim(1)?)?))
+}
+
+/// The newest maps of neighbours, sampled from the maps as received by the poses that `deltas` correct.
+fn moved_maps(coarse: &CoarseMaps, deltas: &Tensor, area: &Area, grid: &BevGrid) -> Result<NeighbourMaps, TchError> {
+    let count = coarse.newest.count()? - 1;
+    if count == 0 {
+        return Ok(NeighbourMaps::still(coarse.newest.only(1, 1)?));
+    }
+    let own = Area::new(grid, [i64::from(grid.height), i64::from(grid.width)], area.radius());
+    let (deltas, poses) = (deltas.f_narrow(0, 0, count)?, &coarse.origins.ego_from_cav[1..=count as usize]);
+    let places = own_lattice(&deltas, poses, [area, &own])?;
+    NeighbourMaps::at(coarse.received.only(1, count + 1)?, places)
+}

@@ -1,0 +1,92 @@
+//! Pairs of maps that FSA compares, and the displacements that it finds.
+
+use std::rc::Rc;
+
+use protocol::Pose;
+use tch::{TchError, Tensor};
+
+use super::correlation::Shifted;
+
+/// The ego's map and `K` others, as they are compared.
+#[derive(Debug)]
+pub(crate) struct Pairs {
+    /// `[1, M, H, W]`: the ego's map.
+    pub(crate) ego: Tensor,
+    /// The same at every shift.
+    pub(crate) own: Rc<Shifted>,
+    /// `[K, M, H, W]`, where their poses put them.
+    pub(crate) shown: Tensor,
+    /// `[K, 1, H, W]`, 1 where they show something.
+    pub(crate) mask: Tensor,
+    /// `[K, CONFIDENCES]` of their poses.
+    pub(crate) confidences: Tensor,
+    /// Where their senders say that they were.
+    pub(crate) ego_from_cav: Vec<Pose>,
+}
+
+impl Pairs {
+    /// Some of the others.
+    pub(crate) fn only(&self, rows: &[i64]) -> Result<Self, TchError> {
+        Ok(Self {
+            ego: self.ego.shallow_clone(),
+            own: Rc::clone(&self.own),
+            shown: picked(&self.shown, rows)?,
+            mask: picked(&self.mask, rows)?,
+            confidences: picked(&self.confidences, rows)?,
+            ego_from_cav: rows.iter().map(|&row| self.ego_from_cav[row as usize]).collect(),
+        })
+    }
+}
+
+/// Displacements of `K` maps from the ego's.
+#[derive(Debug)]
+pub(crate) struct Displacements {
+    /// `[K, 3]`: shift along x and y of the ego in metres, turn about the sender in radians.
+    pub(crate) deltas: Tensor,
+    /// `[K, D]`: how well each map fits, as a part of its tokens. A map that fits nowhere is of a sender with a wrong pose.
+    pub(crate) fit: Tensor,
+    /// `[K]`: the correlation of the whole map with the ego's, where it is highest.
+    pub(crate) similarity: Tensor,
+}
+
+impl Displacements {
+    /// Those of several comparisons, one after another.
+    pub(crate) fn all(several: &[Self]) -> Result<Self, TchError> {
+        let cat = |of: fn(&Self) -> &Tensor| Tensor::f_cat(&several.iter().map(of).collect::<Vec<_>>(), 0);
+        Ok(Self {
+            deltas: cat(|each| &each.deltas)?,
+            fit: cat(|each| &each.fit)?,
+            similarity: cat(|each| &each.similarity)?,
+        })
+    }
+
+    /// Those of some maps.
+    pub(crate) fn only(&self, rows: &[i64]) -> Result<Self, TchError> {
+        Ok(Self {
+            deltas: picked(&self.deltas, rows)?,
+            fit: picked(&self.fit, rows)?,
+            similarity: picked(&self.similarity, rows)?,
+        })
+    }
+
+    /// The same with those of another comparison for the maps in `rows`.
+    pub(crate) fn with(&self, rows: &[i64], other: &Self) -> Result<Self, TchError> {
+        let index = Tensor::f_from_slice(rows)?.f_to_device(self.deltas.device())?;
+        let with = |of: fn(&Self) -> &Tensor| of(self).f_index_copy(0, &index, of(other));
+        Ok(Self {
+            deltas: with(|each| &each.deltas)?,
+            fit: with(|each| &each.fit)?,
+            similarity: with(|each| &each.similarity)?,
+        })
+    }
+}
+
+/// Some rows of a tensor.
+pub(crate) fn picked(tensor: &Tensor, rows: &[i64]) -> Result<Tensor, TchError> {
+    tensor.f_index_select(0, &Tensor::f_from_slice(rows)?.f_to_device(tensor.device())?)
+}
+
+/// The rows of `[K]` that are true.
+pub(crate) fn rows_where(is_so: &Tensor) -> Result<Vec<i64>, TchError> {
+    Vec::try_from(is_so.f_nonzero()?.f_squeeze_dim(1)?)
+}

@@ -1,0 +1,52 @@
+//! Vision transformer (Eq. 8, 9): attention over agents and time at each cell and within windows, then an MLP, in pre-norm blocks.
+//!
+//! Full attention over all cells of all maps is out of reach. As in V2X-ViT, tokens attend over agents and time at each cell, and
+//! across cells within windows of several sizes.
+
+mod attention;
+mod block;
+
+use tch::{Device, TchError, Tensor, nn};
+
+use self::block::Block;
+use super::config::{PastatConfig, Rows};
+use super::extensions::ego_queries::Others;
+use super::patches::channels_last;
+use super::temporal_encoding::Tokens;
+
+/// The blocks of the transformer.
+#[derive(Debug)]
+pub(super) struct Transformer {
+    blocks: Vec<Block>,
+    rows: Rows,
+}
+
+impl Transformer {
+    /// Its variables are `blocks.*` below `path`.
+    pub(super) fn new(path: &nn::Path<'_>, config: &PastatConfig) -> Self {
+        let block = |index: usize| Block::new(&(path / "blocks" / index), config);
+        Self { blocks: (0..config.depth).map(block).collect(), rows: config.rows }
+    }
+
+    /// Context of the ego: its tokens `[1, h, w, D]` after all blocks.
+    pub(super) fn forward(&self, Tokens { values, valid }: &Tokens) -> Result<Tensor, TchError> {
+        if self.rows == Rows::Ego && values.device() == Device::Cpu && !values.requires_grad() {
+            let (others, valid) = (Others::of(values, valid)?, valid.f_narrow(0, 0, 1)?);
+            let ego = channels_last(&values.f_narrow(0, 0, 1)?)?;
+            return self.blocks.iter().try_fold(ego, |ego, block| block.gather(&ego, &others, &valid));
+        }
+        let count = values.size()[0];
+        let mut tokens = channels_last(values)?;
+        for (index, block) in self.blocks.iter().enumerate() {
+            let is_last = index + 1 == self.blocks.len();
+            let rows = if is_last || self.rows == Rows::Ego { 1 } else { count };
+            let kept = block.forward(&tokens, valid, rows)?;
+            tokens = if is_last || rows == count {
+                kept
+            } else {
+                Tensor::f_cat(&[kept, tokens.f_narrow(0, rows, count - rows)?], 0)?
+            };
+        }
+        tokens.f_narrow(0, 0, 1)
+    }
+}

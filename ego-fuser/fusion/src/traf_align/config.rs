@@ -1,0 +1,61 @@
+//! Sizes of TraF-Align.
+
+use perception::model_config::ConfigError;
+use serde::{Deserialize, Serialize};
+
+use crate::bounds::within;
+
+/// Sizes of [`TrafAlign`](super::TrafAlign).
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TrafAlignConfig {
+    /// Channels of the maps.
+    pub channels: i64,
+    /// Cells along each edge of a token.
+    pub patch: i64,
+    /// Channels of a token.
+    pub dim: i64,
+    /// Heads of the attention.
+    pub heads: i64,
+    /// Points that a token looks at: a square of so many along each edge, moved by offsets.
+    pub kernel: i64,
+    /// Layers of attention, all along the same points.
+    pub layers: usize,
+    /// Channels of the trajectory field.
+    pub field: i64,
+    /// Time steps wanted of every agent.
+    pub frames: usize,
+    /// Time from one step to the next, seconds.
+    pub frame_secs: f64,
+}
+
+impl TrafAlignConfig {
+    /// Sized for one core and live traffic.
+    #[must_use]
+    pub fn lean(channels: i64) -> Self {
+        let (patch, dim, heads, kernel, layers, field) = (2, 32, 2, 3, 1, 3);
+        Self { channels, patch, dim, heads, kernel, layers, field, frames: 3, frame_secs: 0.1 }
+    }
+
+    /// About the published sizes.
+    #[must_use]
+    pub fn full(channels: i64) -> Self {
+        Self { patch: 1, dim: channels, heads: 4, layers: 2, frames: 4, ..Self::lean(channels) }
+    }
+
+    /// Checks that a network can be built.
+    ///
+    /// # Errors
+    /// [`ConfigError`] names the field.
+    pub fn validate(&self) -> Result<(), ConfigError> {
+        within("fusion channels", self.channels, 1..=4096)?;
+        within("fusion patch", self.patch, 1..=8)?;
+        within("fusion dim", self.dim, 2..=4096)?;
+        within("fusion heads", if self.dim % self.heads.max(1) == 0 { self.heads } else { 0 }, 1..=64)?;
+        within("fusion kernel", self.kernel, 1..=9)?;
+        within("fusion layers", self.layers as i64, 1..=16)?;
+        within("fusion field", self.field, 1..=64)?;
+        within("fusion frames", self.frames as i64, 1..=16)?;
+        within("fusion frame_secs in ms", (self.frame_secs * 1e3) as i64, 1..=60_000)
+    }
+}

@@ -1,0 +1,129 @@
+//! Alignment method: a message from each vehicle, and from two messages the pose of one in the frame of the other.
+
+use std::fmt;
+
+use dataset::ReadError;
+use dataset::frame::Frame;
+use localization::pose_source::PoseSourceError;
+use nalgebra::Isometry3;
+use protocol::message::Message;
+use protocol::{Box3d, WireError};
+
+use super::free_align::NoAlignment;
+
+/// What a vehicle has to align with.
+#[derive(Debug, Clone, Copy)]
+pub struct Vehicle<'a> {
+    /// Its frame. True poses in it are for those who measure, and for sources that are told to take them.
+    pub frame: &'a Frame,
+    /// Its boxes in the frame of its LiDAR, the surest first; empty where no method needs them.
+    pub boxes: &'a [Box3d],
+}
+
+/// A way to align two vehicles of one scene.
+pub trait AlignmentMethod {
+    /// The message of a vehicle, from what it alone has.
+    ///
+    /// # Errors
+    /// [`AlignError`] when the method cannot go on at all.
+    fn prepare(&mut self, vehicle: &Vehicle<'_>) -> Result<Message, AlignError>;
+
+    /// `ego_from_neighbour`, both in the frames of their LiDARs, or why there is none.
+    fn align(&self, ego: &Vehicle<'_>, own: &Message, received: &Message) -> Result<Isometry3<f64>, NotAligned>;
+}
+
+type Construct = Box<dyn Fn() -> Box<dyn AlignmentMethod>>;
+
+/// An alignment method with its settings; each scene has an instance of its own.
+pub struct AlignmentSpec {
+    /// Name in tables.
+    pub name: String,
+    /// Whether it looks at [`Vehicle::boxes`].
+    pub needs_boxes: bool,
+    construct: Construct,
+}
+
+impl AlignmentSpec {
+    /// A method that `construct` makes for each scene.
+    pub fn new<M: AlignmentMethod + 'static>(
+        name: impl Into<String>,
+        needs_boxes: bool,
+        construct: impl Fn() -> M + 'static,
+    ) -> Self {
+        Self { name: name.into(), needs_boxes, construct: Box::new(move || Box::new(construct())) }
+    }
+
+    /// The method at the beginning of a scene.
+    #[must_use]
+    pub fn for_scene(&self) -> Box<dyn AlignmentMethod> {
+        (self.construct)()
+    }
+}
+
+impl fmt::Debug for AlignmentSpec {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.debug_struct("AlignmentSpec").field("name", &self.name).finish_non_exhaustive()
+    }
+}
+
+/// Why a pair was not aligned.
+#[derive(Debug, Clone, PartialEq, thiserror::Error)]
+pub enum NotAligned {
+    /// One of the two has no pose.
+    #[error("no pose")]
+    NoPose,
+    /// The boxes give no alignment.
+    #[error(transparent)]
+    Boxes(#[from] NoAlignment),
+    /// The clouds give none.
+    #[error(transparent)]
+    Clouds(#[from] localization::registration::icp::NoIcpFit),
+    /// A message is not one of this method.
+    #[error("a message of another kind")]
+    Message,
+}
+
+impl NotAligned {
+    /// One word for counting.
+    #[must_use]
+    pub fn reason(&self) -> &'static str {
+        use localization::registration::icp::NoIcpFit;
+        match self {
+            Self::NoPose => "no_pose",
+            Self::Boxes(NoAlignment::TooFewBoxes { .. }) => "too_few_boxes",
+            Self::Boxes(NoAlignment::TooFewMatches { .. }) => "too_few_matches",
+            Self::Boxes(NoAlignment::Ambiguous { .. }) => "ambiguous",
+            Self::Clouds(NoIcpFit::TooFew { .. }) => "too_few_points",
+            Self::Clouds(NoIcpFit::TooLittleOverlap { .. }) => "too_little_overlap",
+            Self::Clouds(NoIcpFit::Unconstrained { .. }) => "unconstrained",
+            Self::Message => "message",
+        }
+    }
+}
+
+/// Why a comparison ended early.
+#[derive(Debug, thiserror::Error)]
+pub enum AlignError {
+    /// A pose source cannot be set up.
+    #[error(transparent)]
+    PoseSource(#[from] PoseSourceError),
+    /// A frame cannot be read.
+    #[error(transparent)]
+    Read(#[from] ReadError),
+    /// A message cannot be encoded.
+    #[error(transparent)]
+    Wire(#[from] WireError),
+    /// The detector refused.
+    #[error(transparent)]
+    Detector(#[from] perception::detector::DetectorError),
+    /// A recording without true poses.
+    #[error("{scenario}, {stem}: agent {cav} has no true pose to compare with")]
+    NoTruth {
+        /// The scenario.
+        scenario: String,
+        /// The moment.
+        stem: String,
+        /// Whose pose is missing.
+        cav: protocol::CavId,
+    },
+}
