@@ -4,6 +4,7 @@
 //! The same seed tells the same lies, offline and live.
 
 use protocol::{BevFeatures, BevGrid, Box3d, CavId, Detection, PointCloud, Pose, PoseEstimate};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use support::random::SplitMix64;
 
@@ -20,8 +21,9 @@ const LOUDER: f32 = 2.0;
 const PATCH_CELLS: i64 = 3;
 
 /// What a vehicle lies about.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema, clap::ValueEnum)]
 #[serde(rename_all = "snake_case")]
+#[value(rename_all = "snake_case")]
 pub enum Lie {
     /// Its pose is 5 to 30 m off, always by the same, and it is sure of it.
     ShiftedPose,
@@ -50,7 +52,7 @@ impl Lie {
 }
 
 /// Who lies in an evaluation, and what about.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct AttackConfig {
     /// What they lie about.

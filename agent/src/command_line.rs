@@ -38,12 +38,12 @@ enum Command {
 }
 
 impl Command {
-    fn run(&self) -> anyhow::Result<()> {
-        let offline = |forwarded: &Forwarded, name| -> io::Result<()> { Err(forwarded.exec(OFFLINE, name)) };
+    fn run(self) -> anyhow::Result<()> {
+        let offline = |forwarded: Forwarded, name| -> io::Result<()> { Err(forwarded.exec(OFFLINE, name)) };
         match self {
             Self::Run(args) => {
                 malloc_settings::ensure(&malloc_settings::KEPT_MEMORY).context("this program again")?;
-                command::run::run(args)
+                command::run::run(*args)
             }
             Self::Eval(forwarded) => Ok(offline(forwarded, "eval")?),
             Self::Localize(forwarded) => Ok(offline(forwarded, "localize")?),

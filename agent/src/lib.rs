@@ -8,6 +8,7 @@
 
 pub mod agent;
 pub mod attack;
+pub mod config;
 pub mod node;
 pub mod output_filter;
 pub mod rate;

@@ -10,6 +10,7 @@ use std::time::{Duration, Instant};
 
 use protocol::codec::{HEAD_BYTES, encode_within, largest_message, smallest_message};
 use protocol::{BevFeatures, ByteLimit, CodecConfig, EncodedFeatures, LimitedBy, WireError, encode_features};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// Longest that a message may occupy the air at a byte rate, nanoseconds: the period of a LiDAR. More would arrive later than
@@ -24,15 +25,19 @@ const GROWTH: f64 = 1.1;
 /// However blocked the queue, this share of the largest message is tried.
 const SMALLEST_SHARE: f64 = 1.0 / 128.0;
 
-/// What maps have to keep within. Nothing by default.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+/// Limits that feature maps are fitted to: first in a coarser number format, then with fewer cells, the most confident ones.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema, clap::Args)]
 #[serde(default, deny_unknown_fields)]
+#[command(next_help_heading = "Rate control of feature maps")]
 pub struct RateConfig {
-    /// Most bytes of a message with a map, header and metadata included.
+    /// Most bytes of a message with a map, header and metadata included. Absent: any size.
+    #[arg(long, value_name = "BYTES")]
     pub message_bytes: Option<u64>,
-    /// Most bytes per second of such messages, each of which may take up to 100 ms of them.
+    /// Most bytes per second of such messages, each of which may take up to 100 ms of them. Absent: any.
+    #[arg(long, value_name = "BYTES")]
     pub bytes_per_second: Option<u64>,
-    /// Whether to send less while maps wait for earlier ones to leave, and more again when they do not.
+    /// Send less while maps wait for earlier ones to leave, and more again when they do not.
+    #[arg(long)]
     pub watch_queue: bool,
 }
 

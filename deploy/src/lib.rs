@@ -10,4 +10,5 @@
 pub mod experiment;
 pub mod operate;
 pub mod scenario;
+pub mod schema;
 pub mod view;

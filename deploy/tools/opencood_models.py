@@ -228,5 +228,5 @@ def where2comm(model):
         senders = "every_second" if is_original else "neighbours"
         return multi_scale(aggregation, communication, senders, one_frame=not is_original)
     if communication is not None:
-        print(f"senders: agent run --gate {communication['threshold']} --gate-smoothing {window_text}")
+        print(f"senders: agent run --gate {communication['threshold']},{window_text}")
     return single_scale("where2comm", {"kind": "where2comm", "aggregation": aggregation, "missing": "zero"})

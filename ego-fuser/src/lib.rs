@@ -8,6 +8,7 @@
 
 #![warn(clippy::print_stdout, clippy::print_stderr)]
 
+pub mod config;
 pub mod ego;
 pub mod misbehaviour;
 mod neighbourhood;

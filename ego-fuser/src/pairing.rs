@@ -20,10 +20,11 @@ pub struct PairingConfig {
     pub depth: usize,
 }
 
-impl Default for PairingConfig {
-    /// Three frames of 10 Hz of age, half a frame of lead, eight messages.
-    fn default() -> Self {
-        Self { max_age_nanos: 300_000_000, max_lead_nanos: 50_000_000, depth: 8 }
+impl PairingConfig {
+    /// Messages of at most that age, half a frame of 10 Hz of lead, eight messages.
+    #[must_use]
+    pub fn with_max_age_nanos(max_age_nanos: u64) -> Self {
+        Self { max_age_nanos, max_lead_nanos: 50_000_000, depth: 8 }
     }
 }
 
@@ -169,7 +170,7 @@ mod tests {
     }
 
     fn pairing() -> Pairing<u64> {
-        Pairing::new(PairingConfig::default())
+        Pairing::new(PairingConfig::with_max_age_nanos(3 * FRAME))
     }
 
     fn ages(pairing: &mut Pairing<u64>, ego: u64) -> (Vec<i64>, Vec<DropReason>) {

@@ -49,6 +49,8 @@ macro_rules! identifier {
         $(#[$doc])*
         #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
         #[serde(try_from = "String", into = "String")]
+        #[cfg_attr(feature = "config", derive(schemars::JsonSchema))]
+        #[cfg_attr(feature = "config", schemars(extend("pattern" = "^[a-z0-9_-]+$", "maxLength" = $max_len)))]
         pub struct $name(Box<str>);
 
         impl $name {

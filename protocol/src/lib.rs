@@ -81,6 +81,8 @@ mod bev;
 mod body;
 mod box3d;
 pub mod codec;
+#[cfg(feature = "config")]
+pub mod config;
 mod drop_reason;
 mod error;
 pub mod header;

@@ -12,6 +12,7 @@ use crate::string_enum::written_as_text;
 /// A stream of one vehicle.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
+#[cfg_attr(feature = "config", derive(schemars::JsonSchema))]
 pub enum Stream {
     /// `lidar`: sweeps.
     Lidar,

@@ -26,10 +26,10 @@ pub(crate) struct Cli {
 enum Command {
     Convert(command::convert::Args),
     Inspect(command::inspect::Args),
-    Link(command::link::Args),
+    Link(Box<command::link::Args>),
     Record(command::record::Args),
     Recover(command::recover::Args),
-    Stream(command::stream::Args),
+    Stream(Box<command::stream::Args>),
     Synth(command::synth::Args),
 }
 
@@ -38,10 +38,10 @@ pub(crate) fn run(cli: Cli) -> ExitCode {
     let outcome = match cli.command {
         Command::Convert(args) => command::convert::run(&args),
         Command::Inspect(args) => command::inspect::run(&args),
-        Command::Link(args) => command::link::run(&args),
-        Command::Record(args) => command::record::run(&args),
+        Command::Link(args) => command::link::run(*args),
+        Command::Record(args) => command::record::run(args),
         Command::Recover(args) => command::recover::run(&args),
-        Command::Stream(args) => command::stream::run(&args),
+        Command::Stream(args) => command::stream::run(*args),
         Command::Synth(args) => command::synth::run(args),
     };
     exit_code(outcome, BusError::is_behind)

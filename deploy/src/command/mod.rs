@@ -4,6 +4,7 @@ mod demo;
 mod eval;
 mod keys;
 mod router;
+mod schema;
 mod status;
 mod sweep;
 mod up;
@@ -36,6 +37,8 @@ pub(crate) enum Command {
     Keys(keys::Arguments),
     /// Be the router of a fleet whose processes run on several hosts, or write the configuration of a zenohd that is.
     Router(router::Arguments),
+    /// Print the JSON schema of a kind of file, for editors: those in deploy/scenarios and deploy/experiments are its output.
+    Schema(schema::Arguments),
     /// Run a grid of experiments in virtual time: one CSV, charts, a report.
     Sweep(sweep::Arguments),
     /// Say how a run goes: is every process there, ready and answering? Exit code 1 where something is wrong.
@@ -56,6 +59,7 @@ impl Command {
             Self::Status(arguments) => arguments.run(),
             Self::Keys(arguments) => arguments.run(),
             Self::Router(arguments) => arguments.run(),
+            Self::Schema(arguments) => arguments.run(),
             Self::Sweep(arguments) => arguments.run(),
             Self::Up(arguments) => arguments.run(),
             Self::View(arguments) => arguments.run(),

@@ -4,14 +4,14 @@ use std::fs::File;
 use std::io::{self, Read};
 use std::path::{Path, PathBuf};
 
+use localization::pose_source::PoseSourceConfig;
 use protocol::text::hex;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use sha2::{Digest, Sha256};
 
-use crate::scenario::LocalizerModels;
-
 /// What a run was made of. Stands in the `scenario.yaml` of a run folder.
-#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Provenance {
     /// Version of the programs.
@@ -37,24 +37,24 @@ impl Provenance {
     ///
     /// # Errors
     /// The first file that cannot be read, by name.
-    pub fn collect(
-        programs: &[PathBuf],
-        weights: &Path,
-        localizer: Option<&LocalizerModels>,
-        end_to_end: Option<&Path>,
-        scene: &Path,
-    ) -> io::Result<Self> {
+    pub fn collect(programs: &[PathBuf], weights: &Path, poses: &[PoseSourceConfig], scene: &Path) -> io::Result<Self> {
         let scene_files = scene_files(scene)?;
-        let localizer_sha256 = match localizer {
-            Some(LocalizerModels { encoder, head }) => Some([hash_file(encoder)?.1, hash_file(head)?.1]),
-            None => None,
-        };
+        let (mut localizer_sha256, mut end_to_end_sha256) = (None, None);
+        for pose in poses {
+            match pose {
+                PoseSourceConfig::Pgc(pgc) => {
+                    localizer_sha256 = Some([hash_file(&pgc.encoder)?.1, hash_file(&pgc.head)?.1]);
+                }
+                PoseSourceConfig::EndToEnd(network) => end_to_end_sha256 = Some(hash_file(&network.weights)?.1),
+                PoseSourceConfig::Recorded | PoseSourceConfig::Noisy(_) | PoseSourceConfig::Cached(_) => {}
+            }
+        }
         Ok(Self {
             version: env!("CARGO_PKG_VERSION").into(),
             program_sha256: hash_all(programs.first().and_then(|path| path.parent()).unwrap_or(scene), programs)?,
             weights_sha256: hash_file(weights)?.1,
             localizer_sha256,
-            end_to_end_sha256: end_to_end.map(|weights| Ok::<_, io::Error>(hash_file(weights)?.1)).transpose()?,
+            end_to_end_sha256,
             scene_sha256: hash_all(scene, &scene_files)?,
             scene_files: scene_files.len(),
         })
@@ -116,6 +116,8 @@ fn named(error: io::Error, path: &Path) -> io::Error {
 
 #[cfg(test)]
 mod tests {
+    use localization::pose_source::{EndToEndPoseConfig, PgcConfig};
+
     use super::*;
 
     fn scene(folder: &Path, point: &str) -> PathBuf {
@@ -132,11 +134,13 @@ mod tests {
         let [one, two, three] = [(); 3].map(|()| tempfile::tempdir().unwrap());
         let weights = one.path().join("w.safetensors");
         std::fs::write(&weights, b"weights").unwrap();
-        let networks = LocalizerModels { encoder: weights.clone(), head: weights.clone() };
-        let collect = |scene: &Path| {
-            Provenance::collect(std::slice::from_ref(&weights), &weights, Some(&networks), Some(&weights), scene)
-                .unwrap()
-        };
+        let file = || weights.clone();
+        let poses = [
+            PoseSourceConfig::Pgc(PgcConfig { encoder: file(), head: file(), ..Default::default() }),
+            PoseSourceConfig::EndToEnd(EndToEndPoseConfig { weights: file(), ..Default::default() }),
+        ];
+        let collect =
+            |scene: &Path| Provenance::collect(std::slice::from_ref(&weights), &weights, &poses, scene).unwrap();
         let first = collect(&scene(one.path(), "0 0 0"));
         assert_eq!(first.scene_files, 2, "images do not count");
         // From `printf weights | sha256sum`.
@@ -149,7 +153,7 @@ mod tests {
 
     #[test]
     fn a_missing_file_is_named() {
-        let error = Provenance::collect(&[], Path::new("/nowhere/w"), None, None, Path::new("/nowhere")).unwrap_err();
+        let error = Provenance::collect(&[], Path::new("/nowhere/w"), &[], Path::new("/nowhere")).unwrap_err();
         assert!(error.to_string().starts_with("/nowhere"), "{error}");
     }
 }

@@ -9,14 +9,12 @@ use std::io::{BufWriter, Write};
 use std::ops::ControlFlow;
 use std::path::PathBuf;
 
+use agent::config::AgentSettings;
 use dataset::{self, Scenario as Recorded};
-use ego_fuser::misbehaviour::TrustConfig;
-use ego_fuser::pairing::PairingConfig;
 use ego_fuser_offline::evaluation::stepped::{ComputeTimes, Crew, SteppedConfig, VehicleConfig};
 use ego_fuser_offline::evaluation::{EvaluateConfig, EvaluateError, EvaluatedFrame, Evaluator};
 use link::LinkConfig;
-use localization::pose_source::motion_gate::SanityConfig;
-use localization::pose_source::{self, EndToEndPoseConfig, NoisyPoseConfig, PgcConfig, PoseSourceConfig};
+use localization::pose_source::PoseSourceConfig;
 use protocol::{CavId, DetectionsReport, RunId};
 use support::progress;
 
@@ -26,10 +24,10 @@ use crate::experiment::ledger_report::LedgerReport;
 use crate::experiment::metrics::Metrics;
 use crate::experiment::score::Board;
 use crate::operate::agent_pool::CrewProcesses;
-use crate::operate::fleet::{Fleet, FleetError};
+use crate::operate::fleet::{Fleet, FleetError, open_options};
 use crate::operate::run_fleet::{RunResult, UpError, UpOptions};
 use crate::operate::run_folder::{RunFolder, RunFolderError, name_of_now};
-use crate::scenario::{NoiseMode, PoseSource, Scenario, Stepped};
+use crate::scenario::{Scenario, Stepped};
 
 /// Runs a scenario in virtual time to its end.
 ///
@@ -37,7 +35,7 @@ use crate::scenario::{NoiseMode, PoseSource, Scenario, Stepped};
 /// [`UpError`] when the scenario makes no fleet, or a frame cannot be read or computed.
 pub fn up(scenario: &Scenario, options: &UpOptions) -> Result<RunResult, UpError> {
     let mut fleet = Fleet::plan(scenario)?;
-    tch::set_num_threads(i32::try_from(fleet.scenario.models.threads).unwrap_or(1));
+    fleet.scenario.models.threads.apply();
     let recorded = recorded(&fleet)?;
     let mut evaluator = Evaluator::new(evaluate_config(&fleet))?;
     let compute = match fleet.scenario.stepped.as_ref().and_then(|stepped| stepped.compute) {
@@ -81,7 +79,7 @@ fn go(
 /// The recorded scenario that the fleet plays.
 fn recorded(fleet: &Fleet) -> Result<Recorded, FleetError> {
     let scene = &fleet.scenario.scene;
-    let scenarios = dataset::open(&scene.dir)?.scenarios;
+    let scenarios = dataset::open_with(&scene.dir, &open_options(scene))?.scenarios;
     let found = scenarios.into_iter().find(|known| Some(&known.name) == scene.scenario.as_ref());
     found.ok_or_else(|| FleetError::Empty(scene.dir.clone()))
 }
@@ -91,13 +89,13 @@ fn evaluate_config(fleet: &Fleet) -> EvaluateConfig {
     EvaluateConfig {
         weights: scenario.models.weights.clone(),
         method: Some(scenario.method),
-        pose_source: pose_source(scenario, &scenario.agents.pose),
+        pose_source: for_scene(&scenario.agents.pose, scenario),
         codec: scenario.agents.codec,
         rate: scenario.agents.rate,
         protocol: Some(fleet.protocol.clone()),
         delay_nanos: 0,
         attack: None,
-        trust: scenario.ego.trust.then(TrustConfig::default),
+        trust: scenario.ego.trust(),
     }
 }
 
@@ -105,7 +103,7 @@ fn stepped_config(fleet: &Fleet, compute: ComputeTimes) -> Result<SteppedConfig,
     let Scenario { scene, ego, link, .. } = &fleet.scenario;
     let (config, link_folder, seed) = match link {
         Some(link) => {
-            let (config, folder) = LinkConfig::open(&link.air.to_string_lossy())?;
+            let (config, folder) = LinkConfig::open(&link.model)?;
             (config, folder, link.seed)
         }
         None => (LinkConfig::default(), PathBuf::from("."), 0),
@@ -118,7 +116,7 @@ fn stepped_config(fleet: &Fleet, compute: ComputeTimes) -> Result<SteppedConfig,
         link_folder,
         seed,
         deadline_nanos: ego.deadline_ms.saturating_mul(1_000_000),
-        pairing: PairingConfig { max_age_nanos: ego.max_age_ms.saturating_mul(1_000_000), ..PairingConfig::default() },
+        pairing: ego.pairing(),
         compute,
         crew: Crew::Named(std::iter::once(&fleet.ego).chain(others).cloned().collect()),
         vehicles: vehicles.collect(),
@@ -128,38 +126,13 @@ fn stepped_config(fleet: &Fleet, compute: ComputeTimes) -> Result<SteppedConfig,
 }
 
 fn vehicle(scenario: &Scenario, cav: &CavId) -> VehicleConfig {
-    let settings = scenario.settings_of(cav);
-    let pose_source = pose_source(scenario, &settings.pose);
-    VehicleConfig { pose_source, codec: settings.codec, rate: settings.rate, lie: settings.lie }
+    let AgentSettings { pose, codec, rate, lie } = scenario.settings_of(cav);
+    VehicleConfig { pose_source: for_scene(&pose, scenario), codec, rate, lie }
 }
 
-/// The source that an agent's process would set up for these settings.
-fn pose_source(scenario: &Scenario, pose: &PoseSource) -> PoseSourceConfig {
-    let (models, sanity) = (&scenario.models, SanityConfig::default());
-    match pose {
-        PoseSource::Recorded => PoseSourceConfig::Recorded,
-        PoseSource::Noisy(noise) => PoseSourceConfig::Noisy(NoisyPoseConfig {
-            mode: match noise.mode {
-                NoiseMode::Fixed => pose_source::NoiseMode::Fixed,
-                NoiseMode::Independent => pose_source::NoiseMode::Independent,
-                NoiseMode::Autoregressive => pose_source::NoiseMode::Autoregressive,
-            },
-            position_std_m: noise.std_m,
-            heading_std_deg: noise.std_deg,
-            seed: noise.seed,
-            ..NoisyPoseConfig::default()
-        }),
-        // That the networks are named was checked with the scenario.
-        PoseSource::Pgc => {
-            let named = models.localizer.as_ref().map(|models| (models.encoder.clone(), models.head.clone()));
-            let (encoder, head) = named.unwrap_or_default();
-            PoseSourceConfig::Pgc(PgcConfig { encoder, head, sanity })
-        }
-        PoseSource::EndToEnd => {
-            let weights = models.end_to_end.clone().unwrap_or_default();
-            PoseSourceConfig::EndToEnd(EndToEndPoseConfig { weights, sanity })
-        }
-    }
+/// The source as an agent's process would be given it.
+fn for_scene(pose: &PoseSourceConfig, scenario: &Scenario) -> PoseSourceConfig {
+    pose.for_scenario(scenario.scene.scenario.as_deref().unwrap_or_default())
 }
 
 /// Runs over the ticks; detections go to their file as they come.
@@ -197,10 +170,8 @@ fn write(
     folder.write_frames(board.records(), &std::collections::BTreeMap::new())?;
     folder.write_json("ledger.json", &LedgerReport::new(&[], ledger, &balance, (&BTreeSet::new(), 0)))?;
     let models = &fleet.scenario.models;
-    let localizer = models.localizer.as_ref().filter(|_| fleet.scenario.uses_localizer());
-    let end_to_end = models.end_to_end.as_deref().filter(|_| fleet.scenario.uses_end_to_end());
     let programs = Fleet::programs(&options.programs);
-    let provenance = Provenance::collect(&programs, &models.weights, localizer, end_to_end, &fleet.scene_dir);
+    let provenance = Provenance::collect(&programs, &models.weights, &fleet.scenario.poses(), &fleet.scene_dir);
     let provenance = provenance.inspect_err(|error| tracing::warn!("no hashes in scenario.yaml: {error}")).ok();
     let resolved = Scenario { provenance, ..fleet.scenario.clone() };
     folder.write("scenario.yaml", &resolved.to_yaml())?;

@@ -45,9 +45,8 @@ impl CrewProcesses {
     ) -> Result<(Self, RemoteCrew), UpError> {
         let keys = fleet.keys(folder)?;
         let place = MeetingPlace::open(&fleet.scenario.network, run, keys.as_ref())?;
-        let endpoint = place.endpoint.as_str();
-        let mut specs = fleet.processes(&Meeting { run, endpoint, keys: keys.as_ref(), programs, folder });
-        specs.retain(|spec| spec.program.ends_with("agent"));
+        let endpoint = &place.endpoint;
+        let specs = fleet.agent_processes(&Meeting { run, endpoint, keys: keys.as_ref(), programs, folder })?;
         place.check_free(&fleet.scenario.network, run, &specs)?;
         let identity = Identity {
             run: run.clone(),

@@ -1,7 +1,6 @@
 //! One run from beginning to end: plan, start, watch, end, score, write.
 
 use std::collections::{BTreeMap, BTreeSet};
-use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::channel;
 use std::thread::JoinHandle;
@@ -187,9 +186,9 @@ fn go(fleet: &Fleet, options: &UpOptions, run: &RunId, folder: &RunFolder) -> Re
 
     let keys = fleet.keys(folder)?;
     let place = MeetingPlace::open(&fleet.scenario.network, run, keys.as_ref())?;
-    let (endpoint, programs) = (place.endpoint.as_str(), options.programs.as_path());
+    let (endpoint, programs) = (&place.endpoint, options.programs.as_path());
     let meeting = Meeting { run, endpoint, keys: keys.as_ref(), programs, folder };
-    let specs = fleet.processes(&meeting);
+    let specs = fleet.processes(&meeting)?;
     place.check_free(&fleet.scenario.network, run, &specs)?;
     let refused = RefusalWatch::over(&place)?;
     let board = Board::new(fleet.ego.clone(), fleet.ground_truth_rule(), fleet.map_values());
@@ -242,7 +241,7 @@ fn swept(log: &Path) -> BTreeMap<u64, u64> {
 fn watch(
     fleet: &Fleet,
     meeting: &Meeting<'_>,
-    mut specs: Vec<ProcessSpec>,
+    specs: Vec<ProcessSpec>,
     endpoint: &Endpoint,
     scorer: &ScorerNode,
     stop: &Stop,
@@ -250,10 +249,9 @@ fn watch(
     let Meeting { run, folder, .. } = *meeting;
     let (events, happened) = channel();
     let mut display = Display::new(fleet.ticks);
-    if let Some(first) = fleet.scenario.network.metrics {
-        for (spec, address) in specs.iter_mut().zip(ports_behind(first)) {
-            spec.args.push(format!("--metrics={address}").into());
-            display.say(&format!("metrics of {} at http://{address}/metrics", spec.name));
+    for ProcessSpec { name, metrics, .. } in &specs {
+        if let Some(address) = metrics {
+            display.say(&format!("metrics of {name} at http://{address}/metrics"));
         }
     }
     let restarts = fleet.scenario.timeouts.restarts;
@@ -279,11 +277,6 @@ fn watch(
     away.extend(killed.iter().cloned());
     let failures = watch.failures();
     Ok(Watched { ending, killed, away, failures })
-}
-
-/// The ports behind that of `first`, on the same address.
-fn ports_behind(first: SocketAddr) -> impl Iterator<Item = SocketAddr> {
-    (first.port()..u16::MAX).map(move |port| SocketAddr::new(first.ip(), port + 1))
 }
 
 /// Moments until which each step of the end has time.
@@ -330,11 +323,8 @@ fn drain(supervisor: &Supervisor, scorer: &ScorerNode, until: Instant, display: 
 fn fingerprint(fleet: &Fleet, programs: &Path) -> JoinHandle<std::io::Result<Provenance>> {
     let (programs, weights) = (Fleet::programs(programs), fleet.scenario.models.weights.clone());
     let scene = fleet.scene_dir.clone();
-    let localizer = fleet.scenario.models.localizer.clone().filter(|_| fleet.scenario.uses_localizer());
-    let end_to_end = fleet.scenario.models.end_to_end.clone().filter(|_| fleet.scenario.uses_end_to_end());
-    std::thread::spawn(move || {
-        Provenance::collect(&programs, &weights, localizer.as_ref(), end_to_end.as_deref(), &scene)
-    })
+    let poses = fleet.scenario.poses();
+    std::thread::spawn(move || Provenance::collect(&programs, &weights, &poses, &scene))
 }
 
 /// Writes the run folder; what cannot be written is told with the result, which is not lost with it.

@@ -97,6 +97,21 @@ impl RunFolder {
         })
     }
 
+    /// Writes the configuration of a process to `config/<process>.yaml`; its path.
+    ///
+    /// # Errors
+    /// [`RunFolderError::Write`].
+    pub fn write_config(&self, process: &str, config: &impl Serialize) -> Result<PathBuf, RunFolderError> {
+        let name = format!("config/{process}.yaml");
+        let path = self.file(&name);
+        let unwritable = |source| RunFolderError::Write { path: path.clone(), source };
+        let text =
+            serde_saphyr::to_string(config).map_err(|error| unwritable(std::io::Error::other(error.to_string())))?;
+        fs::create_dir_all(self.file("config")).map_err(unwritable)?;
+        self.write(&name, &text)?;
+        Ok(path)
+    }
+
     /// Writes `value` as indented JSON.
     ///
     /// # Errors

@@ -2,12 +2,9 @@
 
 use std::path::{Path, PathBuf};
 
-use link::PRESETS;
+use bus::config_file::{self, ConfigError};
 
 use super::{Scenario, ScenarioError};
-
-/// Largest scenario file, bytes.
-const MAX_BYTES: u64 = 1 << 20;
 
 impl Scenario {
     /// Reads and checks a scenario. Relative paths in it are taken from its folder and come back absolute.
@@ -34,33 +31,21 @@ impl Scenario {
     /// # Errors
     /// [`ScenarioError`] when the file cannot be read or is no scenario.
     pub fn read(path: &Path) -> Result<Self, ScenarioError> {
-        let unreadable = |source| ScenarioError::Read { path: path.into(), source };
-        let size = std::fs::metadata(path).map_err(unreadable)?.len();
-        if size > MAX_BYTES {
-            return Err(unreadable(std::io::Error::other(format!("{size} bytes, more than {MAX_BYTES}"))));
-        }
-        let text = std::fs::read_to_string(path).map_err(unreadable)?;
-        let mut scenario = Self::parse(&text, path)?;
-        let folder = std::path::absolute(path).map_err(unreadable)?;
-        let folder = folder.parent().unwrap_or(Path::new("/"));
-        let Scenario { scene, models, link, security, .. } = &mut scenario;
+        let mut scenario: Self = config_file::read(path)?;
+        let file = std::path::absolute(path).map_err(|source| ConfigError::Io { path: path.into(), source })?;
+        let folder = file.parent().unwrap_or(Path::new("/"));
+        let absolute = |place: &Path| without_dots(&folder.join(place));
+        let Scenario { scene, models, agents, vehicles, link, security, .. } = &mut scenario;
         let keys = security.iter_mut().flat_map(|security| &mut security.keys);
-        let localizer = models.localizer.iter_mut().flat_map(|models| [&mut models.encoder, &mut models.head]);
-        let networks = localizer.chain(&mut models.end_to_end);
-        let is_preset = |air: &Path| PRESETS.iter().any(|(name, _)| Path::new(name) == air);
-        let air = link.iter_mut().map(|link| &mut link.air).filter(|air| !is_preset(air));
-        for place in [&mut scene.dir, &mut models.weights].into_iter().chain(networks).chain(air).chain(keys) {
-            *place = without_dots(&folder.join(&place));
+        for place in [&mut scene.dir, &mut models.weights].into_iter().chain(keys) {
+            *place = absolute(place);
+        }
+        agents.pose = std::mem::take(&mut agents.pose).map_files(absolute);
+        vehicles.values_mut().for_each(|own| own.map_pose(|pose| pose.map_files(absolute)));
+        if let Some(link) = link.as_mut().filter(|link| !link.is_preset()) {
+            link.model = absolute(Path::new(&link.model)).to_string_lossy().into_owned();
         }
         Ok(scenario)
-    }
-
-    fn parse(text: &str, path: &Path) -> Result<Self, ScenarioError> {
-        serde_saphyr::from_str(text).map_err(|error| ScenarioError::Syntax {
-            path: path.into(),
-            line: error.location().map(|location| location.line()),
-            reason: first_line(&error.without_snippet().to_string()),
-        })
     }
 }
 
@@ -80,22 +65,19 @@ fn without_dots(path: &Path) -> PathBuf {
     clean
 }
 
-fn first_line(text: &str) -> String {
-    text.lines().next().unwrap_or_default().trim().to_owned()
-}
-
 #[cfg(test)]
 mod tests {
     use fusion::Method;
     use protocol::{CavId, Dtype};
 
-    use super::super::{NoiseMode, PoseSource};
+    use localization::pose_source::{NoiseMode, NoisyPoseConfig, PoseSourceConfig};
+
     use super::*;
 
     const SMALL: &str = "scene: {dir: ../scene}\nmodels: {weights: w.safetensors}\n";
 
     fn parse(text: &str) -> Result<Scenario, ScenarioError> {
-        Scenario::parse(text, Path::new("s.yaml"))
+        Ok(config_file::parse(text, Path::new("s.yaml"))?)
     }
 
     #[test]
@@ -109,13 +91,13 @@ mod tests {
     #[test]
     fn a_vehicle_overrides_single_fields() {
         let text = format!(
-            "{SMALL}agents: {{codec: {{dtype: f32}}}}\nvehicles:\n  4288:\n    codec: {{dtype: i8, zstd_level: 3}}\n    pose: {{noisy: {{mode: fixed, std_m: 1.5}}}}\n"
+            "{SMALL}agents: {{codec: {{dtype: f32}}}}\nvehicles:\n  4288:\n    codec: {{dtype: i8, zstd_level: 3}}\n    pose: {{noisy: {{mode: fixed, position_std_m: 1.5}}}}\n"
         );
         let scenario = parse(&text).unwrap();
         let own = scenario.settings_of(&CavId::new("4288").unwrap());
         assert_eq!((own.codec.dtype, own.codec.zstd_level), (Dtype::I8, Some(3)));
-        let PoseSource::Noisy(noise) = own.pose else { panic!("{:?}", own.pose) };
-        assert_eq!((noise.mode, noise.std_m, noise.std_deg), (NoiseMode::Fixed, 1.5, 0.2));
+        let PoseSourceConfig::Noisy(noise) = own.pose else { panic!("{:?}", own.pose) };
+        assert_eq!((noise.mode, noise.position_std_m, noise.heading_std_deg), (NoiseMode::Fixed, 1.5, 0.2));
         assert_eq!(scenario.settings_of(&CavId::new("4279").unwrap()), scenario.agents);
     }
 
@@ -139,40 +121,23 @@ mod tests {
     fn one_vehicle_may_find_its_pose_itself() {
         let folder = tempfile::tempdir().unwrap();
         let file = folder.path().join("s.yaml");
-        let text = |models: &str| {
-            format!("scene: {{dir: .}}\nmodels: {{weights: s.yaml{models}}}\nvehicles:\n  4288: {{pose: pgc}}\n")
+        let text = |pose: &str| {
+            format!("scene: {{dir: .}}\nmodels: {{weights: s.yaml}}\nvehicles:\n  4288: {{pose: {{{pose}}}}}\n")
         };
-        std::fs::write(&file, text("")).unwrap();
+        std::fs::write(&file, text("pgc: {encoder: e.safetensors}")).unwrap();
         let message = Scenario::load(&file).unwrap_err().to_string();
-        assert!(message.contains("models.localizer is left out"), "{message}");
-        std::fs::write(&file, text(", localizer: {encoder: e.safetensors, head: s.yaml}")).unwrap();
+        assert!(message.contains("head"), "{message}");
+        std::fs::write(&file, text("pgc: {encoder: e.safetensors, head: s.yaml}")).unwrap();
         let message = Scenario::load(&file).unwrap_err().to_string();
-        assert!(message.contains("models.localizer.encoder: ") && message.contains("e.safetensors"), "{message}");
+        assert!(message.contains("agents.pose: ") && message.contains("e.safetensors"), "{message}");
         std::fs::write(folder.path().join("e.safetensors"), b"").unwrap();
         let scenario = Scenario::load(&file).unwrap();
-        assert!(scenario.models.localizer.as_ref().unwrap().encoder.is_absolute());
-        assert_eq!(scenario.settings_of(&CavId::new("4288").unwrap()).pose, PoseSource::Pgc);
-        assert_eq!(scenario.settings_of(&CavId::new("4279").unwrap()).pose, PoseSource::Recorded);
+        let PoseSourceConfig::Pgc(pgc) = scenario.settings_of(&CavId::new("4288").unwrap()).pose else { panic!() };
+        assert!(pgc.encoder.is_absolute() && pgc.head.exists());
+        assert_eq!(scenario.settings_of(&CavId::new("4279").unwrap()).pose, PoseSourceConfig::Recorded);
         assert_eq!(parse(&scenario.to_yaml()).unwrap(), scenario);
-    }
-
-    #[test]
-    fn a_pose_by_a_network_trained_end_to_end_needs_its_weights() {
-        let folder = tempfile::tempdir().unwrap();
-        let file = folder.path().join("s.yaml");
-        let text = |more: &str| {
-            format!("scene: {{dir: .}}\nmodels: {{weights: s.yaml{more}}}\nagents: {{pose: end_to_end}}\n")
-        };
-        std::fs::write(&file, text("")).unwrap();
-        let message = Scenario::load(&file).unwrap_err().to_string();
-        assert!(message.contains("models.end_to_end is left out"), "{message}");
-        std::fs::write(&file, text(", end_to_end: w.safetensors")).unwrap();
-        let message = Scenario::load(&file).unwrap_err().to_string();
-        assert!(message.contains("models.end_to_end: ") && message.contains("w.safetensors"), "{message}");
-        std::fs::write(folder.path().join("w.safetensors"), b"").unwrap();
-        let scenario = Scenario::load(&file).unwrap();
-        assert!(scenario.models.end_to_end.as_ref().unwrap().is_absolute() && !scenario.uses_localizer());
-        assert_eq!(parse(&scenario.to_yaml()).unwrap(), scenario);
+        std::fs::write(&file, text("end_to_end: {weights: e.safetensors}")).unwrap();
+        assert_eq!(Scenario::load(&file).unwrap().poses()[1].name(), "end_to_end");
     }
 
     #[test]
@@ -197,6 +162,7 @@ mod tests {
         for (line, field) in [
             ("scene: {dir: ., rate: 0}", "scene.rate is 0"),
             ("scene: {dir: ., frames: 0}", "scene.frames is 0"),
+            ("scene: {dir: .}\nagents: {pose: {noisy: {step_s: 0}}}", "noisy.step_s is 0"),
             ("scene: {dir: nowhere}", "nowhere does not exist"),
             ("scene: {dir: .}\nnetwork: {listen: localhost}", "network.listen is localhost"),
             ("scene: {dir: .}\nnetwork: {connect: quic/10.0.0.1:7447}", "network.connect is quic/10.0.0.1:7447"),
@@ -240,14 +206,15 @@ mod tests {
     #[test]
     fn what_is_written_reads_back_the_same() {
         let mut scenario = parse(SMALL).unwrap();
-        scenario.agents.pose = PoseSource::Noisy(super::super::PoseNoise::default());
+        scenario.agents.pose = PoseSourceConfig::Noisy(NoisyPoseConfig::default());
         assert_eq!(parse(&scenario.to_yaml()).unwrap(), scenario);
     }
 
     #[test]
     fn the_samples_are_scenarios_and_say_what_the_defaults_are() {
         let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("scenarios");
-        let samples: Vec<_> = std::fs::read_dir(&folder).unwrap().map(|entry| entry.unwrap().path()).collect();
+        let entries = std::fs::read_dir(&folder).unwrap().map(|entry| entry.unwrap().path());
+        let samples: Vec<_> = entries.filter(|path| path.extension().is_some_and(|kind| kind == "yaml")).collect();
         assert!(samples.len() >= 2, "{samples:?}");
         for sample in samples {
             Scenario::read(&sample).unwrap();
@@ -256,8 +223,8 @@ mod tests {
         let mut plain = parse(SMALL).unwrap();
         (plain.scene.dir, plain.models.weights) = (demo.scene.dir.clone(), demo.models.weights.clone());
         plain.agents.codec.dtype = Dtype::F16;
-        assert!(demo.models.localizer.is_some());
-        (plain.agents.pose, plain.models.localizer) = (PoseSource::Pgc, demo.models.localizer.clone());
+        assert!(matches!(demo.agents.pose, PoseSourceConfig::Pgc(_)));
+        plain.agents.pose = demo.agents.pose.clone();
         assert_eq!(demo, plain);
     }
 }

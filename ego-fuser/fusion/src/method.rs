@@ -8,6 +8,7 @@ use std::str::FromStr;
 use clap::builder::{PossibleValue, PossibleValuesParser, TryMapValueParser, TypedValueParser, ValueParserFactory};
 use perception::model_config::DetectorConfig;
 use protocol::ConfidenceGate;
+use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::de::Error;
 use serde::{Deserialize, Deserializer, Serialize, Serializer};
 
@@ -156,6 +157,20 @@ impl Eq for Method {}
 impl Hash for Method {
     fn hash<H: Hasher>(&self, state: &mut H) {
         self.name().hash(state);
+    }
+}
+
+impl JsonSchema for Method {
+    fn schema_name() -> Cow<'static, str> {
+        "Method".into()
+    }
+
+    fn json_schema(_: &mut SchemaGenerator) -> Schema {
+        let names: Vec<Schema> = Self::ALL
+            .iter()
+            .map(|method| json_schema!({"const": method.name(), "description": method.summary()}))
+            .collect();
+        json_schema!({"description": "How the views of several CAVs become one set of boxes.", "oneOf": names})
     }
 }
 

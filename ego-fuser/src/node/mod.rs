@@ -16,6 +16,7 @@ use bus::shutdown::Stop;
 use bus::{Bus, BusError, Event, Inbox, InboxLimits, Publisher, PublisherOptions, Subscription};
 use protocol::{CavId, DropReason, Limits, Role, Stream, Topic};
 
+use crate::config::{EgoConfig, EgoSettings};
 use crate::ego::{Ego, View};
 use crate::neighbourhood::{Neighbourhood, heard_on, sender_of};
 use crate::pairing::{Pairing, PairingConfig};
@@ -54,16 +55,35 @@ pub struct NodeOptions {
 }
 
 impl Default for NodeOptions {
-    /// 50 ms of deadline, all neighbours.
+    /// The settings' defaults, all neighbours.
     fn default() -> Self {
+        Self::from(&EgoSettings::default())
+    }
+}
+
+impl From<&EgoSettings> for NodeOptions {
+    /// All neighbours, heard directly, until the own agent ends.
+    fn from(settings: &EgoSettings) -> Self {
         Self {
-            deadline: Duration::from_millis(50),
-            pairing: PairingConfig::default(),
+            deadline: Duration::from_millis(settings.deadline_ms),
+            pairing: settings.pairing(),
             neighbours: None,
             over_link: false,
             keeps_running: false,
             limits: Limits::DEFAULT,
-            inbox: InboxLimits::PEERS,
+            inbox: settings.inbox.limits(),
+        }
+    }
+}
+
+impl From<&EgoConfig> for NodeOptions {
+    fn from(config: &EgoConfig) -> Self {
+        let neighbours: BTreeSet<CavId> = config.neighbours.iter().cloned().collect();
+        Self {
+            neighbours: Some(neighbours).filter(|named| !named.is_empty()),
+            over_link: config.over_link,
+            keeps_running: config.keep_running || config.bus.supervised,
+            ..Self::from(&config.ego)
         }
     }
 }

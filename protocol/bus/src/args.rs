@@ -1,11 +1,14 @@
-//! The arguments that every process of a fleet shares.
+//! Configuration that every process of a fleet shares: the connection to its run, and limits of what others send.
 
 use std::io::IsTerminal;
 use std::net::SocketAddr;
 use std::path::PathBuf;
 use std::time::Duration;
 
+use protocol::config::{FieldError, above_zero, within};
 use protocol::{CavId, Role, RunId};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
 use tracing_subscriber::layer::{Layer, SubscriberExt};
 use tracing_subscriber::util::SubscriberInitExt;
 use tracing_subscriber::{EnvFilter, Registry};
@@ -17,14 +20,13 @@ use super::{Bus, BusError, BusOptions, Credentials, Endpoint, Identity, InboxLim
 /// How long a process may take to end after it was asked to: within the 5 s that a whole fleet has.
 pub const STOP_LIMIT: Duration = Duration::from_secs(4);
 
-/// Which run to join, where, and how to end.
-#[derive(Debug, Clone, clap::Args)]
-pub struct BusArgs {
-    /// Name of the run: 1 to 32 characters of a-z, 0-9, '_' and '-'.
+/// Connection of a process to the router of its run.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema, clap::Args)]
+#[serde(default, deny_unknown_fields)]
+#[command(next_help_heading = "Bus")]
+pub struct BusConfig {
+    /// The router to connect to, tcp/HOST:PORT, or quic/HOST:PORT with keys.
     #[arg(long)]
-    pub run: RunId,
-    /// The router to connect to, tcp/HOST:PORT.
-    #[arg(long, default_value = "tcp/127.0.0.1:7447")]
     pub connect: Endpoint,
     /// Be the run's router oneself and listen here, tcp/HOST:PORT; no launcher or zenohd is needed then.
     #[arg(long, conflicts_with = "connect")]
@@ -33,14 +35,14 @@ pub struct BusArgs {
     /// take no router without one. `v2vloc keys` makes them.
     #[arg(long, value_name = "DIR")]
     pub keys: Option<PathBuf>,
-    /// Seconds to go on trying to reach the router.
-    #[arg(long, default_value_t = 10.0)]
-    pub connect_timeout: f64,
+    /// Longest time to go on trying to reach the router, seconds.
+    #[arg(long, value_name = "S")]
+    pub connect_timeout_s: f64,
     /// Shared memory for large messages between processes of one machine, MiB; 0: none, everything takes the socket.
-    #[arg(long, default_value_t = 0)]
-    pub shm_mib: usize,
+    #[arg(long, value_name = "MIB")]
+    pub shared_memory_mib: usize,
     /// Largest message accepted from outside, MiB.
-    #[arg(long, default_value_t = 32)]
+    #[arg(long, value_name = "MIB")]
     pub max_message_mib: usize,
     /// Serve counters and times of this process to Prometheus at http://HOST:PORT/metrics; port 0: any free one.
     #[arg(long, value_name = "HOST:PORT")]
@@ -50,31 +52,56 @@ pub struct BusArgs {
     pub supervised: bool,
 }
 
-impl BusArgs {
-    /// The session that the arguments ask for.
+impl Default for BusConfig {
+    fn default() -> Self {
+        Self {
+            connect: Endpoint::loopback(7447),
+            listen: None,
+            keys: None,
+            connect_timeout_s: 10.0,
+            shared_memory_mib: 0,
+            max_message_mib: 32,
+            metrics: None,
+            supervised: false,
+        }
+    }
+}
+
+impl BusConfig {
+    /// Checks the values.
     ///
     /// # Errors
-    /// [`BusError::Keys`] when there is something wrong with those of `--keys`.
+    /// [`FieldError`] for the first that is not allowed.
+    pub fn validate(&self) -> Result<(), FieldError> {
+        within("bus.connect_timeout_s", self.connect_timeout_s, 0.0, 1e6)?;
+        within("bus.max_message_mib", self.max_message_mib, 1, 1 << 20)?;
+        within("bus.shared_memory_mib", self.shared_memory_mib, 0, 1 << 20)
+    }
+
+    /// The session that the configuration asks for.
+    ///
+    /// # Errors
+    /// [`BusError::Keys`] when there is something wrong with those of `keys`.
     pub fn options(&self) -> Result<BusOptions, BusError> {
         let mut options = match &self.listen {
             Some(listen) => BusOptions::router(listen.clone()),
             None => BusOptions::client(self.connect.clone()),
         };
-        options.patience = Duration::try_from_secs_f64(self.connect_timeout).unwrap_or(Duration::ZERO);
-        options.shared_memory_pool = Some(self.shm_mib << 20).filter(|bytes| *bytes > 0);
-        options.max_message_bytes = self.max_message_mib.max(1) << 20;
+        options.patience = Duration::try_from_secs_f64(self.connect_timeout_s).unwrap_or(Duration::ZERO);
+        options.shared_memory_pool = Some(self.shared_memory_mib << 20).filter(|bytes| *bytes > 0);
+        options.max_message_bytes = self.max_message_mib << 20;
         Ok(match &self.keys {
             Some(folder) => options.with_credentials(Credentials::read(folder)?),
             None => options,
         })
     }
 
-    /// Joins the run in a role.
+    /// Joins `run` in a role.
     ///
     /// # Errors
     /// [`BusError`] names the endpoint and what to do.
-    pub fn join(&self, role: Role, cav: &CavId) -> Result<Bus, BusError> {
-        let identity = Identity { run: self.run.clone(), process: process_id(role, cav), cav: cav.clone() };
+    pub fn join(&self, run: &RunId, role: Role, cav: &CavId) -> Result<Bus, BusError> {
+        let identity = Identity { run: run.clone(), process: process_id(role, cav), cav: cav.clone() };
         let options = self.options()?;
         if let Some(credentials) = &options.credentials {
             credentials.check_name(identity.process.as_str())?;
@@ -102,34 +129,47 @@ impl BusArgs {
     }
 }
 
-/// How much other vehicles may bring a process that listens to them.
-#[derive(Debug, Clone, clap::Args)]
-pub struct PeerArgs {
-    /// Messages that each sender may bring a second; what is more is dropped unread (rate_limit in the ledger).
-    #[arg(long, value_name = "N", default_value_t = InboxLimits::PEERS.messages_per_s, value_parser = above_zero)]
-    pub peer_messages_per_s: f64,
-    /// The same in MiB a second, on each of its streams.
-    #[arg(long, value_name = "MIB", default_value_t = InboxLimits::PEERS.bytes_per_s / MIB, value_parser = above_zero)]
-    pub peer_mib_per_s: f64,
+/// Limits of what other vehicles may send to a process that listens to them.
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema, clap::Args)]
+#[serde(default, deny_unknown_fields)]
+#[command(next_help_heading = "Limits of what others send")]
+pub struct InboxConfig {
+    /// Messages of one sender per second; what exceeds them is dropped unread (`rate_limit` in the ledger).
+    #[arg(id = "inbox_messages_per_s", long = "inbox-messages-per-s", value_name = "N")]
+    pub messages_per_s: f64,
+    /// MiB of one sender per second, on each of its streams.
+    #[arg(id = "inbox_mib_per_s", long = "inbox-mib-per-s", value_name = "MIB")]
+    pub mib_per_s: f64,
     /// MiB that may wait to be decoded, of all senders together.
-    #[arg(long, value_name = "MIB", default_value_t = InboxLimits::PEERS.waiting_bytes >> 20)]
+    #[arg(id = "inbox_waiting_mib", long = "inbox-waiting-mib", value_name = "MIB")]
     pub waiting_mib: usize,
 }
 
 const MIB: f64 = (1 << 20) as f64;
 
-fn above_zero(text: &str) -> Result<f64, String> {
-    let number: f64 = text.parse().map_err(|_| "not a number".to_owned())?;
-    if number > 0.0 { Ok(number) } else { Err("must be above 0".to_owned()) }
+impl Default for InboxConfig {
+    fn default() -> Self {
+        let InboxLimits { messages_per_s, bytes_per_s, waiting_bytes } = InboxLimits::PEERS;
+        Self { messages_per_s, mib_per_s: bytes_per_s / MIB, waiting_mib: waiting_bytes >> 20 }
+    }
 }
 
-impl PeerArgs {
-    /// What an inbox takes.
+impl InboxConfig {
+    /// Checks the values.
+    ///
+    /// # Errors
+    /// [`FieldError`] for the first that is not allowed.
+    pub fn validate(&self) -> Result<(), FieldError> {
+        above_zero("inbox.messages_per_s", self.messages_per_s)?;
+        above_zero("inbox.mib_per_s", self.mib_per_s)
+    }
+
+    /// The same in bytes.
     #[must_use]
     pub fn limits(&self) -> InboxLimits {
         InboxLimits {
-            messages_per_s: self.peer_messages_per_s,
-            bytes_per_s: self.peer_mib_per_s * MIB,
+            messages_per_s: self.messages_per_s,
+            bytes_per_s: self.mib_per_s * MIB,
             waiting_bytes: self.waiting_mib.saturating_mul(1 << 20),
         }
     }

@@ -2,14 +2,32 @@
 
 use std::fmt;
 
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
 use super::BusError;
 
 const TCP: &str = "tcp/";
 const QUIC: &str = "quic/";
 
 /// A checked zenoh endpoint: `tcp/HOST:PORT`, or `quic/HOST:PORT` where both ends have keys.
-#[derive(Debug, Clone, PartialEq, Eq)]
+#[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
+#[serde(try_from = "String", into = "String")]
 pub struct Endpoint(String);
+
+impl TryFrom<String> for Endpoint {
+    type Error = BusError;
+
+    fn try_from(text: String) -> Result<Self, BusError> {
+        Self::new(&text)
+    }
+}
+
+impl From<Endpoint> for String {
+    fn from(endpoint: Endpoint) -> Self {
+        endpoint.0
+    }
+}
 
 impl Endpoint {
     /// Reads `tcp/HOST:PORT` or `quic/HOST:PORT`; IPv6 hosts stand in brackets.

@@ -13,6 +13,8 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use protocol::{CavId, Control, Limits, Party, ProcessId, Role, Selector, Topic};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
 
 use super::bounded_queue::Taken;
 use super::{Bus, BusError, Event, Inbox, Subscription};
@@ -28,7 +30,8 @@ const ASK_AGAIN: Duration = Duration::from_millis(100);
 const NAMED: usize = 20;
 
 /// From the publisher of a topic to one process that listens to it, written `4279/lidar>agent-4279`.
-#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize, JsonSchema)]
+#[serde(try_from = "String", into = "String")]
 pub struct Route {
     /// What is published.
     pub topic: Topic,
@@ -67,6 +70,20 @@ impl FromStr for Route {
             topic: topic.parse().map_err(|cause: protocol::KeyError| error(cause.to_string()))?,
             receiver: receiver.parse().map_err(|cause: protocol::IdError| error(cause.to_string()))?,
         })
+    }
+}
+
+impl TryFrom<String> for Route {
+    type Error = RouteError;
+
+    fn try_from(text: String) -> Result<Self, RouteError> {
+        text.parse()
+    }
+}
+
+impl From<Route> for String {
+    fn from(route: Route) -> Self {
+        route.to_string()
     }
 }
 

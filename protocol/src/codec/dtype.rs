@@ -18,6 +18,7 @@ const ROUND: f32 = 12_582_912.0;
 /// How a value is written.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Default, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
+#[cfg_attr(feature = "config", derive(clap::ValueEnum, schemars::JsonSchema))]
 pub enum Dtype {
     /// As it is: 4 bytes, exact.
     #[default]

@@ -1,5 +1,7 @@
 //! Which cells are worth sending: those around which a vehicle is likely (Where2comm, Hu et al., NeurIPS 2022).
 
+use std::str::FromStr;
+
 use serde::{Deserialize, Serialize};
 
 use crate::BevGrid;
@@ -13,6 +15,7 @@ const MAX_KERNEL: u32 = 63;
 /// The decision is the sender's alone, before anything is on the air: where it sees nothing, nothing is sent.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
+#[cfg_attr(feature = "config", derive(schemars::JsonSchema))]
 pub struct ConfidenceGate {
     /// Smoothed confidence that a cell must exceed. Below zero: every cell passes.
     pub threshold: f32,
@@ -26,6 +29,7 @@ pub struct ConfidenceGate {
 /// not to one, so thresholds belong to a sigma.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
+#[cfg_attr(feature = "config", derive(schemars::JsonSchema))]
 pub struct Smoothing {
     /// Edge of the window, cells; odd.
     pub kernel: u32,
@@ -37,6 +41,33 @@ impl Default for ConfidenceGate {
     /// The published threshold and smoothing: 0.01 after 5 x 5 cells with a sigma of one.
     fn default() -> Self {
         Self { threshold: 0.01, smoothing: Some(Smoothing { kernel: 5, sigma: 1.0 }) }
+    }
+}
+
+impl FromStr for ConfidenceGate {
+    type Err = String;
+
+    /// `THRESHOLD`, with the published smoothing; `THRESHOLD,CELLS,SIGMA`; or `THRESHOLD,none`.
+    fn from_str(text: &str) -> Result<Self, String> {
+        let (threshold, smoothing) = text.split_once(',').map_or((text, None), |(first, rest)| (first, Some(rest)));
+        let threshold = threshold.trim().parse().map_err(|error| format!("threshold {threshold:?}: {error}"))?;
+        Ok(match smoothing {
+            None => Self { threshold, ..Self::default() },
+            Some("none") => Self { threshold, smoothing: None },
+            Some(window) => Self { threshold, smoothing: Some(window.parse()?) },
+        })
+    }
+}
+
+impl FromStr for Smoothing {
+    type Err = String;
+
+    /// `CELLS,SIGMA`.
+    fn from_str(text: &str) -> Result<Self, String> {
+        let (kernel, sigma) = text.split_once(',').ok_or_else(|| format!("{text:?} is not CELLS,SIGMA or none"))?;
+        let kernel = kernel.trim().parse().map_err(|error| format!("window {kernel:?}: {error}"))?;
+        let sigma = sigma.trim().parse().map_err(|error| format!("sigma {sigma:?}: {error}"))?;
+        Ok(Self { kernel, sigma })
     }
 }
 
@@ -142,6 +173,18 @@ mod tests {
         assert!(nothing.cells(&confidence, &GRID).unwrap().is_empty());
         let everything = ConfidenceGate { threshold: -1.0, ..alone };
         assert_eq!(everything.cells(&confidence, &GRID).unwrap().len(), 30);
+    }
+
+    #[test]
+    fn a_gate_is_read_from_a_threshold_and_a_window() {
+        let read = |text: &str| text.parse::<ConfidenceGate>();
+        assert_eq!(read("0.01").unwrap(), ConfidenceGate::default());
+        assert_eq!(read("0.1,none").unwrap(), ConfidenceGate { threshold: 0.1, smoothing: None });
+        assert_eq!(read("-1,3,0.5").unwrap().smoothing, Some(Smoothing { kernel: 3, sigma: 0.5 }));
+        for (text, part) in [("much", "threshold \"much\""), ("0.1,3", "\"3\""), ("0.1,x,1", "window \"x\"")] {
+            let message = read(text).unwrap_err();
+            assert!(message.contains(part), "{text}: {message}");
+        }
     }
 
     #[test]

@@ -37,17 +37,28 @@ pub use rate::{
     ByteLimit, HEAD_BYTES, LimitedBy, RateChoice, RateReason, encode_within, largest_message, smallest_message,
 };
 
-/// How an agent encodes its maps.
+/// Codec of BEV feature maps.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
+#[cfg_attr(feature = "config", derive(clap::Args, schemars::JsonSchema))]
+#[cfg_attr(feature = "config", command(next_help_heading = "Codec of BEV feature maps"))]
 pub struct CodecConfig {
-    /// How exactly values are written.
+    /// Number format of the values.
+    #[cfg_attr(feature = "config", arg(long, value_enum))]
     pub dtype: Dtype,
-    /// Which cells are worth sending at all. `None`: all. A budget chooses among those.
+    /// Confidence that a cell must exceed to be sent, smoothed by a Gaussian window first (edge and sigma in cells); a budget
+    /// chooses among those cells. Absent: as the method says, else all cells.
+    #[cfg_attr(
+        feature = "config",
+        arg(long, value_name = "THRESHOLD[,CELLS,SIGMA|,none]", allow_negative_numbers = true)
+    )]
     pub gate: Option<ConfidenceGate>,
-    /// Most bytes of a body: the cells with the highest confidence that fit are sent. `None`, or enough for all: all.
+    /// Most bytes of a map before compression: the cells with the highest confidence that fit are sent. Absent: all cells.
+    #[cfg_attr(feature = "config", arg(long, value_name = "BYTES"))]
     pub budget_bytes: Option<u64>,
-    /// zstd level, 1..=22; `None`: not packed. The budget holds for what is there before packing.
+    /// zstd level, 1 to 22. Absent: not compressed.
+    #[cfg_attr(feature = "config", arg(long, value_name = "LEVEL", value_parser = clap::value_parser!(i32).range(1..=22)))]
+    #[cfg_attr(feature = "config", schemars(range(min = 1, max = 22)))]
     pub zstd_level: Option<i32>,
 }
 

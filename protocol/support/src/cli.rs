@@ -35,6 +35,13 @@ pub enum Outcome {
 }
 
 impl Outcome {
+    /// Prints a fault of the input.
+    #[must_use]
+    pub fn bad_input(error: &dyn Display) -> Self {
+        output::note(format_args!("error: {error}"));
+        Self::BadInput
+    }
+
     /// [`Self::DataLost`] if data were lost.
     #[must_use]
     pub fn of(lost_data: bool) -> Self {

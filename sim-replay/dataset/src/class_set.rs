@@ -3,6 +3,7 @@
 use std::fmt;
 use std::str::FromStr;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::frame::{ObjectClass, UnknownClass};
@@ -11,7 +12,7 @@ use crate::frame::{ObjectClass, UnknownClass};
 const VEHICLE: &str = "vehicle";
 
 /// A set of object classes. As text: names with commas between, `vehicle` for car, van, truck and bus.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(try_from = "Vec<String>", into = "Vec<String>")]
 pub struct ClassSet(u8);
 

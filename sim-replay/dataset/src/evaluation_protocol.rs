@@ -8,6 +8,7 @@ mod preset;
 
 use std::fmt;
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 pub use config::ProtocolConfig;
@@ -36,7 +37,7 @@ pub struct EvaluationProtocol {
 }
 
 /// Which agents of a scenario take part.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, clap::ValueEnum)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema, clap::ValueEnum)]
 #[serde(rename_all = "snake_case")]
 pub enum AgentKinds {
     /// Vehicles and roadside units.
@@ -49,7 +50,7 @@ pub enum AgentKinds {
 }
 
 /// Which agent of a scenario is the ego.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, clap::ValueEnum)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema, clap::ValueEnum)]
 #[serde(rename_all = "snake_case")]
 pub enum EgoKind {
     /// The first vehicle; the first roadside unit where there is no vehicle.
@@ -60,7 +61,7 @@ pub enum EgoKind {
 }
 
 /// Order of detections when precision and recall are summed up.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, clap::ValueEnum)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema, clap::ValueEnum)]
 #[serde(rename_all = "snake_case")]
 pub enum ApOrder {
     /// By score over all frames.

@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::device_clock::{ClockStep, DeviceClock};
@@ -80,7 +81,7 @@ impl LinkError {
 }
 
 /// Who shares what.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum Medium {
     /// Every ordered pair of vehicles has a link of its own.
@@ -91,7 +92,7 @@ pub enum Medium {
 }
 
 /// How many bytes cross in how much time.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum CapacityConfig {
     /// All at once.
@@ -122,7 +123,7 @@ impl CapacityConfig {
 }
 
 /// What happens to those who have to wait.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct QueueConfig {
     /// Bytes that may wait, without the message that is on its way.
@@ -142,7 +143,7 @@ impl Default for QueueConfig {
 }
 
 /// Who goes when there is no room.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum QueueDrop {
     /// The newcomer.
@@ -153,7 +154,7 @@ pub enum QueueDrop {
 }
 
 /// The law of the propagation delay, after the last bit was sent.
-#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum DelayLaw {
     /// None.
@@ -191,7 +192,7 @@ pub enum DelayLaw {
 }
 
 /// The law of loss.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum LossLaw {
     /// Nothing is lost.
@@ -223,7 +224,7 @@ fn one() -> f64 {
 }
 
 /// What is lost at a time.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case")]
 pub enum LossUnit {
     /// A message.
@@ -234,7 +235,7 @@ pub enum LossUnit {
 }
 
 /// Messages that others overtake.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ReorderConfig {
     /// Share of the messages.
@@ -244,7 +245,7 @@ pub struct ReorderConfig {
 }
 
 /// A time in which nothing crosses, from the beginning of the scene, seconds. What was on its way is lost.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Outage {
     /// First second.
@@ -254,7 +255,7 @@ pub struct Outage {
 }
 
 /// A link, or all links of a shared medium.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct LinkConfig {
     /// Who shares what.

@@ -1,9 +1,10 @@
 //! The clock of a vehicle, which is not the scene's.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// How far a vehicle's clock is off.
-#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct DeviceClock {
     /// Ahead of the scene's clock at time 0, milliseconds.
@@ -15,7 +16,7 @@ pub struct DeviceClock {
 }
 
 /// Someone, or a time server, sets a clock.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ClockStep {
     /// Time since the beginning of the scene, seconds.

@@ -3,6 +3,7 @@
 use std::fmt;
 use std::path::{Path, PathBuf};
 
+use schemars::{JsonSchema, Schema, SchemaGenerator, json_schema};
 use serde::de::value::MapAccessDeserializer;
 use serde::de::{Error, MapAccess, Visitor};
 use serde::{Deserialize, Deserializer, Serialize};
@@ -26,6 +27,27 @@ impl TraceConfig {
     /// [`Self::offset_s`] in nanoseconds.
     pub(super) fn offset_nanos(&self) -> u64 {
         (self.offset_s * 1e9).round().max(0.0) as u64
+    }
+}
+
+impl JsonSchema for TraceConfig {
+    fn schema_name() -> std::borrow::Cow<'static, str> {
+        "TraceConfig".into()
+    }
+
+    fn json_schema(_: &mut SchemaGenerator) -> Schema {
+        json_schema!({
+            "description": "A trace: its path alone, or its path and the second of it at which the link begins.",
+            "anyOf": [
+                {"type": "string"},
+                {
+                    "type": "object",
+                    "properties": {"path": {"type": "string"}, "offset_s": {"type": "number", "default": 0.0}},
+                    "required": ["path"],
+                    "additionalProperties": false
+                }
+            ]
+        })
     }
 }
 

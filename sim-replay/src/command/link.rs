@@ -1,9 +1,10 @@
 //! `sim-replay link`: the emulated air between the agents of a run and an ego.
 
 use anyhow::Context;
-use bus::{BusArgs, PeerArgs, STOP_LIMIT, log_to_stderr};
-use link::{Air, PRESETS};
-use protocol::{CavId, Role, Stream};
+use bus::{Configured, STOP_LIMIT, log_to_stderr};
+use link::Air;
+use protocol::Role;
+use sim_replay::config::LinkProcessConfig;
 use sim_replay::link_node::{self, LinkReport, NodeOptions};
 use support::output;
 
@@ -13,50 +14,29 @@ use support::cli::Outcome;
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
     #[command(flatten)]
-    bus: BusArgs,
-    /// The vehicle that receives.
-    #[arg(long)]
-    ego: CavId,
-    /// A preset or a file that describes the link.
-    #[arg(long, value_name = "PRESET|FILE", default_value = "ideal", long_help = link_help())]
-    link: String,
-    /// Same seed, same losses and delays.
-    #[arg(long, default_value_t = 0)]
-    seed: u64,
-    /// What crosses the link.
-    #[arg(long, value_delimiter = ',', default_value = "pose,bev,descriptor")]
-    streams: Vec<Stream>,
-    #[command(flatten)]
-    peers: PeerArgs,
-    /// Go on when all agents have ended, for the next ones; always so with --supervised.
-    #[arg(long)]
-    keep_running: bool,
+    config: Configured<LinkProcessConfig>,
     /// Print a JSON summary.
     #[arg(long)]
     json: bool,
 }
 
-fn link_help() -> String {
-    let presets = PRESETS.map(|(name, about)| format!("\n  {name}: {about}")).concat();
-    format!("A YAML file with the stages of the link, or a preset:{presets}")
-}
-
 /// Carries messages and prints a summary to standard output.
-pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
+pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
     log_to_stderr();
-    let air = match Air::open(&args.link, args.seed) {
-        Ok(air) => air,
-        Err(error) => {
-            output::note(format_args!("error: {error}"));
-            return Ok(Outcome::BadInput);
-        }
+    let config = match args.config.validated() {
+        Ok(config) => config,
+        Err(error) => return Ok(Outcome::bad_input(&error)),
     };
-    let stop = args.bus.stop().context("installing signal handlers")?;
-    let bus = args.bus.join(Role::Link, &args.ego)?;
+    let air = match Air::open(&config.link.model, config.link.seed) {
+        Ok(air) => air,
+        Err(error) => return Ok(Outcome::bad_input(&error)),
+    };
+    let stop = config.bus.stop().context("installing signal handlers")?;
+    let bus = config.bus.join(&config.run, Role::Link, &config.ego)?;
     let options = NodeOptions {
-        keeps_running: args.keep_running || args.bus.supervised,
-        inbox: args.peers.limits(),
-        ..NodeOptions::new(args.ego.clone(), args.streams.clone())
+        keeps_running: config.keep_running || config.bus.supervised,
+        inbox: config.inbox.limits(),
+        ..NodeOptions::new(config.ego, config.streams)
     };
     let report = link_node::run(&bus, air, &options, &stop)?;
     print(&report, args.json)?;

@@ -1,12 +1,10 @@
 //! `sim-replay record`: a live run into a file.
 
-use std::path::PathBuf;
-
 use anyhow::Context;
-use bus::{BusArgs, STOP_LIMIT, log_to_stderr};
-use protocol::{CavId, Role, Stream};
-use recording::RecordingOptions;
-use sim_replay::recorder::{self, RecordReport, RecorderError, RecorderOptions};
+use bus::{Configured, STOP_LIMIT, log_to_stderr};
+use protocol::{CavId, Role};
+use sim_replay::config::RecorderConfig;
+use sim_replay::recorder::{self, RecordReport, RecorderError};
 use support::output;
 
 use support::cli::Outcome;
@@ -17,38 +15,22 @@ use support::cli::Outcome;
 #[derive(Debug, clap::Args)]
 pub(crate) struct Args {
     #[command(flatten)]
-    bus: BusArgs,
-    /// The new file.
-    #[arg(long, value_name = "FILE.mcap")]
-    out: PathBuf,
-    /// Streams to leave out, for example bev, which is most of the bytes.
-    #[arg(long, value_delimiter = ',', value_name = "STREAM")]
-    without: Vec<Stream>,
-    /// Leave out the channels for ROS 2 tools: half as large, and still exactly what was said.
-    #[arg(long)]
-    plain: bool,
-    /// zstd level, 1 to 22 [default: not packed; clouds and maps hardly shrink].
-    #[arg(long, value_name = "LEVEL", value_parser = clap::value_parser!(u32).range(1..=22))]
-    zstd: Option<u32>,
-    /// Go on when the replay ends, for the next one; always so with --supervised.
-    #[arg(long)]
-    keep_running: bool,
+    config: Configured<RecorderConfig>,
     /// Print a JSON summary.
     #[arg(long)]
     json: bool,
 }
 
 /// Records and prints a summary to standard output.
-pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
+pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
     log_to_stderr();
-    let stop = args.bus.stop().context("installing signal handlers")?;
-    let bus = args.bus.join(Role::Recorder, &CavId::new("recorder")?)?;
-    let options = RecorderOptions {
-        out: args.out.clone(),
-        recording: RecordingOptions { zstd_level: args.zstd, with_ros: !args.plain },
-        without: args.without.clone(),
-        keeps_running: args.keep_running || args.bus.supervised,
+    let config = match args.config.validated() {
+        Ok(config) => config,
+        Err(error) => return Ok(Outcome::bad_input(&error)),
     };
+    let stop = config.bus.stop().context("installing signal handlers")?;
+    let bus = config.bus.join(&config.run, Role::Recorder, &CavId::new("recorder")?)?;
+    let options = config.options();
     // Who waits for the report is told at once of a failure; the last line counts.
     let mut on_failure = |report: &RecordReport| {
         if args.json && serde_json::to_string(report).map_err(Into::into).and_then(output::line).is_err() {
@@ -57,10 +39,7 @@ pub(crate) fn run(args: &Args) -> anyhow::Result<Outcome> {
     };
     let report = match recorder::record(&bus, &options, &stop, &mut on_failure) {
         Ok(report) => report,
-        Err(RecorderError::Recording(error)) => {
-            output::note(format_args!("error: {error}"));
-            return Ok(Outcome::BadInput);
-        }
+        Err(RecorderError::Recording(error)) => return Ok(Outcome::bad_input(&error)),
         Err(error) => return Err(error.into()),
     };
     print(&report, args.json)?;

@@ -93,7 +93,7 @@ pub struct Soak {
 /// When a process falls.
 #[must_use]
 pub fn soak(folder: &Path, lasts: Duration, mut told: impl FnMut(Duration, &[(String, Usage)])) -> Soak {
-    let scenario = write_scenario(folder, "link: {air: ideal}");
+    let scenario = write_scenario(folder, "link: {model: ideal}");
     let mut up = Up::start(folder, &scenario);
     let mut results = Results::of(&up.folder);
     up.wait_for_results("a result", |results| !results.is_empty());

@@ -83,7 +83,7 @@ impl FaultyFleet {
         let heard = Arc::<Mutex<FirstHeard>>::default();
         let observer = observe(&router_endpoint, &heard);
         let rest = format!(
-            "network: {{connect: {}}}\nlink: {{air: ideal}}\ntimeouts: {{restarts: 1000000}}",
+            "network: {{connect: {}}}\nlink: {{model: ideal}}\ntimeouts: {{restarts: 1000000}}",
             proxy.endpoint.as_str()
         );
         let scenario = write_scenario(folder, &rest);

@@ -110,7 +110,7 @@ fn a_second_run_of_the_same_name_is_refused() {
 fn an_agent_that_never_comes_is_named() {
     let _exclusive = exclusive_lock();
     let folder = tempfile::tempdir().unwrap();
-    let rest = "vehicles: {'4288': {launch: elsewhere}}\ntimeouts: {ready_s: 3}";
+    let rest = "remote_agents: ['4288']\ntimeouts: {ready_s: 3}";
     let scenario = write_scenario(folder.path(), 1, "", rest);
     let (code, said) = refused(folder.path(), &scenario);
     assert_eq!(code, Some(1), "{said}");

@@ -101,10 +101,9 @@ fn a_scene_without_poses_is_played_to_those_who_find_theirs() {
 
     tests::localizer::write(folder.path(), 3);
     let text = fs::read_to_string(&recorded).unwrap();
-    let weights = "models: {weights: weights.safetensors";
-    let models = format!("{weights}, localizer: {{encoder: encoder.safetensors, head: head.safetensors}}");
+    let pose = "agents: {pose: {pgc: {encoder: encoder.safetensors, head: head.safetensors}}}\n";
     let finding = folder.path().join("finding.yaml");
-    fs::write(&finding, text.replace(weights, &models) + "agents: {pose: pgc}\n").unwrap();
+    fs::write(&finding, text + pose).unwrap();
     let (code, told) = up(folder.path(), &finding, "finding");
     // Networks that have learnt nothing find no pose, and maps without one cannot be used.
     assert!(matches!(code, Some(0 | 3)), "{told}");

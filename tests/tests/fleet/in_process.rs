@@ -415,7 +415,7 @@ fn late_killed_and_lying_neighbours_are_named_and_the_ego_goes_on() {
             let bus = router.join("ego-10", "10");
             let options = ego_node::NodeOptions {
                 deadline: Duration::from_millis(400),
-                pairing: PairingConfig { max_age_nanos: 150_000_000, ..PairingConfig::default() },
+                pairing: PairingConfig::with_max_age_nanos(150_000_000),
                 keeps_running: true,
                 ..ego_node::NodeOptions::default()
             };

@@ -42,10 +42,8 @@ fn a_vehicle_that_finds_no_pose_says_so_and_the_fleet_goes_on() {
     let _exclusive = exclusive_lock();
     let folder = tempfile::tempdir().unwrap();
     localizer::write(folder.path(), 3);
-    let scenario = write_scenario(folder.path(), 4, "lockstep: true", "vehicles: {4288: {pose: pgc}}");
-    let text = fs::read_to_string(&scenario).unwrap();
-    let networks = "localizer: {encoder: encoder.safetensors, head: head.safetensors}";
-    fs::write(&scenario, text.replace("weights.safetensors}", &format!("weights.safetensors, {networks}}}"))).unwrap();
+    let own = "vehicles: {4288: {pose: {pgc: {encoder: encoder.safetensors, head: head.safetensors}}}}";
+    let scenario = write_scenario(folder.path(), 4, "lockstep: true", own);
     let mut up = Up::start(folder.path(), &scenario);
     // The maps of a vehicle that does not know where it is cannot be used, which is not hidden.
     assert_eq!(up.wait().code(), Some(3));
@@ -70,10 +68,8 @@ fn a_vehicle_whose_network_was_trained_end_to_end_takes_part_with_the_pose_that_
     let _exclusive = exclusive_lock();
     let folder = tempfile::tempdir().unwrap();
     localizer::write_end_to_end(folder.path(), EndToEndKind::Pose, 3);
-    let scenario = write_scenario(folder.path(), 4, "lockstep: true", "vehicles: {4288: {pose: end_to_end}}");
-    let text = fs::read_to_string(&scenario).unwrap();
-    fs::write(&scenario, text.replace("weights.safetensors}", "weights.safetensors, end_to_end: Pose.safetensors}"))
-        .unwrap();
+    let own = "vehicles: {4288: {pose: {end_to_end: {weights: Pose.safetensors}}}}";
+    let scenario = write_scenario(folder.path(), 4, "lockstep: true", own);
     let mut up = Up::start(folder.path(), &scenario);
     assert_eq!(up.wait().code(), Some(0));
     let json =
@@ -198,7 +194,7 @@ fn an_agent_without_its_networks_does_not_start() {
     assert!(code == Some(2) && said.contains("--encoder"), "{said}");
     let (code, said) = run(&["--pose-source", "pgc", "--encoder", "/nowhere/e", "--head", "/nowhere/h"]);
     assert!(code == Some(2) && said.contains("/nowhere/e"), "{said}");
-    let (code, said) = run(&["--pose-source", "end-to-end"]);
+    let (code, said) = run(&["--pose-source", "end_to_end"]);
     assert!(code == Some(2) && said.contains("--end-to-end"), "{said}");
     let (code, said) = run(&["--pose-source", "end_to_end", "--end-to-end", "/nowhere/w"]);
     assert!(code == Some(2) && said.contains("/nowhere/w"), "{said}");
@@ -209,10 +205,8 @@ fn a_fleet_whose_networks_do_not_fit_is_refused_before_it_starts() {
     let _exclusive = exclusive_lock();
     let folder = tempfile::tempdir().unwrap();
     localizer::write(folder.path(), 3);
-    let scenario = write_scenario(folder.path(), 1, "", "agents: {pose: pgc}");
-    let text = fs::read_to_string(&scenario).unwrap();
-    let networks = "localizer: {encoder: head.safetensors, head: head.safetensors}";
-    fs::write(&scenario, text.replace("weights.safetensors}", &format!("weights.safetensors, {networks}}}"))).unwrap();
+    let pose = "agents: {pose: {pgc: {encoder: head.safetensors, head: head.safetensors}}}";
+    let scenario = write_scenario(folder.path(), 1, "", pose);
     let runs = folder.path().join("runs");
     let output = Command::new(programs().join("v2vloc")).arg("up").arg(&scenario).arg("--runs").arg(&runs).output();
     let output = output.unwrap();

@@ -54,6 +54,7 @@ fn a_fleet_plays_its_scene_and_accounts_for_every_message() {
     assert_eq!([Stream::Lidar, Stream::Detections, Stream::Bev].map(told), [12, 6, 0]);
     for process in ["agent-4279", "agent-4288", "ego-4279", "replay", "recorder"] {
         assert!(run.join(format!("log/{process}.log")).exists(), "{process}");
+        assert!(run.join(format!("config/{process}.yaml")).exists(), "{process}");
     }
     let resolved = Scenario::load(&run.join("scenario.yaml")).unwrap();
     assert_eq!(resolved.scene.agents.len(), 2);
@@ -67,7 +68,7 @@ fn a_fleet_talks_through_the_emulated_air() {
     // 131 kB at 20 Mbit/s take 53 ms; what follows has to be awaited.
     let air = "capacity: {token_bucket: {rate_mbps: 20}}\ndelay: {constant_ms: 30}\n";
     fs::write(folder.path().join("air.yaml"), air).unwrap();
-    let rest = "link: {air: air.yaml}\nego: {deadline_ms: 5000}";
+    let rest = "link: {model: air.yaml}\nego: {deadline_ms: 5000}";
     let scenario = write_scenario(folder.path(), 4, "lockstep: true", rest);
     let mut up = Up::start(folder.path(), &scenario);
     let status = up.wait();

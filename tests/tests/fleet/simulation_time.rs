@@ -29,7 +29,7 @@ fn config(link: LinkConfig) -> SteppedConfig {
         link_folder: ".".into(),
         seed: 3,
         deadline_nanos: 100 * MS,
-        pairing: PairingConfig::default(),
+        pairing: PairingConfig::with_max_age_nanos(300 * MS),
         compute: ComputeTimes::NONE,
         crew: Crew::First(usize::MAX),
         vehicles: Default::default(),
@@ -231,7 +231,7 @@ fn a_stepped_run_is_the_same_bytes_every_time() {
     let air = "capacity: {token_bucket: {rate_mbps: 20}}\ndelay: {normal: {mean_ms: 60, std_ms: 30}}\nloss: {bernoulli: 0.2}\n";
     fs::write(folder.path().join("air.yaml"), air).unwrap();
     let rest = "clock: stepped\nstepped: {compute: {pose_ms: 10, map_ms: 40, fuse_ms: 20}}\n\
-        link: {air: air.yaml, seed: 5}\nego: {max_age_ms: 500}\nvehicles: {\"4288\": {pose: {noisy: {std_m: 0.5}}}}";
+        link: {model: air.yaml, seed: 5}\nego: {max_age_ms: 500}\nvehicles: {\"4288\": {pose: {noisy: {position_std_m: 0.5}}}}";
     let scenario = write_scenario(folder.path(), TICKS, "seek: 1", rest);
     let (one, two) = (run_up(folder.path(), &scenario, "one"), run_up(folder.path(), &scenario, "two"));
     assert_same_bytes(&one, &two);
@@ -256,16 +256,16 @@ fn agents_in_processes_of_their_own_give_the_same_bytes() {
     for (method, rest) in [
         (
             "max",
-            "agents: {codec: {dtype: i8, budget_bytes: 4000}}\nvehicles: {\"4288\": {pose: {noisy: {std_m: 0.5, mode: autoregressive}}}}",
+            "agents: {codec: {dtype: i8, budget_bytes: 4000}}\nvehicles: {\"4288\": {pose: {noisy: {position_std_m: 0.5, mode: autoregressive}}}}",
         ),
-        ("late", "agents: {pose: {noisy: {std_m: 0.3, std_deg: 1, mode: independent}}}"),
+        ("late", "agents: {pose: {noisy: {position_std_m: 0.3, heading_std_deg: 1, mode: independent}}}"),
         ("none", ""),
     ] {
         let run = |processes| {
             let text = format!(
                 "run: test\nscene: {{dir: scene}}\nmodels: {{weights: weights.safetensors}}\nmethod: {method}\nclock: stepped\n\
                  stepped: {{compute: {{pose_ms: 10, map_ms: 40, fuse_ms: 20}}, processes: {processes}}}\n\
-                 link: {{air: air.yaml, seed: 5}}\nego: {{max_age_ms: 500}}\n{rest}\n"
+                 link: {{model: air.yaml, seed: 5}}\nego: {{max_age_ms: 500}}\n{rest}\n"
             );
             let path = folder.path().join("scenario.yaml");
             fs::write(&path, text).unwrap();
@@ -312,7 +312,7 @@ fn a_sweep_is_the_same_csv_in_one_process_and_in_many() {
     let text = "name: e\ntitle: A < B\ndataset: scene\nweights: weights.safetensors\nticks: 4\n\
         compute: {pose_ms: 10, map_ms: 30, fuse_ms: 10}\nnoise_mode: independent\n\
         grid:\n  method: [none, late, max]\n  latency_ms: [0, 200]\n  jitter_ms: [20]\n  bandwidth_mbps: [.inf, 10]\n  \
-        codec: [{dtype: f16}, {dtype: i8, keep: 0.25}]\n  loss: [0.2]\n  pose_noise: [{m: 0.2, deg: 0.2}]\n  agents: [2]\n  \
+        codec: [{dtype: f16}, {dtype: i8, keep: 0.25}]\n  loss: [0.2]\n  pose_noise: [{position_std_m: 0.2, heading_std_deg: 0.2}]\n  agents: [2]\n  \
         seed: [1]\n";
     fs::write(folder.path().join("experiment.yaml"), text).unwrap();
     let dry = sweep(folder.path(), "dry", "2", &["--dry-run"]);
@@ -382,7 +382,8 @@ fn an_experiment_that_makes_no_sense_is_refused_by_its_field() {
 fn an_evaluation_crosses_a_link() {
     let folder = scene();
     let output = Command::new(programs().join("v2vloc"))
-        .args(["eval", "--method", "max", "--json", "--link", "opencood-sim", "--seed", "1", "--dataset"])
+        .args(["eval", "--method", "max", "--json", "--link", "opencood-sim", "--deadline-ms", "0"])
+        .args(["--max-age-ms", "300", "--seed", "1", "--dataset"])
         .arg(folder.path().join("scene"))
         .arg("--weights")
         .arg(folder.path().join("weights.safetensors"))

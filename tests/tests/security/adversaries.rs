@@ -110,7 +110,7 @@ fn strangers_and_liars_change_nothing() {
     let stormy = folder.path().join("stormy");
     let endpoint = Endpoint::loopback(free_port()).secured();
     let rest = format!(
-        "security: {{keys: {}}}\nnetwork: {{listen: {}}}\nvehicles: {{\"4288\": {{launch: elsewhere}}}}",
+        "security: {{keys: {}}}\nnetwork: {{listen: {}}}\nremote_agents: [\"4288\"]",
         keys.display(),
         endpoint.as_str()
     );

@@ -70,7 +70,7 @@ fn a_fleet_spans_three_hosts_over_quic() {
         if program != "v2vloc" {
             let index = usize::from(host == "ego");
             command.args(["--run=test".to_owned(), format!("--connect=quic/{}:{PORT}", router_address(index))]);
-            command.arg("--connect-timeout=60");
+            command.arg("--connect-timeout-s=60");
         }
         start(&mut command, &path(&format!("{holder}.log")))
     };
@@ -84,7 +84,8 @@ fn a_fleet_spans_three_hosts_over_quic() {
     let words = [
         "stream",
         scene.to_str().unwrap(),
-        "--lockstep=4279",
+        "--lockstep",
+        "--egos=4279",
         "--expect=4288/bev>ego-4279",
         "--expect=4279/bev>ego-4279",
         "--json",
@@ -94,7 +95,7 @@ fn a_fleet_spans_three_hosts_over_quic() {
 
     // Somebody on the vehicle's host without keys, on the router's port.
     let mut stranger = hosts.command("vehicle", &programs().join("sim-replay"));
-    stranger.args(["record", "--run=test", "--connect-timeout=2", "--out"]).arg(path("stolen.mcap"));
+    stranger.args(["record", "--run=test", "--connect-timeout-s=2", "--out"]).arg(path("stolen.mcap"));
     stranger.arg(format!("--connect=tcp/{}:{PORT}", router_address(0)));
     let stranger = start(&mut stranger, &path("stranger.log")).end();
     assert!(!stranger.status.success(), "plain TCP is not taken");

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use protocol::{NoPoseReason, PoseEstimate, StageTiming};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use tch::Device;
 
@@ -12,25 +13,30 @@ use crate::competitors::EndToEndLocalizer;
 use crate::pgc::{Localize, Localizer, LocalizerError};
 
 /// The networks of a pose generator.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema, clap::Args)]
 #[serde(deny_unknown_fields)]
 pub struct PgcConfig {
-    /// Weights of the encoder, the same for all towns.
+    /// Weights of the localizer's scene encoder (pose source pgc).
+    #[arg(long, value_name = "FILE")]
     pub encoder: PathBuf,
-    /// Weights of the town's head.
+    /// Weights of the scene-specific head (pose source pgc).
+    #[arg(long, value_name = "FILE")]
     pub head: PathBuf,
-    /// What the vehicle can do.
+    /// Motion that the vehicle is capable of.
+    #[arg(skip)]
     #[serde(default)]
     pub sanity: SanityConfig,
 }
 
 /// A network that was trained end to end, to compare a pose generator with.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema, clap::Args)]
 #[serde(deny_unknown_fields)]
 pub struct EndToEndPoseConfig {
-    /// Weights of the town; they say what is regressed.
+    /// Weights of a network that was trained end to end on the scene (pose source end_to_end).
+    #[arg(id = "end_to_end", long = "end-to-end", value_name = "FILE")]
     pub weights: PathBuf,
-    /// What the vehicle can do.
+    /// Motion that the vehicle is capable of.
+    #[arg(skip)]
     #[serde(default)]
     pub sanity: SanityConfig,
 }

@@ -9,11 +9,14 @@ pub mod motion_gate;
 mod noise;
 mod noisy;
 mod numpy_normals;
+mod options;
 mod pose_table;
 
 use std::path::{Path, PathBuf};
 
+use protocol::config::{FieldError, within};
 use protocol::{CavId, NoPoseReason, PointCloud, Pose, PoseEstimate, StageTiming};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 pub use error_table::{ErrorTable, ErrorTableError, TableRow};
@@ -69,8 +72,8 @@ impl PoseSource for RecordedPose {
 /// There is nothing to take a pose from.
 pub const NO_SOURCE: PoseEstimate = PoseEstimate::NoPose { reason: NoPoseReason::NoSource, inlier_count: 0 };
 
-/// Which source, as a scenario file names it.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize)]
+/// A pose source and its settings.
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
 pub enum PoseSourceConfig {
     /// The measured pose.
@@ -87,30 +90,37 @@ pub enum PoseSourceConfig {
 }
 
 /// An error on the measured pose.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema, clap::Args)]
 #[serde(default, deny_unknown_fields)]
 pub struct NoisyPoseConfig {
-    /// Which kind of error.
+    /// Correlation of the errors of successive frames (pose source noisy).
+    #[arg(id = "noise_mode", long = "noise-mode", value_name = "MODE", value_enum)]
     pub mode: NoiseMode,
-    /// Standard deviation of x, y and z, metres.
+    /// Standard deviation of x, y and z, metres (pose source noisy).
+    #[arg(id = "noise_position_std_m", long = "noise-position-std-m", value_name = "M")]
     pub position_std_m: f64,
-    /// Standard deviation of yaw, degrees.
+    /// Standard deviation of yaw, degrees (pose source noisy).
+    #[arg(id = "noise_heading_std_deg", long = "noise-heading-std-deg", value_name = "DEG")]
     pub heading_std_deg: f64,
-    /// Same seed, same errors.
+    /// Same seed, same errors (pose source noisy).
+    #[arg(id = "noise_seed", long = "noise-seed", value_name = "SEED")]
     pub seed: u64,
-    /// Time between two draws of the modes that depend on time, seconds.
+    /// Time between two draws of the modes that depend on time, seconds (pose source noisy).
+    #[arg(id = "noise_step_s", long = "noise-step-s", value_name = "S")]
     pub step_s: f64,
-    /// `autoregressive`: time after which an error has decayed to 1/e, seconds.
+    /// Time after which an autoregressive error has decayed to 1/e, seconds (pose source noisy).
+    #[arg(id = "noise_decay_s", long = "noise-decay-s", value_name = "S")]
     pub decay_s: f64,
-    /// `replayed`: the table of errors.
+    /// Table of errors for the replayed mode, as `agent eval --error-table` writes it (pose source noisy).
+    #[arg(id = "noise_table", long = "noise-table", value_name = "FILE")]
     pub table: Option<PathBuf>,
 }
 
 impl Default for NoisyPoseConfig {
-    /// OpenCOOD's: 0.2 m, 0.2 degrees, one fixed offset, seed 25.
+    /// OpenCOOD's standard deviations, 0.2 m and 0.2 degrees, and its seed, 25; drawn anew for every agent and frame.
     fn default() -> Self {
         Self {
-            mode: NoiseMode::Fixed,
+            mode: NoiseMode::Independent,
             position_std_m: 0.2,
             heading_std_deg: 0.2,
             seed: 25,
@@ -121,15 +131,35 @@ impl Default for NoisyPoseConfig {
     }
 }
 
+impl NoisyPoseConfig {
+    /// Checks the values.
+    ///
+    /// # Errors
+    /// [`FieldError`] for the first that is not allowed.
+    pub fn validate(&self) -> Result<(), FieldError> {
+        within("noisy.position_std_m", self.position_std_m, 0.0, 1e3)?;
+        within("noisy.heading_std_deg", self.heading_std_deg, 0.0, 360.0)?;
+        within("noisy.step_s", self.step_s, 1e-3, 1e3)?;
+        // The upper bound keeps the sum over past innovations short: seven decay times.
+        within("noisy.decay_s", self.decay_s, 0.0, 1e3 * self.step_s)?;
+        match (self.mode, &self.table) {
+            (NoiseMode::Replayed, None) => {
+                Err(FieldError::new("noisy.table", "absent", "must name the table of errors (--noise-table)"))
+            }
+            _ => Ok(()),
+        }
+    }
+}
+
 /// The four kinds of pose error.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema, clap::ValueEnum)]
 #[serde(rename_all = "snake_case")]
 pub enum NoiseMode {
     /// One offset, the same for all agents and frames: what the reference code does, which seeds anew at every call.
     /// There the ego stays exact; give its agent the `recorded` source to repeat that.
-    #[default]
     Fixed,
     /// Drawn anew for every agent and frame.
+    #[default]
     Independent,
     /// First-order autoregressive per agent: it wanders, as a filter's error does.
     Autoregressive,
@@ -140,19 +170,9 @@ pub enum NoiseMode {
 /// Why a pose source cannot be set up.
 #[derive(Debug, thiserror::Error)]
 pub enum PoseSourceError {
-    /// A number is negative, not finite or absurd.
-    #[error("pose source: {field} is {value}, must be {must}")]
-    Value {
-        /// Name of the field.
-        field: &'static str,
-        /// What stood there.
-        value: f64,
-        /// What would be right.
-        must: &'static str,
-    },
-    /// `replayed` without a table.
-    #[error("pose source: mode replayed needs `table`, the file of errors")]
-    NoTable,
+    /// A value is not allowed, or a file is not named.
+    #[error("pose source: {0}")]
+    Value(#[from] FieldError),
     /// The table is not readable.
     #[error(transparent)]
     Table(#[from] ErrorTableError),
@@ -188,6 +208,42 @@ impl PoseSourceConfig {
         }
     }
 
+    /// Checks the values; files are not looked at.
+    ///
+    /// # Errors
+    /// [`FieldError`] for the first that is not allowed, or a file that is not named.
+    pub fn validate(&self) -> Result<(), FieldError> {
+        let named = |field: &str, option: &str, file: &Path| {
+            if !file.as_os_str().is_empty() {
+                return Ok(());
+            }
+            Err(FieldError::new(format!("{}.{field}", self.name()), "empty", format!("must name a file ({option})")))
+        };
+        match self {
+            Self::Recorded => Ok(()),
+            Self::Noisy(noise) => noise.validate(),
+            Self::Pgc(pgc) => {
+                named("encoder", "--encoder", &pgc.encoder).and_then(|()| named("head", "--head", &pgc.head))
+            }
+            Self::EndToEnd(network) => named("weights", "--end-to-end", &network.weights),
+            Self::Cached(table) => named("file", "--poses", &table.file),
+        }
+    }
+
+    /// The same with the paths of its files changed.
+    #[must_use]
+    pub fn map_files(mut self, change: impl Fn(&Path) -> PathBuf) -> Self {
+        let files: Vec<&mut PathBuf> = match &mut self {
+            Self::Recorded => vec![],
+            Self::Noisy(noisy) => noisy.table.iter_mut().collect(),
+            Self::Pgc(pgc) => vec![&mut pgc.encoder, &mut pgc.head],
+            Self::EndToEnd(network) => vec![&mut network.weights],
+            Self::Cached(cached) => vec![&mut cached.file],
+        };
+        files.into_iter().for_each(|file| *file = change(file));
+        self
+    }
+
     /// The files that poses come from.
     #[must_use]
     pub fn files(&self) -> Vec<&Path> {
@@ -211,6 +267,7 @@ impl PoseSourceConfig {
     /// # Errors
     /// [`PoseSourceError`] names the field or the file.
     pub fn build(&self) -> Result<Box<dyn PoseSource>, PoseSourceError> {
+        self.validate()?;
         Ok(match self {
             Self::Recorded => Box::new(RecordedPose),
             Self::Noisy(config) => Box::new(NoisyPose::new(config)?),

@@ -7,6 +7,7 @@
 use std::collections::VecDeque;
 
 use nalgebra::Isometry3;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 /// Accepted poses further back say nothing about the speed now, seconds.
@@ -15,7 +16,7 @@ const SPEED_WINDOW_S: f64 = 1.5;
 const SPEED_BASE_S: f64 = 0.3;
 
 /// What a vehicle can do.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
 pub struct SanityConfig {
     /// Largest speed, metres per second.

@@ -1,5 +1,7 @@
 //! The measured pose with an error.
 
+use std::path::Path;
+
 use protocol::{CavId, NoPoseReason, Pose, PoseEstimate};
 
 use super::error_table::{ErrorTable, TableRow};
@@ -32,23 +34,13 @@ impl NoisyPose {
     /// # Errors
     /// [`PoseSourceError`] names the field or the file.
     pub fn new(config: &NoisyPoseConfig) -> Result<Self, PoseSourceError> {
-        let within = |field, value: f64, low: f64, high: f64, must| {
-            if (low..=high).contains(&value) { Ok(()) } else { Err(PoseSourceError::Value { field, value, must }) }
-        };
-        within("position_std_m", config.position_std_m, 0.0, 1e3, "0 to 1000")?;
-        within("heading_std_deg", config.heading_std_deg, 0.0, 360.0, "0 to 360")?;
-        within("step_s", config.step_s, 1e-3, 1e3, "0.001 to 1000")?;
-        // The upper bound keeps the sum over past innovations short: seven decay times.
-        within("decay_s", config.decay_s, 0.0, 1e3 * config.step_s, "0 to 1000 steps")?;
+        config.validate()?;
         let noise = PoseNoise::new(config.position_std_m, config.heading_std_deg.to_radians(), config.seed);
         let kind = match config.mode {
             NoiseMode::Fixed => Kind::Fixed(noise),
             NoiseMode::Independent => Kind::Independent(noise),
             NoiseMode::Autoregressive => Kind::Autoregressive(noise, correlation(config)),
-            NoiseMode::Replayed => {
-                let table = config.table.as_deref().ok_or(PoseSourceError::NoTable)?;
-                Kind::Replayed(ErrorTable::read(table)?)
-            }
+            NoiseMode::Replayed => Kind::Replayed(ErrorTable::read(config.table.as_deref().unwrap_or(Path::new("")))?),
         };
         Ok(Self { seed: config.seed, step_nanos: config.step_s * 1e9, kind })
     }
@@ -150,7 +142,8 @@ mod tests {
         let pose = estimates.iter().find_map(PoseEstimate::world_from_cav).unwrap();
         assert!((pose.translation_m[0] - 100.5).abs() < 1e-9);
         let config = NoisyPoseConfig { table: None, ..config };
-        assert!(matches!(NoisyPose::new(&config), Err(PoseSourceError::NoTable)));
+        let message = NoisyPose::new(&config).unwrap_err().to_string();
+        assert!(message.contains("noisy.table is absent"), "{message}");
     }
 
     #[test]

@@ -6,6 +6,7 @@ use std::io::{self, Write as _};
 use std::path::{Path, PathBuf};
 
 use protocol::{CavId, NoPoseReason, Pose, PoseEstimate};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use support::csv_file::{CsvError, CsvFile, CsvRow, CsvText};
 
@@ -141,12 +142,14 @@ impl PoseTable {
 }
 
 /// Which table, and of which scenario.
-#[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema, clap::Args)]
 #[serde(deny_unknown_fields)]
 pub struct CachedPoseConfig {
-    /// The table, as `agent localize` writes it.
+    /// Table of poses, as `agent localize` writes it (pose source cached).
+    #[arg(id = "poses", long = "poses", value_name = "FILE")]
     pub file: PathBuf,
-    /// The scenario that is replayed; needed where the table has several.
+    /// Scenario that is replayed; needed where the table has several.
+    #[arg(skip)]
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub scenario: Option<String>,
 }

@@ -7,6 +7,7 @@ use std::{env, fs};
 
 use dataset::IntensityScale;
 use dataset::evaluation_protocol::ProtocolConfig;
+use ego_fuser::config::EgoSettings;
 use ego_fuser_offline::evaluation::EvaluateError;
 use ego_fuser_offline::evaluation::stepped::ComputeTimes;
 use fusion::Exchange;
@@ -23,7 +24,7 @@ use training::feature_store::KeptMaps;
 
 use super::SweepError;
 use super::grid::{self, Point};
-use super::spec::{EgoRule, Experiment};
+use super::spec::Experiment;
 use crate::experiment::evaluation::{EvaluationError, EvaluationOptions, judged, metrics};
 use crate::experiment::fingerprint::hash_file;
 use crate::experiment::metrics::Metrics;
@@ -39,7 +40,7 @@ pub struct CellKey {
     /// SHA-256 of the trace that the link names, where it does.
     pub trace_sha256: Option<String>,
     /// When the ego fuses what.
-    pub ego: EgoRule,
+    pub ego: EgoSettings,
     /// The protocol that was asked for.
     #[serde(default)]
     pub protocol: ProtocolConfig,
@@ -160,7 +161,7 @@ impl Hashes {
             point: point.clone(),
             link,
             trace_sha256,
-            ego: experiment.ego,
+            ego: experiment.ego.clone(),
             protocol: experiment.protocol.clone(),
             compute: experiment.compute,
             poses,
@@ -184,8 +185,9 @@ pub(super) fn options(experiment: &Experiment, point: &Point, maps: &Path) -> Re
         pose_source: point.poses(experiment),
         codec: point.codec(config.feature_grid(), channels),
         rate: point.rate(),
+        trust: experiment.ego.trust(),
         maps: (point.method.exchange() != Exchange::Points).then(|| kept_maps(experiment, maps)),
-        stepped: Some(grid::stepped(point.link(experiment)?, point, experiment.ego, experiment.compute)),
+        stepped: Some(grid::stepped(point.link(experiment)?, point, &experiment.ego, experiment.compute)),
         part: experiment.part(),
         protocol: experiment.protocol.clone(),
         ..EvaluationOptions::default()

@@ -61,8 +61,8 @@ const DIMENSIONS: [Dimension; 7] = [
         name: "pose_noise",
         label: "pose noise, m (degrees alike)",
         is_logarithmic: false,
-        value: |cell| cell.key.point.pose_noise.map(|noise| noise.m),
-        text: |point| point.pose_noise.map(|noise| format!("{} m {} deg", noise.m, noise.deg)),
+        value: |cell| cell.key.point.pose_noise.map(|noise| noise.position_std_m),
+        text: |point| point.pose_noise.map(|noise| format!("{} m {} deg", noise.position_std_m, noise.heading_std_deg)),
     },
     Dimension {
         name: "agents",

@@ -2,19 +2,20 @@
 
 use std::fmt::Debug;
 
+use bus::InboxConfig;
 use dataset::Scenario;
 use fusion::Exchange;
 use link::{CapacityConfig, DelayLaw, LinkConfig, LossLaw};
 
 use super::spec::{CodecSpec, Experiment, Grid, NoiseSpec};
-use localization::pose_source::PoseSourceConfig;
+use localization::pose_source::{NoiseMode, PoseSourceConfig};
 
 /// More runs than this are a mistake.
 pub(super) const MOST_RUNS: usize = 10_000;
 
 /// Checks everything that can be said without looking at the data.
 pub(super) fn check(experiment: &Experiment) -> Result<(), String> {
-    let Experiment { name, grid, ego, compute, maps_limit_gb, scenarios, ticks, .. } = experiment;
+    let Experiment { name, grid, ego, poses, compute, maps_limit_gb, scenarios, ticks, .. } = experiment;
     let is_name = |c: char| c.is_ascii_alphanumeric() || c == '-' || c == '_';
     if name.is_empty() || !name.chars().all(is_name) {
         return Err(format!("name {name:?} is to name files: letters, digits, - and _"));
@@ -24,8 +25,8 @@ pub(super) fn check(experiment: &Experiment) -> Result<(), String> {
             return Err(format!("{field} is 0: there would be nothing to judge"));
         }
     }
-    number("ego.deadline_ms", ego.deadline_ms as f64, 0.0, 60_000.0)?;
-    number("ego.max_age_ms", ego.max_age_ms as f64, 0.0, 600_000.0)?;
+    ego.validate().map_err(|error| error.to_string())?;
+    poses.validate().map_err(|error| format!("poses: {error}"))?;
     number("compute.pose_ms", compute.pose_ms, 0.0, 60_000.0)?;
     number("compute.map_ms", compute.map_ms, 0.0, 60_000.0)?;
     number("compute.fuse_ms", compute.fuse_ms, 0.0, 60_000.0)?;
@@ -60,14 +61,14 @@ pub(super) fn check_scenes(experiment: &Experiment, scenarios: &[Scenario]) -> R
 fn axes(grid: &Grid) -> Result<(), String> {
     let Grid { method, codec, latency_ms, jitter_ms, bandwidth_mbps, loss, pose_noise, agents, seed } = grid;
     values("grid.method", Some(method), |_| Ok(()))?;
-    values("grid.codec", codec.as_ref(), |CodecSpec { keep, zstd, fit, .. }| {
+    values("grid.codec", codec.as_ref(), |CodecSpec { keep, zstd_level, fit, .. }| {
         if let Some(keep) = keep
             && !(*keep > 0.0 && *keep <= 1.0)
         {
             return Err(format!("grid.codec: keep is {keep}, must be above 0 and at most 1"));
         }
         number("grid.codec: fit", fit.unwrap_or(1.0), 0.01, 1.0)?;
-        number("grid.codec: zstd", f64::from(zstd.unwrap_or(1)), 1.0, 22.0)
+        number("grid.codec: zstd_level", f64::from(zstd_level.unwrap_or(1)), 1.0, 22.0)
     })?;
     values("grid.latency_ms", latency_ms.as_ref(), |ms| number("grid.latency_ms", *ms, 0.0, 600_000.0))?;
     values("grid.jitter_ms", jitter_ms.as_ref(), |ms| number("grid.jitter_ms", *ms, 0.0, 600_000.0))?;
@@ -76,9 +77,9 @@ fn axes(grid: &Grid) -> Result<(), String> {
         mbps => number("grid.bandwidth_mbps", mbps, 1e-6, 1e6),
     })?;
     values("grid.loss", loss.as_ref(), |share| number("grid.loss", *share, 0.0, 1.0))?;
-    values("grid.pose_noise", pose_noise.as_ref(), |NoiseSpec { m, deg }| {
-        number("grid.pose_noise: m", *m, 0.0, 1000.0)?;
-        number("grid.pose_noise: deg", *deg, 0.0, 360.0)
+    values("grid.pose_noise", pose_noise.as_ref(), |NoiseSpec { position_std_m, heading_std_deg }| {
+        number("grid.pose_noise: position_std_m", *position_std_m, 0.0, 1000.0)?;
+        number("grid.pose_noise: heading_std_deg", *heading_std_deg, 0.0, 360.0)
     })?;
     values("grid.agents", agents.as_ref(), |count| number("grid.agents", *count as f64, 1.0, 64.0))?;
     values("grid.seed", seed.as_ref(), |_| Ok(()))
@@ -88,6 +89,15 @@ fn axes(grid: &Grid) -> Result<(), String> {
 fn contradictions(experiment: &Experiment, link: &LinkConfig) -> Result<(), String> {
     let Experiment { grid, ego, poses, link: name, .. } = experiment;
     let says = |axis: &str, field: &str| Err(format!("{axis} and the {field} of link {name} contradict each other"));
+    if let Some(ego) = &ego.id {
+        return Err(format!("ego.id is {ego}: choose by protocol.ego instead"));
+    }
+    if ego.inbox != InboxConfig::default() {
+        return Err("ego.inbox is given, but virtual time knows no limits of what others send".into());
+    }
+    if experiment.noise_mode == NoiseMode::Replayed {
+        return Err("noise_mode is replayed, which needs a table: name it in poses instead".into());
+    }
     if grid.latency_ms.is_some() && link.delay != DelayLaw::None {
         return says("grid.latency_ms", "delay");
     }
@@ -122,7 +132,7 @@ fn contradictions(experiment: &Experiment, link: &LinkConfig) -> Result<(), Stri
     }
     let jitters = grid.jitter_ms.iter().flatten().any(|ms| *ms > 0.0);
     let loses = grid.loss.iter().flatten().any(|share| *share > 0.0 && *share < 1.0);
-    let errs = grid.pose_noise.iter().flatten().any(|noise| noise.m > 0.0 || noise.deg > 0.0);
+    let errs = grid.pose_noise.iter().flatten().any(|noise| noise.position_std_m > 0.0 || noise.heading_std_deg > 0.0);
     let is_random = jitters || loses || errs || is_random(link);
     if !is_random && grid.seed.as_ref().is_some_and(|seeds| seeds.len() > 1) {
         return Err("grid.seed has several values, but nothing in the experiment is random".into());
@@ -193,7 +203,13 @@ mod tests {
             ("ego: {max_age_ms: 300}\ngrid: {method: [max], latency_ms: [500]}", "ego.max_age_ms is 300"),
             ("grid: {method: [late], codec: [{dtype: i8}]}", "grid.method (late) sends none"),
             ("grid: {method: [max], seed: [1, 2]}", "nothing in the experiment is random"),
-            ("poses: {cached: {file: p.csv}}\ngrid: {method: [max], pose_noise: [{m: 1, deg: 1}]}", "poses is cached"),
+            (
+                "poses: {cached: {file: p.csv}}\ngrid: {method: [max], pose_noise: [{position_std_m: 1, heading_std_deg: 1}]}",
+                "poses is cached",
+            ),
+            ("ego: {id: '7'}\ngrid: {method: [max]}", "protocol.ego"),
+            ("noise_mode: replayed\ngrid: {method: [max]}", "noise_mode is replayed"),
+            ("poses: {noisy: {step_s: 0}}\ngrid: {method: [max]}", "poses: noisy.step_s is 0"),
             ("ticks: 0\ngrid: {method: [max]}", "ticks is 0"),
         ] {
             let problem = problem(text);

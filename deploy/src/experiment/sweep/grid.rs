@@ -3,16 +3,16 @@
 use std::path::PathBuf;
 
 use agent::rate::RateConfig;
+use ego_fuser::config::EgoSettings;
 use ego_fuser::pairing::PairingConfig;
 use ego_fuser_offline::evaluation::stepped::{ComputeTimes, Crew, SteppedConfig};
 use fusion::Method;
 use link::{CapacityConfig, DelayLaw, LinkConfig, LinkError, LossLaw};
-use localization::pose_source::{self, NoisyPoseConfig, PoseSourceConfig};
+use localization::pose_source::{NoisyPoseConfig, PoseSourceConfig};
 use protocol::{BevGrid, CodecConfig, Dtype};
 use serde::{Deserialize, Serialize};
 
-use super::spec::{CodecSpec, EgoRule, Experiment, Grid, NoiseSpec};
-use crate::scenario::NoiseMode;
+use super::spec::{CodecSpec, Experiment, Grid, NoiseSpec};
 
 /// One point of a grid.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize)]
@@ -128,20 +128,23 @@ impl Point {
     /// Where poses come from.
     #[must_use]
     pub fn poses(&self, experiment: &Experiment) -> PoseSourceConfig {
-        let Some(NoiseSpec { m, deg }) = self.pose_noise else { return experiment.poses.clone() };
-        let mode = match experiment.noise_mode {
-            NoiseMode::Fixed => pose_source::NoiseMode::Fixed,
-            NoiseMode::Independent => pose_source::NoiseMode::Independent,
-            NoiseMode::Autoregressive => pose_source::NoiseMode::Autoregressive,
+        let Some(NoiseSpec { position_std_m, heading_std_deg }) = self.pose_noise else {
+            return experiment.poses.clone();
         };
-        let noise = NoisyPoseConfig { mode, position_std_m: m, heading_std_deg: deg, ..NoisyPoseConfig::default() };
-        PoseSourceConfig::Noisy(NoisyPoseConfig { seed: self.seed, ..noise })
+        let (mode, seed) = (experiment.noise_mode, self.seed);
+        PoseSourceConfig::Noisy(NoisyPoseConfig {
+            mode,
+            position_std_m,
+            heading_std_deg,
+            seed,
+            ..NoisyPoseConfig::default()
+        })
     }
 
     /// How maps of `channels` on `grid` are written.
     #[must_use]
     pub fn codec(&self, grid: BevGrid, channels: u64) -> CodecConfig {
-        let CodecSpec { dtype, keep, zstd, fit: _ } = self.codec;
+        let CodecSpec { dtype, keep, zstd_level, fit: _ } = self.codec;
         let cells = grid.cells() as u64;
         let budget = |keep: f64| {
             let kept = (keep * cells as f64).ceil() as u64;
@@ -150,7 +153,7 @@ impl Point {
         };
         // All cells need no budget, and a mask would only cost bytes.
         let budget_bytes = keep.filter(|keep| *keep < 1.0).map(budget);
-        CodecConfig { dtype, gate: None, budget_bytes, zstd_level: zstd }
+        CodecConfig { dtype, gate: None, budget_bytes, zstd_level }
     }
 
     /// What maps are fitted to: nothing where they are not, or where the link takes anything.
@@ -168,20 +171,18 @@ impl Point {
 pub(super) fn stepped(
     (link, link_folder): (LinkConfig, PathBuf),
     point: &Point,
-    ego: EgoRule,
+    ego: &EgoSettings,
     compute: ComputeTimes,
 ) -> SteppedConfig {
-    let nanos = |ms: u64| ms.saturating_mul(1_000_000);
     SteppedConfig {
         link,
         link_folder,
         seed: point.seed,
-        deadline_nanos: nanos(ego.deadline_ms),
+        deadline_nanos: ego.deadline_ms.saturating_mul(1_000_000),
         pairing: PairingConfig {
-            max_age_nanos: nanos(ego.max_age_ms),
             // At 10 Hz as many messages wait as may still be used.
             depth: (ego.max_age_ms / 100 + 4) as usize,
-            ..PairingConfig::default()
+            ..ego.pairing()
         },
         compute,
         crew: Crew::First(point.agents.unwrap_or(usize::MAX)),

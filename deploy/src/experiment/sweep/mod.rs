@@ -17,6 +17,7 @@ use std::io::{self, BufRead, Write};
 use std::path::{Path, PathBuf};
 use std::time::Instant;
 
+use bus::config_file::ConfigError;
 use dataset::{self, LeftOut, ReadError, Scenario};
 use ego_fuser_offline::evaluation::EvaluateError;
 use figures;
@@ -30,7 +31,7 @@ use training::feature_store::FeatureStore;
 
 pub use cell::{Cell, CellKey, MessageCounts};
 pub use grid::{Point, points};
-pub use spec::{CodecSpec, EgoRule, Experiment, Generate, Grid, NoiseSpec};
+pub use spec::{CodecSpec, Experiment, Generate, Grid, NoiseSpec};
 pub use table::csv;
 
 use crate::experiment::evaluation::{EvaluationError, evaluate};
@@ -67,6 +68,9 @@ pub enum SweepError {
         /// The field, and what is wrong with it.
         problem: String,
     },
+    /// The experiment cannot be read.
+    #[error(transparent)]
+    File(#[from] ConfigError),
     /// The data set cannot be read.
     #[error("dataset: {0}")]
     Dataset(#[from] ReadError),

@@ -3,21 +3,22 @@
 use std::ops::RangeInclusive;
 use std::path::{Path, PathBuf};
 
+use bus::config_file;
 use dataset::evaluation_protocol::ProtocolConfig;
+use ego_fuser::config::EgoSettings;
 use ego_fuser_offline::evaluation::stepped::ComputeTimes;
 use fusion::Method;
 use link::LinkConfig;
-use localization::pose_source::PoseSourceConfig;
+use localization::pose_source::{NoiseMode, PoseSourceConfig};
 use protocol::Dtype;
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
-use support::bounded_file;
 
 use super::SweepError;
 use super::check;
-use crate::scenario::NoiseMode;
 
 /// An experiment.
-#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Experiment {
     /// Name of its files: letters, digits, `-` and `_`.
@@ -47,9 +48,9 @@ pub struct Experiment {
     /// How the errors of successive frames hang together, where the grid has pose noise.
     #[serde(default)]
     pub noise_mode: NoiseMode,
-    /// When the ego fuses what.
+    /// Deadline, age and trust of the ego; which vehicle it is, `protocol.ego` says.
     #[serde(default)]
-    pub ego: EgoRule,
+    pub ego: EgoSettings,
     /// How long everyone computes.
     #[serde(default = "no_time")]
     pub compute: ComputeTimes,
@@ -64,7 +65,7 @@ pub struct Experiment {
 }
 
 /// A generated data set, see `sim-replay synth`.
-#[derive(Debug, Clone, PartialEq, Eq, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Eq, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Generate {
     /// Seed of routes and traffic; 1000 and above are for measuring.
@@ -85,24 +86,8 @@ impl Generate {
     }
 }
 
-/// When the ego fuses what.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct EgoRule {
-    /// It fuses what has arrived so long after its sweep, milliseconds.
-    pub deadline_ms: u64,
-    /// Oldest map that is still fused, by capture time, milliseconds.
-    pub max_age_ms: u64,
-}
-
-impl Default for EgoRule {
-    fn default() -> Self {
-        Self { deadline_ms: 100, max_age_ms: 1000 }
-    }
-}
-
 /// What varies: every value of each field with every value of the others. What is left out is as the link says.
-#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Grid {
     /// Methods.
@@ -134,7 +119,7 @@ pub struct Grid {
 }
 
 /// How maps are written.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct CodecSpec {
     /// How exactly.
@@ -142,9 +127,9 @@ pub struct CodecSpec {
     /// Share of the cells that are sent, those with the highest confidence; all where absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub keep: Option<f64>,
-    /// zstd level; not packed where absent.
+    /// zstd level, 1 to 22. Absent: not compressed.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub zstd: Option<i32>,
+    pub zstd_level: Option<i32>,
     /// Share of the link's rate that maps are fitted to, in coarser numbers and then with fewer cells; not fitted where absent.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub fit: Option<f64>,
@@ -152,7 +137,7 @@ pub struct CodecSpec {
 
 impl Default for CodecSpec {
     fn default() -> Self {
-        Self { dtype: Dtype::F16, keep: None, zstd: None, fit: None }
+        Self { dtype: Dtype::F16, keep: None, zstd_level: None, fit: None }
     }
 }
 
@@ -166,13 +151,13 @@ impl CodecSpec {
 }
 
 /// Standard deviations of a pose's error.
-#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct NoiseSpec {
     /// Of the position along each axis, metres.
-    pub m: f64,
+    pub position_std_m: f64,
     /// Of the heading, degrees.
-    pub deg: f64,
+    pub heading_std_deg: f64,
 }
 
 fn no_time() -> ComputeTimes {
@@ -187,9 +172,6 @@ fn gigabytes() -> f64 {
     6.0
 }
 
-/// Largest file that is read, bytes.
-const MAX_BYTES: u64 = 1 << 20;
-
 impl Experiment {
     /// Reads and checks an experiment. Relative paths in it are taken from its folder, but for files of `poses`, which
     /// go by the working directory as on the command line.
@@ -197,14 +179,8 @@ impl Experiment {
     /// # Errors
     /// [`SweepError`] names the file and the field.
     pub fn read(path: &Path) -> Result<Self, SweepError> {
-        let text =
-            bounded_file::read_text(path, MAX_BYTES).map_err(|source| SweepError::Io { path: path.into(), source })?;
         let spec = |problem: String| SweepError::Spec { path: path.into(), problem };
-        let mut experiment: Self = serde_saphyr::from_str(&text).map_err(|error| {
-            let line = error.location().map_or(String::new(), |location| format!("line {}: ", location.line()));
-            let reason = error.without_snippet().to_string();
-            spec(format!("{line}{}", reason.lines().next().unwrap_or_default().trim()))
-        })?;
+        let mut experiment: Self = config_file::read(path)?;
         let folder = path.parent().unwrap_or(Path::new("."));
         experiment.dataset = folder.join(&experiment.dataset);
         experiment.weights = folder.join(&experiment.weights);

@@ -66,7 +66,7 @@ fn line(experiment: &Experiment, cell: &Cell) -> Vec<String> {
     let Cell { key, metrics, used, messages, wall_seconds: _ } = cell;
     let point = &key.point;
     let sends_maps = point.method.exchange() == Exchange::Features;
-    let is_plain = sends_maps && point.codec.fit.is_none() && point.codec.zstd.is_none();
+    let is_plain = sends_maps && point.codec.fit.is_none() && point.codec.zstd_level.is_none();
     let bandwidth = match point.bandwidth_mbps {
         None if experiment.grid.bandwidth_mbps.is_some() => "inf".into(),
         mbps => plain(mbps),
@@ -74,9 +74,12 @@ fn line(experiment: &Experiment, cell: &Cell) -> Vec<String> {
     let mut fields = vec![point.method.name().to_owned()];
     fields.push(if sends_maps { point.codec.name() } else { String::new() });
     fields.push(if sends_maps { plain(point.codec.keep) } else { String::new() });
-    fields.push(point.codec.zstd.filter(|_| sends_maps).map_or(String::new(), |level| level.to_string()));
+    fields.push(point.codec.zstd_level.filter(|_| sends_maps).map_or(String::new(), |level| level.to_string()));
     fields.extend([plain(point.latency_ms), plain(point.jitter_ms), bandwidth, plain(point.loss)]);
-    fields.extend([plain(point.pose_noise.map(|noise| noise.m)), plain(point.pose_noise.map(|noise| noise.deg))]);
+    fields.extend([
+        plain(point.pose_noise.map(|noise| noise.position_std_m)),
+        plain(point.pose_noise.map(|noise| noise.heading_std_deg)),
+    ]);
     fields.push(point.agents.map_or(String::new(), |agents| agents.to_string()));
     fields.extend([point.seed.to_string(), metrics.frames.to_string()]);
     for ByIou { at_30, at_50, at_70 } in [metrics.ap_global, metrics.ap_frame_order] {

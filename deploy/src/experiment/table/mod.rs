@@ -13,6 +13,7 @@ use std::path::{Path, PathBuf};
 use std::process::Command;
 
 use agent::rate::RateConfig;
+use bus::config_file::ConfigError;
 use dataset::{self, IntensityScale, ReadError};
 use perception::boxes::postprocess::SCORE_THRESHOLD;
 
@@ -44,6 +45,9 @@ pub enum TableError {
         /// What is wrong with it.
         problem: String,
     },
+    /// The file of tables cannot be read.
+    #[error(transparent)]
+    File(#[from] ConfigError),
     /// Neither the row nor the file of tables names weights.
     #[error("row {0} has no weights, and there is no folder of weights")]
     NoWeights(String),

@@ -3,18 +3,19 @@
 use std::path::{Path, PathBuf};
 
 use agent::attack::AttackConfig;
+use bus::config_file;
 use dataset::evaluation_protocol::ProtocolConfig;
 use fusion::Method;
 use localization::pose_source::PoseSourceConfig;
 use protocol::{CodecConfig, Dtype};
+use schemars::JsonSchema;
 use serde::Deserialize;
-use support::bounded_file;
 
 use super::TableError;
 use crate::experiment::weights_choice::weights_of;
 
 /// A file of tables: what is common to all, and each.
-#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct TableSpec {
     /// Data set, split or scenario; the first vehicle of each scenario is the ego.
@@ -42,7 +43,7 @@ pub struct TableSpec {
 }
 
 /// One table: every row in every column.
-#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Table {
     /// Name of its files.
@@ -57,7 +58,7 @@ pub struct Table {
 }
 
 /// A method with its weights.
-#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Row {
     /// What stands before it; absent: the method.
@@ -74,7 +75,7 @@ pub struct Row {
 }
 
 /// What rows are judged under.
-#[derive(Debug, Clone, PartialEq, Deserialize)]
+#[derive(Debug, Clone, PartialEq, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct Column {
     /// What stands above it.
@@ -101,19 +102,13 @@ fn gigabytes() -> f64 {
     8.0
 }
 
-/// Largest file that is read, bytes.
-const MAX_BYTES: u64 = 1 << 20;
-
 impl TableSpec {
     /// Reads a file of tables.
     ///
     /// # Errors
     /// [`TableError`] names the file and what is wrong with it.
     pub fn read(path: &Path) -> Result<Self, TableError> {
-        let text = bounded_file::read_text(path, MAX_BYTES)
-            .map_err(|source| TableError::Io { path: path.to_owned(), source })?;
-        let spec: Self = serde_saphyr::from_str(&text)
-            .map_err(|error| TableError::Spec { path: path.to_owned(), problem: error.to_string() })?;
+        let spec: Self = config_file::read(path)?;
         spec.check().map_err(|problem| TableError::Spec { path: path.to_owned(), problem })?;
         Ok(spec)
     }

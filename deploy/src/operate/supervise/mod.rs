@@ -9,6 +9,7 @@ mod tests;
 mod watcher;
 
 use std::ffi::OsString;
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 use std::sync::mpsc::Sender;
 use std::time::{Duration, Instant};
@@ -30,6 +31,8 @@ pub struct ProcessSpec {
     pub args: Vec<OsString>,
     /// What its end means.
     pub life: Life,
+    /// Where it serves its counters to Prometheus, if it does.
+    pub metrics: Option<SocketAddr>,
 }
 
 /// What the end of a process means.

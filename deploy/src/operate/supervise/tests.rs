@@ -10,7 +10,8 @@ use super::*;
 const PATIENCE: Duration = Duration::from_secs(20);
 
 fn shell(name: &str, life: Life, script: &str) -> ProcessSpec {
-    ProcessSpec { name: name.into(), program: "/bin/sh".into(), args: vec!["-c".into(), script.into()], life }
+    let args = vec!["-c".into(), script.into()];
+    ProcessSpec { name: name.into(), program: "/bin/sh".into(), args, life, metrics: None }
 }
 
 fn start(spec: ProcessSpec, restarts: u32) -> (Supervisor, Receiver<ProcessEvent>, tempfile::TempDir) {
@@ -112,8 +113,7 @@ fn who_ignores_the_request_is_killed_at_the_deadline() {
 #[test]
 fn a_missing_program_is_named() {
     let (events, _received) = channel();
-    let spec =
-        ProcessSpec { name: "agent".into(), program: "/nowhere/agent".into(), args: vec![], life: Life::Service };
+    let spec = ProcessSpec { program: "/nowhere/agent".into(), ..shell("agent", Life::Service, "") };
     let folder = tempfile::tempdir().unwrap();
     let error = Supervisor::start(vec![spec], folder.path(), 0, &events).err().unwrap();
     assert!(error.to_string().starts_with("/nowhere/agent is missing"), "{error}");

@@ -69,8 +69,8 @@ pub(crate) struct Arguments {
     #[arg(long, default_value_t = 0.0)]
     heading_noise: f64,
     /// How the errors of a sample's vehicles and moments hang together.
-    #[arg(long, value_enum, default_value_t = Mode::Independent)]
-    noise_mode: Mode,
+    #[arg(long, value_enum, default_value_t)]
+    noise_mode: NoiseMode,
     /// Share of the samples with that error.
     #[arg(long, default_value_t = 1.0)]
     noise_share: f64,
@@ -206,11 +206,7 @@ impl Arguments {
         let read = |file: &PathBuf| PoseTable::read(file).map(Arc::new).map_err(BadInput::of);
         let is_noisy = self.position_noise != 0.0 || self.heading_noise != 0.0;
         let noise = is_noisy.then(|| NoisyPoseConfig {
-            mode: match self.noise_mode {
-                Mode::Fixed => NoiseMode::Fixed,
-                Mode::Independent => NoiseMode::Independent,
-                Mode::Autoregressive => NoiseMode::Autoregressive,
-            },
+            mode: self.noise_mode,
             position_std_m: self.position_noise,
             heading_std_deg: self.heading_noise,
             ..NoisyPoseConfig::default()
@@ -256,17 +252,6 @@ enum Exactness {
     F16,
     /// 1 byte a value and a scale per channel, packed.
     I8,
-}
-
-/// How errors of poses hang together.
-#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
-enum Mode {
-    /// One offset of all neighbours in all frames; the ego is exact.
-    Fixed,
-    /// Drawn anew for every vehicle and frame.
-    Independent,
-    /// Wanders, as a filter's error does.
-    Autoregressive,
 }
 
 /// Shows on standard error how it goes.

@@ -5,6 +5,7 @@ use std::sync::Arc;
 
 use dataset::frame::Frame;
 use localization::pose_source::{NoiseMode, NoisyPose, NoisyPoseConfig, PoseSourceError, PoseTable};
+use protocol::config::within;
 use protocol::{CavId, Pose, PoseEstimate};
 use rand::Rng;
 
@@ -33,9 +34,7 @@ impl SamplePoses {
     /// [`PoseSourceError`] names the field.
     pub fn validate(&self) -> Result<(), PoseSourceError> {
         for (field, value) in [("noise_share", self.noise_share), ("lost_share", self.lost_share)] {
-            if !(0.0..=1.0).contains(&value) {
-                return Err(PoseSourceError::Value { field, value, must: "a share, 0 to 1" });
-            }
+            within(field, value, 0.0, 1.0)?;
         }
         self.noise.as_ref().map_or(Ok(()), |noise| NoisyPose::new(noise).map(|_| ()))
     }

@@ -1,5 +1,6 @@
 //! Options of an evaluation protocol: a preset, and single changes over it.
 
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use super::{AgentKinds, ApOrder, EgoKind, EvaluationProtocol, PRESETS, preset_of_layout};
@@ -7,7 +8,7 @@ use crate::Layout;
 use crate::class_set::ClassSet;
 
 /// A protocol as command lines and files ask for it. What is absent is as in the preset.
-#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, clap::Args)]
+#[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema, clap::Args)]
 #[serde(default, deny_unknown_fields)]
 #[command(next_help_heading = "Evaluation protocol")]
 pub struct ProtocolConfig {
@@ -17,12 +18,12 @@ pub struct ProtocolConfig {
     #[serde(rename = "preset")]
     pub preset: Option<String>,
     /// Agents farther from the ego than this do not take part, metres in the plane.
-    #[arg(long = "comm-range", value_name = "M")]
+    #[arg(long = "comm-range-m", value_name = "M")]
     pub comm_range_m: Option<f64>,
     /// Where objects count, in the ego's LiDAR frame: x, y, z low, then x, y, z high, metres. Without this the range of the
     /// protocol ends where the area of the network ends.
     #[arg(
-        long = "ground-truth-range",
+        long = "ground-truth-range-m",
         value_name = "M,M,M,M,M,M",
         value_delimiter = ',',
         num_args = 6,

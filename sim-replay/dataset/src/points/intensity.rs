@@ -7,13 +7,17 @@
 use std::fmt;
 use std::str::FromStr;
 
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
 use crate::pcd::{IntensityKind, PcdCloud};
 
 /// Largest number in a byte.
 pub(super) const BYTE: f32 = 255.0;
 
 /// Divisor of the intensities that a data set stores: [`Self::AUTO`], or a number parsed from text.
-#[derive(Debug, Clone, Copy, PartialEq, Default)]
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
+#[serde(try_from = "String", into = "String")]
 pub struct IntensityScale {
     /// A normal, positive number.
     divisor: Option<f32>,
@@ -36,6 +40,20 @@ impl FromStr for IntensityScale {
         }
         let divisor = text.parse().ok().filter(|divisor: &f32| divisor.is_normal() && *divisor > 0.0);
         divisor.map(|divisor| Self { divisor: Some(divisor) }).ok_or_else(|| IntensityScaleError(text.to_owned()))
+    }
+}
+
+impl TryFrom<String> for IntensityScale {
+    type Error = IntensityScaleError;
+
+    fn try_from(text: String) -> Result<Self, Self::Error> {
+        text.parse()
+    }
+}
+
+impl From<IntensityScale> for String {
+    fn from(scale: IntensityScale) -> Self {
+        scale.to_string()
     }
 }
 

@@ -4,6 +4,7 @@ use std::time::{Duration, Instant};
 
 use agent::agent::AgentInput;
 use dataset::{LoadOptions, Scenario};
+use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use support::nanos;
 use support::statistics::median;
@@ -16,7 +17,7 @@ const MEASURED_TICKS: usize = 5;
 const MEASURED_VEHICLES: usize = 2;
 
 /// Compute time of each step, milliseconds: the same for all vehicles and ticks.
-#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
+#[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(deny_unknown_fields)]
 pub struct ComputeTimes {
     /// From the capture of a sweep to the publication of the pose.

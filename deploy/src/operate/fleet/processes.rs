@@ -1,0 +1,198 @@
+//! Processes of a fleet: one resolved configuration each, written into the run folder.
+
+use std::net::SocketAddr;
+use std::path::Path;
+
+use agent::config::AgentConfig;
+use agent::rate::RateConfig;
+use bus::{BusConfig, Endpoint};
+use ego_fuser::config::EgoConfig;
+use fusion::Exchange;
+use protocol::{CavId, CodecConfig, RunId, Stream};
+use serde::Serialize;
+use sim_replay::config::{LinkProcessConfig, RecorderConfig, ReplayConfig, SensorLinkConfig, WaitConfig};
+
+use super::{Fleet, RECORDER, REPLAY};
+use crate::operate::run_folder::{BOOKMARK, RECORDING, RunFolder, RunFolderError, SWEEP_LOG};
+use crate::operate::security::RunKeys;
+use crate::operate::supervise::{Life, ProcessSpec};
+use crate::scenario::Clock;
+
+/// Where the processes of a run meet, where their programs lie, and where they write.
+#[derive(Debug, Clone, Copy)]
+pub struct Meeting<'a> {
+    /// The run that they join.
+    pub run: &'a RunId,
+    /// Of the router.
+    pub endpoint: &'a Endpoint,
+    /// Where the processes find their keys, where they have some.
+    pub keys: Option<&'a RunKeys>,
+    /// Folder of the programs.
+    pub programs: &'a Path,
+    /// Folder of the run.
+    pub folder: &'a RunFolder,
+}
+
+impl Fleet {
+    /// Every process to start, the recorder last where the scenario asks for one. Writes their configurations.
+    ///
+    /// # Errors
+    /// [`RunFolderError::Write`] when the run folder cannot be written.
+    pub fn processes(&self, meeting: &Meeting<'_>) -> Result<Vec<ProcessSpec>, RunFolderError> {
+        let mut planner = self.planner(meeting);
+        self.plan_agents(&mut planner)?;
+        planner
+            .plan(format!("ego-{}", self.ego), "ego-fuser run", Life::Service, |bus| self.ego_config(meeting, bus))?;
+        if self.is_over_link() {
+            planner.plan(format!("link-{}", self.ego), "sim-replay link", Life::Service, |bus| {
+                self.link_config(meeting, bus)
+            })?;
+        }
+        planner.plan(REPLAY.into(), "sim-replay stream", Life::Task, |bus| self.replay_config(meeting, bus))?;
+        if let Some(record) = &self.scenario.record {
+            let (run, out) = (meeting.run.clone(), meeting.folder.file(RECORDING));
+            let config = |bus| RecorderConfig { run, out, record: record.clone(), keep_running: false, bus };
+            // A recording cannot be resumed in the middle.
+            planner.plan(RECORDER.into(), "sim-replay record --json", Life::Optional, config)?;
+        }
+        Ok(planner.specs)
+    }
+
+    /// The agents that this run starts. Writes their configurations.
+    ///
+    /// # Errors
+    /// [`RunFolderError::Write`] when the run folder cannot be written.
+    pub fn agent_processes(&self, meeting: &Meeting<'_>) -> Result<Vec<ProcessSpec>, RunFolderError> {
+        let mut planner = self.planner(meeting);
+        self.plan_agents(&mut planner)?;
+        Ok(planner.specs)
+    }
+
+    fn planner<'a>(&self, meeting: &'a Meeting<'a>) -> Planner<'a> {
+        let bus = BusConfig {
+            connect: meeting.endpoint.clone(),
+            shared_memory_mib: self.scenario.network.shared_memory_mib,
+            supervised: true,
+            ..BusConfig::default()
+        };
+        Planner { meeting, bus, metrics: self.scenario.network.metrics, specs: Vec::new() }
+    }
+
+    fn plan_agents(&self, planner: &mut Planner<'_>) -> Result<(), RunFolderError> {
+        for cav in self.agents.iter().filter(|cav| !self.scenario.remote_agents.contains(cav)) {
+            let meeting = planner.meeting;
+            planner
+                .plan(format!("agent-{cav}"), "agent run", Life::Service, |bus| self.agent_config(cav, meeting, bus))?;
+        }
+        Ok(())
+    }
+
+    fn agent_config(&self, cav: &CavId, meeting: &Meeting<'_>, bus: BusConfig) -> AgentConfig {
+        let mut settings = self.scenario.settings_of(cav);
+        let scene = self.scenario.scene.scenario.as_deref().unwrap_or_default();
+        settings.pose = settings.pose.for_scenario(scene);
+        let is_ego = *cav == self.ego;
+        if is_ego {
+            // It sends to its own ego, not over the link, and the ego is to have all of its map.
+            settings.codec = CodecConfig { gate: None, budget_bytes: None, ..settings.codec };
+            settings.rate = RateConfig::default();
+        } else {
+            settings.codec.gate = settings.codec.gate.or(self.scenario.method.gate());
+        }
+        let notes_sweeps = is_ego && self.scenario.clock == Clock::Wall;
+        AgentConfig {
+            run: meeting.run.clone(),
+            cav: cav.clone(),
+            models: self.scenario.models.clone(),
+            settings,
+            publish: vec![self.publish()],
+            keep_running: false,
+            sweep_log: notes_sweeps.then(|| meeting.folder.file(SWEEP_LOG)),
+            bus,
+        }
+    }
+
+    fn ego_config(&self, meeting: &Meeting<'_>, bus: BusConfig) -> EgoConfig {
+        EgoConfig {
+            run: meeting.run.clone(),
+            models: self.scenario.models.clone(),
+            method: Some(self.scenario.method),
+            ego: self.scenario.ego.clone(),
+            neighbours: Vec::new(),
+            comm_range_m: self.protocol.ground_truth.comm_range_m,
+            over_link: self.is_over_link(),
+            keep_running: false,
+            bus,
+        }
+    }
+
+    fn link_config(&self, meeting: &Meeting<'_>, bus: BusConfig) -> LinkProcessConfig {
+        LinkProcessConfig {
+            run: meeting.run.clone(),
+            ego: self.ego.clone(),
+            link: self.scenario.link.clone().unwrap_or_default(),
+            streams: vec![Stream::Pose, self.publish().stream(), Stream::Descriptor],
+            keep_running: false,
+            inbox: self.scenario.ego.inbox,
+            bus,
+        }
+    }
+
+    fn replay_config(&self, meeting: &Meeting<'_>, bus: BusConfig) -> ReplayConfig {
+        let scene = &self.scenario.scene;
+        ReplayConfig {
+            run: meeting.run.clone(),
+            scene: scene.clone(),
+            wait: WaitConfig {
+                expect: self.recorded(self.routes()),
+                ready_timeout_s: self.scenario.timeouts.ready_s,
+                egos: vec![self.ego.clone()],
+                ..WaitConfig::default()
+            },
+            sensor_link: SensorLinkConfig::default(),
+            bookmark: Some(meeting.folder.file(BOOKMARK)),
+            bus,
+        }
+    }
+
+    /// Whether the scenario emulates a link and the method sends anything through it.
+    pub(super) fn is_over_link(&self) -> bool {
+        self.scenario.link.is_some() && self.scenario.method.exchange() != Exchange::Nothing
+    }
+}
+
+/// Processes so far, and what the next one has in common with them.
+struct Planner<'a> {
+    meeting: &'a Meeting<'a>,
+    bus: BusConfig,
+    /// Address of the process before; the next one takes the port behind it.
+    metrics: Option<SocketAddr>,
+    specs: Vec<ProcessSpec>,
+}
+
+impl Planner<'_> {
+    /// Writes the configuration of a process; `command` is its program, subcommand and output format.
+    fn plan<C: Serialize>(
+        &mut self,
+        name: String,
+        command: &str,
+        life: Life,
+        config: impl FnOnce(BusConfig) -> C,
+    ) -> Result<(), RunFolderError> {
+        let Meeting { keys, programs, folder, .. } = self.meeting;
+        self.metrics = self.metrics.and_then(port_behind);
+        let keys = keys.map(|keys| keys.of_process(&name));
+        let bus = BusConfig { keys, metrics: self.metrics, ..self.bus.clone() };
+        let file = folder.write_config(&name, &config(bus))?;
+        let mut words = command.split(' ');
+        let program = programs.join(words.next().unwrap_or_default());
+        let mut args: Vec<_> = words.map(Into::into).collect();
+        args.extend(["--config".into(), file.into()]);
+        self.specs.push(ProcessSpec { name, program, args, life, metrics: self.metrics });
+        Ok(())
+    }
+}
+
+fn port_behind(address: SocketAddr) -> Option<SocketAddr> {
+    Some(SocketAddr::new(address.ip(), address.port().checked_add(1)?))
+}

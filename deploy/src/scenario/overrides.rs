@@ -1,0 +1,58 @@
+//! Settings of single vehicles over those of all.
+
+use agent::config::AgentSettings;
+use localization::pose_source::PoseSourceConfig;
+use schemars::{JsonSchema, Schema, SchemaGenerator};
+use serde::de::Error;
+use serde::{Deserialize, Deserializer, Serialize};
+use serde_json::{Map, Value};
+
+/// Fields of [`AgentSettings`] that one vehicle has of its own; each replaces that of all vehicles as a whole.
+#[derive(Debug, Clone, PartialEq, Default, Serialize)]
+#[serde(transparent)]
+pub struct AgentOverrides(Map<String, Value>);
+
+impl<'de> Deserialize<'de> for AgentOverrides {
+    fn deserialize<D: Deserializer<'de>>(deserializer: D) -> Result<Self, D::Error> {
+        let fields = Map::deserialize(deserializer)?;
+        serde_json::from_value::<AgentSettings>(Value::Object(fields.clone())).map_err(D::Error::custom)?;
+        Ok(Self(fields))
+    }
+}
+
+impl JsonSchema for AgentOverrides {
+    fn inline_schema() -> bool {
+        true
+    }
+
+    fn schema_name() -> std::borrow::Cow<'static, str> {
+        AgentSettings::schema_name()
+    }
+
+    /// That of the settings: none of their fields is required.
+    fn json_schema(generator: &mut SchemaGenerator) -> Schema {
+        generator.subschema_for::<AgentSettings>()
+    }
+}
+
+impl AgentOverrides {
+    /// `settings` with the fields of this vehicle.
+    #[must_use]
+    pub fn over(&self, settings: &AgentSettings) -> AgentSettings {
+        let Ok(Value::Object(mut all)) = serde_json::to_value(settings) else { return settings.clone() };
+        all.extend(self.0.clone());
+        // Both were settings before.
+        serde_json::from_value(Value::Object(all)).unwrap_or_else(|_| settings.clone())
+    }
+
+    /// Changes the pose source, where the vehicle has one of its own.
+    pub(super) fn map_pose(&mut self, change: impl FnOnce(PoseSourceConfig) -> PoseSourceConfig) {
+        if !self.0.contains_key("pose") {
+            return;
+        }
+        let pose = change(self.over(&AgentSettings::default()).pose);
+        if let Ok(pose) = serde_json::to_value(pose) {
+            self.0.insert("pose".into(), pose);
+        }
+    }
+}

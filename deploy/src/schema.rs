@@ -1,0 +1,52 @@
+//! JSON schemas of the files that people write, from the types that read them.
+
+use schemars::{JsonSchema, SchemaGenerator, generate::SchemaSettings};
+
+use link::LinkConfig;
+
+use crate::experiment::sweep::Experiment;
+use crate::experiment::table::TableSpec;
+use crate::scenario::Scenario;
+
+/// A kind of file with a schema.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, clap::ValueEnum)]
+pub enum SchemaOf {
+    /// `v2vloc up SCENARIO`.
+    Scenario,
+    /// `v2vloc sweep EXPERIMENT`.
+    Experiment,
+    /// `v2vloc eval --table FILE`.
+    Table,
+    /// A file with the stages of a link.
+    Link,
+}
+
+impl SchemaOf {
+    /// Every kind of file, with the place of its schema below `deploy`.
+    pub const ALL: [(Self, &'static str); 4] = [
+        (Self::Scenario, "scenarios/scenario.schema.json"),
+        (Self::Experiment, "experiments/experiment.schema.json"),
+        (Self::Table, "experiments/table.schema.json"),
+        (Self::Link, "experiments/links/link.schema.json"),
+    ];
+
+    /// The schema as indented JSON with a line end.
+    #[must_use]
+    pub fn json(self) -> String {
+        let text = match self {
+            Self::Scenario => text_of::<Scenario>(),
+            Self::Experiment => text_of::<Experiment>(),
+            Self::Table => text_of::<TableSpec>(),
+            Self::Link => text_of::<LinkConfig>(),
+        };
+        text + "\n"
+    }
+}
+
+fn text_of<T: JsonSchema>() -> String {
+    let generator = SchemaGenerator::new(SchemaSettings::draft07());
+    format!("{:#}", generator.into_root_schema_for::<T>().to_value())
+}
+
+#[cfg(test)]
+mod tests;

@@ -1,0 +1,124 @@
+//! Configuration of `ego-fuser run`: one type for file, options and JSON schema.
+
+use agent::config::ModelConfig;
+use bus::{BusConfig, InboxConfig, ProcessConfig};
+use protocol::config::{FieldError, within};
+use protocol::{CavId, RunId};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use crate::ego::Ego;
+use crate::misbehaviour::TrustConfig;
+use crate::pairing::PairingConfig;
+use fusion::method::Method;
+
+/// Configuration of `ego-fuser run`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema, clap::Args)]
+#[serde(deny_unknown_fields)]
+pub struct EgoConfig {
+    /// Name of the run: 1 to 32 characters of a-z, 0-9, '_' and '-'.
+    #[arg(long, required_unless_present = "config")]
+    pub run: RunId,
+    /// Detector and threads.
+    #[command(flatten)]
+    pub models: ModelConfig,
+    /// A method of `ego-fuser methods`. Absent: the one that the weights were trained for.
+    #[arg(long)]
+    #[serde(default)]
+    pub method: Option<Method>,
+    /// Neighbours that may take part. None named: all that are found.
+    #[arg(long, value_name = "IDS", value_delimiter = ',', allow_hyphen_values = true)]
+    #[serde(default)]
+    pub neighbours: Vec<CavId>,
+    /// Communication range: neighbours farther away have no part, metres in the plane.
+    #[arg(long, value_name = "M")]
+    #[serde(default = "comm_range_m")]
+    pub comm_range_m: f64,
+    /// Receive neighbours through link emulation (`sim-replay link`) and not directly.
+    #[arg(long)]
+    #[serde(default)]
+    pub over_link: bool,
+    /// Go on when the own agent ends, for the next one; always so with `supervised`.
+    #[arg(long)]
+    #[serde(default)]
+    pub keep_running: bool,
+    /// Vehicle, deadline, age, trust and limits.
+    #[command(flatten)]
+    #[serde(default)]
+    pub ego: EgoSettings,
+    /// Connection to the router.
+    #[command(flatten)]
+    #[serde(default)]
+    pub bus: BusConfig,
+}
+
+fn comm_range_m() -> f64 {
+    Ego::COMM_RANGE_M
+}
+
+/// Settings of the fusing vehicle: the same in a scenario and an experiment.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema, clap::Args)]
+#[serde(default, deny_unknown_fields)]
+pub struct EgoSettings {
+    /// The vehicle that fuses. Absent in a scenario: the first of its scene.
+    #[arg(id = "ego", long = "ego", value_name = "ID", required_unless_present = "config", allow_hyphen_values = true)]
+    pub id: Option<CavId>,
+    /// Longest time that a frame waits for its neighbours, from the arrival of the own agent's message, milliseconds.
+    #[arg(long, value_name = "MS")]
+    #[schemars(range(max = 60_000))]
+    pub deadline_ms: u64,
+    /// Largest age of a neighbour's message that is still fused, by capture time, milliseconds.
+    #[arg(long, value_name = "MS")]
+    #[schemars(range(max = 600_000))]
+    pub max_age_ms: u64,
+    /// Leave out neighbours whose messages contradict what the ego perceives itself.
+    #[arg(long)]
+    pub trust: bool,
+    /// Limits of what other vehicles send.
+    #[command(flatten)]
+    pub inbox: InboxConfig,
+}
+
+impl Default for EgoSettings {
+    fn default() -> Self {
+        Self { id: None, deadline_ms: 100, max_age_ms: 150, trust: false, inbox: InboxConfig::default() }
+    }
+}
+
+impl EgoSettings {
+    /// Checks the values.
+    ///
+    /// # Errors
+    /// [`FieldError`] for the first that is not allowed.
+    pub fn validate(&self) -> Result<(), FieldError> {
+        within("ego.deadline_ms", self.deadline_ms, 0, 60_000)?;
+        within("ego.max_age_ms", self.max_age_ms, 0, 600_000)?;
+        self.inbox.validate()
+    }
+
+    /// Which messages are paired with a frame.
+    #[must_use]
+    pub fn pairing(&self) -> PairingConfig {
+        PairingConfig::with_max_age_nanos(self.max_age_ms.saturating_mul(1_000_000))
+    }
+
+    /// Misbehaviour detection, where it is asked for.
+    #[must_use]
+    pub fn trust(&self) -> Option<TrustConfig> {
+        self.trust.then(TrustConfig::default)
+    }
+}
+
+impl ProcessConfig for EgoConfig {
+    const REQUIRED: &'static [&'static str] = &["run", "models.weights"];
+
+    fn validate(&self) -> Result<(), FieldError> {
+        self.models.threads.validate()?;
+        self.ego.validate()?;
+        if self.ego.id.is_none() {
+            return Err(FieldError::new("ego.id", "absent", "must name the vehicle that fuses (--ego)"));
+        }
+        within("comm_range_m", self.comm_range_m, 0.0, 1e5)?;
+        self.bus.validate()
+    }
+}

@@ -1,0 +1,101 @@
+//! Configuration files: YAML of a bounded size into typed values, with errors that name file, line and field.
+
+use std::fmt::{self, Display};
+use std::path::{Path, PathBuf};
+
+use protocol::config::FieldError;
+use serde::de::DeserializeOwned;
+
+/// Largest file that is read, bytes.
+const MAX_BYTES: u64 = 1 << 20;
+
+/// Why a configuration file cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum ConfigError {
+    /// The file cannot be read or written.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// Cause.
+        source: std::io::Error,
+    },
+    /// The file is not YAML, or a field is unknown, missing or of the wrong kind.
+    #[error("{}{}: {reason}", path.display(), line.map_or(String::new(), |line| format!(":{line}")))]
+    Syntax {
+        /// The file.
+        path: PathBuf,
+        /// Line of the offence, from 1.
+        line: Option<u64>,
+        /// The offence.
+        reason: String,
+    },
+    /// A field has a value that is not allowed. `path` is absent for values of the command line.
+    #[error("{}{error}", Origin(path.as_deref()))]
+    Value {
+        /// The file.
+        path: Option<PathBuf>,
+        /// Field, value and rule.
+        error: FieldError,
+    },
+}
+
+struct Origin<'a>(Option<&'a Path>);
+
+impl Display for Origin<'_> {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        self.0.map_or(Ok(()), |path| write!(f, "{}: ", path.display()))
+    }
+}
+
+/// Reads a YAML file of at most 1 MiB.
+///
+/// # Errors
+/// [`ConfigError`] names the file, and the line where there is one.
+pub fn read<T: DeserializeOwned>(path: &Path) -> Result<T, ConfigError> {
+    let unreadable = |source| ConfigError::Io { path: path.into(), source };
+    let size = std::fs::metadata(path).map_err(unreadable)?.len();
+    if size > MAX_BYTES {
+        return Err(unreadable(std::io::Error::other(format!("{size} bytes, more than {MAX_BYTES}"))));
+    }
+    parse(&std::fs::read_to_string(path).map_err(unreadable)?, path)
+}
+
+/// Parses YAML; `path` is named in errors.
+///
+/// # Errors
+/// [`ConfigError::Syntax`].
+pub fn parse<T: DeserializeOwned>(text: &str, path: &Path) -> Result<T, ConfigError> {
+    serde_saphyr::from_str(text).map_err(|error| ConfigError::Syntax {
+        path: path.into(),
+        line: error.location().map(|location| location.line()),
+        reason: error.without_snippet().to_string().lines().next().unwrap_or_default().trim().to_owned(),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[derive(Debug, serde::Deserialize)]
+    #[serde(deny_unknown_fields)]
+    struct Small {
+        #[expect(dead_code, reason = "only its name counts")]
+        rate: f64,
+    }
+
+    #[test]
+    fn errors_name_file_line_and_field() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("a.yaml");
+        let missing = read::<Small>(&path).unwrap_err().to_string();
+        assert!(missing.contains("a.yaml: "), "{missing}");
+        std::fs::write(&path, "# first\nrat: 1\n").unwrap();
+        let unknown = read::<Small>(&path).unwrap_err().to_string();
+        assert!(unknown.contains("a.yaml:2: ") && unknown.contains("rat"), "{unknown}");
+        let error = FieldError::new("rate", f64::NAN, "must be 0 to 1");
+        let found = ConfigError::Value { path: Some("a.yaml".into()), error: error.clone() }.to_string();
+        assert_eq!(found, "a.yaml: rate is NaN: must be 0 to 1");
+        assert_eq!(ConfigError::Value { path: None, error }.to_string(), "rate is NaN: must be 0 to 1");
+    }
+}

@@ -1,0 +1,197 @@
+//! Configuration of a process: a file (`--config FILE`), changed by the options of the command line that are given.
+//!
+//! One type serves file, command line and JSON schema: serde reads and writes it, clap makes an option of every field, and the
+//! comment of a field is help text and description. Defaults stand in `Default` alone; the help quotes them from there.
+
+use std::path::PathBuf;
+
+use clap::{Arg, ArgMatches, Args, Command, FromArgMatches};
+use protocol::config::{FieldError, document, options_of};
+use serde::Serialize;
+use serde::de::DeserializeOwned;
+use serde_json::{Map, Value};
+
+use super::config_file::{self, ConfigError};
+
+/// Configuration of one process.
+pub trait ProcessConfig: Args + Serialize + DeserializeOwned {
+    /// Fields that have no default: `run`, or `models.weights` in a section. The option of each bears the last part.
+    const REQUIRED: &'static [&'static str];
+
+    /// Checks the values of all fields.
+    ///
+    /// # Errors
+    /// [`FieldError`] for the first value that is not allowed.
+    fn validate(&self) -> Result<(), FieldError>;
+}
+
+/// The configuration with the required fields given by `value_of` their option and defaults elsewhere.
+///
+/// # Errors
+/// A value that its field does not take.
+pub fn minimal<C: ProcessConfig>(value_of: impl Fn(&str) -> String) -> Result<C, serde_json::Error> {
+    let mut root = Map::new();
+    for field in C::REQUIRED {
+        let (section, name) = field.split_once('.').map_or((None, *field), |(section, name)| (Some(section), name));
+        let value = Value::String(value_of(name));
+        match section {
+            None => root.insert(name.into(), value),
+            Some(section) => root
+                .entry(section)
+                .or_insert_with(|| Value::Object(Map::new()))
+                .as_object_mut()
+                .and_then(|section| section.insert(name.into(), value)),
+        };
+    }
+    serde_json::from_value(Value::Object(root))
+}
+
+/// Options of a process: those of its configuration, and `--config`.
+#[derive(Debug, Clone)]
+pub struct Configured<C> {
+    file: Option<PathBuf>,
+    config: C,
+}
+
+impl<C: ProcessConfig> Configured<C> {
+    /// The configuration, its values checked.
+    ///
+    /// # Errors
+    /// [`ConfigError::Value`] names file, field and value.
+    pub fn validated(self) -> Result<C, ConfigError> {
+        let Self { file, config } = self;
+        config.validate().map_err(|error| ConfigError::Value { path: file, error })?;
+        Ok(config)
+    }
+}
+
+impl<C: ProcessConfig> FromArgMatches for Configured<C> {
+    fn from_arg_matches(matches: &ArgMatches) -> Result<Self, clap::Error> {
+        Self::from_arg_matches_mut(&mut matches.clone())
+    }
+
+    fn from_arg_matches_mut(matches: &mut ArgMatches) -> Result<Self, clap::Error> {
+        let refused = |error: &dyn std::fmt::Display| {
+            clap::Error::raw(clap::error::ErrorKind::ValueValidation, format!("{error}\n"))
+        };
+        let file = matches.remove_one::<PathBuf>("config");
+        let mut config: C = match &file {
+            Some(path) => config_file::read(path).map_err(|error| refused(&error))?,
+            None => minimal(|option| text_of(matches, option)).map_err(|error| refused(&error))?,
+        };
+        config.update_from_arg_matches_mut(matches)?;
+        Ok(Self { file, config })
+    }
+
+    fn update_from_arg_matches(&mut self, matches: &ArgMatches) -> Result<(), clap::Error> {
+        self.config.update_from_arg_matches(matches)
+    }
+}
+
+/// The option as it was given. A path that is no text is set again, exactly, with all other options.
+fn text_of(matches: &ArgMatches, option: &str) -> String {
+    let given = matches.get_raw(option).and_then(|mut values| values.next());
+    given.map_or_else(String::new, |value| value.to_string_lossy().into_owned())
+}
+
+impl<C: ProcessConfig> Args for Configured<C> {
+    fn augment_args(command: Command) -> Command {
+        let config = Arg::new("config")
+            .long("config")
+            .value_name("FILE")
+            .value_parser(clap::value_parser!(PathBuf))
+            .help("Configuration of this process, YAML; options that are given change what it holds");
+        // A word that is an id, a path and a name.
+        let defaults = minimal::<C>(|_| "x".into()).and_then(serde_json::to_value).unwrap_or_default();
+        let required = C::REQUIRED.iter().map(|field| field.rsplit('.').next().unwrap_or(field));
+        let required: Vec<&str> = required.collect();
+        let options = options_of::<C>().filter(|option| !required.contains(&option.get_id().as_str()));
+        let heading = None::<&str>;
+        document(C::augment_args_for_update(command.arg(config)), options, &defaults).next_help_heading(heading)
+    }
+
+    fn augment_args_for_update(command: Command) -> Command {
+        Self::augment_args(command)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use clap::Parser;
+    use serde::Deserialize;
+
+    use super::*;
+
+    #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, clap::Args)]
+    #[serde(default, deny_unknown_fields)]
+    struct Section {
+        /// Waits so long.
+        #[arg(id = "section_seconds", long = "section-seconds")]
+        seconds: f64,
+        /// Goes on.
+        #[arg(long)]
+        goes_on: bool,
+    }
+
+    impl Default for Section {
+        fn default() -> Self {
+            Self { seconds: 2.5, goes_on: false }
+        }
+    }
+
+    #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, clap::Args)]
+    #[serde(deny_unknown_fields)]
+    struct Config {
+        /// Name.
+        #[arg(long, required_unless_present = "config")]
+        name: String,
+        #[command(flatten)]
+        #[serde(default)]
+        section: Section,
+    }
+
+    impl ProcessConfig for Config {
+        const REQUIRED: &'static [&'static str] = &["name"];
+
+        fn validate(&self) -> Result<(), FieldError> {
+            protocol::config::above_zero("section.seconds", self.section.seconds)
+        }
+    }
+
+    #[derive(Debug, Parser)]
+    struct Cli {
+        #[command(flatten)]
+        config: Configured<Config>,
+    }
+
+    fn parsed(words: &[&str]) -> Result<Config, String> {
+        let cli = Cli::try_parse_from([&["program"], words].concat()).map_err(|error| error.to_string())?;
+        cli.config.validated().map_err(|error| error.to_string())
+    }
+
+    #[test]
+    fn options_change_what_a_file_holds_and_nothing_else() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("c.yaml");
+        std::fs::write(&path, "name: a\nsection: {seconds: 4, goes_on: true}\n").unwrap();
+        let file = path.to_str().unwrap();
+        let config = |name: &str, seconds, goes_on| Config { name: name.into(), section: Section { seconds, goes_on } };
+        assert_eq!(parsed(&["--name", "b"]).unwrap(), config("b", 2.5, false));
+        assert_eq!(parsed(&["--config", file]).unwrap(), config("a", 4.0, true));
+        assert_eq!(parsed(&["--config", file, "--name=b", "--goes-on=false"]).unwrap(), config("b", 4.0, false));
+        assert_eq!(parsed(&["--name=b", "--goes-on", "--section-seconds=1"]).unwrap(), config("b", 1.0, true));
+        assert!(parsed(&[]).unwrap_err().contains("--name"));
+        let message = parsed(&["--config", file, "--section-seconds=0"]).unwrap_err();
+        assert!(message.contains("c.yaml: section.seconds is 0"), "{message}");
+        std::fs::write(&path, "nam: a\n").unwrap();
+        let message = parsed(&["--config", file]).unwrap_err();
+        assert!(message.contains("c.yaml:1: ") && message.contains("nam"), "{message}");
+    }
+
+    #[test]
+    fn the_help_quotes_the_defaults() {
+        let help = <Cli as clap::CommandFactory>::command().render_help().to_string();
+        assert!(help.contains("Waits so long [default: 2.5]"), "{help}");
+        assert!(help.contains("--goes-on[=<true|false>]") && !help.contains("Name [default"), "{help}");
+    }
+}

@@ -1,0 +1,85 @@
+//! Configuration of `sim-replay record`.
+
+use std::path::PathBuf;
+
+use protocol::config::{FieldError, within};
+use protocol::{RunId, Stream};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use crate::recorder::RecorderOptions;
+use bus::{BusConfig, ProcessConfig};
+use recording::RecordingOptions;
+
+/// Configuration of `sim-replay record`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema, clap::Args)]
+#[serde(deny_unknown_fields)]
+pub struct RecorderConfig {
+    /// Name of the run: 1 to 32 characters of a-z, 0-9, '_' and '-'.
+    #[arg(long, required_unless_present = "config")]
+    pub run: RunId,
+    /// The new file.
+    #[arg(long, value_name = "FILE.mcap", required_unless_present = "config")]
+    pub out: PathBuf,
+    /// Contents of the recording.
+    #[command(flatten)]
+    #[serde(default)]
+    pub record: RecordingConfig,
+    /// Go on when the replay ends, for the next one; always so with `supervised`.
+    #[arg(long)]
+    #[serde(default)]
+    pub keep_running: bool,
+    /// Connection to the router.
+    #[command(flatten)]
+    #[serde(default)]
+    pub bus: BusConfig,
+}
+
+/// Contents of a recording.
+#[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize, JsonSchema, clap::Args)]
+#[serde(default, deny_unknown_fields)]
+pub struct RecordingConfig {
+    /// Streams to leave out, for example bev, which is most of the bytes.
+    #[arg(long, value_delimiter = ',', value_name = "STREAM")]
+    pub without: Vec<Stream>,
+    /// Leave out the channels for ROS 2 tools: half as large, and still exactly what was published.
+    #[arg(long)]
+    pub plain: bool,
+    /// zstd level, 1 to 22. Absent: not compressed; clouds and maps hardly shrink.
+    #[arg(long, value_name = "LEVEL")]
+    #[schemars(range(min = 1, max = 22))]
+    pub zstd_level: Option<u32>,
+}
+
+impl RecordingConfig {
+    /// Checks the values.
+    ///
+    /// # Errors
+    /// [`FieldError`] for the first that is not allowed.
+    pub fn validate(&self) -> Result<(), FieldError> {
+        within("record.zstd_level", self.zstd_level.unwrap_or(1), 1, 22)
+    }
+}
+
+impl ProcessConfig for RecorderConfig {
+    const REQUIRED: &'static [&'static str] = &["run", "out"];
+
+    fn validate(&self) -> Result<(), FieldError> {
+        self.record.validate()?;
+        self.bus.validate()
+    }
+}
+
+impl RecorderConfig {
+    /// The same as the recorder takes it.
+    #[must_use]
+    pub fn options(&self) -> RecorderOptions {
+        let RecordingConfig { without, plain, zstd_level } = self.record.clone();
+        RecorderOptions {
+            out: self.out.clone(),
+            recording: RecordingOptions { zstd_level, with_ros: !plain },
+            without,
+            keeps_running: self.keep_running || self.bus.supervised,
+        }
+    }
+}

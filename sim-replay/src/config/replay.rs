@@ -1,0 +1,160 @@
+//! Configuration of `sim-replay stream`.
+
+use std::path::PathBuf;
+use std::time::Duration;
+
+use protocol::config::{FieldError, within};
+use protocol::{CavId, RunId};
+use schemars::JsonSchema;
+use serde::{Deserialize, Serialize};
+
+use super::SceneConfig;
+use crate::stream::StreamOptions;
+use bus::{BusConfig, ProcessConfig, Route};
+use dataset::LoadOptions;
+use link::{CapacityConfig, DelayLaw, LinkConfig, LossLaw};
+
+/// Configuration of `sim-replay stream`.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema, clap::Args)]
+#[serde(deny_unknown_fields)]
+pub struct ReplayConfig {
+    /// Name of the run: 1 to 32 characters of a-z, 0-9, '_' and '-'.
+    #[arg(long, required_unless_present = "config")]
+    pub run: RunId,
+    /// Checkpoint: note here after each tick how far the replay is, and resume from there where the file exists.
+    #[arg(long, value_name = "FILE")]
+    #[serde(default)]
+    pub bookmark: Option<PathBuf>,
+    /// Recorded scene.
+    #[command(flatten)]
+    pub scene: SceneConfig,
+    /// Processes that the clock waits for.
+    #[command(flatten)]
+    #[serde(default)]
+    pub wait: WaitConfig,
+    /// Link from sensors to agents.
+    #[command(flatten)]
+    #[serde(default)]
+    pub sensor_link: SensorLinkConfig,
+    /// Connection to the router.
+    #[command(flatten)]
+    #[serde(default)]
+    pub bus: BusConfig,
+}
+
+/// Processes that the clock waits for.
+#[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema, clap::Args)]
+#[serde(default, deny_unknown_fields)]
+#[command(next_help_heading = "Waiting for others")]
+pub struct WaitConfig {
+    /// Wait for the vehicles' agents before the clock starts.
+    #[arg(long)]
+    pub await_agents: bool,
+    /// A further route that has to stand before the clock starts, TOPIC>PROCESS, for example 4288/bev>ego-4279; repeatable.
+    #[arg(long, value_name = "ROUTE", allow_hyphen_values = true)]
+    pub expect: Vec<Route>,
+    /// Longest time to wait for all routes, seconds.
+    #[arg(long, value_name = "S")]
+    pub ready_timeout_s: f64,
+    /// Egos whose detections of a tick are waited for in lockstep.
+    #[arg(long, value_name = "IDS", value_delimiter = ',', allow_hyphen_values = true)]
+    pub egos: Vec<CavId>,
+    /// Longest time to wait for an ego's detections in lockstep, seconds; the tick then counts as unanswered.
+    #[arg(long, value_name = "S")]
+    pub answer_timeout_s: f64,
+}
+
+impl Default for WaitConfig {
+    fn default() -> Self {
+        Self { await_agents: true, expect: Vec::new(), ready_timeout_s: 60.0, egos: Vec::new(), answer_timeout_s: 60.0 }
+    }
+}
+
+/// Link that sensor frames cross on their way to the agents. Nothing set: none.
+#[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema, clap::Args)]
+#[serde(default, deny_unknown_fields)]
+#[command(next_help_heading = "Link from sensors to agents")]
+pub struct SensorLinkConfig {
+    /// Mean delay, milliseconds.
+    #[arg(long, value_name = "MS")]
+    pub latency_ms: Option<f64>,
+    /// Standard deviation of the delay, milliseconds; the order of frames stays. Needs `latency_ms`.
+    #[arg(long, value_name = "MS")]
+    pub jitter_ms: Option<f64>,
+    /// Rate of each vehicle's link, Mbit/s.
+    #[arg(long, value_name = "MBPS")]
+    pub bandwidth_mbps: Option<f64>,
+    /// Share of the frames that get lost, 0 to 1.
+    #[arg(long, value_name = "SHARE")]
+    pub loss: Option<f64>,
+    /// Same seed, same delays and losses.
+    #[arg(long)]
+    pub seed: u64,
+}
+
+impl SensorLinkConfig {
+    /// The stages of the link; `None` where nothing is set.
+    #[must_use]
+    pub fn stages(&self) -> Option<LinkConfig> {
+        let Self { latency_ms, jitter_ms, bandwidth_mbps, loss, .. } = *self;
+        if latency_ms.is_none() && bandwidth_mbps.is_none() && loss.is_none() {
+            return None;
+        }
+        Some(LinkConfig {
+            delay: match (latency_ms, jitter_ms) {
+                (None, _) => DelayLaw::None,
+                (Some(mean_ms), None) => DelayLaw::ConstantMs(mean_ms),
+                (Some(mean_ms), Some(std_ms)) => DelayLaw::Normal { mean_ms, std_ms },
+            },
+            capacity: bandwidth_mbps.map_or(CapacityConfig::Unlimited, |rate_mbps| CapacityConfig::TokenBucket {
+                rate_mbps,
+                burst_bytes: 0,
+            }),
+            loss: loss.map_or(LossLaw::None, LossLaw::Bernoulli),
+            // A vehicle's own bus does not reorder.
+            keep_order: true,
+            ..LinkConfig::default()
+        })
+    }
+}
+
+impl ProcessConfig for ReplayConfig {
+    const REQUIRED: &'static [&'static str] = &["run", "scene.dir"];
+
+    fn validate(&self) -> Result<(), FieldError> {
+        self.scene.validate()?;
+        within("wait.ready_timeout_s", self.wait.ready_timeout_s, 0.0, 1e6)?;
+        within("wait.answer_timeout_s", self.wait.answer_timeout_s, 0.0, 1e6)?;
+        if self.scene.lockstep && self.wait.egos.is_empty() {
+            return Err(FieldError::new("wait.egos", "empty", "must name the egos that scene.lockstep waits for"));
+        }
+        if self.sensor_link.jitter_ms.is_some() && self.sensor_link.latency_ms.is_none() {
+            return Err(FieldError::new("sensor_link.latency_ms", "absent", "must be given with jitter_ms"));
+        }
+        self.bus.validate()
+    }
+}
+
+impl ReplayConfig {
+    /// The same as the replay takes it.
+    #[must_use]
+    pub fn options(&self) -> StreamOptions {
+        let Self { scene, wait, .. } = self;
+        let seconds = |seconds| Duration::try_from_secs_f64(seconds).unwrap_or(Duration::MAX);
+        StreamOptions {
+            agents: scene.agents.clone(),
+            rate: scene.rate,
+            repeats: scene.repeat,
+            seek: scene.seek,
+            frames: scene.frames,
+            load: LoadOptions { lidar_variant: scene.variant.clone(), points: true, radar: scene.radar },
+            await_agents: wait.await_agents,
+            expect: wait.expect.clone(),
+            patience: seconds(wait.ready_timeout_s),
+            lockstep: if scene.lockstep { wait.egos.clone() } else { Vec::new() },
+            answer_patience: seconds(wait.answer_timeout_s),
+            link: self.sensor_link.stages().map(|link| (link, self.sensor_link.seed)),
+            bookmark: self.bookmark.clone(),
+        }
+    }
+}
