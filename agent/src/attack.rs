@@ -24,7 +24,7 @@ const PATCH_CELLS: i64 = 3;
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize, JsonSchema, clap::ValueEnum)]
 #[serde(rename_all = "snake_case")]
 #[value(rename_all = "snake_case")]
-pub enum Lie {
+pub enum Falsification {
     /// Its pose is 5 to 30 m off, always by the same, and it is sure of it.
     ShiftedPose,
     /// What it sees is noise of the same mean and spread as the truth.
@@ -35,7 +35,7 @@ pub enum Lie {
     Invented,
 }
 
-impl Lie {
+impl Falsification {
     /// Every lie, in the order of tables.
     pub const ALL: [Self; 4] = [Self::ShiftedPose, Self::Noise, Self::Copied, Self::Invented];
 
@@ -56,7 +56,7 @@ impl Lie {
 #[serde(deny_unknown_fields)]
 pub struct AttackConfig {
     /// What they lie about.
-    pub lie: Lie,
+    pub lie: Falsification,
     /// How many: the first neighbours of every scenario.
     #[serde(default = "one")]
     pub liars: usize,
@@ -79,7 +79,7 @@ impl AttackConfig {
 
 /// What a vehicle saw, as a copier repeats it.
 #[derive(Debug, Clone, Default)]
-pub struct Overheard {
+pub struct CapturedMessages {
     /// A map.
     pub features: Option<BevFeatures>,
     /// Detections.
@@ -91,18 +91,18 @@ pub struct Overheard {
 /// A liar's state.
 #[derive(Debug)]
 pub struct Attack {
-    lie: Lie,
+    lie: Falsification,
     random: SplitMix64,
     offset_m: [f64; 2],
     /// Where it puts what it makes up, in its own frame: x, y, heading.
     places: Vec<[f64; 3]>,
-    overheard: Overheard,
+    overheard: CapturedMessages,
 }
 
 impl Attack {
     /// The lies that the vehicle `cav` tells under `seed`.
     #[must_use]
-    pub fn new(lie: Lie, cav: &CavId, seed: u64) -> Self {
+    pub fn new(lie: Falsification, cav: &CavId, seed: u64) -> Self {
         let letters: Vec<u64> = cav.as_str().bytes().map(u64::from).collect();
         let mut random = SplitMix64::derived(seed, &letters);
         let (distance_m, direction) = (random.between(5.0, 30.0), random.between(0.0, std::f64::consts::TAU));
@@ -113,12 +113,12 @@ impl Attack {
         let places = (0..INVENTED).map(|_| place(&mut random)).collect();
         let offset_m = [distance_m * direction.cos(), distance_m * direction.sin()];
         tracing::warn!(%cav, lie = lie.name(), "this vehicle has been told to LIE to its neighbours");
-        Self { lie, random, offset_m, places, overheard: Overheard::default() }
+        Self { lie, random, offset_m, places, overheard: CapturedMessages::default() }
     }
 
-    /// Another vehicle's words, for [`Lie::Copied`].
-    pub fn overhear(&mut self, overheard: Overheard) {
-        if self.lie == Lie::Copied {
+    /// Another vehicle's words, for [`Falsification::Copied`].
+    pub fn overhear(&mut self, overheard: CapturedMessages) {
+        if self.lie == Falsification::Copied {
             self.overheard = overheard;
         }
     }
@@ -134,7 +134,7 @@ impl Attack {
 impl OutputFilter for Attack {
     /// The pose it gives instead of its own.
     fn pose(&self, pose: PoseEstimate) -> PoseEstimate {
-        let (Lie::ShiftedPose, Some(own)) = (self.lie, pose.world_from_cav()) else { return pose };
+        let (Falsification::ShiftedPose, Some(own)) = (self.lie, pose.world_from_cav()) else { return pose };
         let [x, y, z] = own.translation_m;
         let [dx, dy] = self.offset_m;
         PoseEstimate::new(Pose { translation_m: [x + dx, y + dy, z], ..*own }, 1.0)
@@ -144,20 +144,20 @@ impl OutputFilter for Attack {
     fn perception(&mut self, truth: Perception) -> Perception {
         let mut told = truth;
         match self.lie {
-            Lie::ShiftedPose => {}
-            Lie::Noise => {
+            Falsification::ShiftedPose => {}
+            Falsification::Noise => {
                 make_noise(&mut told.features, &mut self.random);
                 told.confidence.fill_with(|| self.random.unit() as f32);
                 told.detections = (0..2 * INVENTED).map(|_| self.anything()).collect();
             }
-            Lie::Copied => {
+            Falsification::Copied => {
                 let features = self.overheard.features.get_or_insert_with(|| told.features.clone());
                 if features.values.len() == told.features.values.len() {
                     told.features = features.clone();
                 }
                 told.detections = self.overheard.detections.get_or_insert(told.detections).clone();
             }
-            Lie::Invented => {
+            Falsification::Invented => {
                 invent(&mut told.features, &mut told.confidence, &self.places);
                 told.detections.extend(self.places.iter().map(|&place| vehicle(place, 0.9)));
             }
@@ -168,8 +168,8 @@ impl OutputFilter for Attack {
     /// The points it says to have measured instead of its own.
     fn points(&mut self, truth: PointCloud) -> PointCloud {
         match self.lie {
-            Lie::ShiftedPose => truth,
-            Lie::Noise => {
+            Falsification::ShiftedPose => truth,
+            Falsification::Noise => {
                 let random = &mut self.random;
                 let any = |_: &[f32; 4]| {
                     [(40.0, -40.0), (40.0, -40.0), (0.5, -2.5), (1.0, 0.0)]
@@ -177,8 +177,8 @@ impl OutputFilter for Attack {
                 };
                 PointCloud { xyzi: truth.xyzi.iter().map(any).collect() }
             }
-            Lie::Copied => self.overheard.points.get_or_insert(truth).clone(),
-            Lie::Invented => {
+            Falsification::Copied => self.overheard.points.get_or_insert(truth).clone(),
+            Falsification::Invented => {
                 let mut told = truth;
                 for &place in &self.places {
                     points_of(place, &mut self.random, &mut told.xyzi);
@@ -270,7 +270,7 @@ mod tests {
 
     #[test]
     fn a_shifted_pose_is_off_by_the_same_every_time_and_sure_of_itself() {
-        let attack = Attack::new(Lie::ShiftedPose, &cav("a"), 1);
+        let attack = Attack::new(Falsification::ShiftedPose, &cav("a"), 1);
         let told = |x: f64| {
             let told = attack.pose(PoseEstimate::new(Pose::from_xyz_yaw([x, 0.0, 0.0], 0.3), 0.4));
             assert_eq!(told.confidence(), 1.0);
@@ -281,25 +281,25 @@ mod tests {
         let [dx, dy] = told(10.0);
         assert!((5.0..=30.0).contains(&dx.hypot(dy)));
         assert!((told(20.0)[0] - dx).abs() < 1e-9);
-        let other = Attack::new(Lie::ShiftedPose, &cav("b"), 1).offset_m;
+        let other = Attack::new(Falsification::ShiftedPose, &cav("b"), 1).offset_m;
         assert!(other != attack.offset_m, "every liar has its own");
     }
 
     #[test]
     fn what_is_told_has_the_shape_of_the_truth_and_other_values() {
-        for lie in [Lie::Noise, Lie::Invented] {
+        for lie in [Falsification::Noise, Falsification::Invented] {
             let told = Attack::new(lie, &cav("a"), 1).perception(truth());
             assert_eq!(told.features.values.len(), truth().features.values.len());
             assert!(told.features.values != truth().features.values && !told.detections.is_empty(), "{lie:?}");
             assert!(told.features.values.iter().all(|value| value.is_finite()));
         }
-        let invented = Attack::new(Lie::Invented, &cav("a"), 1).perception(truth());
+        let invented = Attack::new(Falsification::Invented, &cav("a"), 1).perception(truth());
         assert!(invented.confidence.iter().filter(|sure| **sure > 0.8).count() > 5);
     }
 
     #[test]
     fn a_copier_repeats_what_it_heard_or_what_it_saw_first() {
-        let mut attack = Attack::new(Lie::Copied, &cav("a"), 1);
+        let mut attack = Attack::new(Falsification::Copied, &cav("a"), 1);
         let later = || {
             let mut later = truth();
             later.features.values.fill(1.0);
@@ -307,7 +307,7 @@ mod tests {
         };
         assert_eq!(attack.perception(truth()).features, truth().features);
         assert_eq!(attack.perception(later()).features, truth().features);
-        let heard = Overheard { features: Some(later().features), ..Overheard::default() };
+        let heard = CapturedMessages { features: Some(later().features), ..CapturedMessages::default() };
         attack.overhear(heard);
         assert_eq!(attack.perception(truth()).features, later().features);
     }

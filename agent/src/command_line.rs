@@ -52,7 +52,7 @@ impl Command {
     }
 }
 
-/// Runs a subcommand.
+/// RunScope a subcommand.
 pub(crate) fn run(cli: Cli) -> ExitCode {
     exit_code(cli.command.run().map(|()| Outcome::Done), BusError::is_behind)
 }

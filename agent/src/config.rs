@@ -10,7 +10,7 @@ use protocol::{CavId, CodecConfig, RunId, Stream};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use crate::attack::Lie;
+use crate::attack::Falsification;
 use crate::node::NodeOptions;
 use crate::rate::RateConfig;
 use localization::pose_source::PoseSourceConfig;
@@ -79,7 +79,7 @@ pub struct AgentSettings {
     /// Falsification of the vehicle's messages, to measure what it does to the ego. Absent: none.
     #[arg(long, value_enum, help_heading = "Attack")]
     #[serde(skip_serializing_if = "Option::is_none")]
-    pub lie: Option<Lie>,
+    pub lie: Option<Falsification>,
 }
 
 /// A message beside the pose.

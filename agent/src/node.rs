@@ -7,9 +7,9 @@ use std::path::PathBuf;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::{Duration, Instant};
 
-use bus::bounded_queue::Taken;
+use bus::bounded_queue::Pop;
 use bus::shutdown::Stop;
-use bus::{Arrival, Books, Bus, BusError, Event, Inbox, Publisher, PublisherOptions, Subscription, unix_nanos};
+use bus::{Arrival, Bus, BusError, Event, Inbox, MessageStats, Publisher, PublisherOptions, Subscription, unix_nanos};
 use protocol::codec::CodecConfig;
 use protocol::message::{Bev, Boxes, Descriptor, Points};
 use protocol::{DropReason, Dtype, Gnss, Lidar, Limits, PointCloud, PoseEstimate, Role, Stream, Topic, wire};
@@ -72,7 +72,7 @@ pub struct NodeReport {
     pub pose_jumps: u64,
 }
 
-/// Runs `agent` on the calling thread until the replay ends or `stop` is requested.
+/// RunScope `agent` on the calling thread until the replay ends or `stop` is requested.
 ///
 /// # Errors
 /// [`BusError`] when the bus refuses. What goes wrong with single messages is counted and logged.
@@ -162,14 +162,14 @@ impl<'a> Node<'a> {
             self.outlet.describe();
             let deadline = self.pairing.deadline().unwrap_or(self.outlet.next_descriptor);
             match self.inbox.take(Some(deadline.min(self.outlet.next_descriptor))) {
-                Taken::Item(_, Event::Message(arrival)) => self.admit(arrival),
-                Taken::Item(topic, Event::End { .. }) if topic == self.lidar && !self.options.keeps_running => {
+                Pop::Item(_, Event::Message(arrival)) => self.admit(arrival),
+                Pop::Item(topic, Event::End { .. }) if topic == self.lidar && !self.options.keeps_running => {
                     // Whatever still waits for a pose has waited long enough.
                     self.advance(Instant::now() + POSE_PATIENCE);
                     return;
                 }
-                Taken::Item(_, Event::End { .. }) | Taken::TimedOut => {}
-                Taken::Closed => return,
+                Pop::Item(_, Event::End { .. }) | Pop::TimedOut => {}
+                Pop::Closed => return,
             }
             self.advance(Instant::now());
         }
@@ -302,7 +302,7 @@ impl Outlet {
         pose: PoseEstimate,
         perception: Perception,
         shared: Option<PointCloud>,
-        books: &Books,
+        books: &MessageStats,
     ) {
         let Perception { features, confidence, detections, .. } = perception;
         if let Some(bev) = &self.bev {

@@ -8,7 +8,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
 use crate::ego::Ego;
-use crate::misbehaviour::TrustConfig;
+use crate::misbehaviour::MisbehaviourConfig;
 use crate::pairing::PairingConfig;
 use fusion::method::Method;
 
@@ -104,8 +104,8 @@ impl EgoSettings {
 
     /// Misbehaviour detection, where it is asked for.
     #[must_use]
-    pub fn trust(&self) -> Option<TrustConfig> {
-        self.trust.then(TrustConfig::default)
+    pub fn trust(&self) -> Option<MisbehaviourConfig> {
+        self.trust.then(MisbehaviourConfig::default)
     }
 }
 

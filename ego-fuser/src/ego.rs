@@ -17,7 +17,7 @@ use protocol::{DecodedFeatures, Detection, DropReason, Pose, StageTiming};
 use support::stage_times::StageTimes;
 use tch::{Kind, TchError, Tensor, no_grad};
 
-use crate::misbehaviour::{Belief, Trust, TrustConfig};
+use crate::misbehaviour::{Assessment, MisbehaviourConfig, MisbehaviourDetector};
 use fusion::f64_tensor;
 use fusion::history::{History, KeptMap};
 use fusion::method::{Exchange, Method};
@@ -47,7 +47,7 @@ pub struct EgoOutput {
     /// The other neighbours, each with its reason.
     pub skipped: Vec<(usize, Skipped)>,
     /// How far each neighbour that could be fused is believed; empty where nobody asks.
-    pub beliefs: Vec<(usize, Belief)>,
+    pub beliefs: Vec<(usize, Assessment)>,
     /// Where the time went.
     pub stages: Vec<StageTiming>,
 }
@@ -59,7 +59,7 @@ pub struct Ego {
     detector: Detector,
     fusion: FusionStage,
     history: History,
-    trust: Option<Trust>,
+    trust: Option<MisbehaviourDetector>,
     limits: PostprocessConfig,
     comm_range_m: f64,
 }
@@ -109,8 +109,8 @@ impl Ego {
     ///
     /// # Errors
     /// The tensor library's.
-    pub fn with_trust(mut self, config: Option<TrustConfig>) -> Result<Self, EgoError> {
-        self.trust = config.map(|config| Trust::new(config, &mut self.detector)).transpose()?;
+    pub fn with_trust(mut self, config: Option<MisbehaviourConfig>) -> Result<Self, EgoError> {
+        self.trust = config.map(|config| MisbehaviourDetector::new(config, &mut self.detector)).transpose()?;
         Ok(self)
     }
 
@@ -129,7 +129,7 @@ impl Ego {
     /// Forgets the maps of earlier frames: another scene begins.
     pub fn forget(&mut self) {
         self.history.clear();
-        self.trust.iter_mut().for_each(Trust::clear);
+        self.trust.iter_mut().for_each(MisbehaviourDetector::clear);
     }
 
     /// Detects around the ego. Neighbours that cannot be used are left out; with none left the ego goes on alone.
@@ -158,7 +158,7 @@ impl Ego {
         let mut beliefs = Vec::new();
         if self.trust.is_some() && !fused.is_empty() {
             let found = self.judge(&aligned)?;
-            let is_out: Vec<bool> = found.iter().map(Belief::is_out).collect();
+            let is_out: Vec<bool> = found.iter().map(Assessment::is_out).collect();
             let doubted = fused.iter().zip(&is_out).filter(|(_, is_out)| **is_out);
             skipped.extend(doubted.map(|(&index, _)| (index, Skipped::Unusable(DropReason::Distrusted))));
             beliefs = fused.iter().copied().zip(found).collect();
@@ -176,7 +176,7 @@ impl Ego {
     }
 
     /// How far each of the neighbours, which follow the ego itself, is believed.
-    fn judge(&mut self, aligned: &[Aligned<'_>]) -> Result<Vec<Belief>, EgoError> {
+    fn judge(&mut self, aligned: &[Aligned<'_>]) -> Result<Vec<Assessment>, EgoError> {
         let Some(trust) = &mut self.trust else { return Ok(Vec::new()) };
         let told: Vec<(&View, Pose)> = aligned[1..].iter().map(|view| (view.view, view.ego_from_cav)).collect();
         Ok(no_grad(|| trust.judge(aligned[0].view, &told, &mut self.detector))?)

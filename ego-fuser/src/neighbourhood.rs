@@ -3,7 +3,7 @@
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::sync::Arc;
 
-use bus::{Bus, BusError, Inbox, RollCall, Subscription};
+use bus::{Bus, BusError, Inbox, Membership, Subscription};
 use protocol::{CavId, Role, Stream, Topic};
 
 /// Neighbours that an ego listens to at most: a flood of tokens must not become a flood of subscriptions.
@@ -19,7 +19,7 @@ pub(crate) struct Neighbourhood {
     streams: Vec<Stream>,
     over_link: bool,
     allowed: Option<BTreeSet<CavId>>,
-    roll_call: RollCall,
+    roll_call: Membership,
     members: BTreeMap<CavId, Member>,
     queue: Queue,
 }
@@ -61,7 +61,7 @@ impl Neighbourhood {
         over_link: bool,
         allowed: Option<BTreeSet<CavId>>,
     ) -> Result<Self, BusError> {
-        let roll_call = RollCall::begin(bus, Role::Agent, 2 * MAX_NEIGHBOURS)?;
+        let roll_call = Membership::begin(bus, Role::Agent, 2 * MAX_NEIGHBOURS)?;
         let (members, queue) = (BTreeMap::new(), Queue::default());
         Ok(Self { ego: ego.clone(), streams, over_link, allowed, roll_call, members, queue })
     }

@@ -19,11 +19,11 @@ use serde::{Deserialize, Serialize};
 
 use crate::CavId;
 use crate::IdError;
+use crate::KeyExpr;
 use crate::Limits;
 use crate::ProcessId;
 use crate::Role;
 use crate::RunId;
-use crate::Selector;
 use crate::Stream;
 use crate::Topic;
 use crate::Verb;
@@ -32,7 +32,7 @@ use crate::string_enum::written_as_text;
 /// A process as its certificate names it: `agent-4279`, `replay`.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize, Deserialize)]
 #[serde(try_from = "String", into = "String")]
-pub struct Party {
+pub struct Principal {
     /// What it does.
     pub role: Role,
     /// For which vehicle; a process without one has the name of its role.
@@ -41,7 +41,7 @@ pub struct Party {
 
 /// A text that names no party.
 #[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
-pub enum PartyError {
+pub enum PrincipalError {
     /// It begins with no role.
     #[error("{0:?} is no party: agent-<cav>, ego-<cav>, link-<cav>, replay, scorer, recorder or viewer")]
     Role(String),
@@ -50,7 +50,7 @@ pub enum PartyError {
     Cav(#[from] IdError),
 }
 
-impl Party {
+impl Principal {
     /// A process of a vehicle.
     #[must_use]
     pub fn new(role: Role, cav: &CavId) -> Self {
@@ -77,8 +77,8 @@ impl Party {
 
     /// All it may do in `runs`.
     #[must_use]
-    pub fn rights(&self, runs: &Runs) -> Vec<Right> {
-        let keys = |topic: &dyn fmt::Display| Selector::within(runs, topic);
+    pub fn rights(&self, runs: &RunScope) -> Vec<Permission> {
+        let keys = |topic: &dyn fmt::Display| KeyExpr::within(runs, topic);
         let own = |stream| keys(&Topic::Stream { cav: self.cav.clone(), stream });
         let everyones = |stream: &dyn fmt::Display| keys(&format_args!("*/{stream}"));
         let over_link = |stream: &dyn fmt::Display| keys(&format_args!("rx/{}/*/{stream}", self.cav));
@@ -118,14 +118,15 @@ impl Party {
                 (Vec::new(), shown.chain(rest).collect::<Vec<_>>())
             }
         };
-        let right = |act| move |keys: Selector| Right { act, keys };
-        let mut rights: Vec<Right> = publish.into_iter().map(right(Act::Publish)).collect();
-        rights.push(right(Act::Publish)(keys(&Topic::Ready(self.name()))));
-        rights.push(right(Act::Publish)(keys(&Topic::Stats(self.name()))));
-        rights.extend(hear.into_iter().map(right(Act::Hear)));
-        rights.push(right(Act::Announce)(keys(&Topic::Alive { role: self.role, cav: self.cav.clone() })));
-        rights.extend(self.watched().map(|topic| right(Act::Watch)(keys(&topic))));
-        rights.push(right(Act::Ask)(keys(&crate::key::NOBODY)));
+        let right = |act| move |keys: KeyExpr| Permission { act, keys };
+        let mut rights: Vec<Permission> = publish.into_iter().map(right(Operation::Publish)).collect();
+        rights.push(right(Operation::Publish)(keys(&Topic::Ready(self.name()))));
+        rights.push(right(Operation::Publish)(keys(&Topic::Stats(self.name()))));
+        rights.extend(hear.into_iter().map(right(Operation::Subscribe)));
+        rights
+            .push(right(Operation::DeclareLiveliness)(keys(&Topic::Alive { role: self.role, cav: self.cav.clone() })));
+        rights.extend(self.watched().map(|topic| right(Operation::SubscribeLiveliness)(keys(&topic))));
+        rights.push(right(Operation::Query)(keys(&crate::key::NOBODY)));
         rights
     }
 
@@ -141,10 +142,10 @@ impl Party {
 
 /// Keys of which no message has more than so many bytes, in whatever run.
 #[must_use]
-pub fn size_limits() -> Vec<(Vec<Selector>, usize)> {
+pub fn size_limits() -> Vec<(Vec<KeyExpr>, usize)> {
     let small = [Stream::Pose, Stream::Gnss, Stream::Preview, Stream::Descriptor, Stream::Boxes, Stream::Detections];
     let keys = |stream| [format!("*/{stream}"), format!("rx/*/*/{stream}")];
-    let selectors = |topics: Vec<String>| topics.iter().map(|topics| Selector::within(&Runs::Any, topics)).collect();
+    let selectors = |topics: Vec<String>| topics.iter().map(|topics| KeyExpr::within(&RunScope::Any, topics)).collect();
     let limit = |stream: Stream| Some((selectors(keys(stream).into()), stream.most_bytes()?));
     let talk = ["control/*", "ready/*", "stats/*"].map(str::to_owned).into();
     let talk = (selectors(talk), 2 * Limits::HARD_METADATA_BYTES as usize);
@@ -158,7 +159,7 @@ const SHARED: [Stream; 5] = [Stream::Pose, Stream::Bev, Stream::Boxes, Stream::P
 /// What an ego tells everyone.
 const DETECTIONS: [Stream; 2] = [Stream::Detections, Stream::DetectionsJson];
 
-impl fmt::Display for Party {
+impl fmt::Display for Principal {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         if self.cav.as_str() == self.role.as_str() {
             return f.write_str(self.role.as_str());
@@ -167,12 +168,12 @@ impl fmt::Display for Party {
     }
 }
 
-impl FromStr for Party {
-    type Err = PartyError;
+impl FromStr for Principal {
+    type Err = PrincipalError;
 
-    fn from_str(text: &str) -> Result<Self, PartyError> {
+    fn from_str(text: &str) -> Result<Self, PrincipalError> {
         let (role, cav) = text.split_once('-').map_or((text, None), |(role, cav)| (role, Some(cav)));
-        let unknown = || PartyError::Role(text.chars().take(2 * ProcessId::MAX_LEN).collect());
+        let unknown = || PrincipalError::Role(text.chars().take(2 * ProcessId::MAX_LEN).collect());
         let role = Role::ALL.into_iter().find(|known| known.as_str() == role).ok_or_else(unknown)?;
         match cav {
             Some(cav) => Ok(Self { role, cav: CavId::new(cav)? }),
@@ -181,18 +182,18 @@ impl FromStr for Party {
     }
 }
 
-written_as_text!(Party);
+written_as_text!(Principal);
 
 /// In which runs rights hold.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Runs {
+pub enum RunScope {
     /// This one.
     One(RunId),
     /// Whatever they are called: for a router that outlives runs.
     Any,
 }
 
-impl fmt::Display for Runs {
+impl fmt::Display for RunScope {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         match self {
             Self::One(run) => run.fmt(f),
@@ -203,78 +204,79 @@ impl fmt::Display for Runs {
 
 /// What a party may do with keys.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, PartialOrd, Ord, Hash)]
-pub enum Act {
+pub enum Operation {
     /// Put messages.
     Publish,
-    /// Subscribe, and be sent what is put.
-    Hear,
-    /// Show itself by a liveliness token.
-    Announce,
-    /// See the tokens of others.
-    Watch,
-    /// Ask a question, which nobody may answer.
-    Ask,
+    /// Subscribe to messages.
+    Subscribe,
+    /// Declare a liveliness token.
+    DeclareLiveliness,
+    /// Subscribe to the liveliness tokens of others.
+    SubscribeLiveliness,
+    /// Send a query; no principal may answer one.
+    Query,
 }
 
-impl Act {
-    /// Every act, in order.
-    pub const ALL: [Self; 5] = [Self::Publish, Self::Hear, Self::Announce, Self::Watch, Self::Ask];
+impl Operation {
+    /// Every operation, in order.
+    pub const ALL: [Self; 5] =
+        [Self::Publish, Self::Subscribe, Self::DeclareLiveliness, Self::SubscribeLiveliness, Self::Query];
 }
 
 /// One thing that a party may do.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Right {
+pub struct Permission {
     /// What.
-    pub act: Act,
+    pub act: Operation,
     /// With which keys.
-    pub keys: Selector,
+    pub keys: KeyExpr,
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn rights(party: &str, act: Act) -> Vec<String> {
-        let runs = Runs::One(RunId::new("r1").unwrap());
-        let rights = party.parse::<Party>().unwrap().rights(&runs);
+    fn rights(party: &str, act: Operation) -> Vec<String> {
+        let runs = RunScope::One(RunId::new("r1").unwrap());
+        let rights = party.parse::<Principal>().unwrap().rights(&runs);
         rights.iter().filter(|right| right.act == act).map(|right| right.keys.to_string()).collect()
     }
 
     #[test]
     fn parties_are_written_and_read_back() {
         for text in ["agent-4279", "agent--1", "ego-4279", "link-4279", "replay", "scorer", "recorder", "viewer"] {
-            let party: Party = text.parse().unwrap();
+            let party: Principal = text.parse().unwrap();
             assert_eq!((party.to_string().as_str(), party.name().as_str()), (text, text));
         }
         for text in ["", "router", "agent-*", "agent-truth", "agent-4279/bev", "driver-1"] {
-            assert!(text.parse::<Party>().is_err(), "{text}");
+            assert!(text.parse::<Principal>().is_err(), "{text}");
         }
     }
 
     #[test]
     fn a_vehicle_publishes_under_its_own_name_alone() {
         for party in ["agent-4279", "ego-4279"] {
-            for keys in rights(party, Act::Publish) {
+            for keys in rights(party, Operation::Publish) {
                 let own = ["v2v/r1/4279/".to_owned(), format!("v2v/r1/stats/{party}"), format!("v2v/r1/ready/{party}")];
                 assert!(own.iter().any(|own| keys.starts_with(own)), "{party}: {keys}");
                 assert!(!keys.contains('*'), "{party}: {keys}");
             }
         }
-        assert!(rights("link-4279", Act::Publish).contains(&"v2v/r1/rx/4279/*/bev".to_owned()));
-        assert_eq!(rights("agent-4279", Act::Announce), ["v2v/r1/alive/agent/4279"]);
+        assert!(rights("link-4279", Operation::Publish).contains(&"v2v/r1/rx/4279/*/bev".to_owned()));
+        assert_eq!(rights("agent-4279", Operation::DeclareLiveliness), ["v2v/r1/alive/agent/4279"]);
     }
 
     #[test]
     fn agents_never_hear_the_truth_or_each_other() {
-        assert!(rights("agent-4279", Act::Hear).iter().all(|keys| keys.starts_with("v2v/r1/4279/")));
+        assert!(rights("agent-4279", Operation::Subscribe).iter().all(|keys| keys.starts_with("v2v/r1/4279/")));
         for party in ["agent-4279", "ego-4279", "link-4279"] {
-            assert!(!rights(party, Act::Hear).contains(&"v2v/r1/truth".to_owned()), "{party}");
+            assert!(!rights(party, Operation::Subscribe).contains(&"v2v/r1/truth".to_owned()), "{party}");
         }
     }
 
     #[test]
     fn rights_hold_in_one_run_or_in_any() {
-        let agent: Party = "agent-1".parse().unwrap();
-        assert!(agent.rights(&Runs::Any).iter().all(|right| right.keys.as_str().starts_with("v2v/*/")));
+        let agent: Principal = "agent-1".parse().unwrap();
+        assert!(agent.rights(&RunScope::Any).iter().all(|right| right.keys.as_str().starts_with("v2v/*/")));
     }
 }

@@ -33,7 +33,7 @@ named! {
         /// From a vehicle farther away than vehicles talk to each other.
         OutOfRange = "out_of_range",
         /// Who sent it, was to have it or carried it was away for a while, and nobody can tell what became of it.
-        Away = "away",
+        PeerOffline = "peer_offline",
         /// Of a time that has not come yet.
         Future = "future",
         /// From a vehicle whose words do not fit what the ego sees itself.

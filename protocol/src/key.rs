@@ -13,7 +13,7 @@
 //! | `v2v/<run>/alive/<role>/<cav>` | every process | anyone | none: a liveliness token |
 //!
 //! A vehicle cannot be called `rx`, `truth`, `control`, `ready`, `stats` or `alive` ([`CavId`] refuses it), so each key has
-//! one reading. A [`Key`] never holds a wildcard; what subscribes to several keys is a [`Selector`].
+//! one reading. A [`Key`] never holds a wildcard; what subscribes to several keys is a [`KeyExpr`].
 
 use std::fmt;
 use std::str::FromStr;
@@ -23,7 +23,7 @@ use crate::IdError;
 use crate::ProcessId;
 use crate::Role;
 use crate::RunId;
-use crate::Runs;
+use crate::RunScope;
 use crate::Stream;
 use crate::Topic;
 use crate::Verb;
@@ -147,17 +147,17 @@ impl FromStr for Key {
 
 /// A key expression to subscribe to; never one to publish on.
 #[derive(Debug, Clone, PartialEq, Eq, Hash)]
-pub struct Selector(String);
+pub struct KeyExpr(String);
 
-impl Selector {
+impl KeyExpr {
     /// Keys below the run in some runs.
-    pub(crate) fn within(runs: &Runs, topics: &dyn fmt::Display) -> Self {
+    pub(crate) fn within(runs: &RunScope, topics: &dyn fmt::Display) -> Self {
         Self(format!("{KEY_ROOT}/{runs}/{topics}"))
     }
 
     /// Everything of some runs, in two expressions: the wildcard of the first passes over chunks that begin with `@`.
     #[must_use]
-    pub fn all_of(runs: &Runs) -> [Self; 2] {
+    pub fn all_of(runs: &RunScope) -> [Self; 2] {
         [Self::within(runs, &"**"), Self::within(runs, &format_args!("*/{}", Stream::Preview))]
     }
 
@@ -169,7 +169,7 @@ impl Selector {
 
     /// What no process ever declares: `v2v/<run>/nobody`. To ask there is to ask the network alone.
     #[must_use]
-    pub fn nobody(run: &RunId) -> Self {
+    pub fn none(run: &RunId) -> Self {
         Self(format!("{KEY_ROOT}/{run}/{NOBODY}"))
     }
 
@@ -234,7 +234,7 @@ impl Selector {
     }
 }
 
-impl fmt::Display for Selector {
+impl fmt::Display for KeyExpr {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.write_str(&self.0)
     }
@@ -329,17 +329,17 @@ mod tests {
     #[test]
     fn selectors_name_the_keys_they_are_for() {
         let run = RunId::new("r1").unwrap();
-        assert_eq!(Selector::stream(&run, Stream::Bev).as_str(), "v2v/r1/*/bev");
-        assert_eq!(Selector::received(&run, &cav("4279"), Stream::Pose).as_str(), "v2v/r1/rx/4279/*/pose");
-        assert_eq!(Selector::received_by_anyone(&run, Stream::Pose).as_str(), "v2v/r1/rx/*/*/pose");
-        assert_eq!(Selector::truth(&run).as_str(), "v2v/r1/truth");
-        assert_eq!(Selector::alive(&run, Role::Agent).as_str(), "v2v/r1/alive/agent/*");
-        assert_eq!(Selector::everyone_alive(&run).as_str(), "v2v/r1/alive/*/*");
-        assert_eq!(Selector::control(&run).as_str(), "v2v/r1/control/*");
-        assert_eq!(Selector::ready(&run).as_str(), "v2v/r1/ready/*");
-        assert_eq!(Selector::stats(&run).as_str(), "v2v/r1/stats/*");
-        assert_eq!(Selector::run(&run).as_str(), "v2v/r1/**");
-        assert!(Selector::run(&run).as_str().parse::<Key>().is_err());
+        assert_eq!(KeyExpr::stream(&run, Stream::Bev).as_str(), "v2v/r1/*/bev");
+        assert_eq!(KeyExpr::received(&run, &cav("4279"), Stream::Pose).as_str(), "v2v/r1/rx/4279/*/pose");
+        assert_eq!(KeyExpr::received_by_anyone(&run, Stream::Pose).as_str(), "v2v/r1/rx/*/*/pose");
+        assert_eq!(KeyExpr::truth(&run).as_str(), "v2v/r1/truth");
+        assert_eq!(KeyExpr::alive(&run, Role::Agent).as_str(), "v2v/r1/alive/agent/*");
+        assert_eq!(KeyExpr::everyone_alive(&run).as_str(), "v2v/r1/alive/*/*");
+        assert_eq!(KeyExpr::control(&run).as_str(), "v2v/r1/control/*");
+        assert_eq!(KeyExpr::ready(&run).as_str(), "v2v/r1/ready/*");
+        assert_eq!(KeyExpr::stats(&run).as_str(), "v2v/r1/stats/*");
+        assert_eq!(KeyExpr::run(&run).as_str(), "v2v/r1/**");
+        assert!(KeyExpr::run(&run).as_str().parse::<Key>().is_err());
     }
 
     proptest! {

@@ -20,12 +20,12 @@ use std::fmt;
 
 use serde::{Deserialize, Serialize};
 
-use crate::Balance;
 use crate::DropReason;
 use crate::ProcessId;
 use crate::RateReason;
+use crate::Reconciliation;
 use crate::Topic;
-use crate::reconciliation::Difference;
+use crate::reconciliation::Discrepancy;
 
 /// What is counted separately: a topic, and who receives it (`None`: whoever does).
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -221,28 +221,28 @@ impl Ledger {
     /// Compares what was sent with what is accounted for, for each topic and receiver. Call it on the sum of all
     /// processes' books.
     #[must_use]
-    pub fn balance(&self) -> Balance {
-        Balance::of(self)
+    pub fn balance(&self) -> Reconciliation {
+        Reconciliation::of(self)
     }
 
-    /// Books what nobody can account for on the accounts that `is_excused` names, because one of those concerned was away:
+    /// MessageStats what nobody can account for on the accounts that `is_excused` names, because one of those concerned was away:
     /// as dropped for that reason what vanished, as sent what came although its sender never told of it. Returns how many
     /// messages that were. All other accounts have to add up by themselves.
-    pub fn excuse(&mut self, is_excused: impl Fn(&Account) -> bool) -> u64 {
-        let mut excused = 0;
-        for Difference { topic, to, missing, .. } in self.balance().differences {
+    pub fn exempt(&mut self, is_excused: impl Fn(&Account) -> bool) -> u64 {
+        let mut exempted = 0;
+        for Discrepancy { topic, to, missing, .. } in self.balance().differences {
             let account = Account { topic, to };
             if !is_excused(&account) {
                 continue;
             }
             let counts = self.counts(&account);
             match u64::try_from(missing) {
-                Ok(vanished) => *counts.dropped.entry(DropReason::Away).or_default() += vanished,
+                Ok(vanished) => *counts.dropped.entry(DropReason::PeerOffline).or_default() += vanished,
                 Err(_) => counts.sent = counts.sent.saturating_add(missing.unsigned_abs()),
             }
-            excused += missing.unsigned_abs();
+            exempted += missing.unsigned_abs();
         }
-        excused
+        exempted
     }
 
     fn counts(&mut self, account: &Account) -> &mut Counts {
@@ -256,7 +256,7 @@ impl Ledger {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Unheard;
+    use crate::UnreceivedTopic;
 
     fn process(name: &str) -> ProcessId {
         ProcessId::new(name).unwrap()
@@ -300,7 +300,7 @@ mod tests {
         let forward = sum(&books);
         books.reverse();
         assert_eq!(sum(&books), forward);
-        assert_eq!(forward.balance(), Balance::default());
+        assert_eq!(forward.balance(), Reconciliation::default());
         let total = forward.total();
         assert_eq!((total.sent, total.received, total.in_flight, total.dropped_total()), (11, 6, 1, 4));
     }
@@ -347,12 +347,12 @@ mod tests {
         let mut ledger = sum(&books());
         let (published, lost) = (Account::published(bev()), Account::towards(bev(), &process("ego-4279")));
         (0..3).for_each(|_| ledger.sent(&published));
-        assert_eq!(ledger.excuse(|_| false), 0);
-        assert_eq!(ledger.excuse(|account| *account == lost), 3);
-        assert_eq!(ledger.get(&lost).unwrap().dropped[&DropReason::Away], 3);
+        assert_eq!(ledger.exempt(|_| false), 0);
+        assert_eq!(ledger.exempt(|account| *account == lost), 3);
+        assert_eq!(ledger.get(&lost).unwrap().dropped[&DropReason::PeerOffline], 3);
         assert!(ledger.balance().is_exact());
         (0..2).for_each(|_| ledger.received(&lost));
-        assert_eq!(ledger.excuse(|account| *account == lost), 2);
+        assert_eq!(ledger.exempt(|account| *account == lost), 2);
         assert!(ledger.balance().is_exact());
     }
 
@@ -362,7 +362,7 @@ mod tests {
         ledger.sent(&Account::published(bev()));
         let balance = ledger.balance();
         assert!(balance.is_exact());
-        assert_eq!(balance.unheard, [Unheard { topic: bev(), messages: 1 }]);
+        assert_eq!(balance.unheard, [UnreceivedTopic { topic: bev(), messages: 1 }]);
     }
 
     #[test]

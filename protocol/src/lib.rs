@@ -103,19 +103,19 @@ pub mod text;
 mod topic;
 pub mod wire;
 
-pub use access::{Act, Party, PartyError, Right, Runs};
+pub use access::{Operation, Permission, Principal, PrincipalError, RunScope};
 pub use bev::{BevFeatures, BevGrid};
 pub use body::{Body, BodyShape};
 pub use box3d::{Box3d, Detection};
 pub use codec::{
-    ByteLimit, Codec, CodecConfig, ConfidenceGate, DecodedFeatures, Dtype, EncodedFeatures, LimitedBy, Packing,
+    ByteLimit, Codec, CodecConfig, Compression, ConfidenceGate, DecodedFeatures, Dtype, EncodedFeatures, LimitedBy,
     RateChoice, RateReason, Selection, Smoothing, encode_features, encode_within,
 };
 pub use drop_reason::DropReason;
 pub use error::WireError;
 pub use header::{HEADER_LEN, Header, Kind, Stamp, WIRE_VERSION};
 pub use id::{CavId, IdError, ProcessId, RunId};
-pub use key::{Key, KeyError, Selector};
+pub use key::{Key, KeyError, KeyExpr};
 pub use ledger::{Account, Counts, Ledger};
 pub use limits::Limits;
 pub use message::{
@@ -123,10 +123,10 @@ pub use message::{
     HeardNeighbour, Lidar, Message, ModelHash, NoPoseReason, Payload, Points, PoseEstimate, Radar, SkippedNeighbour,
     StageSummary, StageTiming, Stats, TopicCount, TrueObject, Truth,
 };
-pub use misbehaviour_reason::Doubt;
+pub use misbehaviour_reason::MisbehaviourReason;
 pub use point_cloud::{Handedness, PointCloud};
 pub use pose::{Pose, PoseError};
-pub use reconciliation::{Balance, Difference, Unheard};
+pub use reconciliation::{Discrepancy, Reconciliation, UnreceivedTopic};
 pub use stream::Stream;
 pub use topic::{Role, Topic, Verb};
 pub use wire::Encoded;

@@ -4,18 +4,18 @@ use crate::string_enum::named;
 
 named! {
     /// What speaks against the words of a neighbour.
-    pub enum Doubt {
+    pub enum MisbehaviourReason {
         /// It is not where it says to be, or sees nothing of what is there.
-        Elsewhere = "elsewhere",
+        PositionMismatch = "position_mismatch",
         /// It sees vehicles where there are none.
-        Invented = "invented",
+        GhostObjects = "ghost_objects",
         /// It says what somebody else has said.
-        Copied = "copied",
+        Duplicated = "duplicated",
         /// What it says has nothing to do with what it said just before.
         Inconsistent = "inconsistent",
         /// It stands where it cannot have driven to.
-        Jumped = "jumped",
+        ImplausibleMotion = "implausible_motion",
         /// Nothing speaks against it, but nothing for it either.
-        Unproven = "unproven",
+        Probation = "probation",
     }
 }

@@ -36,7 +36,7 @@ impl PointCloud {
 
     /// Every so manieth point, so that there are at most `most`.
     #[must_use]
-    pub fn thinned(&self, most: usize) -> Self {
+    pub fn decimate(&self, most: usize) -> Self {
         let step = self.len().div_ceil(most.max(1)).max(1);
         Self { xyzi: self.xyzi.iter().step_by(step).copied().collect() }
     }

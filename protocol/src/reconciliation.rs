@@ -13,16 +13,16 @@ use crate::Topic;
 
 /// What [`Ledger::balance`] finds.
 #[derive(Debug, Clone, PartialEq, Eq, Default, Serialize, Deserialize)]
-pub struct Balance {
+pub struct Reconciliation {
     /// Accounts whose numbers do not add up.
-    pub differences: Vec<Difference>,
+    pub differences: Vec<Discrepancy>,
     /// Topics that nobody subscribed to: sent, lost to no one.
-    pub unheard: Vec<Unheard>,
+    pub unheard: Vec<UnreceivedTopic>,
 }
 
 /// One account that does not add up.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Difference {
+pub struct Discrepancy {
     /// The topic.
     pub topic: Topic,
     /// The receiving process, where one is known.
@@ -35,14 +35,14 @@ pub struct Difference {
 
 /// A topic without a receiver.
 #[derive(Debug, Clone, PartialEq, Eq, Serialize, Deserialize)]
-pub struct Unheard {
+pub struct UnreceivedTopic {
     /// The topic.
     pub topic: Topic,
     /// Messages published.
     pub messages: u64,
 }
 
-impl Balance {
+impl Reconciliation {
     /// Whether every message is accounted for.
     #[must_use]
     pub fn is_exact(&self) -> bool {
@@ -64,7 +64,7 @@ impl Balance {
             } else if !heard.contains(&account.topic) {
                 match u64::try_from(counts.missing()) {
                     Ok(0) => {}
-                    Ok(messages) => balance.unheard.push(Unheard { topic: account.topic.clone(), messages }),
+                    Ok(messages) => balance.unheard.push(UnreceivedTopic { topic: account.topic.clone(), messages }),
                     Err(_) => balance.push_difference(account, counts),
                 }
             }
@@ -76,14 +76,14 @@ impl Balance {
         let missing = counts.missing();
         if missing != 0 {
             let Account { topic, to } = account.clone();
-            // Books of real runs are far from the ends of the range; hostile ones may be cut there.
+            // MessageStats of real runs are far from the ends of the range; hostile ones may be cut there.
             let missing = missing.clamp(i64::MIN.into(), i64::MAX.into()) as i64;
-            self.differences.push(Difference { topic, to, missing, counts });
+            self.differences.push(Discrepancy { topic, to, missing, counts });
         }
     }
 }
 
-impl fmt::Display for Difference {
+impl fmt::Display for Discrepancy {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         let Self { topic, to, missing, counts } = self;
         let to = to.as_ref().map(|to| format!(" to {to}")).unwrap_or_default();

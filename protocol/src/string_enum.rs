@@ -57,8 +57,8 @@ pub(crate) use {named, written_as_text};
 
 #[cfg(test)]
 mod tests {
-    use crate::Doubt;
     use crate::DropReason;
+    use crate::MisbehaviourReason;
     use crate::RateReason;
     use crate::Role;
     use crate::Verb;
@@ -72,7 +72,7 @@ mod tests {
                 assert_eq!(serde_json::to_string(value).unwrap(), format!("\"{value}\""));
             }
         }
-        check(&Doubt::ALL);
+        check(&MisbehaviourReason::ALL);
         check(&DropReason::ALL);
         check(&RateReason::ALL);
         check(&Role::ALL);

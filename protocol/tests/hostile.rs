@@ -8,8 +8,8 @@ use proptest::collection::vec;
 use proptest::prelude::*;
 use proptest::sample::{Index, select};
 use protocol::{
-    Bev, BevGrid, Body, Codec, CodecConfig, DropReason, Dtype, EncodedFeatures, HEADER_LEN, Header, Lidar, Limits,
-    Message, Packing, Points, Selection, WireError, wire,
+    Bev, BevGrid, Body, Codec, CodecConfig, Compression, DropReason, Dtype, EncodedFeatures, HEADER_LEN, Header, Lidar,
+    Limits, Message, Points, Selection, WireError, wire,
 };
 use sample::any::any_message;
 
@@ -99,7 +99,7 @@ fn absurd_lengths_in_the_header_are_refused() {
     }
 }
 
-fn absurd_map(grid: BevGrid, channels: u32, selection: Selection, packing: Packing) -> WireError {
+fn absurd_map(grid: BevGrid, channels: u32, selection: Selection, packing: Compression) -> WireError {
     let codec = Codec { dtype: Dtype::I8, selection, packing };
     let features = EncodedFeatures { grid, channels, code_of: None, codec, rate: None, body: Body::Bytes(vec![0; 15]) };
     features.decode(&Limits::DEFAULT).unwrap_err()
@@ -110,7 +110,7 @@ fn absurd_shapes_in_the_metadata_are_refused() {
     let (grid, none) = (sample::grid(), Selection::TopK { cells: 0 });
     let huge = BevGrid { width: u32::MAX, height: u32::MAX, ..grid };
     let large = BevGrid { width: 1024, height: 1024, ..grid };
-    for packing in [Packing::Raw, Packing::Zstd] {
+    for packing in [Compression::Raw, Compression::Zstd] {
         assert!(matches!(absurd_map(huge, u32::MAX, Selection::Dense, packing), WireError::Limit { .. }));
         assert!(matches!(absurd_map(huge, 1, none, packing), WireError::Limit { what: "grid cells", .. }));
         assert!(matches!(absurd_map(grid, u32::MAX, none, packing), WireError::Limit { what: "channels", .. }));

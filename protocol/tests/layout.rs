@@ -2,7 +2,7 @@
 
 mod sample;
 
-use protocol::{HEADER_LEN, Message, Packing, wire};
+use protocol::{Compression, HEADER_LEN, Message, wire};
 
 /// Kind, length and FNV-1a of each sample in turn. Maps packed by zstd are left out: their bytes are zstd's affair. (A CRC
 /// would not do here: over data that end in their own CRC it is constant.)
@@ -43,7 +43,7 @@ fn fnv1a(bytes: &[u8]) -> u64 {
 }
 
 fn packed(message: &Message) -> bool {
-    matches!(message, Message::Bev(bev) if bev.features.codec.packing == Packing::Zstd)
+    matches!(message, Message::Bev(bev) if bev.features.codec.packing == Compression::Zstd)
 }
 
 #[test]

@@ -6,7 +6,7 @@ mod sample;
 use std::io::Write;
 
 use protocol::{
-    BevGrid, Body, Codec, Dtype, EncodedFeatures, HEADER_LEN, Limits, Message, Packing, Selection, WireError, wire,
+    BevGrid, Body, Codec, Compression, Dtype, EncodedFeatures, HEADER_LEN, Limits, Message, Selection, WireError, wire,
 };
 
 const MIB: u64 = 1 << 20;
@@ -20,7 +20,7 @@ fn resident(field: &str) -> u64 {
 }
 
 /// `[1024, 32, 64]`: 8 MiB as `f32`, the most the limits allow.
-fn largest_map(dtype: Dtype, selection: Selection, packing: Packing, body: Vec<u8>) -> EncodedFeatures {
+fn largest_map(dtype: Dtype, selection: Selection, packing: Compression, body: Vec<u8>) -> EncodedFeatures {
     let grid = BevGrid { width: 64, height: 32, ..sample::grid() };
     let codec = Codec { dtype, selection, packing };
     EncodedFeatures { grid, channels: 1024, code_of: None, codec, rate: None, body: Body::Bytes(body) }
@@ -84,10 +84,10 @@ fn claims_take_no_memory_and_bombs_at_most_twice_the_limit() {
     let after_claims = resident("VmHWM") - before;
     assert!(after_claims < 4 * MIB, "claims took {after_claims} bytes");
 
-    let dense = |bomb: &[u8]| largest_map(Dtype::F32, Selection::Dense, Packing::Zstd, bomb.to_vec());
+    let dense = |bomb: &[u8]| largest_map(Dtype::F32, Selection::Dense, Compression::Zstd, bomb.to_vec());
     assert!(matches!(dense(&bomb).decode(&LIMITS), Err(WireError::Compression { .. })));
     assert!(dense(&small_bomb).decode(&LIMITS).unwrap().features.values.iter().all(|value| *value == 0.0));
-    let nothing = largest_map(Dtype::F16, Selection::TopK { cells: 0 }, Packing::Raw, vec![0; 64 * 32 / 8]);
+    let nothing = largest_map(Dtype::F16, Selection::TopK { cells: 0 }, Compression::Raw, vec![0; 64 * 32 / 8]);
     let message = Message::Bev(protocol::Bev { pose: sample::pose(), features: nothing });
     let bytes = wire::encode_any(&sample::stamp(), message).unwrap().to_vec();
     let (_, message) = wire::decode_any([&bytes[..]], &LIMITS).unwrap();

@@ -33,7 +33,7 @@ enum Command {
     Synth(command::synth::Args),
 }
 
-/// Runs what was asked for.
+/// RunScope what was asked for.
 pub(crate) fn run(cli: Cli) -> ExitCode {
     let outcome = match cli.command {
         Command::Convert(args) => command::convert::run(&args),

@@ -1,6 +1,6 @@
 //! The air between the agents of a live run and one ego.
 //!
-//! What agents publish is taken in as it comes, kept for as long as the [`Air`] says, and published under
+//! What agents publish is taken in as it comes, kept for as long as the [`LinkEmulator`] says, and published under
 //! `rx/<ego>/<cav>/<stream>` as it was, stamp and all. One thread receives and decides; sending has threads of its own.
 
 use std::collections::{BTreeMap, BTreeSet};
@@ -10,10 +10,10 @@ use std::time::{Duration, Instant};
 use protocol::{CavId, DropReason, Gnss, Limits, Role, Stream, Topic};
 use serde::Serialize;
 
-use bus::bounded_queue::Taken;
+use bus::bounded_queue::Pop;
 use bus::shutdown::Stop;
-use bus::{Arrival, Bus, BusError, Event, Inbox, InboxLimits, Publisher, PublisherOptions, RollCall, Subscription};
-use link::{Air, Fate, Outcome, Parcel};
+use bus::{Arrival, Bus, BusError, Event, Inbox, InboxLimits, Membership, Publisher, PublisherOptions, Subscription};
+use link::{Delivery, LinkEmulator, Outcome, Packet};
 use support::nanos;
 
 /// Messages of one topic that may wait to be looked at, and that may wait to be passed on.
@@ -79,7 +79,7 @@ impl LinkReport {
 ///
 /// # Errors
 /// [`BusError`] when the bus refuses. What is wrong with single messages is counted and logged.
-pub fn run(bus: &Bus, air: Air, options: &NodeOptions, stop: &Stop) -> Result<LinkReport, BusError> {
+pub fn run(bus: &Bus, air: LinkEmulator, options: &NodeOptions, stop: &Stop) -> Result<LinkReport, BusError> {
     let mut node = Node::open(bus, air, options, stop)?;
     let presence = bus.announce(Role::Link)?;
     node.carry(stop)?;
@@ -108,10 +108,10 @@ struct Vehicle {
 
 struct Node<'a> {
     bus: &'a Bus,
-    air: Air,
+    air: LinkEmulator,
     options: &'a NodeOptions,
     inbox: Arc<Inbox>,
-    roll_call: RollCall,
+    roll_call: Membership,
     vehicles: BTreeMap<CavId, Vehicle>,
     /// For whom there was no place.
     turned_away: BTreeSet<CavId>,
@@ -128,13 +128,13 @@ struct Node<'a> {
 }
 
 impl<'a> Node<'a> {
-    fn open(bus: &'a Bus, air: Air, options: &'a NodeOptions, stop: &Stop) -> Result<Self, BusError> {
+    fn open(bus: &'a Bus, air: LinkEmulator, options: &'a NodeOptions, stop: &Stop) -> Result<Self, BusError> {
         let inbox = bus.limited_inbox(PLACES, MAX_VEHICLES * (options.streams.len() + 1), options.inbox);
         stop.on_request({
             let inbox = Arc::clone(&inbox);
             move || inbox.close()
         });
-        let roll_call = RollCall::begin(bus, Role::Agent, 2 * MAX_VEHICLES)?;
+        let roll_call = Membership::begin(bus, Role::Agent, 2 * MAX_VEHICLES)?;
         Ok(Self {
             bus,
             air,
@@ -157,17 +157,17 @@ impl<'a> Node<'a> {
         while !stop.requested() {
             self.look_round()?;
             match self.inbox.take(Some(self.next_moment())) {
-                Taken::Item(Topic::Stream { cav, stream: Stream::Gnss }, Event::Message(arrival)) => {
+                Pop::Item(Topic::Stream { cav, stream: Stream::Gnss }, Event::Message(arrival)) => {
                     self.locate(&cav, &arrival);
                 }
-                Taken::Item(Topic::Stream { cav, stream }, Event::Message(arrival)) => self.admit(cav, stream, arrival),
-                Taken::Item(Topic::Stream { cav, stream }, Event::End { .. }) => {
+                Pop::Item(Topic::Stream { cav, stream }, Event::Message(arrival)) => self.admit(cav, stream, arrival),
+                Pop::Item(Topic::Stream { cav, stream }, Event::End { .. }) => {
                     if let Some(vehicle) = self.vehicles.get_mut(&cav) {
                         vehicle.ended.insert(stream);
                     }
                 }
-                Taken::Item(..) | Taken::TimedOut => {}
-                Taken::Closed => break,
+                Pop::Item(..) | Pop::TimedOut => {}
+                Pop::Closed => break,
             }
             self.settle();
             if self.is_over() {
@@ -265,13 +265,13 @@ impl<'a> Node<'a> {
                 vehicle.ended.remove(&stream);
             }
             // It has gone, and its place is another's.
-            None => return self.lose(&arrival, DropReason::Away),
+            None => return self.lose(&arrival, DropReason::PeerOffline),
         }
         if self.kept_bytes.saturating_add(arrival.wire_bytes()) > self.options.max_kept_bytes {
             return self.lose(&arrival, DropReason::LinkQueue);
         }
         self.kept_bytes += arrival.wire_bytes();
-        self.air.offer(Parcel {
+        self.air.offer(Packet {
             id: self.next_id,
             from,
             to: self.options.ego.clone(),
@@ -299,17 +299,17 @@ impl<'a> Node<'a> {
         let Some(began) = self.began else { return };
         for Outcome { parcel, fate, .. } in self.air.advance(nanos::between(began, Instant::now())) {
             match fate {
-                Fate::Dropped(reason) => {
+                Delivery::Dropped(reason) => {
                     if let Some(lost) = self.release(parcel.id) {
                         self.lose(&lost, reason);
                     }
                 }
-                Fate::Arrived { is_copy, is_repeated } => self.pass_on(&parcel, is_copy, is_repeated),
+                Delivery::Arrived { is_copy, is_repeated } => self.pass_on(&parcel, is_copy, is_repeated),
             }
         }
     }
 
-    fn pass_on(&mut self, parcel: &Parcel, is_copy: bool, is_repeated: bool) {
+    fn pass_on(&mut self, parcel: &Packet, is_copy: bool, is_repeated: bool) {
         let publisher = self.vehicles.get(&parcel.from).and_then(|vehicle| vehicle.publishers.get(&parcel.stream));
         let (Some(publisher), Some(arrival)) = (publisher, self.kept.get(&parcel.id)) else { return };
         match arrival.header.stamp.capture_nanos {

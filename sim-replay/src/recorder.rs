@@ -3,12 +3,12 @@
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
-use protocol::{Key, RunId, Selector, Stream, Topic, Verb};
+use protocol::{Key, KeyExpr, RunId, Stream, Topic, Verb};
 use serde::{Deserialize, Serialize};
 
-use bus::bounded_queue::Taken;
+use bus::bounded_queue::Pop;
 use bus::shutdown::Stop;
-use bus::{Bus, BusError, Overheard, Tap};
+use bus::{Bus, BusError, PassiveSubscriber, RawMessage};
 use recording::{RecordingError, RecordingOptions, RecordingWriter};
 
 /// Messages of one key that may wait for the disk.
@@ -106,7 +106,7 @@ pub fn record(
         }
         Err(error) => return Err(error.into()),
     };
-    let tap = bus.tap(&[Selector::run(&bus.identity().run)], PLACES)?;
+    let tap = bus.tap(&[KeyExpr::run(&bus.identity().run)], PLACES)?;
     stop.on_request(tap.closer());
     let presence = bus.announce(protocol::Role::Recorder)?;
     let mut recorder = Recorder {
@@ -152,18 +152,18 @@ struct Recorder<'a> {
 }
 
 impl Recorder<'_> {
-    fn listen(&mut self, tap: &Tap, keeps_running: bool) {
+    fn listen(&mut self, tap: &PassiveSubscriber, keeps_running: bool) {
         let mut flush_at = Instant::now() + FLUSH_PERIOD;
         loop {
             match tap.take(Some(flush_at)) {
-                Taken::Item(topic, overheard) => {
+                Pop::Item(topic, overheard) => {
                     if topic == Topic::Control(Verb::End) {
                         self.over = Some(Instant::now());
                     }
                     self.take(&overheard);
                 }
-                Taken::TimedOut => {}
-                Taken::Closed => return,
+                Pop::TimedOut => {}
+                Pop::Closed => return,
             }
             let now = Instant::now();
             if now >= flush_at {
@@ -176,7 +176,7 @@ impl Recorder<'_> {
         }
     }
 
-    fn take(&mut self, overheard: &Overheard) {
+    fn take(&mut self, overheard: &RawMessage) {
         let Key { run, topic } = &overheard.key;
         let stream = match topic {
             Topic::Stream { stream, .. } | Topic::Received { stream, .. } => Some(stream),

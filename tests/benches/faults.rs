@@ -62,7 +62,7 @@ fn under_faults(seed: u64, count: usize) -> Vec<String> {
     let faults = plan(seed, count);
     let report = FaultyFleet::start(folder.path())
         .suffer(&faults, |number, fault, ms| eprintln!("{number}: {fault}, as before after {ms} ms"));
-    let Report { findings, slowest, balances, differences, excused, stop, left_over, growth, restarts } = report;
+    let Report { findings, slowest, balances, differences, exempted, stop, left_over, growth, restarts } = report;
     let returns = findings.fused_again_ms.len();
     let ms: Vec<f64> = findings.fused_again_ms.iter().map(|&ms| ms as f64).collect();
     let ms = statistics::sorted(&ms);
@@ -75,7 +75,7 @@ fn under_faults(seed: u64, count: usize) -> Vec<String> {
         quantile(0.5),
         quantile(0.95)
     );
-    println!("{excused} messages excused, as one they concern was away; {differences}");
+    println!("{exempted} messages exempted, as one they concern was away; {differences}");
     let [descriptors, threads] = growth;
     missed(&[
         (

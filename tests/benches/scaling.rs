@@ -22,7 +22,7 @@ use std::time::{Duration, Instant};
 
 use agent::agent::{Agent, AgentInput};
 use anyhow::{Context, Result, bail};
-use bus::bounded_queue::Taken;
+use bus::bounded_queue::Pop;
 use bus::{Barrier, Bus, BusOptions, Event, Identity, PublisherOptions, Route, open, unix_nanos};
 use dataset::{self, LoadOptions};
 use fusion::Method;
@@ -182,7 +182,7 @@ fn measure(file: &Path, map: &EncodedFeatures, count: usize, seconds: u32) -> Re
     for index in 0..=count {
         routes.push(Route { topic: topic(index, Stream::Bev), receiver: "ego-0".parse()? });
     }
-    Barrier::new(routes).attend(&scorer)?.wait(PATIENCE)?;
+    Barrier::new(routes).await_routes(&scorer)?.wait(PATIENCE)?;
 
     let (began, mut cpu_ms, mut first_nanos) = (Instant::now(), 0.0, 0);
     let ticks = WARM_UP + seconds * 10;
@@ -200,12 +200,12 @@ fn measure(file: &Path, map: &EncodedFeatures, count: usize, seconds: u32) -> Re
     thread::sleep(PERIOD * 3);
     let cpu_ms = machine::cpu_ms(ego.id())? - cpu_ms;
     publishers.into_iter().for_each(bus::Publisher::finish);
-    presences.into_iter().try_for_each(bus::Presence::withdraw)?;
+    presences.into_iter().try_for_each(bus::LivelinessToken::withdraw)?;
     if !ego.wait()?.success() {
         bail!("the ego failed: see above");
     }
     let mut heard = Vec::new();
-    while let Taken::Item(_, Event::Message(arrival)) = inbox.take(Some(Instant::now())) {
+    while let Pop::Item(_, Event::Message(arrival)) = inbox.take(Some(Instant::now())) {
         let result: Detections = arrival.decode(&Limits::DEFAULT)?;
         let in_time = result.fused.iter().filter(|fused| fused.age_nanos == 0).count();
         let (capture_nanos, publish_nanos) = (arrival.header.stamp.capture_nanos, arrival.header.stamp.publish_nanos);

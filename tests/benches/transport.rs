@@ -51,7 +51,7 @@ impl Messages {
         let inbox = ego.inbox(4, 1);
         let subscription = ego.subscribe(topic.clone(), &inbox).expect("a subscription");
         let route = Route { topic, receiver: ego.identity().process.clone() };
-        Barrier::new([route]).attend(agent).expect("a bus").wait(PATIENCE).expect("a route");
+        Barrier::new([route]).await_routes(agent).expect("a bus").wait(PATIENCE).expect("a route");
         Self { publisher, inbox, _subscription: subscription }
     }
 

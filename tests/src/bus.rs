@@ -3,7 +3,7 @@
 use std::net::TcpListener;
 use std::time::{Duration, Instant};
 
-use bus::{self, Bus, BusOptions, Endpoint, Event, Identity, Inbox, bounded_queue::Taken};
+use bus::{self, Bus, BusOptions, Endpoint, Event, Identity, Inbox, bounded_queue::Pop};
 use protocol::{CavId, ProcessId, RunId, Topic};
 use zenoh::Session;
 
@@ -67,9 +67,9 @@ pub fn free_port() -> u16 {
 #[must_use]
 pub fn next_event(inbox: &Inbox) -> (Topic, Event) {
     match inbox.take(Some(Instant::now() + PATIENCE)) {
-        Taken::Item(topic, event) => (topic, event),
-        Taken::TimedOut => panic!("nothing came within {PATIENCE:?}"),
-        Taken::Closed => panic!("the inbox is closed"),
+        Pop::Item(topic, event) => (topic, event),
+        Pop::TimedOut => panic!("nothing came within {PATIENCE:?}"),
+        Pop::Closed => panic!("the inbox is closed"),
     }
 }
 

@@ -3,9 +3,9 @@
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 
-use bus::{self, Bus, BusError, BusOptions, Credentials, Endpoint, Guard, Identity, Refusal, Refusals};
+use bus::{self, AccessControl, Bus, BusError, BusOptions, Credentials, Endpoint, Identity, Rejection, RejectionLog};
 use deploy::operate::keys::{KeyPlan, make};
-use protocol::{CavId, Party, RunId, Runs};
+use protocol::{CavId, Principal, RunId, RunScope};
 use zenoh::{Config, Session, Wait};
 
 use crate::bus::free_port;
@@ -16,7 +16,7 @@ use crate::bus::free_port;
 /// When the disk refuses.
 #[must_use]
 pub fn keys_for(folder: &Path, parties: &[&str]) -> PathBuf {
-    let parties = parties.iter().map(|name| name.parse::<Party>().expect("a party")).collect();
+    let parties = parties.iter().map(|name| name.parse::<Principal>().expect("a party")).collect();
     make(&KeyPlan::new(folder, parties, 1)).expect("a writable folder");
     folder.to_path_buf()
 }
@@ -68,12 +68,12 @@ impl GuardedRouter {
     #[must_use]
     pub fn open(keys: &Path) -> Self {
         let credentials = Credentials::read(&keys.join("router")).expect("keys of a router");
-        let runs = Runs::One(RunId::new("test").expect("an identifier"));
-        let guard = Guard { members: credentials.members().expect("a list"), runs };
+        let runs = RunScope::One(RunId::new("test").expect("an identifier"));
+        let guard = AccessControl { members: credentials.members().expect("a list"), runs };
         // Another process may take the port between the two calls.
         let opened = (0..20).find_map(|_| {
             let options = BusOptions::router(Endpoint::loopback(free_port()));
-            let options = options.with_credentials(credentials.clone()).guarded_by(guard.clone());
+            let options = options.with_credentials(credentials.clone()).with_access_control(guard.clone());
             bus::open(&options).ok().map(|session| (options.endpoint().clone(), session))
         });
         let (endpoint, session) = opened.expect("a free port on loopback");
@@ -114,16 +114,16 @@ impl GuardedRouter {
     /// When the router does not take it.
     #[must_use]
     pub fn join(&self, party: &str) -> Bus {
-        let known: Party = party.parse().expect("a party");
+        let known: Principal = party.parse().expect("a party");
         self.join_as(party, party, known.cav.as_str()).expect("the router takes those with keys")
     }
 
     /// How many messages of one kind it has refused to a peer so far.
     #[must_use]
     pub fn refused(&self, peer: &str, message: &str) -> u64 {
-        let mut refusals = Refusals::of(&self.endpoint);
+        let mut refusals = RejectionLog::of(&self.endpoint);
         refusals.update(&self.session);
-        let is_it = |refusal: &Refusal| refusal.peer == peer && refusal.message == message;
+        let is_it = |refusal: &Rejection| refusal.peer == peer && refusal.message == message;
         refusals.counts().iter().filter(|(refusal, _)| is_it(refusal)).map(|(_, count)| count).sum()
     }
 }

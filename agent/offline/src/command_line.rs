@@ -29,7 +29,7 @@ enum Command {
     Train(command::train::Args),
 }
 
-/// Runs a subcommand.
+/// RunScope a subcommand.
 pub(crate) fn run(cli: Cli) -> ExitCode {
     let kept = malloc_settings::ensure(&malloc_settings::KEPT_MEMORY).context("this program again");
     let outcome = kept.and_then(|()| match cli.command {

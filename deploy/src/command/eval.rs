@@ -3,7 +3,7 @@
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
-use agent::attack::{AttackConfig, Lie};
+use agent::attack::{AttackConfig, Falsification};
 use agent::config::Threads;
 use agent::rate::RateConfig;
 use dataset::IntensityScale;
@@ -12,8 +12,8 @@ use deploy::experiment::evaluation::{EvaluationOptions, Part, evaluate, frame_co
 use deploy::experiment::report;
 use deploy::experiment::table::{self, TableObserver, TableSpec};
 use ego_fuser::config::EgoSettings;
-use ego_fuser::misbehaviour::TrustConfig;
-use ego_fuser_offline::evaluation::stepped::{ComputeTimes, Crew, SteppedConfig};
+use ego_fuser::misbehaviour::MisbehaviourConfig;
+use ego_fuser_offline::evaluation::stepped::{AgentPool, ComputeTimes, SteppedConfig};
 use fusion::Method;
 use indicatif::ProgressBar;
 use link::LinkConfig;
@@ -72,7 +72,7 @@ pub(crate) struct Arguments {
     compute: Vec<f64>,
     /// Lets neighbours lie: to see what that does to the ego.
     #[arg(long, value_enum, value_name = "LIE")]
-    attack: Option<Lie>,
+    attack: Option<Falsification>,
     /// How many of them lie, the first of every scenario (--attack).
     #[arg(long, default_value_t = 1, requires = "attack")]
     liars: usize,
@@ -153,7 +153,7 @@ impl Arguments {
             rate: self.rate.0,
             delay_nanos: self.delay * 1_000_000,
             attack: self.attack.map(|lie| AttackConfig { lie, liars: self.liars, seed: self.attack_seed }),
-            trust: self.trust.then(TrustConfig::default),
+            trust: self.trust.then(MisbehaviourConfig::default),
             maps: self.maps.as_ref().map(|folder| KeptMaps {
                 folder: folder.clone(),
                 dtype: codec.dtype,
@@ -189,7 +189,7 @@ impl Arguments {
             deadline_nanos: ego.deadline_ms.saturating_mul(1_000_000),
             pairing: ego.pairing(),
             compute: ComputeTimes { pose_ms, map_ms, fuse_ms },
-            crew: Crew::First(usize::MAX),
+            crew: AgentPool::First(usize::MAX),
             vehicles: BTreeMap::new(),
             ticks: 0..usize::MAX,
             lidar_variant: None,

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 use std::time::Duration;
 
 use deploy::operate::keys::{KeyError, KeyPlan, make};
-use protocol::{CavId, Party, Role};
+use protocol::{CavId, Principal, Role};
 use support::output;
 
 use support::cli::BadInput;
@@ -38,11 +38,11 @@ pub(crate) struct Arguments {
 impl Arguments {
     /// Writes the keys and names the files.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
-        let mut parties: Vec<Party> = self.agents.iter().map(|cav| Party::new(Role::Agent, cav)).collect();
-        parties.extend(self.egos.iter().flat_map(|cav| [Role::Ego, Role::Link].map(|role| Party::new(role, cav))));
+        let mut parties: Vec<Principal> = self.agents.iter().map(|cav| Principal::new(Role::Agent, cav)).collect();
+        parties.extend(self.egos.iter().flat_map(|cav| [Role::Ego, Role::Link].map(|role| Principal::new(role, cav))));
         // Later vehicles join a fleet whose other processes have theirs.
-        let others = [Role::Replay, Role::Scorer, Role::Recorder, Role::Viewer].map(Party::alone);
-        let has_own = |party: &Party| self.out.join(party.to_string()).exists();
+        let others = [Role::Replay, Role::Scorer, Role::Recorder, Role::Viewer].map(Principal::alone);
+        let has_own = |party: &Principal| self.out.join(party.to_string()).exists();
         parties.extend(others.into_iter().filter(|party| self.force || !has_own(party)));
         let mut plan = KeyPlan::new(&self.out, parties, self.days);
         plan.hosts.extend(self.hosts);

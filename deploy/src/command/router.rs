@@ -6,8 +6,8 @@ use std::time::{Duration, Instant};
 
 use anyhow::Context;
 use bus::shutdown::Stop;
-use bus::{BusOptions, Credentials, Endpoint, Guard, ROUTER, Refusals, STOP_LIMIT, open};
-use protocol::{RunId, Runs};
+use bus::{AccessControl, BusOptions, Credentials, Endpoint, ROUTER, RejectionLog, STOP_LIMIT, open};
+use protocol::{RunId, RunScope};
 use support::output;
 use zenoh::Wait;
 
@@ -65,7 +65,7 @@ impl Arguments {
         stop.enforce(STOP_LIMIT);
         let session = open(&options)?;
         output::note(format_args!("routing at {} (Ctrl-C ends it)", options.endpoint()));
-        let (mut refusals, mut said) = (Refusals::of(options.endpoint()), BTreeMap::new());
+        let (mut refusals, mut said) = (RejectionLog::of(options.endpoint()), BTreeMap::new());
         loop {
             let ended = stop.wait_until(Instant::now() + LOOK_ROUND);
             if options.guard.is_some() {
@@ -98,8 +98,8 @@ impl Arguments {
         let Some(folder) = &self.keys else { return Ok(options) };
         let credentials = Credentials::read(folder)?;
         credentials.check_name(ROUTER)?;
-        let runs = self.run.clone().map_or(Runs::Any, Runs::One);
-        let guard = Guard { members: credentials.members()?, runs };
-        Ok(options.with_credentials(credentials).guarded_by(guard))
+        let runs = self.run.clone().map_or(RunScope::Any, RunScope::One);
+        let guard = AccessControl { members: credentials.members()?, runs };
+        Ok(options.with_credentials(credentials).with_access_control(guard))
     }
 }

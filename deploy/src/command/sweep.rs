@@ -27,7 +27,7 @@ pub(crate) struct Arguments {
 }
 
 impl Arguments {
-    /// Runs the experiment and prints its table.
+    /// RunScope the experiment and prints its table.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
         tch::set_num_threads(1);
         let out = match self.out {

@@ -43,7 +43,7 @@ pub(crate) struct Arguments {
 }
 
 impl Arguments {
-    /// Runs the scenario and prints what came of it.
+    /// RunScope the scenario and prints what came of it.
     pub(crate) fn run(self) -> anyhow::Result<Outcome> {
         let mut scenario = Scenario::read(&self.scenario)?;
         if let Some(scene) = self.scene {

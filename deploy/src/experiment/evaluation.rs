@@ -10,7 +10,7 @@ use agent::attack::AttackConfig;
 use agent::rate::RateConfig;
 use dataset::evaluation_protocol::{EvaluationProtocol, ProtocolConfig};
 use dataset::{self, IntensityScale, OpenOptions, ReadError, Scenario};
-use ego_fuser::misbehaviour::TrustConfig;
+use ego_fuser::misbehaviour::MisbehaviourConfig;
 use ego_fuser_offline::evaluation::stepped::{ComputeTimes, SteppedConfig};
 use ego_fuser_offline::evaluation::{EvaluateConfig, EvaluateError, EvaluatedFrame, Evaluator};
 use fusion::Exchange;
@@ -21,7 +21,7 @@ use protocol::{CavId, CodecConfig};
 use training::feature_store::{FeatureStore, KeptMaps, MapSource};
 
 use crate::experiment::metrics::Metrics;
-use crate::experiment::score::Board;
+use crate::experiment::score::FrameScores;
 use crate::experiment::weights_choice::{WeightsChoiceError, weights_of};
 
 /// What to evaluate.
@@ -42,7 +42,7 @@ pub struct EvaluationOptions {
     /// Neighbours that lie; absent: none.
     pub attack: Option<AttackConfig>,
     /// Whether the ego leaves out neighbours that it does not trust, and when.
-    pub trust: Option<TrustConfig>,
+    pub trust: Option<MisbehaviourConfig>,
     /// Where maps of encoders are kept, so that each is computed once for many evaluations.
     pub maps: Option<KeptMaps>,
     /// Frames to judge at most, over all scenarios.
@@ -138,7 +138,7 @@ pub fn frame_count(options: &EvaluationOptions) -> Result<usize, EvaluationError
     Ok(options.frames.map_or(ticks, |frames| frames.min(ticks)))
 }
 
-/// Runs one method over all scenarios, the first vehicle of each being the ego; `on_frame` is told of every frame. Frames
+/// RunScope one method over all scenarios, the first vehicle of each being the ego; `on_frame` is told of every frame. Frames
 /// and parts that cannot be read are left out and counted in [`Metrics::left_out`].
 ///
 /// # Errors
@@ -160,7 +160,7 @@ pub(crate) fn judged(
     options: &EvaluationOptions,
     method: Method,
     on_frame: &mut dyn FnMut(),
-) -> Result<(Board, Evaluator, Instant), EvaluationError> {
+) -> Result<(FrameScores, Evaluator, Instant), EvaluationError> {
     let began = Instant::now();
     let OpenedData { scenarios, protocol, problems } = options.part.open(&options.dataset, &options.protocol)?;
     let weights = weights_of(&options.weights, method)?;
@@ -179,7 +179,7 @@ pub(crate) fn judged(
         evaluator = evaluator.with_maps(maps(kept, &weights, &scenarios)?);
     }
     if let Some(stepped) = &options.stepped {
-        evaluator = evaluator.over_link(stepped.clone());
+        evaluator = evaluator.with_link(stepped.clone());
     }
     evaluator.add_left_out_files(&problems);
     let grid = evaluator.ego().detector().config().feature_grid();
@@ -188,13 +188,13 @@ pub(crate) fn judged(
     let left = options.frames.unwrap_or(usize::MAX);
     // Without a time to compute, a result is as old as its sweep by definition: that is no latency.
     let is_timed = options.stepped.as_ref().is_some_and(|stepped| stepped.compute != ComputeTimes::NONE);
-    let mut board: Option<Board> = None;
+    let mut board: Option<FrameScores> = None;
     for scenario in options.part.chosen(&scenarios) {
         let Some(ego) = scenario.agents.first() else { continue };
         if !scenario.has_poses(0, 0) {
             return Err(EvaluationError::NoPoses { scenario: scenario.name.clone(), ego: ego.clone() });
         }
-        let board = board.get_or_insert_with(|| Board::new(ego.clone(), *evaluator.rule(), map_values));
+        let board = board.get_or_insert_with(|| FrameScores::new(ego.clone(), *evaluator.rule(), map_values));
         board.change_ego(ego);
         let judged = evaluator.run(scenario, &mut |frame| {
             judge(board, frame, is_timed);
@@ -218,7 +218,7 @@ fn maps(kept: &KeptMaps, weights: &Path, scenarios: &[Scenario]) -> Result<MapSo
 }
 
 /// Judges a frame; where computers take a time its stamp says when it was published.
-pub(crate) fn judge(board: &mut Board, frame: EvaluatedFrame, is_timed: bool) {
+pub(crate) fn judge(board: &mut FrameScores, frame: EvaluatedFrame, is_timed: bool) {
     let EvaluatedFrame { tick, stamp, result, frames, poses, objects } = frame;
     let poses: Vec<_> = frames.iter().map(|frame| frame.cav.clone()).zip(poses).collect();
     let truth: Vec<(CavId, _)> =
@@ -227,7 +227,12 @@ pub(crate) fn judge(board: &mut Board, frame: EvaluatedFrame, is_timed: bool) {
     board.judge_whole((tick as u64, stamp.capture_nanos), latency_ms, result, objects, &poses, truth);
 }
 
-pub(crate) fn metrics(board: &Board, evaluator: &Evaluator, options: &EvaluationOptions, began: Instant) -> Metrics {
+pub(crate) fn metrics(
+    board: &FrameScores,
+    evaluator: &Evaluator,
+    options: &EvaluationOptions,
+    began: Instant,
+) -> Metrics {
     let (clock, seconds) = match options.stepped {
         Some(_) => ("stepped", board.seconds()),
         None => ("offline", began.elapsed().as_secs_f64()),

@@ -2,8 +2,8 @@
 
 use std::collections::{BTreeMap, BTreeSet};
 
-use bus::Refusal;
-use protocol::{Balance, Counts, Ledger, StageSummary};
+use bus::Rejection;
+use protocol::{Counts, Ledger, Reconciliation, StageSummary};
 use serde::Serialize;
 
 use crate::experiment::score::ProcessBooks;
@@ -14,11 +14,11 @@ pub struct LedgerReport {
     /// Whether every message that was sent is received, dropped for a reason, or in flight.
     pub balances: bool,
     /// What does not add up, and topics that nobody listened to.
-    pub balance: Balance,
+    pub balance: Reconciliation,
     /// Processes that were away for a while.
     pub away: BTreeSet<String>,
     /// Messages of which nobody can tell what became of them, because one of those was away.
-    pub excused: u64,
+    pub exempted: u64,
     /// Everything added up.
     pub total: Counts,
     /// All processes together, by topic and receiver.
@@ -55,13 +55,13 @@ pub struct ProcessReport {
 }
 
 impl LedgerReport {
-    /// The report on `books`, whose sum is `sum`; who was away, and what is excused by that.
+    /// The report on `books`, whose sum is `sum`; who was away, and what is exempted by that.
     #[must_use]
     pub fn new(
         books: &[ProcessBooks],
         sum: &Ledger,
-        balance: &Balance,
-        (away, excused): (&BTreeSet<String>, u64),
+        balance: &Reconciliation,
+        (away, exempted): (&BTreeSet<String>, u64),
     ) -> Self {
         let process = |books: &ProcessBooks| ProcessReport {
             process: books.process.to_string(),
@@ -72,7 +72,7 @@ impl LedgerReport {
             balances: balance.is_exact(),
             balance: balance.clone(),
             away: away.clone(),
-            excused,
+            exempted,
             total: sum.total(),
             sum: sum.clone(),
             refused: Vec::new(),
@@ -82,8 +82,8 @@ impl LedgerReport {
 
     /// The same with what the router of the run refused.
     #[must_use]
-    pub fn with_refused(self, refused: &BTreeMap<Refusal, u64>) -> Self {
-        let refused = refused.iter().map(|(Refusal { peer, message, reason }, count)| RefusedReport {
+    pub fn with_refused(self, refused: &BTreeMap<Rejection, u64>) -> Self {
+        let refused = refused.iter().map(|(Rejection { peer, message, reason }, count)| RefusedReport {
             peer: peer.clone(),
             message: message.clone(),
             reason: reason.clone(),

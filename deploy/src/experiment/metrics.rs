@@ -12,7 +12,7 @@ use protocol::{CavId, Counts, DropReason, Ledger};
 use serde::{Deserialize, Serialize};
 use support::statistics::{quantile, sorted};
 
-use crate::experiment::score::{Board, NeighbourRecord};
+use crate::experiment::score::{FrameScores, NeighbourRecord};
 
 pub use answered::Answered;
 pub use contribution::Contribution;
@@ -69,7 +69,7 @@ pub struct Metrics {
 impl Metrics {
     /// What a board has seen of a run of `seconds`; `sent_bytes` is the size of all that neighbours sent, where it is known.
     pub(crate) fn of(
-        board: &Board,
+        board: &FrameScores,
         clock: &str,
         [method, pose_source]: [&str; 2],
         seconds: f64,

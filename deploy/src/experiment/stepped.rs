@@ -11,7 +11,7 @@ use std::path::PathBuf;
 
 use agent::config::AgentSettings;
 use dataset::{self, Scenario as Recorded};
-use ego_fuser_offline::evaluation::stepped::{ComputeTimes, Crew, SteppedConfig, VehicleConfig};
+use ego_fuser_offline::evaluation::stepped::{AgentPool, ComputeTimes, SteppedConfig, VehicleConfig};
 use ego_fuser_offline::evaluation::{EvaluateConfig, EvaluateError, EvaluatedFrame, Evaluator};
 use link::LinkConfig;
 use localization::pose_source::PoseSourceConfig;
@@ -22,14 +22,14 @@ use crate::experiment::evaluation::judge;
 use crate::experiment::fingerprint::Provenance;
 use crate::experiment::ledger_report::LedgerReport;
 use crate::experiment::metrics::Metrics;
-use crate::experiment::score::Board;
+use crate::experiment::score::FrameScores;
 use crate::operate::agent_pool::CrewProcesses;
 use crate::operate::fleet::{Fleet, FleetError, open_options};
 use crate::operate::run_fleet::{RunResult, UpError, UpOptions};
 use crate::operate::run_folder::{RunFolder, RunFolderError, name_of_now};
 use crate::scenario::{Scenario, Stepped};
 
-/// Runs a scenario in virtual time to its end.
+/// RunScope a scenario in virtual time to its end.
 ///
 /// # Errors
 /// [`UpError`] when the scenario makes no fleet, or a frame cannot be read or computed.
@@ -46,7 +46,7 @@ pub fn up(scenario: &Scenario, options: &UpOptions) -> Result<RunResult, UpError
     let processes = fleet.scenario.stepped.is_some_and(|stepped| stepped.processes);
     fleet.scenario.stepped = Some(Stepped { compute: Some(compute), processes });
     let run = fleet.scenario.run.clone().unwrap_or_else(|| name_of_now(options.prefix));
-    let mut evaluator = evaluator.over_link(stepped_config(&fleet, compute)?);
+    let mut evaluator = evaluator.with_link(stepped_config(&fleet, compute)?);
     let folder = RunFolder::create(&options.runs, &run)?;
     let result = go(&fleet, &recorded, &mut evaluator, (&run, &folder), options);
     if result.as_ref().is_err_and(UpError::is_refusal) {
@@ -55,7 +55,7 @@ pub fn up(scenario: &Scenario, options: &UpOptions) -> Result<RunResult, UpError
     result
 }
 
-/// Runs a fleet, as the run of that name in that folder.
+/// RunScope a fleet, as the run of that name in that folder.
 fn go(
     fleet: &Fleet,
     recorded: &Recorded,
@@ -118,7 +118,7 @@ fn stepped_config(fleet: &Fleet, compute: ComputeTimes) -> Result<SteppedConfig,
         deadline_nanos: ego.deadline_ms.saturating_mul(1_000_000),
         pairing: ego.pairing(),
         compute,
-        crew: Crew::Named(std::iter::once(&fleet.ego).chain(others).cloned().collect()),
+        crew: AgentPool::Named(std::iter::once(&fleet.ego).chain(others).cloned().collect()),
         vehicles: vehicles.collect(),
         ticks: scene.seek..last,
         lidar_variant: scene.variant.clone(),
@@ -135,9 +135,14 @@ fn for_scene(pose: &PoseSourceConfig, scenario: &Scenario) -> PoseSourceConfig {
     pose.for_scenario(scenario.scene.scenario.as_deref().unwrap_or_default())
 }
 
-/// Runs over the ticks; detections go to their file as they come.
-fn play(fleet: &Fleet, recorded: &Recorded, evaluator: &mut Evaluator, folder: &RunFolder) -> Result<Board, UpError> {
-    let mut board = Board::new(fleet.ego.clone(), fleet.ground_truth_rule(), fleet.map_values());
+/// RunScope over the ticks; detections go to their file as they come.
+fn play(
+    fleet: &Fleet,
+    recorded: &Recorded,
+    evaluator: &mut Evaluator,
+    folder: &RunFolder,
+) -> Result<FrameScores, UpError> {
+    let mut board = FrameScores::new(fleet.ego.clone(), fleet.ground_truth_rule(), fleet.map_values());
     let path = folder.file("detections.jsonl");
     let unwritable = |source| RunFolderError::Write { path: path.clone(), source };
     let mut file = BufWriter::new(File::create(&path).map_err(unwritable)?);
@@ -158,7 +163,7 @@ fn play(fleet: &Fleet, recorded: &Recorded, evaluator: &mut Evaluator, folder: &
 fn write(
     fleet: &Fleet,
     evaluator: &Evaluator,
-    board: &Board,
+    board: &FrameScores,
     folder: RunFolder,
     options: &UpOptions,
 ) -> Result<RunResult, UpError> {

@@ -8,15 +8,15 @@ use std::time::Duration;
 use bus::shutdown::Stop;
 use bus::{Bus, Identity};
 use ego_fuser_offline::evaluation::EvaluateError;
-use ego_fuser_offline::evaluation::stepped::RemoteCrew;
+use ego_fuser_offline::evaluation::stepped::RemotePool;
 use protocol::{CavId, ProcessId, RunId};
 
-use crate::operate::fleet::{Fleet, Meeting};
-use crate::operate::network::MeetingPlace;
+use crate::operate::fleet::{Fleet, SessionContext};
+use crate::operate::network::RouterEndpoint;
 use crate::operate::run_fleet::UpError;
 use crate::operate::run_folder::RunFolder;
 use crate::operate::security::RunKeys;
-use crate::operate::supervise::{Happening, Supervisor};
+use crate::operate::supervise::{ProcessEventKind, Supervisor};
 
 /// What the process that hands out the sweeps is called on the bus.
 const NAME: &str = "stepped";
@@ -27,7 +27,7 @@ const LEAVE_LIMIT: Duration = Duration::from_secs(2);
 pub(crate) struct CrewProcesses {
     supervisor: Supervisor,
     bus: Bus,
-    place: MeetingPlace,
+    place: RouterEndpoint,
     grace: Duration,
     _keys: Option<RunKeys>,
 }
@@ -42,11 +42,11 @@ impl CrewProcesses {
         run: &RunId,
         folder: &RunFolder,
         programs: &Path,
-    ) -> Result<(Self, RemoteCrew), UpError> {
+    ) -> Result<(Self, RemotePool), UpError> {
         let keys = fleet.keys(folder)?;
-        let place = MeetingPlace::open(&fleet.scenario.network, run, keys.as_ref())?;
+        let place = RouterEndpoint::open(&fleet.scenario.network, run, keys.as_ref())?;
         let endpoint = &place.endpoint;
-        let specs = fleet.agent_processes(&Meeting { run, endpoint, keys: keys.as_ref(), programs, folder })?;
+        let specs = fleet.agent_processes(&SessionContext { run, endpoint, keys: keys.as_ref(), programs, folder })?;
         place.check_free(&fleet.scenario.network, run, &specs)?;
         let identity = Identity {
             run: run.clone(),
@@ -62,7 +62,7 @@ impl CrewProcesses {
             let stop = stop.clone();
             move || {
                 for event in happened {
-                    if let Happening::GaveUp { how, .. } = event.what {
+                    if let ProcessEventKind::GaveUp { how, .. } = event.what {
                         tracing::error!("{} {how}", event.name);
                         stop.request();
                     }
@@ -72,7 +72,7 @@ impl CrewProcesses {
         let stream = fleet.publish().stream();
         let vehicles: Vec<_> = fleet.agents.iter().map(|cav| (cav.clone(), stream)).collect();
         let timeouts = &fleet.scenario.timeouts;
-        let remote = RemoteCrew::meet(&bus, &vehicles, Duration::from_secs_f64(timeouts.ready_s), &stop)
+        let remote = RemotePool::connect(&bus, &vehicles, Duration::from_secs_f64(timeouts.ready_s), &stop)
             .map_err(|error| EvaluateError::from(Box::new(error)))?;
         let grace = Duration::from_secs_f64(timeouts.stop_s);
         Ok((Self { supervisor, bus, place, grace, _keys: keys }, remote))

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use sim_replay::recorder::RecordReport;
 
 use crate::operate::fleet::RECORDER;
-use crate::operate::supervise::{Happening, ProcessEvent};
+use crate::operate::supervise::{ProcessEvent, ProcessEventKind};
 
 /// The failures of a run, by process.
 #[derive(Debug, Default)]
@@ -21,25 +21,25 @@ impl Failures {
     pub(crate) fn note(&mut self, event: &ProcessEvent) -> Option<&str> {
         let ProcessEvent { name, what } = event;
         let words = match what {
-            Happening::Said { line } if name == RECORDER => {
+            ProcessEventKind::Said { line } if name == RECORDER => {
                 serde_json::from_str::<RecordReport>(line).ok()?.loss_in_words()?
             }
-            Happening::Said { line } => {
+            ProcessEventKind::Said { line } => {
                 self.said.insert(name.clone(), line.clone());
                 return None;
             }
             // Its report tells why.
-            Happening::Done { data_lost: true } if self.failed.contains_key(name) => return None,
-            Happening::Done { data_lost: true } => match self.said.get(name) {
+            ProcessEventKind::Done { data_lost: true } if self.failed.contains_key(name) => return None,
+            ProcessEventKind::Done { data_lost: true } => match self.said.get(name) {
                 Some(line) => format!("data were lost: {line}"),
                 None => "data were lost; see its log".into(),
             },
-            Happening::GaveUp { how, is_optional: true } => format!("{how}; the run went on without it"),
-            Happening::Failed { how } => format!("{how} when it was asked to end"),
-            Happening::GaveUp { is_optional: false, .. }
-            | Happening::Started { .. }
-            | Happening::Fell { .. }
-            | Happening::Done { data_lost: false } => return None,
+            ProcessEventKind::GaveUp { how, is_optional: true } => format!("{how}; the run went on without it"),
+            ProcessEventKind::Failed { how } => format!("{how} when it was asked to end"),
+            ProcessEventKind::GaveUp { is_optional: false, .. }
+            | ProcessEventKind::Started { .. }
+            | ProcessEventKind::Fell { .. }
+            | ProcessEventKind::Done { data_lost: false } => return None,
         };
         self.failed.insert(name.clone(), words);
         self.failed.get(name).map(String::as_str)
@@ -55,7 +55,7 @@ impl Failures {
 mod tests {
     use super::*;
 
-    fn noted(events: &[(&str, Happening)]) -> Vec<String> {
+    fn noted(events: &[(&str, ProcessEventKind)]) -> Vec<String> {
         let mut failures = Failures::default();
         for (name, what) in events {
             failures.note(&ProcessEvent { name: (*name).into(), what: what.clone() });
@@ -63,7 +63,7 @@ mod tests {
         failures.in_words()
     }
 
-    fn report(failure: Option<&str>, not_written: u64) -> Happening {
+    fn report(failure: Option<&str>, not_written: u64) -> ProcessEventKind {
         let report = RecordReport {
             file: "runs/a/recording.mcap".into(),
             messages: 40,
@@ -73,7 +73,7 @@ mod tests {
             not_written,
             failure: failure.map(str::to_owned),
         };
-        Happening::Said { line: serde_json::to_string(&report).unwrap() }
+        ProcessEventKind::Said { line: serde_json::to_string(&report).unwrap() }
     }
 
     #[test]
@@ -81,25 +81,28 @@ mod tests {
         let events = [
             ("recorder", report(Some("disk full"), 0)),
             ("recorder", report(Some("disk full"), 344)),
-            ("recorder", Happening::Done { data_lost: true }),
+            ("recorder", ProcessEventKind::Done { data_lost: true }),
         ];
         let words = "recorder: recording cut at 0.9 s: disk full, 344 messages missing; \
                      sim-replay recover runs/a/recording.mcap --out runs/a/recording.whole.mcap";
         assert_eq!(noted(&events), [words]);
-        assert!(noted(&[("recorder", report(None, 0)), ("recorder", Happening::Done { data_lost: false })]).is_empty());
+        assert!(
+            noted(&[("recorder", report(None, 0)), ("recorder", ProcessEventKind::Done { data_lost: false })])
+                .is_empty()
+        );
     }
 
     #[test]
     fn every_process_counts() {
-        let said = |line: &str| Happening::Said { line: line.into() };
+        let said = |line: &str| ProcessEventKind::Said { line: line.into() };
         let events = [
             ("replay", said("7 ticks were not answered")),
-            ("replay", Happening::Done { data_lost: true }),
-            ("link-1", Happening::Failed { how: "ended with code 1".into() }),
-            ("agent-1", Happening::Started { pid: 1 }),
+            ("replay", ProcessEventKind::Done { data_lost: true }),
+            ("link-1", ProcessEventKind::Failed { how: "ended with code 1".into() }),
+            ("agent-1", ProcessEventKind::Started { pid: 1 }),
             ("agent-1", said("40 sweeps")),
-            ("agent-1", Happening::Done { data_lost: false }),
-            ("recorder", Happening::GaveUp { how: "was ended by signal 9".into(), is_optional: true }),
+            ("agent-1", ProcessEventKind::Done { data_lost: false }),
+            ("recorder", ProcessEventKind::GaveUp { how: "was ended by signal 9".into(), is_optional: true }),
         ];
         assert_eq!(
             noted(&events),

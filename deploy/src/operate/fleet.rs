@@ -12,18 +12,18 @@ use dataset::ground_truth::GroundTruthRule;
 use dataset::{self, OpenOptions};
 use fusion::Exchange;
 use fusion::Method;
-use link::Air;
+use link::LinkEmulator;
 use localization::competitors::EndToEndLocalizer;
 use localization::pgc::{Localizer, LocalizerError};
 use localization::pose_source::PoseSourceConfig;
 use perception::model_config::DetectorConfig;
 use perception::weights::Weights;
-use protocol::{CavId, Party, Role};
+use protocol::{CavId, Principal, Role};
 use sim_replay::config::SceneConfig;
 use tch::Device;
 
 pub use self::error::FleetError;
-pub use self::processes::Meeting;
+pub use self::processes::SessionContext;
 use crate::experiment::weights_choice::weights_of;
 use crate::operate::keys::KeyError;
 use crate::operate::run_folder::RunFolder;
@@ -78,7 +78,7 @@ impl Fleet {
         let detector = Weights::load(&scenario.models.weights)?.config()?;
         scenario.poses().iter().try_for_each(load_networks)?;
         if let Some(link) = &scenario.link {
-            Air::open(&link.model, link.seed)?;
+            LinkEmulator::open(&link.model, link.seed)?;
         }
         let scene = &mut scenario.scene;
         let dataset = dataset::open_with(&scene.dir, &open_options(scene))?;
@@ -158,10 +158,10 @@ impl Fleet {
 
     /// Every process that the run may have, for its keys.
     #[must_use]
-    pub fn parties(&self) -> Vec<Party> {
-        let agents = self.agents.iter().map(|cav| Party::new(Role::Agent, cav));
-        let egos = [Role::Ego, Role::Link].map(|role| Party::new(role, &self.ego));
-        let others = [Role::Replay, Role::Scorer, Role::Recorder, Role::Viewer].map(Party::alone);
+    pub fn parties(&self) -> Vec<Principal> {
+        let agents = self.agents.iter().map(|cav| Principal::new(Role::Agent, cav));
+        let egos = [Role::Ego, Role::Link].map(|role| Principal::new(role, &self.ego));
+        let others = [Role::Replay, Role::Scorer, Role::Recorder, Role::Viewer].map(Principal::alone);
         agents.chain(egos).chain(others).collect()
     }
 

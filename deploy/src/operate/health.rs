@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 
 use serde::{Deserialize, Serialize};
 
-use crate::operate::supervise::{Happening, ProcessEvent};
+use crate::operate::supervise::{ProcessEvent, ProcessEventKind};
 
 /// Without news for so long, a process is shown as silent.
 const SILENT: Duration = Duration::from_millis(1500);
@@ -107,7 +107,7 @@ impl Health {
             failure: None,
         });
         match &event.what {
-            Happening::Started { pid } => {
+            ProcessEventKind::Started { pid } => {
                 *noted = Noted {
                     state: State::Starting,
                     pid: Some(*pid),
@@ -118,16 +118,16 @@ impl Health {
                     failure: noted.failure.take(),
                 };
             }
-            Happening::Fell { how, restart, .. } => {
+            ProcessEventKind::Fell { how, restart, .. } => {
                 (noted.state, noted.pid, noted.restarts) = (State::Fallen, None, *restart);
                 noted.last_fall = Some(how.clone());
             }
-            Happening::Said { .. } => {}
-            Happening::GaveUp { how, .. } | Happening::Failed { how } => {
+            ProcessEventKind::Said { .. } => {}
+            ProcessEventKind::GaveUp { how, .. } | ProcessEventKind::Failed { how } => {
                 (noted.state, noted.pid) = (State::Down, None);
                 noted.last_fall = Some(how.clone());
             }
-            Happening::Done { .. } => (noted.state, noted.pid) = (State::Ended, None),
+            ProcessEventKind::Done { .. } => (noted.state, noted.pid) = (State::Ended, None),
         }
     }
 
@@ -230,7 +230,7 @@ impl Usage {
 mod tests {
     use super::*;
 
-    fn event(name: &str, what: Happening) -> ProcessEvent {
+    fn event(name: &str, what: ProcessEventKind) -> ProcessEvent {
         ProcessEvent { name: name.into(), what }
     }
 
@@ -238,7 +238,7 @@ mod tests {
     fn watch() -> (Health, Instant) {
         let mut health = Health::new(Duration::from_secs(5), Duration::from_secs(60));
         let began = Instant::now();
-        health.note(&event("ego", Happening::Started { pid: std::process::id() }), began);
+        health.note(&event("ego", ProcessEventKind::Started { pid: std::process::id() }), began);
         (health, began)
     }
 
@@ -264,7 +264,8 @@ mod tests {
         assert_eq!(state(&health), State::Silent);
         let hanging = look(&mut health, began, [6000, 6100, 1000]);
         assert_eq!(hanging, [("ego".to_owned(), "has said nothing for 5.1 s".to_owned())]);
-        health.note(&event("ego", Happening::Fell { how: "hung".into(), again_after: SILENT, restart: 1 }), began);
+        health
+            .note(&event("ego", ProcessEventKind::Fell { how: "hung".into(), again_after: SILENT, restart: 1 }), began);
         let status = health.statuses(began).remove(0);
         assert_eq!((status.state, status.restarts, status.last_fall.as_deref()), (State::Fallen, 1, Some("hung")));
     }

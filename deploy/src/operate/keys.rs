@@ -18,7 +18,7 @@ use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 use bus::{AUTHORITY_FILE, CERTIFICATE_FILE, KEY_FILE, MEMBERS_FILE, ROUTER};
-use protocol::Party;
+use protocol::Principal;
 use rcgen::{
     BasicConstraints, CertificateParams, DistinguishedName, DnType, ExtendedKeyUsagePurpose, IsCa, Issuer, KeyPair,
     KeyUsagePurpose, SanType, date_time_ymd,
@@ -37,7 +37,7 @@ pub struct KeyPlan {
     /// Where; an authority that is there already signs.
     pub folder: PathBuf,
     /// For whom, beside the router.
-    pub parties: Vec<Party>,
+    pub parties: Vec<Principal>,
     /// Names and addresses under which the router is reached.
     pub hosts: Vec<String>,
     /// How long the certificates hold.
@@ -49,7 +49,7 @@ pub struct KeyPlan {
 impl KeyPlan {
     /// Certificates for `parties` of a fleet on this machine, for `days` days.
     #[must_use]
-    pub fn new(folder: &Path, parties: Vec<Party>, days: u32) -> Self {
+    pub fn new(folder: &Path, parties: Vec<Principal>, days: u32) -> Self {
         let hosts = ["localhost", "127.0.0.1", "::1"].map(str::to_owned).into();
         Self { folder: folder.to_path_buf(), parties, hosts, lifetime: DAY * days, replace: false }
     }
@@ -84,7 +84,7 @@ pub enum KeyError {
 /// # Errors
 /// [`KeyError`]; files that were written before it stay.
 pub fn make(plan: &KeyPlan) -> Result<Vec<PathBuf>, KeyError> {
-    let mut desk = Desk { plan, written: Vec::new() };
+    let mut desk = KeyStore { plan, written: Vec::new() };
     let folders = plan.parties.iter().map(ToString::to_string).chain([ROUTER.to_owned()]);
     let folders: Vec<(String, PathBuf)> = folders.map(|name| (name.clone(), plan.folder.join(name))).collect();
     let router_is_there = plan.folder.join(ROUTER).join(CERTIFICATE_FILE).exists();
@@ -109,12 +109,12 @@ struct Authority {
     issuer: Issuer<'static, KeyPair>,
 }
 
-struct Desk<'a> {
+struct KeyStore<'a> {
     plan: &'a KeyPlan,
     written: Vec<PathBuf>,
 }
 
-impl Desk<'_> {
+impl KeyStore<'_> {
     /// Takes the authority of the folder, or founds one.
     fn authority(&mut self) -> Result<Authority, KeyError> {
         let folder = &self.plan.folder;
@@ -163,7 +163,7 @@ impl Desk<'_> {
         for entry in fs::read_dir(folder).map_err(io)? {
             let entry = entry.map_err(io)?;
             let name = entry.file_name().to_string_lossy().into_owned();
-            if entry.path().join(CERTIFICATE_FILE).exists() && name.parse::<Party>().is_ok() {
+            if entry.path().join(CERTIFICATE_FILE).exists() && name.parse::<Principal>().is_ok() {
                 members.push(name + "\n");
             }
         }
@@ -229,7 +229,7 @@ mod tests {
 
     use super::*;
 
-    fn parties(names: &[&str]) -> Vec<Party> {
+    fn parties(names: &[&str]) -> Vec<Principal> {
         names.iter().map(|name| name.parse().unwrap()).collect()
     }
 

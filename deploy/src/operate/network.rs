@@ -7,7 +7,7 @@ use bus::shutdown::{self, Overdue};
 use bus::{BusError, BusOptions, Endpoint, open, present, process_id};
 use zenoh::{Session, Wait};
 
-use protocol::{Party, ProcessId, Role, RunId};
+use protocol::{Principal, ProcessId, Role, RunId};
 
 use crate::experiment::score::scorer_cav;
 use crate::operate::run_fleet::UpError;
@@ -19,7 +19,7 @@ use crate::scenario::Network;
 const CLOSE_LIMIT: Duration = Duration::from_millis(500);
 
 /// An open session, and the endpoint that the other processes connect to.
-pub struct MeetingPlace {
+pub struct RouterEndpoint {
     /// The session of this process.
     pub session: Session,
     /// What to tell the others.
@@ -28,7 +28,7 @@ pub struct MeetingPlace {
     pub is_guarded: bool,
 }
 
-impl MeetingPlace {
+impl RouterEndpoint {
     /// Opens the router of this run, or connects to the one that the scenario names; with keys over QUIC.
     ///
     /// # Errors
@@ -38,7 +38,7 @@ impl MeetingPlace {
             Some(router) => {
                 let options = BusOptions::client(Endpoint::new(router)?);
                 keys.map_or(Ok(options.clone()), |keys| {
-                    keys.for_client(options, Party::alone(Role::Scorer).name().as_str())
+                    keys.for_client(options, Principal::alone(Role::Scorer).name().as_str())
                 })
             }
             None => {
@@ -131,7 +131,7 @@ mod tests {
         let taken = TcpListener::bind("127.0.0.1:0").unwrap();
         let listen = format!("tcp/{}", taken.local_addr().unwrap());
         let network = Network { listen: listen.clone(), ..Network::default() };
-        let error = MeetingPlace::open(&network, &"r1".parse().unwrap(), None).err().unwrap().to_string();
+        let error = RouterEndpoint::open(&network, &"r1".parse().unwrap(), None).err().unwrap().to_string();
         assert!(error.contains(&listen) && error.contains("in use"), "{error}");
     }
 }

@@ -1,21 +1,21 @@
 //! Who was away for a while during a run, and of whose messages therefore nobody can tell what became of them.
 //!
 //! The books of a process that is killed end with what it told last, up to half a second before; what is sent to one that
-//! is not there, or over a connection that breaks, arrives nowhere. Such accounts are excused by name, in the ledger and
+//! is not there, or over a connection that breaks, arrives nowhere. Such accounts are exempted by name, in the ledger and
 //! in the report; all others have to add up.
 
 use std::collections::BTreeSet;
 use std::sync::{Arc, Mutex, PoisonError};
 
-use bus::{Bus, BusError, Sighting, Watch, process_id};
+use bus::{Bus, BusError, LivelinessEvent, LivelinessSubscription, process_id};
 use protocol::{Account, Role, Stream, Topic};
 
 const ROLES: [Role; 4] = [Role::Agent, Role::Ego, Role::Link, Role::Replay];
 
 /// Notes who vanishes and comes back.
-pub struct Absences {
+pub struct OfflineIntervals {
     state: Arc<Mutex<State>>,
-    _watches: Vec<Watch>,
+    _watches: Vec<LivelinessSubscription>,
 }
 
 #[derive(Default)]
@@ -26,7 +26,7 @@ struct State {
     returned: BTreeSet<String>,
 }
 
-impl Absences {
+impl OfflineIntervals {
     /// Watches everyone on `bus`.
     ///
     /// # Errors
@@ -38,10 +38,10 @@ impl Absences {
             bus.watch(role, move |sighting| {
                 let mut state = state.lock().unwrap_or_else(PoisonError::into_inner);
                 match sighting {
-                    Sighting::Vanished { role, cav } => {
+                    LivelinessEvent::Vanished { role, cav } => {
                         state.gone.insert(process_id(role, &cav).to_string());
                     }
-                    Sighting::Appeared { role, cav } => {
+                    LivelinessEvent::Appeared { role, cav } => {
                         let name = process_id(role, &cav).to_string();
                         if state.gone.remove(&name) {
                             state.returned.insert(name);

@@ -7,23 +7,23 @@ use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
 
 use bus::shutdown::Stop;
-use bus::{BusError, Endpoint, Refusal};
+use bus::{BusError, Endpoint, Rejection};
 use ego_fuser_offline::evaluation::EvaluateError;
-use protocol::{Balance, Ledger, ProcessId, RunId};
+use protocol::{Ledger, ProcessId, Reconciliation, RunId};
 
 use crate::experiment::fingerprint::Provenance;
 use crate::experiment::ledger_report::LedgerReport;
 use crate::experiment::metrics::Metrics;
 use crate::experiment::progress::Display;
-use crate::experiment::score::{Board, Progress, Scored, ScorerError, ScorerNode};
-use crate::operate::fleet::{Fleet, FleetError, Meeting, RECORDER, REPLAY};
+use crate::experiment::score::{FrameScores, Progress, Scored, ScorerError, ScorerNode};
+use crate::operate::fleet::{Fleet, FleetError, RECORDER, REPLAY, SessionContext};
 use crate::operate::keys::KeyError;
-use crate::operate::network::MeetingPlace;
+use crate::operate::network::RouterEndpoint;
 use crate::operate::offline_intervals;
 use crate::operate::run_folder::{RunFolder, RunFolderError, SWEEP_LOG, name_of_now};
 use crate::operate::security::RefusalWatch;
 use crate::operate::status::Phase;
-use crate::operate::status_reporter::{Ending, Watch};
+use crate::operate::status_reporter::{Ending, StatusReporter};
 use crate::operate::supervise::{ProcessSpec, SuperviseError, Supervisor};
 use crate::scenario::{Clock, Scenario};
 
@@ -56,7 +56,7 @@ pub struct RunResult {
     /// The numbers.
     pub metrics: Metrics,
     /// Whether every message is accounted for.
-    pub balance: Balance,
+    pub balance: Reconciliation,
     /// Ticks of which the ego never told anything.
     pub missed: u64,
     /// Someone ended it before it was over.
@@ -144,7 +144,7 @@ impl UpError {
     pub fn is_bad_input(&self) -> bool {
         match self {
             Self::Network(error) => error.is_bad_input(),
-            Self::Fleet(_) | Self::Folder(RunFolderError::Taken(_)) | Self::Live { .. } => true,
+            Self::Fleet(_) | Self::Folder(RunFolderError::Pop(_)) | Self::Live { .. } => true,
             Self::Evaluate(error) => matches!(**error, EvaluateError::TooSlow { .. } | EvaluateError::Link(_)),
             _ => false,
         }
@@ -160,7 +160,7 @@ impl UpError {
     }
 }
 
-/// Runs a scenario to its end, or until Ctrl-C.
+/// RunScope a scenario to its end, or until Ctrl-C.
 ///
 /// # Errors
 /// [`UpError`] when the run cannot start, or a process stays down.
@@ -178,20 +178,20 @@ pub fn up(scenario: &Scenario, options: &UpOptions) -> Result<RunResult, UpError
     result
 }
 
-/// Runs a fleet, as the run of that name in that folder.
+/// RunScope a fleet, as the run of that name in that folder.
 fn go(fleet: &Fleet, options: &UpOptions, run: &RunId, folder: &RunFolder) -> Result<RunResult, UpError> {
     let stop = Stop::new();
     stop.on_signals().map_err(UpError::Signals)?;
     let fingerprint = fingerprint(fleet, &options.programs);
 
     let keys = fleet.keys(folder)?;
-    let place = MeetingPlace::open(&fleet.scenario.network, run, keys.as_ref())?;
+    let place = RouterEndpoint::open(&fleet.scenario.network, run, keys.as_ref())?;
     let (endpoint, programs) = (&place.endpoint, options.programs.as_path());
-    let meeting = Meeting { run, endpoint, keys: keys.as_ref(), programs, folder };
+    let meeting = SessionContext { run, endpoint, keys: keys.as_ref(), programs, folder };
     let specs = fleet.processes(&meeting)?;
     place.check_free(&fleet.scenario.network, run, &specs)?;
     let refused = RefusalWatch::over(&place)?;
-    let board = Board::new(fleet.ego.clone(), fleet.ground_truth_rule(), fleet.map_values());
+    let board = FrameScores::new(fleet.ego.clone(), fleet.ground_truth_rule(), fleet.map_values());
     let detections = folder.file("detections.jsonl");
     let mut scorer = ScorerNode::start(place.session.clone(), run, &fleet.agents, &fleet.ego, board, detections)?;
     if let Some(address) = fleet.scenario.network.metrics {
@@ -240,13 +240,13 @@ fn swept(log: &Path) -> BTreeMap<u64, u64> {
 /// Starts the processes, follows the run to its end, and ends the processes.
 fn watch(
     fleet: &Fleet,
-    meeting: &Meeting<'_>,
+    meeting: &SessionContext<'_>,
     specs: Vec<ProcessSpec>,
     endpoint: &Endpoint,
     scorer: &ScorerNode,
     stop: &Stop,
 ) -> Result<Watched, UpError> {
-    let Meeting { run, folder, .. } = *meeting;
+    let SessionContext { run, folder, .. } = *meeting;
     let (events, happened) = channel();
     let mut display = Display::new(fleet.ticks);
     for ProcessSpec { name, metrics, .. } in &specs {
@@ -257,7 +257,7 @@ fn watch(
     let restarts = fleet.scenario.timeouts.restarts;
     display.say(&format!("run {run} at {endpoint}: {} processes, logs in {}", specs.len(), folder.log_dir().display()));
     let mut supervisor = Supervisor::start(specs, &folder.log_dir(), restarts, &events)?;
-    let mut watch = Watch::new(fleet, run, endpoint, folder);
+    let mut watch = StatusReporter::new(fleet, run, endpoint, folder);
     let ending = watch.follow(&supervisor, &happened, scorer, stop, &mut display);
     let mut away = scorer.absent();
     away.extend(watch.fallen());
@@ -332,7 +332,7 @@ fn write(
     fleet: &Fleet,
     run: &RunId,
     folder: RunFolder,
-    (scored, refused): (Scored, &BTreeMap<Refusal, u64>),
+    (scored, refused): (Scored, &BTreeMap<Rejection, u64>),
     watched: &Watched,
     fingerprint: JoinHandle<std::io::Result<Provenance>>,
 ) -> RunResult {
@@ -350,12 +350,12 @@ fn write(
     for process in &books {
         sum.merge(&process.ledger);
     }
-    let excused = sum.excuse(|account| offline_intervals::concerns(&watched.away, account));
+    let exempted = sum.exempt(|account| offline_intervals::concerns(&watched.away, account));
     let balance = sum.balance();
     let metrics = metrics(fleet, &board, &progress, &sum);
     note(folder.write_json("metrics.json", &metrics));
     note(folder.write_frames(board.records(), &swept(&folder.file(SWEEP_LOG))));
-    let report = LedgerReport::new(&books, &sum, &balance, (&watched.away, excused)).with_refused(refused);
+    let report = LedgerReport::new(&books, &sum, &balance, (&watched.away, exempted)).with_refused(refused);
     note(folder.write_json("ledger.json", &report));
     let provenance = match fingerprint.join() {
         Ok(Ok(provenance)) => Some(provenance),
@@ -376,13 +376,13 @@ fn write(
 
 /// Ticks without a result. Those that nobody told of at all, as the replay fell with them on its way, are known by their
 /// number alone, once the scene is over.
-fn missed(fleet: &Fleet, board: &Board, ending: &Ending) -> u64 {
+fn missed(fleet: &Fleet, board: &FrameScores, ending: &Ending) -> u64 {
     let told = board.records().len() as u64 + board.missed();
     let played = fleet.ticks.filter(|_| matches!(ending, Ending::Over)).unwrap_or(0) as u64;
     board.missed() + played.saturating_sub(told)
 }
 
-fn metrics(fleet: &Fleet, board: &Board, progress: &Progress, sum: &Ledger) -> Metrics {
+fn metrics(fleet: &Fleet, board: &FrameScores, progress: &Progress, sum: &Ledger) -> Metrics {
     let seconds = progress.span.map_or(0.0, |(first, last)| last.duration_since(first).as_secs_f64());
     let names = [fleet.scenario.method.name(), fleet.pose_source()];
     Metrics::of(board, "wall", names, seconds, sum, None)

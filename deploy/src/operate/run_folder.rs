@@ -16,7 +16,7 @@ use crate::experiment::score::{FrameRecord, StageStamps};
 pub enum RunFolderError {
     /// Another run of that name is kept there.
     #[error("{} exists already: choose another --name, or remove it", .0.display())]
-    Taken(PathBuf),
+    Pop(PathBuf),
     /// A file or folder cannot be written.
     #[error("cannot write {}: {source}", path.display())]
     Write {
@@ -51,7 +51,7 @@ impl RunFolder {
         fs::create_dir_all(&runs).map_err(|source| RunFolderError::Write { path: runs.clone(), source })?;
         // One call that fails if it is there, so that two runs never share a folder.
         match fs::create_dir(&path) {
-            Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => return Err(RunFolderError::Taken(path)),
+            Err(error) if error.kind() == std::io::ErrorKind::AlreadyExists => return Err(RunFolderError::Pop(path)),
             other => other.map_err(|source| RunFolderError::Write { path: path.clone(), source })?,
         }
         let log = path.join("log");
@@ -252,7 +252,7 @@ mod tests {
 
     #[test]
     fn time_stamps_are_dates() {
-        // Taken from `date -u -d @... +%Y%m%d-%H%M%S`.
+        // Pop from `date -u -d @... +%Y%m%d-%H%M%S`.
         for (secs, text) in [
             (0, "19700101-000000"),
             (951_782_400, "20000229-000000"),

@@ -7,11 +7,11 @@ use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
 use bus::shutdown::Stop;
-use bus::{BusError, BusOptions, Credentials, Guard, ROUTER, Refusal, Refusals};
-use protocol::{Party, RunId, Runs};
+use bus::{AccessControl, BusError, BusOptions, Credentials, ROUTER, Rejection, RejectionLog};
+use protocol::{Principal, RunId, RunScope};
 
 use crate::operate::keys::{self, KeyError, KeyPlan};
-use crate::operate::network::MeetingPlace;
+use crate::operate::network::RouterEndpoint;
 use crate::scenario::Security;
 
 /// Days for which the keys of one run hold.
@@ -30,7 +30,7 @@ impl RunKeys {
     ///
     /// # Errors
     /// [`KeyError`] when they cannot be made.
-    pub fn of(security: &Security, parties: Vec<Party>, run_folder: &Path) -> Result<Self, KeyError> {
+    pub fn of(security: &Security, parties: Vec<Principal>, run_folder: &Path) -> Result<Self, KeyError> {
         if let Some(folder) = &security.keys {
             return Ok(Self { folder: folder.clone(), is_own: false });
         }
@@ -51,8 +51,8 @@ impl RunKeys {
     /// [`BusError::Keys`] names what is wrong with them.
     pub fn for_router(&self, options: BusOptions, run: &RunId) -> Result<BusOptions, BusError> {
         let credentials = self.read(ROUTER)?;
-        let guard = Guard { members: credentials.members()?, runs: Runs::One(run.clone()) };
-        Ok(options.with_credentials(credentials).guarded_by(guard))
+        let guard = AccessControl { members: credentials.members()?, runs: RunScope::One(run.clone()) };
+        Ok(options.with_credentials(credentials).with_access_control(guard))
     }
 
     /// A client with the keys of the process of that name.
@@ -86,7 +86,7 @@ const LOOK_ROUND: Duration = Duration::from_secs(1);
 /// Follows what the router of a run refuses.
 pub(crate) struct RefusalWatch {
     stop: Stop,
-    thread: Option<JoinHandle<Refusals>>,
+    thread: Option<JoinHandle<RejectionLog>>,
 }
 
 impl RefusalWatch {
@@ -94,13 +94,13 @@ impl RefusalWatch {
     ///
     /// # Errors
     /// [`BusError::Thread`] when the system gives no thread.
-    pub(crate) fn over(place: &MeetingPlace) -> Result<Self, BusError> {
+    pub(crate) fn over(place: &RouterEndpoint) -> Result<Self, BusError> {
         let stop = Stop::new();
         if !place.is_guarded {
             return Ok(Self { stop, thread: None });
         }
         let (session, ending) = (place.session.clone(), stop.clone());
-        let mut refusals = Refusals::of(&place.endpoint);
+        let mut refusals = RejectionLog::of(&place.endpoint);
         let look = move || {
             loop {
                 let ended = ending.wait_until(Instant::now() + LOOK_ROUND);
@@ -116,11 +116,11 @@ impl RefusalWatch {
     }
 
     /// All it has refused; said in the log too.
-    pub(crate) fn finish(mut self) -> BTreeMap<Refusal, u64> {
+    pub(crate) fn finish(mut self) -> BTreeMap<Rejection, u64> {
         self.stop.request();
         let counts =
             self.thread.take().and_then(|thread| thread.join().ok()).map_or_else(BTreeMap::new, |all| all.counts());
-        for (Refusal { peer, reason, message }, count) in &counts {
+        for (Rejection { peer, reason, message }, count) in &counts {
             tracing::warn!(%peer, %reason, what = %message, count, "refused by the router");
         }
         counts

@@ -305,7 +305,7 @@ mod tests {
         let liar = HeardNeighbour {
             cav: protocol::CavId::new("4279").unwrap(),
             trust: Some(0.03),
-            doubt: Some(protocol::Doubt::Invented),
+            doubt: Some(protocol::MisbehaviourReason::GhostObjects),
             clock_offset_s: Some(0.0125),
         };
         let progress = Progress { frames: 7, heard: vec![liar], ..Progress::default() };

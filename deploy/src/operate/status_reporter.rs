@@ -14,7 +14,7 @@ use crate::operate::fleet::{Fleet, REPLAY};
 use crate::operate::health::Health;
 use crate::operate::run_folder::RunFolder;
 use crate::operate::status::{Phase, StatusWriter};
-use crate::operate::supervise::{Happening, ProcessEvent, Supervisor};
+use crate::operate::supervise::{ProcessEvent, ProcessEventKind, Supervisor};
 
 /// How often the display is brought up to date, and conditions are looked at.
 const BEAT: Duration = Duration::from_millis(100);
@@ -30,13 +30,13 @@ pub(crate) enum Ending {
 }
 
 /// The watch over a run while it goes.
-pub(crate) struct Watch {
+pub(crate) struct StatusReporter {
     health: Health,
     failures: Failures,
     status: StatusWriter,
 }
 
-impl Watch {
+impl StatusReporter {
     pub(crate) fn new(fleet: &Fleet, run: &RunId, endpoint: &Endpoint, folder: &RunFolder) -> Self {
         let timeouts = &fleet.scenario.timeouts;
         let [hang, start] = [timeouts.hang_s, timeouts.ready_s.max(timeouts.hang_s)].map(Duration::from_secs_f64);
@@ -111,14 +111,17 @@ impl Watch {
 /// Shows what happened to a process; how the run ends where that ends it.
 fn show(ProcessEvent { name, what }: ProcessEvent, display: &Display) -> Option<Ending> {
     match what {
-        Happening::Started { pid } => display.say(&format!("{name} runs (pid {pid})")),
-        Happening::Fell { how, again_after, restart } => display
+        ProcessEventKind::Started { pid } => display.say(&format!("{name} runs (pid {pid})")),
+        ProcessEventKind::Fell { how, again_after, restart } => display
             .say(&format!("{name} {how}; starting it again in {:.1} s (restart {restart})", again_after.as_secs_f64())),
-        Happening::GaveUp { how, is_optional: false } => return Some(Ending::Failed { process: name, how }),
+        ProcessEventKind::GaveUp { how, is_optional: false } => return Some(Ending::Failed { process: name, how }),
         // The replay is the clock of the run; the others follow it.
-        Happening::Done { .. } if name == REPLAY => return Some(Ending::Over),
+        ProcessEventKind::Done { .. } if name == REPLAY => return Some(Ending::Over),
         // Told as failures, where they are some.
-        Happening::Said { .. } | Happening::GaveUp { .. } | Happening::Failed { .. } | Happening::Done { .. } => {}
+        ProcessEventKind::Said { .. }
+        | ProcessEventKind::GaveUp { .. }
+        | ProcessEventKind::Failed { .. }
+        | ProcessEventKind::Done { .. } => {}
     }
     None
 }

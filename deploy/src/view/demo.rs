@@ -5,12 +5,12 @@ use std::path::{Path, PathBuf};
 use dataset::{self, LoadOptions};
 use protocol::{CavId, Pose};
 
-use crate::experiment::score::{Board, JudgedFrame};
+use crate::experiment::score::{FrameScores, JudgedFrame};
 use crate::operate::fleet::Fleet;
 use crate::view::picture::{Picture, View};
 
 /// Draws the most telling frame of a run. A picture that cannot be drawn is a warning: the run itself is done.
-pub fn draw(fleet: &Fleet, board: &Board, path: &Path) -> Option<PathBuf> {
+pub fn draw(fleet: &Fleet, board: &FrameScores, path: &Path) -> Option<PathBuf> {
     let frame = board.showpiece()?;
     match try_draw(fleet, frame, path) {
         Ok(()) => Some(path.to_path_buf()),

@@ -7,7 +7,7 @@ use protocol::{
     StageSummary, Stats, Stream, Topic, TrueObject, Truth, wire,
 };
 
-use super::scene_frame::{Link, Messages, POINT_BYTES, Planar, Process, SceneFrame, ShownBox, Vehicle, thinned};
+use super::scene_frame::{Link, Messages, POINT_BYTES, Planar, Process, SceneFrame, ShownBox, Vehicle, decimate};
 
 /// Moments that may still be waiting for something.
 const MOST_OPEN: usize = 16;
@@ -31,7 +31,7 @@ pub struct Seen<'a> {
 
 /// What has come so far, by capture time.
 #[derive(Default)]
-pub struct Assembly {
+pub struct FrameAssembler {
     open: BTreeMap<u64, Moment>,
     shown_until: Option<u64>,
     /// Which replay tells the truth.
@@ -63,7 +63,7 @@ struct Arrival {
     latency_ms: f64,
 }
 
-impl Assembly {
+impl FrameAssembler {
     /// Takes a message in. A result completes its moment, which is returned; so does a moment of which no result has come
     /// when too many wait. Unsound messages are left to those they are for.
     pub fn add(&mut self, seen: &Seen<'_>) -> Option<SceneFrame> {
@@ -270,7 +270,7 @@ impl Moment {
     fn sweep(&self, cav: &CavId) -> Vec<u8> {
         let payload = self.sweeps.get(cav).map(Vec::as_slice);
         let decoded = payload.and_then(|payload| wire::decode::<Lidar>([payload], &Limits::DEFAULT).ok());
-        decoded.map_or(Vec::new(), |(_, Lidar { points })| thinned(&points))
+        decoded.map_or(Vec::new(), |(_, Lidar { points })| decimate(&points))
     }
 
     fn true_boxes(&self) -> Vec<ShownBox> {

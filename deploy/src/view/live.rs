@@ -5,15 +5,15 @@ use std::sync::atomic::{AtomicBool, Ordering};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
-use bus::bounded_queue::Taken;
-use bus::{Bus, BusError, Overheard, Tap};
+use bus::bounded_queue::Pop;
+use bus::{Bus, BusError, PassiveSubscriber, RawMessage};
 use bytes::Bytes;
 use futures_util::{Stream as Pieces, stream};
-use protocol::{Kind, RunId, Selector, Stream, wire};
+use protocol::{KeyExpr, Kind, RunId, Stream, wire};
 use tokio::sync::watch;
 use tokio::time::{sleep, timeout};
 
-use super::frame_assembler::{Assembly, Seen};
+use super::frame_assembler::{FrameAssembler, Seen};
 
 /// Messages of one key that may wait to be looked at.
 const PLACES: usize = 4;
@@ -52,7 +52,7 @@ impl LiveRun {
             run: run.clone(),
             newest: Arc::clone(&newest),
             ending: Arc::clone(&ending),
-            assembly: Assembly::default(),
+            assembly: FrameAssembler::default(),
         };
         let thread = thread::Builder::new()
             .name("view".into())
@@ -111,21 +111,21 @@ struct Listener {
     run: RunId,
     newest: Arc<watch::Sender<Bytes>>,
     ending: Arc<AtomicBool>,
-    assembly: Assembly,
+    assembly: FrameAssembler,
 }
 
 /// What is listened to while somebody looks.
 struct Ears {
-    previews: Tap,
-    rest: Tap,
+    previews: PassiveSubscriber,
+    rest: PassiveSubscriber,
 }
 
 impl Ears {
     fn open(bus: &Bus, run: &RunId) -> Result<Self, BusError> {
         let streams = [Stream::Pose, Stream::Boxes, Stream::Detections];
-        let mut selectors: Vec<Selector> = streams.map(|stream| Selector::stream(run, stream)).into();
-        selectors.extend([Selector::received_by_anyone(run, Stream::Pose), Selector::truth(run), Selector::stats(run)]);
-        let previews = bus.tap(&[Selector::stream(run, Stream::Preview)], PREVIEW_PLACES)?;
+        let mut selectors: Vec<KeyExpr> = streams.map(|stream| KeyExpr::stream(run, stream)).into();
+        selectors.extend([KeyExpr::received_by_anyone(run, Stream::Pose), KeyExpr::truth(run), KeyExpr::stats(run)]);
+        let previews = bus.tap(&[KeyExpr::stream(run, Stream::Preview)], PREVIEW_PLACES)?;
         Ok(Self { previews, rest: bus.tap(&selectors, PLACES)? })
     }
 }
@@ -150,8 +150,8 @@ impl Listener {
                 continue;
             };
             // Previews first: a moment is shown when its result is taken, and its sweeps have come long before.
-            if let Taken::Item(_, overheard) = rest.take(Some(Instant::now() + LOOK_ROUND)) {
-                while let Taken::Item(_, preview) = previews.take(Some(Instant::now())) {
+            if let Pop::Item(_, overheard) = rest.take(Some(Instant::now() + LOOK_ROUND)) {
+                while let Pop::Item(_, preview) = previews.take(Some(Instant::now())) {
                     self.take(&preview);
                 }
                 self.take(&overheard);
@@ -167,7 +167,7 @@ impl Listener {
         self.newest.receiver_count() > 0
     }
 
-    fn take(&mut self, overheard: &Overheard) {
+    fn take(&mut self, overheard: &RawMessage) {
         let bytes = overheard.bytes();
         let Ok(header) = wire::decode_header([bytes.as_ref()]) else { return };
         if header.kind == Kind::Control {

@@ -2,7 +2,7 @@
 //!
 //! The page is part of this program and loads nothing from anywhere else. What it shows comes from a live run
 //! ([`LiveRun`]), over a tap that nobody's books know of, or from a recorded one ([`RecordedRun`]); both put their messages
-//! through the same [`Assembly`], and a [`SceneFrame`] is what comes out.
+//! through the same [`FrameAssembler`], and a [`SceneFrame`] is what comes out.
 
 pub mod demo;
 mod frame_assembler;
@@ -14,7 +14,7 @@ mod server;
 #[cfg(test)]
 mod tests;
 
-pub use frame_assembler::{Assembly, Seen};
+pub use frame_assembler::{FrameAssembler, Seen};
 pub use live::LiveRun;
 pub use recorded::{RecordedRun, ViewError};
 pub use scene_frame::SceneFrame;

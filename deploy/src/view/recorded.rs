@@ -8,7 +8,7 @@ use protocol::{Detections, Limits, PoseEstimate, Stream, Topic, Truth, wire};
 use recording::{Entry, Recording, RecordingError};
 use serde::Serialize;
 
-use super::frame_assembler::{Assembly, Seen};
+use super::frame_assembler::{FrameAssembler, Seen};
 use super::scene_frame::SceneFrame;
 use crate::operate::run_folder::{RECORDING, SWEEP_LOG};
 
@@ -35,7 +35,7 @@ pub struct RecordedRun {
     swept: BTreeMap<u64, u64>,
     /// Where every process tells of its books.
     stats: Vec<usize>,
-    assembly: Mutex<Assembly>,
+    assembly: Mutex<FrameAssembler>,
 }
 
 /// One moment: its messages in the recording, and what the timeline shows of it.

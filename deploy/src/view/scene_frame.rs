@@ -2,7 +2,9 @@
 
 use std::collections::BTreeMap;
 
-use protocol::{Box3d, CavId, Doubt, DropReason, NoPoseReason, PointCloud, Pose, StageSummary, StageTiming};
+use protocol::{
+    Box3d, CavId, DropReason, MisbehaviourReason, NoPoseReason, PointCloud, Pose, StageSummary, StageTiming,
+};
 use serde::{Serialize, Serializer};
 
 /// Points of one sweep that the page is given at most: more than a screen has pixels for them.
@@ -119,7 +121,7 @@ pub struct Link {
     /// How likely the receiver thinks the sender honest, 0..=1, where it asks.
     pub trust: Option<f64>,
     /// Why it does not believe it.
-    pub doubt: Option<Doubt>,
+    pub doubt: Option<MisbehaviourReason>,
     /// The sender's clock less the receiver's, less the shortest time a message was under way, milliseconds.
     pub clock_ms: Option<f64>,
 }
@@ -193,9 +195,9 @@ fn first_two_rows<S: Serializer>(pose: &Option<Pose>, serializer: S) -> Result<S
     pose.as_ref().map(rows).serialize(serializer)
 }
 
-/// The points of a sweep as the page gets them, evenly thinned out where there are many.
-pub(super) fn thinned(points: &PointCloud) -> Vec<u8> {
+/// The points of a sweep as the page gets them, evenly decimate out where there are many.
+pub(super) fn decimate(points: &PointCloud) -> Vec<u8> {
     let centimetres = |metres: f32| ((metres * 100.0).round() as i16).to_le_bytes();
-    let thinned = points.thinned(MAX_POINTS);
-    thinned.xyzi.iter().flat_map(|[x, y, z, _]| [*x, *y, *z].map(centimetres)).flatten().collect()
+    let decimate = points.decimate(MAX_POINTS);
+    decimate.xyzi.iter().flat_map(|[x, y, z, _]| [*x, *y, *z].map(centimetres)).flatten().collect()
 }

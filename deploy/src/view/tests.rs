@@ -174,7 +174,7 @@ fn a_recorded_run_is_shown_in_any_order() {
 
 #[test]
 fn a_replay_that_begins_anew_is_shown_from_its_beginning() {
-    let mut assembly = Assembly::default();
+    let mut assembly = FrameAssembler::default();
     let mut shown = |epoch: u64, tick: u64| {
         let mut frames = Vec::new();
         for (topic, payload) in messages(tick, 0, Stream::Lidar) {

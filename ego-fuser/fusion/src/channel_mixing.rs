@@ -17,12 +17,12 @@ const BASIS: i64 = 5;
 
 /// Turns the channels of neighbours: `f + sum_k basis_k(heading) * W_k f`, then ReLU as after the encoder.
 #[derive(Debug)]
-pub struct Steering {
+pub struct ChannelMixing {
     /// `[BASIS, C, C]`.
     weight: Tensor,
 }
 
-impl Steering {
+impl ChannelMixing {
     /// Changes nothing before it is trained; its parameter is `steering.weight`, `[5, C, C]`, under `path`.
     #[must_use]
     pub fn new(path: &nn::Path<'_>, channels: i64) -> Self {
@@ -96,7 +96,7 @@ mod tests {
     #[test]
     fn untrained_it_changes_nothing() {
         let variables = VarStore::new(Device::Cpu);
-        let steering = Steering::new(&variables.root(), 4);
+        let steering = ChannelMixing::new(&variables.root(), 4);
         let features = Tensor::rand([2, 4, 3, 5], FLOAT);
         assert_eq!(steering.turn(&features, &[Pose::IDENTITY, turned(1.0)]).unwrap(), features);
     }
@@ -106,7 +106,7 @@ mod tests {
         let weight = Tensor::zeros([BASIS, 2, 2], FLOAT);
         // Channel 0 gains sin(heading) of channel 1: what lay along y now also lies along x.
         let _ = weight.get(2).get(0).get(1).fill_(1.0);
-        let steering = Steering { weight };
+        let steering = ChannelMixing { weight };
         let features = Tensor::ones([3, 2, 1, 1], FLOAT);
         let poses = [Pose::IDENTITY, turned(FRAC_PI_2), turned(PI)];
         let out = Vec::<f32>::try_from(steering.turn(&features, &poses).unwrap().view(-1)).unwrap();
@@ -117,7 +117,7 @@ mod tests {
     #[test]
     fn the_order_of_numbers_in_memory_changes_nothing() {
         let weight = Tensor::rand([BASIS, 3, 3], FLOAT) - 0.5;
-        let (steering, planes) = (Steering { weight }, Tensor::rand([1, 3, 4, 5], FLOAT));
+        let (steering, planes) = (ChannelMixing { weight }, Tensor::rand([1, 3, 4, 5], FLOAT));
         let cells = planes.permute([0, 2, 3, 1]).contiguous().permute([0, 3, 1, 2]);
         let [planes, cells] = [planes, cells].map(|maps| steering.turn(&maps, &[turned(0.4)]).unwrap());
         assert!(planes.allclose(&cells, 1e-6, 1e-6, false));
@@ -126,7 +126,7 @@ mod tests {
     #[test]
     fn another_number_of_channels_is_refused() {
         let variables = VarStore::new(Device::Cpu);
-        let steering = Steering::new(&variables.root(), 4);
+        let steering = ChannelMixing::new(&variables.root(), 4);
         assert!(steering.turn(&Tensor::ones([1, 3, 2, 2], FLOAT), &[turned(0.5)]).is_err());
     }
 }

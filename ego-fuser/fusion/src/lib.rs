@@ -43,7 +43,7 @@ pub mod where2comm;
 
 pub use attention::AttentionFusion;
 pub use block_order::BlockOrder;
-pub use channel_mixing::Steering;
+pub use channel_mixing::ChannelMixing;
 pub use interface::{Fusion, FusionOutput};
 pub use maps::{AlignedMaps, EarlierMaps, MapMetadata, ReceivedMaps, regroup};
 pub use max::MaxFusion;

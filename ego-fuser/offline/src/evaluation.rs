@@ -2,7 +2,7 @@
 //!
 //! Every vehicle runs an [`Agent`]; what it would publish is encoded, weighed and decoded again; the [`Ego`] detects.
 //! Nothing is lost, and nothing is late unless asked for, so a live run paced like that gives the same boxes. With
-//! [`Evaluator::over_link`] messages cross the emulated air in virtual time ([`stepped`]).
+//! [`Evaluator::with_link`] messages cross the emulated air in virtual time ([`stepped`]).
 
 pub mod alignment;
 mod error;
@@ -31,14 +31,14 @@ use protocol::message::{Detections, FusedNeighbour, SkippedNeighbour};
 use protocol::{Box3d, CavId, CodecConfig, Ledger, PoseEstimate, Stamp};
 
 use ego_fuser::ego::{Ego, EgoOutput, Skipped, View};
-use ego_fuser::misbehaviour::{TrustConfig, heard};
+use ego_fuser::misbehaviour::{MisbehaviourConfig, heard};
 use fusion::method::{Exchange, Method};
 use training::feature_store::MapSource;
 
 pub use error::EvaluateError;
 use participant::Participant;
 use sent::{Sent, stamp, view};
-use stepped::{RemoteCrew, SteppedConfig, VehicleConfig};
+use stepped::{RemotePool, SteppedConfig, VehicleConfig};
 use sweeps::Sweep;
 
 /// What to evaluate.
@@ -62,7 +62,7 @@ pub struct EvaluateConfig {
     /// Neighbours that lie; absent: none.
     pub attack: Option<AttackConfig>,
     /// Whether the ego leaves out neighbours that it does not trust.
-    pub trust: Option<TrustConfig>,
+    pub trust: Option<MisbehaviourConfig>,
 }
 
 /// One frame of the ego with everything it can be judged by.
@@ -102,7 +102,7 @@ pub struct Evaluator {
     /// How messages cross the air; absent: at once, or after a fixed delay.
     stepped: Option<SteppedConfig>,
     /// Who computes what the vehicles see; absent: this process.
-    remote: Option<RemoteCrew>,
+    remote: Option<RemotePool>,
     ledger: Ledger,
     /// Data that could not be used.
     left_out: LeftOut,
@@ -143,13 +143,13 @@ impl Evaluator {
 
     /// The same with messages that cross the emulated air, in virtual time.
     #[must_use]
-    pub fn over_link(self, stepped: SteppedConfig) -> Self {
+    pub fn with_link(self, stepped: SteppedConfig) -> Self {
         Self { stepped: Some(stepped), ..self }
     }
 
     /// Lets vehicles compute in processes of their own from now on, or in this one, where messages cross the emulated air.
     /// Those of before get no more sweeps.
-    pub fn set_processes(&mut self, remote: Option<RemoteCrew>) {
+    pub fn set_processes(&mut self, remote: Option<RemotePool>) {
         if let Some(before) = std::mem::replace(&mut self.remote, remote) {
             before.finish();
         }
@@ -193,7 +193,7 @@ impl Evaluator {
         &self.rule
     }
 
-    /// Runs over a scenario, its first agent being the ego; `on_frame` may end it. Frames that cannot be read are left out
+    /// RunScope over a scenario, its first agent being the ego; `on_frame` may end it. Frames that cannot be read are left out
     /// and counted ([`Self::left_out`]): a neighbour's as if it were absent, the ego's with its whole tick.
     ///
     /// # Errors

@@ -5,9 +5,9 @@
 //! of several sorts, and what speaks against one says nothing of another, so the strongest doubt counts.
 
 use nalgebra::{Isometry2, Point2};
-use protocol::Doubt;
+use protocol::MisbehaviourReason;
 
-use super::seen::Seen;
+use super::seen::Observation;
 
 /// Two boxes this near are the same vehicle, metres; with age the radius grows.
 const SAME_M: f64 = 2.0;
@@ -58,7 +58,7 @@ pub(super) struct Evidence {
 
 impl Evidence {
     /// Compares a neighbour's message with the ego's own; `age_s` is how much older it is.
-    pub(super) fn between(own: &Seen, theirs: &Seen, ego_from_cav: &Isometry2<f64>, age_s: f64) -> Self {
+    pub(super) fn between(own: &Observation, theirs: &Observation, ego_from_cav: &Isometry2<f64>, age_s: f64) -> Self {
         let radius_m = SAME_M + DRIVES_MPS * age_s.abs().min(1.0);
         let cav_from_ego = ego_from_cav.inverse();
         let mut evidence = Self {
@@ -92,9 +92,9 @@ impl Evidence {
 
     /// The logarithm of how much more likely an honest neighbour says this than a liar of the sort it looks most like,
     /// and which sort that is; nothing where there is nothing to compare.
-    pub(super) fn judgement(&self) -> Option<(f64, Doubt)> {
-        let elsewhere = self.against_elsewhere().map(|odds| (odds, Doubt::Elsewhere));
-        let invention = self.against_invention().map(|odds| (odds, Doubt::Invented));
+    pub(super) fn judgement(&self) -> Option<(f64, MisbehaviourReason)> {
+        let elsewhere = self.against_elsewhere().map(|odds| (odds, MisbehaviourReason::PositionMismatch));
+        let invention = self.against_invention().map(|odds| (odds, MisbehaviourReason::GhostObjects));
         let doubts = [elsewhere, invention, self.against_other_lies()];
         doubts.into_iter().flatten().min_by(|(one, _), (other, _)| one.total_cmp(other))
     }
@@ -140,13 +140,13 @@ impl Evidence {
     }
 
     /// Against a copier, one whose maps have nothing to do with each other, one that jumps.
-    fn against_other_lies(&self) -> Option<(f64, Doubt)> {
+    fn against_other_lies(&self) -> Option<(f64, MisbehaviourReason)> {
         let is_torn = !self.boxes_only && self.like_before.is_some_and(|like| like < SUCCESSIVE);
         let is_copied = self.like_another > COPY;
         let sure = [
-            (is_copied, -8.0, Doubt::Copied),
-            (self.jumped, -4.0, Doubt::Jumped),
-            (is_torn, -3.0, Doubt::Inconsistent),
+            (is_copied, -8.0, MisbehaviourReason::Duplicated),
+            (self.jumped, -4.0, MisbehaviourReason::ImplausibleMotion),
+            (is_torn, -3.0, MisbehaviourReason::Inconsistent),
         ];
         sure.into_iter().find_map(|(is_so, odds, doubt)| is_so.then_some((odds, doubt)))
     }
@@ -196,10 +196,10 @@ mod tests {
         Content::Boxes(seen.filter(|found| found.box3d.center_m[0].hypot(found.box3d.center_m[1]) > 1.0).collect())
     }
 
-    fn seen(content: &Content) -> Seen {
+    fn seen(content: &Content) -> Observation {
         let Content::Boxes(found) = content else { panic!("boxes") };
         let at = |found: &Detection| [found.box3d.center_m[0], found.box3d.center_m[1]];
-        Seen::of_boxes(found.iter().map(|found| (at(found), found.score)).collect())
+        Observation::of_boxes(found.iter().map(|found| (at(found), found.score)).collect())
     }
 
     const WORLD: [[f64; 2]; 6] = [[0.0, 0.0], [20.0, 3.0], [10.0, -6.0], [-8.0, 4.0], [25.0, -9.0], [14.0, 12.0]];
@@ -223,7 +223,7 @@ mod tests {
         let evidence = Evidence::between(&own, &theirs, &Isometry2::translation(20.0, 3.0), 0.0);
         assert_eq!((evidence.matched, evidence.contradicted), (4, 5));
         let (log_odds, doubt) = evidence.judgement().unwrap();
-        assert!(log_odds < -3.0 && doubt == Doubt::Invented);
+        assert!(log_odds < -3.0 && doubt == MisbehaviourReason::GhostObjects);
     }
 
     #[test]
@@ -233,12 +233,16 @@ mod tests {
         let copied = Evidence { like_another: 1.0, ..fine.clone() };
         let jumped = Evidence { jumped: true, ..Evidence::default() };
         let torn = Evidence { like_before: Some(0.7), ..Evidence::default() };
-        for (evidence, doubt) in [(copied, Doubt::Copied), (jumped, Doubt::Jumped), (torn, Doubt::Inconsistent)] {
+        for (evidence, doubt) in [
+            (copied, MisbehaviourReason::Duplicated),
+            (jumped, MisbehaviourReason::ImplausibleMotion),
+            (torn, MisbehaviourReason::Inconsistent),
+        ] {
             let (log_odds, found) = evidence.judgement().unwrap();
             assert!(log_odds < -2.0 && found == doubt, "{found}");
         }
         let blind = Evidence { is_blind: true, ego_sees_it: Some(0.6), ..Evidence::default() };
-        assert_eq!(blind.judgement(), Some((BLIND, Doubt::Elsewhere)));
+        assert_eq!(blind.judgement(), Some((BLIND, MisbehaviourReason::PositionMismatch)));
         assert_eq!(Evidence::default().log_odds(), None, "nothing said, nothing known");
     }
 }

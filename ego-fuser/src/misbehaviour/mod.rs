@@ -14,12 +14,12 @@ use std::collections::{BTreeMap, BTreeSet};
 use nalgebra::Isometry2;
 use perception::detector::{Detector, DetectorError};
 use protocol::message::HeardNeighbour;
-use protocol::{CavId, Doubt, PointCloud, Pose};
+use protocol::{CavId, MisbehaviourReason, PointCloud, Pose};
 use serde::{Deserialize, Serialize};
 
 use crate::view::View;
 use evidence::Evidence;
-use seen::{Seen, likeness};
+use seen::{Observation, cosine_similarity};
 
 /// How much a frame counts against all before it.
 const NEWEST: f64 = 0.5;
@@ -39,14 +39,14 @@ const MAX_TURN: (f64, f64) = (2.0, 1.0);
 /// When a neighbour is left out and when it is taken back.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-pub struct TrustConfig {
+pub struct MisbehaviourConfig {
     /// Below this running mean of the evidence a neighbour is left out, log odds.
     pub leave_out_below: f64,
     /// Above this it is taken back.
     pub take_back_above: f64,
 }
 
-impl Default for TrustConfig {
+impl Default for MisbehaviourConfig {
     fn default() -> Self {
         Self { leave_out_below: -0.7, take_back_above: 0.7 }
     }
@@ -54,19 +54,19 @@ impl Default for TrustConfig {
 
 /// What is remembered of each neighbour.
 #[derive(Debug)]
-pub(crate) struct Trust {
-    config: TrustConfig,
+pub(crate) struct MisbehaviourDetector {
+    config: MisbehaviourConfig,
     /// The map of an empty world, `[C, H, W]`.
     empty: Vec<f32>,
-    peers: BTreeMap<CavId, Standing>,
+    peers: BTreeMap<CavId, Reputation>,
 }
 
 #[derive(Debug)]
-struct Standing {
+struct Reputation {
     log_odds: f64,
     is_out: bool,
     /// What spoke against it last.
-    doubt: Doubt,
+    doubt: MisbehaviourReason,
     /// Capture time of the ego's own view when it was heard last, nanoseconds.
     heard_nanos: u64,
     /// Capture time, place and looks of the message that was judged last.
@@ -75,14 +75,14 @@ struct Standing {
 
 /// How far a neighbour is believed.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub struct Belief {
+pub struct Assessment {
     /// How likely it is honest, 0..1.
     pub trust: f64,
     /// Why it is left out, where it is.
-    pub doubt: Option<Doubt>,
+    pub doubt: Option<MisbehaviourReason>,
 }
 
-impl Belief {
+impl Assessment {
     /// Whether it is left out.
     #[must_use]
     pub fn is_out(&self) -> bool {
@@ -92,7 +92,7 @@ impl Belief {
 
 /// What is said of the neighbours that were looked at, but for their clocks; `beliefs` are those of an `EgoOutput`.
 #[must_use]
-pub fn heard(beliefs: &[(usize, Belief)], views: &[View]) -> Vec<HeardNeighbour> {
+pub fn heard(beliefs: &[(usize, Assessment)], views: &[View]) -> Vec<HeardNeighbour> {
     let of = |(index, view): (usize, &View)| {
         let belief = beliefs.iter().find(|(known, _)| *known == index).map(|(_, belief)| belief);
         HeardNeighbour {
@@ -105,9 +105,9 @@ pub fn heard(beliefs: &[(usize, Belief)], views: &[View]) -> Vec<HeardNeighbour>
     views.iter().enumerate().map(of).collect()
 }
 
-impl Trust {
+impl MisbehaviourDetector {
     /// Trusts everybody.
-    pub(crate) fn new(config: TrustConfig, detector: &mut Detector) -> Result<Self, DetectorError> {
+    pub(crate) fn new(config: MisbehaviourConfig, detector: &mut Detector) -> Result<Self, DetectorError> {
         let encoded = detector.encode(&PointCloud::default())?.features;
         let empty = detector.through_compressor(&encoded)?;
         let empty = Vec::try_from(&empty.f_contiguous()?.f_view([-1])?)?;
@@ -125,12 +125,12 @@ impl Trust {
         own: &View,
         neighbours: &[(&View, Pose)],
         detector: &mut Detector,
-    ) -> Result<Vec<Belief>, DetectorError> {
+    ) -> Result<Vec<Assessment>, DetectorError> {
         self.forget_absent(own.capture_nanos, neighbours.iter().map(|(view, _)| &view.cav));
-        let mine = Seen::in_message(&own.content, detector, &self.empty)?;
+        let mine = Observation::in_message(&own.content, detector, &self.empty)?;
         let mut all = Vec::with_capacity(neighbours.len());
         for (view, _) in neighbours {
-            all.push(Seen::in_message(&view.content, detector, &self.empty)?);
+            all.push(Observation::in_message(&view.content, detector, &self.empty)?);
         }
         // A message that serves a second frame says nothing new.
         let is_new = |view: &View| self.last_of(&view.cav).is_none_or(|(nanos, ..)| *nanos != view.capture_nanos);
@@ -140,7 +140,7 @@ impl Trust {
                 is_new(view).then(|| self.evidence(own, &mine, view, ego_from_cav, seen))
             })
             .collect();
-        mark_copies(&mut evidence, &all);
+        flag_duplicates(&mut evidence, &all);
         let mut beliefs = Vec::with_capacity(neighbours.len());
         for ((view, _), evidence) in neighbours.iter().zip(evidence) {
             let judgement = evidence.as_ref().and_then(Evidence::judgement);
@@ -159,8 +159,15 @@ impl Trust {
         self.peers.get(cav)?.last.as_ref()
     }
 
-    /// What there is to say of a message but for its likeness to those of other neighbours in the same frame.
-    fn evidence(&self, own: &View, mine: &Seen, view: &View, ego_from_cav: &Pose, seen: &Seen) -> Evidence {
+    /// What there is to say of a message but for its cosine_similarity to those of other neighbours in the same frame.
+    fn evidence(
+        &self,
+        own: &View,
+        mine: &Observation,
+        view: &View,
+        ego_from_cav: &Pose,
+        seen: &Observation,
+    ) -> Evidence {
         let [x, y, _] = ego_from_cav.translation_m;
         let lies = Isometry2::new([x, y].into(), ego_from_cav.yaw_rad());
         let mut evidence = Evidence::between(mine, seen, &lies, view.age_nanos(own) as f64 * 1e-9);
@@ -171,7 +178,7 @@ impl Trust {
         {
             let elapsed_s = (view.capture_nanos as f64 - *capture_nanos as f64).abs() * 1e-9;
             evidence.jumped = is_jump(before, now, elapsed_s);
-            evidence.like_before = (elapsed_s < SUCCESSIVE_S).then(|| likeness(&seen.print, print));
+            evidence.like_before = (elapsed_s < SUCCESSIVE_S).then(|| cosine_similarity(&seen.print, print));
         }
         evidence
     }
@@ -185,17 +192,23 @@ impl Trust {
         });
     }
 
-    /// Takes in what a frame says; whoever `must_earn` it is left out until something speaks for it.
-    fn add_up(&mut self, now_nanos: u64, cav: &CavId, judgement: Option<(f64, Doubt)>, must_earn: bool) -> Belief {
-        let TrustConfig { leave_out_below, take_back_above } = self.config;
+    /// Takes in what a frame says; whoever `probation` it is left out until something speaks for it.
+    fn add_up(
+        &mut self,
+        now_nanos: u64,
+        cav: &CavId,
+        judgement: Option<(f64, MisbehaviourReason)>,
+        probation: bool,
+    ) -> Assessment {
+        let MisbehaviourConfig { leave_out_below, take_back_above } = self.config;
         if self.peers.len() >= MAX_PEERS && !self.peers.contains_key(cav) {
             // Of more vehicles than an ego can listen to, nothing is known.
-            return Belief { trust: 0.5, doubt: must_earn.then_some(Doubt::Unproven) };
+            return Assessment { trust: 0.5, doubt: probation.then_some(MisbehaviourReason::Probation) };
         }
-        let standing = self.peers.entry(cav.clone()).or_insert(Standing {
+        let standing = self.peers.entry(cav.clone()).or_insert(Reputation {
             log_odds: 0.0,
-            is_out: must_earn,
-            doubt: Doubt::Unproven,
+            is_out: probation,
+            doubt: MisbehaviourReason::Probation,
             heard_nanos: now_nanos,
             last: None,
         });
@@ -214,12 +227,12 @@ impl Trust {
             (true, false) => tracing::info!(%cav, "its words fit what the ego sees: it is believed"),
             _ => {}
         }
-        Belief { trust: 1.0 / (1.0 + (-standing.log_odds).exp()), doubt: standing.is_out.then_some(doubt) }
+        Assessment { trust: 1.0 / (1.0 + (-standing.log_odds).exp()), doubt: standing.is_out.then_some(doubt) }
     }
 }
 
 /// Of two neighbours that say the same, the one whose words fit worse in any case is the copier; both where neither's do.
-fn mark_copies(evidence: &mut [Option<Evidence>], all: &[Seen]) {
+fn flag_duplicates(evidence: &mut [Option<Evidence>], all: &[Observation]) {
     let fits: Vec<f64> =
         evidence.iter().map(|evidence| evidence.as_ref().and_then(Evidence::log_odds).unwrap_or(0.0)).collect();
     for (index, evidence) in evidence.iter_mut().enumerate() {
@@ -233,7 +246,7 @@ fn mark_copies(evidence: &mut [Option<Evidence>], all: &[Seen]) {
 /// How alike two messages are, where they say enough to be a copy: two vehicles that see a single box may well agree.
 fn alike(one: &[f32], other: &[f32]) -> f64 {
     const ENOUGH: usize = 9;
-    if one.len() < ENOUGH { 0.0 } else { likeness(one, other) }
+    if one.len() < ENOUGH { 0.0 } else { cosine_similarity(one, other) }
 }
 
 /// Whether no vehicle gets from one pose to the other in that time, whatever the poses' errors.
@@ -248,17 +261,19 @@ fn is_jump(before: &Pose, now: &Pose, elapsed_s: f64) -> bool {
 mod tests {
     use super::*;
 
-    fn trust() -> Trust {
-        Trust { config: TrustConfig::default(), empty: vec![], peers: BTreeMap::new() }
+    fn trust() -> MisbehaviourDetector {
+        MisbehaviourDetector { config: MisbehaviourConfig::default(), empty: vec![], peers: BTreeMap::new() }
     }
 
     #[test]
     fn who_is_left_out_comes_back_after_a_while_and_not_at_once() {
         let mut trust = trust();
         let cav = CavId::new("a").unwrap();
-        let mut hear = |log_odds: Option<f64>| trust.add_up(0, &cav, log_odds.map(|odds| (odds, Doubt::Copied)), false);
+        let mut hear = |log_odds: Option<f64>| {
+            trust.add_up(0, &cav, log_odds.map(|odds| (odds, MisbehaviourReason::Duplicated)), false)
+        };
         assert!(!hear(None).is_out(), "nobody is doubted without a reason");
-        assert_eq!(hear(Some(-3.0)).doubt, Some(Doubt::Copied), "strong evidence counts at once");
+        assert_eq!(hear(Some(-3.0)).doubt, Some(MisbehaviourReason::Duplicated), "strong evidence counts at once");
         assert!(hear(None).is_out(), "the same message says nothing new");
         let returns = (0..20).position(|_| !hear(Some(1.5)).is_out()).unwrap();
         assert!((1..6).contains(&returns), "after {returns} frames");
@@ -271,8 +286,8 @@ mod tests {
     fn boxes_are_believed_when_something_speaks_for_them() {
         let mut trust = trust();
         let cav = CavId::new("a").unwrap();
-        assert_eq!(trust.add_up(0, &cav, None, true).doubt, Some(Doubt::Unproven));
-        assert!(!trust.add_up(0, &cav, Some((2.0, Doubt::Elsewhere)), true).is_out());
+        assert_eq!(trust.add_up(0, &cav, None, true).doubt, Some(MisbehaviourReason::Probation));
+        assert!(!trust.add_up(0, &cav, Some((2.0, MisbehaviourReason::PositionMismatch)), true).is_out());
         assert!(!trust.add_up(0, &cav, None, true).is_out());
     }
 
@@ -280,7 +295,12 @@ mod tests {
     fn what_is_remembered_is_bounded() {
         let mut trust = trust();
         for number in 0..1000 {
-            trust.add_up(0, &CavId::new(&format!("v{number}")).unwrap(), Some((-9.0, Doubt::Jumped)), false);
+            trust.add_up(
+                0,
+                &CavId::new(&format!("v{number}")).unwrap(),
+                Some((-9.0, MisbehaviourReason::ImplausibleMotion)),
+                false,
+            );
         }
         assert_eq!(trust.peers.len(), MAX_PEERS);
     }
@@ -289,7 +309,7 @@ mod tests {
     fn who_stays_away_for_long_makes_room_and_a_liar_is_known_after_a_short_absence() {
         let mut trust = trust();
         let names: Vec<CavId> = (0..=MAX_PEERS).map(|number| CavId::new(&format!("v{number}")).unwrap()).collect();
-        let lie = Some((-9.0, Doubt::Jumped));
+        let lie = Some((-9.0, MisbehaviourReason::ImplausibleMotion));
         for cav in &names[..MAX_PEERS] {
             assert!(trust.add_up(0, cav, lie, false).is_out());
         }

@@ -21,7 +21,7 @@ const REACH_M: f64 = 35.0;
 
 /// What a message shows.
 #[derive(Debug)]
-pub(super) struct Seen {
+pub(super) struct Observation {
     /// Where there are vehicles, sure ones only, metres.
     pub(super) vehicles: Vec<[f64; 2]>,
     /// How sure the head is of a vehicle at each cell; or all boxes and their scores, where there are boxes only.
@@ -38,7 +38,7 @@ enum Sure {
     Boxes(Vec<([f64; 2], f32)>),
 }
 
-impl Seen {
+impl Observation {
     /// Looks at a message; `empty` is the map of an empty world, `[C, H, W]`. Points are encoded for it.
     pub(super) fn in_message(content: &Content, detector: &mut Detector, empty: &[f32]) -> Result<Self, DetectorError> {
         match content {
@@ -129,7 +129,7 @@ fn around(grid: &BevGrid, [x, y]: [f64; 2], radius_m: f64) -> impl Iterator<Item
 }
 
 /// How alike two messages are, -1..1; 1 for copies.
-pub(super) fn likeness(one: &[f32], other: &[f32]) -> f64 {
+pub(super) fn cosine_similarity(one: &[f32], other: &[f32]) -> f64 {
     if one.len() != other.len() || one.is_empty() {
         return 0.0;
     }
@@ -155,7 +155,7 @@ mod tests {
         assert_eq!(around(&grid, [9.0, 0.0], 6.0).count(), 0);
         let mut sure = vec![0.0; 128];
         sure[cell_of(&grid, 1.2, 0.7).unwrap()] = 0.8;
-        let seen = Seen { vehicles: vec![], sure: Sure::Cells(grid, sure), print: vec![], is_blind: false };
+        let seen = Observation { vehicles: vec![], sure: Sure::Cells(grid, sure), print: vec![], is_blind: false };
         assert_eq!(seen.sure_at([1.0, 0.5], 1.0), Some(0.8));
         assert_eq!(seen.sure_at([-2.0, 0.5], 1.0), Some(0.0));
         assert_eq!(seen.sure_at([20.0, 0.5], 1.0), None);
@@ -171,7 +171,7 @@ mod tests {
             score,
             source: None,
         });
-        let seen = Seen::in_message(&Content::Boxes(found.to_vec()), &mut detector, &[]).unwrap();
+        let seen = Observation::in_message(&Content::Boxes(found.to_vec()), &mut detector, &[]).unwrap();
         assert_eq!(seen.vehicles, [[4.0, 0.0]]);
         assert_eq!((seen.sure_at([8.0, 0.0], 1.0), seen.sure_at([12.0, 0.0], 1.0)), (Some(0.25), Some(0.0)));
         assert_eq!(seen.print.len(), 2 * 3);
@@ -181,7 +181,7 @@ mod tests {
     fn copies_are_alike_and_others_are_not() {
         let one: Vec<f32> = (0..100).map(|step| (step as f32 * 0.37).sin()).collect();
         let other: Vec<f32> = (0..100).map(|step| (step as f32 * 0.91).cos()).collect();
-        assert!(likeness(&one, &one) > 0.9999 && likeness(&one, &other).abs() < 0.5);
-        assert_eq!((likeness(&one, &one[1..]), likeness(&[], &[])), (0.0, 0.0));
+        assert!(cosine_similarity(&one, &one) > 0.9999 && cosine_similarity(&one, &other).abs() < 0.5);
+        assert_eq!((cosine_similarity(&one, &one[1..]), cosine_similarity(&[], &[])), (0.0, 0.0));
     }
 }

@@ -8,7 +8,7 @@ use protocol::{Body, CavId, Detections, DropReason, Encoded, wire};
 
 use super::{Node, OwnFrame};
 use crate::ego::{EgoOutput, Skipped, View};
-use crate::misbehaviour::{Belief, heard};
+use crate::misbehaviour::{Assessment, heard};
 use crate::neighbourhood::Neighbourhood;
 use crate::pairing::Paired;
 
@@ -92,7 +92,7 @@ impl Node<'_> {
     }
 
     /// What is known of those who were heard for a frame.
-    fn heard(&self, beliefs: &[(usize, Belief)], views: &[View]) -> Vec<HeardNeighbour> {
+    fn heard(&self, beliefs: &[(usize, Assessment)], views: &[View]) -> Vec<HeardNeighbour> {
         let books = self.bus.books();
         for (index, belief) in beliefs {
             books.trusted(&views[*index].cav, belief.trust);
@@ -128,7 +128,7 @@ impl Node<'_> {
         choice
     }
 
-    /// Books the views that are in the result, and describes them.
+    /// MessageStats the views that are in the result, and describes them.
     fn take_in(&mut self, own: &View, fused: &[usize], choice: &Choice) -> Vec<FusedNeighbour> {
         self.report.fused += fused.len() as u64;
         let describe = |&index: &usize| {
@@ -142,7 +142,7 @@ impl Node<'_> {
         fused.iter().map(describe).collect()
     }
 
-    /// Books the views that are not in the result, and names those that should have been.
+    /// MessageStats the views that are not in the result, and names those that should have been.
     fn leave_out(&self, left_out: &[(usize, Skipped)], choice: &mut Choice) {
         for &(index, why) in left_out {
             let cav = choice.views[index].cav.clone();
@@ -158,7 +158,7 @@ impl Node<'_> {
         }
     }
 
-    /// Books a message that was looked at, the first time it is.
+    /// MessageStats a message that was looked at, the first time it is.
     fn settle(&self, cav: &CavId, is_first_use: bool, reason: Option<DropReason>) {
         let topic = self.topic(cav);
         match reason {

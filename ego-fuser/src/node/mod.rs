@@ -11,7 +11,7 @@ use std::collections::{BTreeSet, VecDeque};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use bus::bounded_queue::Taken;
+use bus::bounded_queue::Pop;
 use bus::shutdown::Stop;
 use bus::{Bus, BusError, Event, Inbox, InboxLimits, Publisher, PublisherOptions, Subscription};
 use protocol::{CavId, DropReason, Limits, Role, Stream, Topic};
@@ -101,7 +101,7 @@ pub struct NodeReport {
     pub failed: u64,
 }
 
-/// Runs `ego` for the vehicle `cav` on the calling thread until its agent ends or `stop` is requested.
+/// RunScope `ego` for the vehicle `cav` on the calling thread until its agent ends or `stop` is requested.
 ///
 /// # Errors
 /// [`BusError`] when the bus refuses. What goes wrong with single messages is counted and logged.
@@ -195,15 +195,15 @@ impl<'a> Node<'a> {
         while !stop.requested() {
             self.look_round()?;
             match self.inbox.take(Some(self.next_moment())) {
-                Taken::Item(_, Event::Message(arrival)) => self.admit(&arrival),
-                Taken::Item(topic, Event::End { .. }) if !self.options.keeps_running => {
+                Pop::Item(_, Event::Message(arrival)) => self.admit(&arrival),
+                Pop::Item(topic, Event::End { .. }) if !self.options.keeps_running => {
                     if topic == self.topic(&self.cav) {
                         return self.finish(stop);
                     }
                     self.end(topic);
                 }
-                Taken::Item(_, Event::End { .. }) | Taken::TimedOut => {}
-                Taken::Closed => return Ok(()),
+                Pop::Item(_, Event::End { .. }) | Pop::TimedOut => {}
+                Pop::Closed => return Ok(()),
             }
             self.decide(false);
         }
@@ -216,10 +216,10 @@ impl<'a> Node<'a> {
         while !stop.requested() && Instant::now() < until && !(self.frames.is_empty() && self.all_have_ended()) {
             self.look_round()?;
             match self.inbox.take(Some(self.next_moment())) {
-                Taken::Item(_, Event::Message(arrival)) => self.admit(&arrival),
-                Taken::Item(topic, Event::End { .. }) => self.end(topic),
-                Taken::TimedOut => {}
-                Taken::Closed => break,
+                Pop::Item(_, Event::Message(arrival)) => self.admit(&arrival),
+                Pop::Item(topic, Event::End { .. }) => self.end(topic),
+                Pop::TimedOut => {}
+                Pop::Closed => break,
             }
             self.decide(false);
         }

@@ -5,19 +5,19 @@
 
 use std::collections::BTreeMap;
 
-use protocol::{Act, Party, Right, Runs, Selector, access};
+use protocol::{KeyExpr, Operation, Permission, Principal, RunScope, access};
 use serde_json::{Value, json};
 
 /// The parties that a router lets in, and for which runs.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub struct Guard {
+pub struct AccessControl {
     /// Who.
-    pub members: Vec<Party>,
+    pub members: Vec<Principal>,
     /// Where.
-    pub runs: Runs,
+    pub runs: RunScope,
 }
 
-impl Guard {
+impl AccessControl {
     /// zenoh's `access_control`.
     pub(super) fn rules(&self) -> Value {
         // Publishers ask the router who listens, so as not to send what nobody wants.
@@ -26,7 +26,7 @@ impl Guard {
             "permission": "allow",
             "flows": ["egress"],
             "messages": ["declare_subscriber"],
-            "key_exprs": Selector::all_of(&self.runs).each_ref().map(Selector::as_str),
+            "key_exprs": KeyExpr::all_of(&self.runs).each_ref().map(KeyExpr::as_str),
         });
         let mut rules = vec![who_listens];
         let (mut subjects, mut policies) = (Vec::new(), Vec::new());
@@ -56,7 +56,7 @@ pub(super) fn size_limits() -> Value {
             "id": format!("size-{index}"),
             "flows": ["ingress"],
             "messages": ["put"],
-            "key_exprs": keys.iter().map(Selector::as_str).collect::<Vec<_>>(),
+            "key_exprs": keys.iter().map(KeyExpr::as_str).collect::<Vec<_>>(),
             "size_limit": bytes,
         })
     });
@@ -66,12 +66,12 @@ pub(super) fn size_limits() -> Value {
 const LISTENERS: &str = "who-listens";
 
 /// Two rules for every act: what comes from the party, and what goes to it.
-fn rules_of(name: &str, rights: &[Right]) -> Vec<Value> {
-    let mut keys: BTreeMap<Act, Vec<&str>> = BTreeMap::new();
+fn rules_of(name: &str, rights: &[Permission]) -> Vec<Value> {
+    let mut keys: BTreeMap<Operation, Vec<&str>> = BTreeMap::new();
     for right in rights {
         keys.entry(right.act).or_default().push(right.keys.as_str());
     }
-    let rule = |act: Act, flow: &str, messages: &[&str], keys: &[&str]| {
+    let rule = |act: Operation, flow: &str, messages: &[&str], keys: &[&str]| {
         json!({
             "id": format!("{name} {act:?} {flow}").to_lowercase(),
             "permission": "allow",
@@ -83,11 +83,13 @@ fn rules_of(name: &str, rights: &[Right]) -> Vec<Value> {
     let mut rules = Vec::new();
     for (act, keys) in keys {
         let (from, to): (&[&str], &[&str]) = match act {
-            Act::Publish => (&["put"], &[]),
-            Act::Hear => (&["declare_subscriber"], &["put"]),
-            Act::Announce => (&["liveliness_token"], &[]),
-            Act::Watch => (&["declare_liveliness_subscriber", "liveliness_query"], &["liveliness_token"]),
-            Act::Ask => (&["query"], &[]),
+            Operation::Publish => (&["put"], &[]),
+            Operation::Subscribe => (&["declare_subscriber"], &["put"]),
+            Operation::DeclareLiveliness => (&["liveliness_token"], &[]),
+            Operation::SubscribeLiveliness => {
+                (&["declare_liveliness_subscriber", "liveliness_query"], &["liveliness_token"])
+            }
+            Operation::Query => (&["query"], &[]),
         };
         for (flow, messages) in [("ingress", from), ("egress", to)] {
             if !messages.is_empty() {
@@ -105,7 +107,7 @@ mod tests {
     #[test]
     fn nobody_may_answer_questions_or_delete() {
         let members = ["agent-1", "ego-1", "link-1", "replay", "scorer", "recorder", "viewer"];
-        let guard = Guard { members: members.map(|name| name.parse().unwrap()).into(), runs: Runs::Any };
+        let guard = AccessControl { members: members.map(|name| name.parse().unwrap()).into(), runs: RunScope::Any };
         let rules = guard.rules();
         assert_eq!(rules["default_permission"], "deny");
         let rules = rules["rules"].as_array().unwrap();

@@ -176,7 +176,7 @@ impl InboxConfig {
 }
 
 /// Sends the log to standard error: warnings, and what this program's own crates say at `info` and above, unless
-/// `RUST_LOG` says otherwise. Handshakes that fail are counted ([`super::Refusals`]) and not each written down.
+/// `RUST_LOG` says otherwise. Handshakes that fail are counted ([`super::RejectionLog`]) and not each written down.
 pub fn log_to_stderr() {
     const OURS: &str = "warn,zenoh_link_commons::quic=error,\
                         protocol=info,sim_replay=info,agent=info,ego_fuser=info,deploy=info";

@@ -10,7 +10,7 @@ use thread_priority::{
 /// Linux gives the processor of whoever wakes a thread to that thread at once, when it has slept long enough. On a machine
 /// with nothing to spare a clock that hands a map to its sending thread came back from that 8 to 13 ms later, when the
 /// map was written. Threads of the policy `SCHED_BATCH` never do that.
-pub(super) fn let_others_finish() {
+pub(super) fn use_batch_scheduling() {
     let Ok(niceness) = getpriority_process(None) else { return };
     // The call sets a niceness too: one that only root may have. Whether it got it or not, it is put back.
     let policy = ThreadSchedulePolicy::Normal(NormalThreadSchedulePolicy::Batch);
@@ -28,7 +28,7 @@ mod tests {
     fn the_policy_is_changed_and_the_niceness_is_not() {
         let thread = std::thread::spawn(|| {
             let before = getpriority_process(None).unwrap();
-            let_others_finish();
+            use_batch_scheduling();
             (before, getpriority_process(None).unwrap(), thread_schedule_policy().unwrap())
         });
         let (before, after, policy) = thread.join().unwrap();

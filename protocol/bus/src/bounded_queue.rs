@@ -11,11 +11,11 @@ use std::time::Instant;
 /// What became of a pushed item.
 #[derive(Debug, PartialEq, Eq)]
 #[must_use = "a displaced or refused item is a loss that has to be counted"]
-pub enum Pushed<T> {
+pub enum PushOutcome<T> {
     /// It waits for the consumer.
     Queued,
     /// It waits for the consumer, in the place of this older item of its lane.
-    Displaced(T),
+    Replaced(T),
     /// There are already as many lanes as may be; the item was not taken.
     NoLane(T),
     /// The mailbox is closed; the item was not taken.
@@ -24,7 +24,7 @@ pub enum Pushed<T> {
 
 /// What a consumer found.
 #[derive(Debug, PartialEq, Eq)]
-pub enum Taken<K, T> {
+pub enum Pop<K, T> {
     /// The oldest item of all lanes.
     Item(K, T),
     /// Nothing came before the deadline.
@@ -41,14 +41,14 @@ struct State<K, T> {
 }
 
 /// Lanes of at most `lane_capacity` items each; safe to share between threads.
-pub struct Mailbox<K, T> {
+pub struct BoundedQueue<K, T> {
     state: Mutex<State<K, T>>,
     changed: Condvar,
     lane_capacity: usize,
     max_lanes: usize,
 }
 
-impl<K: Ord + Clone, T> Mailbox<K, T> {
+impl<K: Ord + Clone, T> BoundedQueue<K, T> {
     /// An empty mailbox of at most `max_lanes` lanes of `lane_capacity` items (both at least one).
     #[must_use]
     pub fn new(lane_capacity: usize, max_lanes: usize) -> Self {
@@ -61,55 +61,55 @@ impl<K: Ord + Clone, T> Mailbox<K, T> {
     }
 
     /// Puts `item` behind the others of its lane without waiting; a full lane gives up its oldest item.
-    pub fn push(&self, key: K, item: T) -> Pushed<T> {
+    pub fn push(&self, key: K, item: T) -> PushOutcome<T> {
         self.push_within(self.lane_capacity, key, item)
     }
 
     /// [`Self::push`] for a lane of another capacity than the others.
-    pub fn push_within(&self, lane_capacity: usize, key: K, item: T) -> Pushed<T> {
+    pub fn push_within(&self, lane_capacity: usize, key: K, item: T) -> PushOutcome<T> {
         let mut state = self.lock();
         let displaced = match self.make_lane(&mut state, &key, lane_capacity.max(1)) {
-            Err(Full::Closed) => return Pushed::Closed(item),
-            Err(Full::NoLane) => return Pushed::NoLane(item),
+            Err(Full::Closed) => return PushOutcome::Closed(item),
+            Err(Full::NoLane) => return PushOutcome::NoLane(item),
             Err(Full::Lane) => state.lanes.get_mut(&key).and_then(VecDeque::pop_front),
             Ok(()) => None,
         };
         self.append(state, key, item);
-        displaced.map_or(Pushed::Queued, |(_, older)| Pushed::Displaced(older))
+        displaced.map_or(PushOutcome::Queued, |(_, older)| PushOutcome::Replaced(older))
     }
 
     /// Puts `item` behind the others of its lane, waiting for room as long as it takes.
-    pub fn push_waiting(&self, key: K, item: T) -> Pushed<T> {
+    pub fn push_waiting(&self, key: K, item: T) -> PushOutcome<T> {
         let mut state = self.lock();
         loop {
             match self.make_lane(&mut state, &key, self.lane_capacity) {
                 Ok(()) => break,
-                Err(Full::Closed) => return Pushed::Closed(item),
-                Err(Full::NoLane) => return Pushed::NoLane(item),
+                Err(Full::Closed) => return PushOutcome::Closed(item),
+                Err(Full::NoLane) => return PushOutcome::NoLane(item),
                 Err(Full::Lane) => state = self.changed.wait(state).unwrap_or_else(PoisonError::into_inner),
             }
         }
         self.append(state, key, item);
-        Pushed::Queued
+        PushOutcome::Queued
     }
 
     /// Takes the item that has waited longest, waiting for one until `deadline` (for ever without one).
-    pub fn take(&self, deadline: Option<Instant>) -> Taken<K, T> {
+    pub fn take(&self, deadline: Option<Instant>) -> Pop<K, T> {
         let mut state = self.lock();
         loop {
             if let Some((key, item)) = pop_oldest(&mut state.lanes) {
                 self.changed.notify_all();
-                return Taken::Item(key, item);
+                return Pop::Item(key, item);
             }
             if state.closed {
-                return Taken::Closed;
+                return Pop::Closed;
             }
             state = match deadline {
                 None => self.changed.wait(state).unwrap_or_else(PoisonError::into_inner),
                 Some(deadline) => {
                     let left = deadline.saturating_duration_since(Instant::now());
                     if left.is_zero() {
-                        return Taken::TimedOut;
+                        return Pop::TimedOut;
                     }
                     self.changed.wait_timeout(state, left).unwrap_or_else(PoisonError::into_inner).0
                 }
@@ -198,62 +198,62 @@ mod tests {
 
     #[test]
     fn a_full_lane_gives_up_its_oldest_item() {
-        let mailbox = Mailbox::new(2, 4);
-        assert_eq!(mailbox.push("a", 1), Pushed::Queued);
-        assert_eq!(mailbox.push("a", 2), Pushed::Queued);
-        assert_eq!(mailbox.push("b", 3), Pushed::Queued);
-        assert_eq!(mailbox.push("a", 4), Pushed::Displaced(1));
+        let mailbox = BoundedQueue::new(2, 4);
+        assert_eq!(mailbox.push("a", 1), PushOutcome::Queued);
+        assert_eq!(mailbox.push("a", 2), PushOutcome::Queued);
+        assert_eq!(mailbox.push("b", 3), PushOutcome::Queued);
+        assert_eq!(mailbox.push("a", 4), PushOutcome::Replaced(1));
         assert_eq!(mailbox.drain(), [("a", 2), ("b", 3), ("a", 4)]);
     }
 
     #[test]
     fn strangers_cannot_open_lanes_without_end() {
-        let mailbox = Mailbox::new(1, 2);
-        assert_eq!(mailbox.push(1, ()), Pushed::Queued);
-        assert_eq!(mailbox.push(2, ()), Pushed::Queued);
-        assert_eq!(mailbox.push(3, ()), Pushed::NoLane(()));
+        let mailbox = BoundedQueue::new(1, 2);
+        assert_eq!(mailbox.push(1, ()), PushOutcome::Queued);
+        assert_eq!(mailbox.push(2, ()), PushOutcome::Queued);
+        assert_eq!(mailbox.push(3, ()), PushOutcome::NoLane(()));
         let _ = mailbox.take(None);
-        assert_eq!(mailbox.push(3, ()), Pushed::Queued, "an emptied lane is free again");
+        assert_eq!(mailbox.push(3, ()), PushOutcome::Queued, "an emptied lane is free again");
     }
 
     #[test]
     fn what_was_pushed_before_closing_is_still_taken() {
-        let mailbox = Mailbox::new(1, 1);
-        assert_eq!(mailbox.push((), 7), Pushed::Queued);
+        let mailbox = BoundedQueue::new(1, 1);
+        assert_eq!(mailbox.push((), 7), PushOutcome::Queued);
         mailbox.close();
-        assert_eq!(mailbox.push((), 8), Pushed::Closed(8));
-        assert_eq!(mailbox.take(None), Taken::Item((), 7));
-        assert_eq!(mailbox.take(None), Taken::Closed);
+        assert_eq!(mailbox.push((), 8), PushOutcome::Closed(8));
+        assert_eq!(mailbox.take(None), Pop::Item((), 7));
+        assert_eq!(mailbox.take(None), Pop::Closed);
     }
 
     #[test]
     fn an_empty_mailbox_times_out() {
-        let mailbox = Mailbox::<(), ()>::new(1, 1);
-        assert_eq!(mailbox.take(Some(Instant::now() + Duration::from_millis(5))), Taken::TimedOut);
+        let mailbox = BoundedQueue::<(), ()>::new(1, 1);
+        assert_eq!(mailbox.take(Some(Instant::now() + Duration::from_millis(5))), Pop::TimedOut);
     }
 
     #[test]
     fn a_waiting_producer_loses_nothing() {
-        let mailbox = Arc::new(Mailbox::new(1, 1));
+        let mailbox = Arc::new(BoundedQueue::new(1, 1));
         let producer = thread::spawn({
             let mailbox = Arc::clone(&mailbox);
-            move || (0..100).all(|item| mailbox.push_waiting((), item) == Pushed::Queued)
+            move || (0..100).all(|item| mailbox.push_waiting((), item) == PushOutcome::Queued)
         });
         for expected in 0..100 {
-            assert_eq!(mailbox.take(None), Taken::Item((), expected));
+            assert_eq!(mailbox.take(None), Pop::Item((), expected));
         }
         assert!(producer.join().unwrap());
     }
 
     #[test]
     fn closing_frees_a_waiting_producer() {
-        let mailbox = Arc::new(Mailbox::new(1, 1));
-        assert_eq!(mailbox.push((), 1), Pushed::Queued);
+        let mailbox = Arc::new(BoundedQueue::new(1, 1));
+        assert_eq!(mailbox.push((), 1), PushOutcome::Queued);
         let producer = thread::spawn({
             let mailbox = Arc::clone(&mailbox);
             move || mailbox.push_waiting((), 2)
         });
         mailbox.close();
-        assert_eq!(producer.join().unwrap(), Pushed::Closed(2));
+        assert_eq!(producer.join().unwrap(), PushOutcome::Closed(2));
     }
 }

@@ -6,21 +6,21 @@ use std::sync::Arc;
 use std::thread::JoinHandle;
 use std::time::Duration;
 
-use protocol::{CavId, Control, Key, ProcessId, Role, RunId, Selector, Topic};
+use protocol::{CavId, Control, Key, KeyExpr, ProcessId, Role, RunId, Topic};
 use zenoh::qos::Priority;
 use zenoh::{Session, Wait};
 
-use super::flush_barrier::Receipt;
+use super::flush_barrier::FlushBarrier;
 use super::inbox_limits::InboxLimits;
-use super::liveliness::{Presence, Sighting, Watch};
+use super::liveliness::{LivelinessEvent, LivelinessSubscription, LivelinessToken};
 use super::metrics::MetricsServer;
-use super::passive_subscriber::Tap;
+use super::passive_subscriber::PassiveSubscriber;
 use super::publisher::{Publisher, PublisherOptions, unix_nanos};
 use super::shutdown::{self, Overdue};
-use super::status_publisher::{Notices, Speaker};
+use super::status_publisher::{StatusPublisher, StatusSender};
 use super::subscriber::{Inbox, Subscription};
-use super::watchdog::Working;
-use super::{Books, BusError, BusOptions, open};
+use super::watchdog::Heartbeat;
+use super::{BusError, BusOptions, MessageStats, open};
 
 /// Who joins which run.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -38,8 +38,8 @@ pub struct Bus {
     session: Session,
     identity: Identity,
     epoch: u64,
-    books: Books,
-    notices: Notices,
+    books: MessageStats,
+    notices: StatusPublisher,
     speaking: JoinHandle<()>,
     metrics: Option<MetricsServer>,
 }
@@ -58,8 +58,9 @@ impl Bus {
     /// # Errors
     /// [`BusError::Thread`] when the system gives no thread.
     pub fn over(session: Session, identity: Identity) -> Result<Self, BusError> {
-        let (epoch, books, notices) = (new_epoch(), Books::new(identity.process.clone()), Notices::new());
-        let speaking = notices.speak(Speaker {
+        let (epoch, books, notices) =
+            (new_epoch(), MessageStats::new(identity.process.clone()), StatusPublisher::new());
+        let speaking = notices.speak(StatusSender {
             session: session.clone(),
             run: identity.run.clone(),
             cav: identity.cav.clone(),
@@ -87,7 +88,7 @@ impl Bus {
 
     /// Its ledger and stage timings.
     #[must_use]
-    pub fn books(&self) -> &Books {
+    pub fn books(&self) -> &MessageStats {
         &self.books
     }
 
@@ -125,8 +126,8 @@ impl Bus {
 
     /// Until what is returned is dropped, this process says how it is only while a thread works from `inbox`: waits there or
     /// has come back since the last time. One whose work stands still falls silent so, and whoever watches over it can tell.
-    pub fn works_from(&self, inbox: &Inbox) -> Working {
-        Working::begin(&self.notices, inbox.pulse())
+    pub fn works_from(&self, inbox: &Inbox) -> Heartbeat {
+        Heartbeat::begin(&self.notices, inbox.pulse())
     }
 
     /// Delivers `topic` into `inbox`.
@@ -149,7 +150,7 @@ impl Bus {
     ///
     /// # Errors
     /// [`BusError::Zenoh`] when the session is closed.
-    pub fn subscribe_all(&self, selector: &Selector, inbox: &Arc<Inbox>) -> Result<Subscription, BusError> {
+    pub fn subscribe_all(&self, selector: &KeyExpr, inbox: &Arc<Inbox>) -> Result<Subscription, BusError> {
         Subscription::to_all(&self.session, selector, inbox, &self.notices)
     }
 
@@ -157,8 +158,8 @@ impl Bus {
     ///
     /// # Errors
     /// [`BusError::Zenoh`] when the session is closed.
-    pub fn tap(&self, selectors: &[Selector], places: usize) -> Result<Tap, BusError> {
-        Tap::open(&self.session, selectors, places, &self.notices)
+    pub fn tap(&self, selectors: &[KeyExpr], places: usize) -> Result<PassiveSubscriber, BusError> {
+        PassiveSubscriber::open(&self.session, selectors, places, &self.notices)
     }
 
     /// Says `control` to all who listen, without waiting.
@@ -170,16 +171,20 @@ impl Bus {
     ///
     /// # Errors
     /// [`BusError::Zenoh`] when the session is closed.
-    pub fn announce(&self, role: Role) -> Result<Presence, BusError> {
-        Presence::announce(&self.session, &self.identity.run, role, &self.identity.cav)
+    pub fn announce(&self, role: Role) -> Result<LivelinessToken, BusError> {
+        LivelinessToken::announce(&self.session, &self.identity.run, role, &self.identity.cav)
     }
 
     /// Watches the processes of a role come and go, those already there first. `report` must not wait or call zenoh.
     ///
     /// # Errors
     /// [`BusError::Zenoh`] when the session is closed.
-    pub fn watch(&self, role: Role, report: impl Fn(Sighting) + Send + Sync + 'static) -> Result<Watch, BusError> {
-        Watch::begin(&self.session, &Selector::alive(&self.identity.run, role), report)
+    pub fn watch(
+        &self,
+        role: Role,
+        report: impl Fn(LivelinessEvent) + Send + Sync + 'static,
+    ) -> Result<LivelinessSubscription, BusError> {
+        LivelinessSubscription::begin(&self.session, &KeyExpr::alive(&self.identity.run, role), report)
     }
 
     /// The key of a topic in this run.
@@ -201,7 +206,7 @@ impl Bus {
                 tracing::error!("the thread for notices panicked");
             }
             // A connection that is closed throws away what still lies in its buffers.
-            Receipt::new(&session, &identity.run, Priority::Background).wait(limit);
+            FlushBarrier::new(&session, &identity.run, Priority::Background).wait(limit);
             if let Err(cause) = session.close().wait() {
                 tracing::warn!("closing the zenoh session: {cause}");
             }

@@ -5,7 +5,7 @@ use std::os::unix::fs::PermissionsExt;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
-use protocol::Party;
+use protocol::Principal;
 use x509_parser::pem::parse_x509_pem;
 
 use super::BusError;
@@ -78,11 +78,11 @@ impl Credentials {
     ///
     /// # Errors
     /// [`BusError::Keys`] names the line that names nobody.
-    pub fn members(&self) -> Result<Vec<Party>, BusError> {
+    pub fn members(&self) -> Result<Vec<Principal>, BusError> {
         let path = self.folder.join(MEMBERS_FILE);
         let text = readable(&path)?;
         let lines = text.lines().map(str::trim).filter(|line| !line.is_empty());
-        lines.map(|line| line.parse().map_err(|cause: protocol::PartyError| bad(&path, &cause))).collect()
+        lines.map(|line| line.parse().map_err(|cause: protocol::PrincipalError| bad(&path, &cause))).collect()
     }
 }
 

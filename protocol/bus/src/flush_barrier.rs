@@ -2,7 +2,7 @@
 
 use std::time::{Duration, Instant};
 
-use protocol::{RunId, Selector};
+use protocol::{KeyExpr, RunId};
 use zenoh::qos::{CongestionControl, Priority};
 use zenoh::{Session, Wait};
 
@@ -11,16 +11,16 @@ use zenoh::{Session, Wait};
 const ROUND: Duration = Duration::from_secs(2);
 
 /// Tells when the router has everything that was put before.
-pub(super) struct Receipt {
+pub(super) struct FlushBarrier {
     session: Session,
-    asked: Selector,
+    asked: KeyExpr,
     priority: Priority,
 }
 
-impl Receipt {
+impl FlushBarrier {
     /// Of what is sent with `priority` and before all that has a lower one.
     pub(super) fn new(session: &Session, run: &RunId, priority: Priority) -> Self {
-        Self { session: session.clone(), asked: Selector::nobody(run), priority }
+        Self { session: session.clone(), asked: KeyExpr::none(run), priority }
     }
 
     /// Waits for it, in at most `limit`. A question that nobody answers comes back from the router at once, and has to go

@@ -34,7 +34,7 @@ impl InboxLimits {
 }
 
 /// The meters of an inbox, one for each topic.
-pub(super) struct Meters {
+pub(super) struct RateLimiter {
     limits: InboxLimits,
     meters: Mutex<BTreeMap<Option<Topic>, Meter>>,
 }
@@ -46,7 +46,7 @@ struct Meter {
     at: Instant,
 }
 
-impl Meters {
+impl RateLimiter {
     pub(super) fn new(limits: InboxLimits) -> Self {
         Self { limits, meters: Mutex::default() }
     }
@@ -84,12 +84,12 @@ mod tests {
 
     use super::*;
 
-    fn meters(messages_per_s: f64, bytes_per_s: f64) -> Meters {
-        Meters::new(InboxLimits { messages_per_s, bytes_per_s, waiting_bytes: usize::MAX })
+    fn meters(messages_per_s: f64, bytes_per_s: f64) -> RateLimiter {
+        RateLimiter::new(InboxLimits { messages_per_s, bytes_per_s, waiting_bytes: usize::MAX })
     }
 
     /// How many of `count` messages get through that come in equal steps.
-    fn admitted(meters: &Meters, topic: &str, count: u32, step: Duration, bytes: usize) -> usize {
+    fn admitted(meters: &RateLimiter, topic: &str, count: u32, step: Duration, bytes: usize) -> usize {
         let (topic, began) = (topic.parse().unwrap(), Instant::now());
         (0..count).filter(|index| meters.admit(&topic, bytes, began + step * *index)).count()
     }

@@ -3,10 +3,10 @@
 //! - One process routes on a fixed endpoint, the others connect to it; nothing is discovered ([`open`]).
 //! - No producer waits for the network and no callback of zenoh's waits for a consumer: between them lie bounded
 //!   mailboxes in which the newest wins ([`mailbox`], [`Publisher`], [`Inbox`]).
-//! - What is overwritten, refused or still under way is counted ([`Books`]), and the books are published.
+//! - What is overwritten, refused or still under way is counted ([`MessageStats`]), and the books are published.
 //! - A scene starts when every route has carried something ([`Barrier`]).
 //! - With keys every process shows who it is, and the router lets it say only what is its to say ([`Credentials`],
-//!   [`Guard`]); what it refused is counted ([`Refusals`]).
+//!   [`AccessControl`]); what it refused is counted ([`RejectionLog`]).
 //! - Ending takes a bounded time, whatever the network does ([`shutdown`]).
 //!
 //! Nothing here is async: zenoh brings its own runtimes, and a `put` that waits for a slow network must not hold up an
@@ -44,22 +44,22 @@ mod subscriber;
 mod watchdog;
 pub mod web;
 
-pub use access_control::Guard;
+pub use access_control::AccessControl;
 pub use args::{BusConfig, InboxConfig, STOP_LIMIT, log_to_stderr};
 pub use bus::{Bus, Identity};
 pub use credentials::{AUTHORITY_FILE, CERTIFICATE_FILE, Credentials, KEY_FILE, MEMBERS_FILE, ROUTER};
 pub use endpoint::Endpoint;
 pub use error::BusError;
 pub use inbox_limits::InboxLimits;
-pub use liveliness::{Presence, Sighting, Watch, present};
-pub use membership::RollCall;
-pub use message_stats::{Books, PeerSummary, StageHistogram};
+pub use liveliness::{LivelinessEvent, LivelinessSubscription, LivelinessToken, present};
+pub use membership::Membership;
+pub use message_stats::{MessageStats, PeerSummary, StageHistogram};
 pub use metrics::{MetricsServer, exposition};
-pub use passive_subscriber::{Overheard, Tap};
+pub use passive_subscriber::{PassiveSubscriber, RawMessage};
 pub use process_config::{Configured, ProcessConfig, minimal};
 pub use publisher::{Overflow, Publisher, PublisherOptions, unix_nanos};
-pub use readiness::{Attended, Barrier, NotReady, Route, RouteError, process_id};
-pub use rejection_log::{Refusal, Refusals, STRANGER};
+pub use readiness::{Barrier, NotReady, Route, RouteError, RoutesReady, process_id};
+pub use rejection_log::{Rejection, RejectionLog, STRANGER};
 pub use session::{BusOptions, Role as SessionRole, open};
 pub use subscriber::{Arrival, Event, Inbox, Subscription};
-pub use watchdog::Working;
+pub use watchdog::Heartbeat;

@@ -3,7 +3,7 @@
 use std::collections::BTreeSet;
 use std::time::Duration;
 
-use protocol::{CavId, Key, ProcessId, Role, RunId, Selector, Topic};
+use protocol::{CavId, Key, KeyExpr, ProcessId, Role, RunId, Topic};
 use zenoh::sample::SampleKind;
 use zenoh::{Session, Wait};
 
@@ -17,9 +17,9 @@ const LOOK_LIMIT: Duration = Duration::from_secs(3);
 /// A process that dies is missed as soon as its connection closes, which on one machine is at once; one that falls
 /// silent behind a cut cable only after zenoh's lease of 10 s. Faster than that is the age of its last message.
 #[must_use = "the token is withdrawn when this is dropped"]
-pub struct Presence(zenoh::liveliness::LivelinessToken);
+pub struct LivelinessToken(zenoh::liveliness::LivelinessToken);
 
-impl Presence {
+impl LivelinessToken {
     /// Tells everyone that `cav`'s process of this role is there.
     ///
     /// # Errors
@@ -44,7 +44,7 @@ impl Presence {
 /// # Errors
 /// [`BusError::Zenoh`] when the session is closed.
 pub fn present(session: &Session, run: &RunId) -> Result<BTreeSet<ProcessId>, BusError> {
-    let selector = Selector::everyone_alive(run);
+    let selector = KeyExpr::everyone_alive(run);
     let tokens = session.liveliness().get(selector.as_str()).timeout(LOOK_LIMIT).wait();
     let tokens = tokens.map_err(|cause| BusError::zenoh(format!("looking for {selector}"), &cause))?;
     let process = |reply: zenoh::query::Reply| match reply.result().ok()?.key_expr().as_str().parse() {
@@ -56,7 +56,7 @@ pub fn present(session: &Session, run: &RunId) -> Result<BTreeSet<ProcessId>, Bu
 
 /// A process came or went.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Sighting {
+pub enum LivelinessEvent {
     /// It is there, perhaps since long before the watch began.
     Appeared {
         /// What it does.
@@ -75,9 +75,11 @@ pub enum Sighting {
 
 /// A watch over tokens; ends when dropped.
 #[must_use = "the watch ends when this is dropped"]
-pub struct Watch(#[expect(dead_code, reason = "held for its lifetime only")] zenoh::pubsub::Subscriber<()>);
+pub struct LivelinessSubscription(
+    #[expect(dead_code, reason = "held for its lifetime only")] zenoh::pubsub::Subscriber<()>,
+);
 
-impl Watch {
+impl LivelinessSubscription {
     /// Calls `report` for every token that `selector` meets, those present already first.
     ///
     /// `report` runs on zenoh's receive thread: it hands over and returns, and must not call zenoh.
@@ -86,15 +88,15 @@ impl Watch {
     /// [`BusError::Zenoh`] when the session is closed.
     pub fn begin(
         session: &Session,
-        selector: &Selector,
-        report: impl Fn(Sighting) + Send + Sync + 'static,
+        selector: &KeyExpr,
+        report: impl Fn(LivelinessEvent) + Send + Sync + 'static,
     ) -> Result<Self, BusError> {
         let watch = session.liveliness().declare_subscriber(selector.as_str()).history(true).callback(move |sample| {
             // A token that is no key of ours says nothing to us.
             if let Ok(Key { topic: Topic::Alive { role, cav }, .. }) = sample.key_expr().as_str().parse() {
                 report(match sample.kind() {
-                    SampleKind::Put => Sighting::Appeared { role, cav },
-                    SampleKind::Delete => Sighting::Vanished { role, cav },
+                    SampleKind::Put => LivelinessEvent::Appeared { role, cav },
+                    SampleKind::Delete => LivelinessEvent::Vanished { role, cav },
                 });
             }
         });

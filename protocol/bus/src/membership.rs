@@ -5,32 +5,32 @@ use std::time::Instant;
 
 use protocol::{CavId, Role};
 
-use super::bounded_queue::{Mailbox, Pushed, Taken};
-use super::liveliness::{Sighting, Watch};
+use super::bounded_queue::{BoundedQueue, Pop, PushOutcome};
+use super::liveliness::{LivelinessEvent, LivelinessSubscription};
 use super::{Bus, BusError};
 
 /// Sightings that wait to be asked for; of one vehicle only the last.
-pub struct RollCall {
-    sightings: Arc<Mailbox<CavId, bool>>,
-    _watch: Watch,
+pub struct Membership {
+    sightings: Arc<BoundedQueue<CavId, bool>>,
+    _watch: LivelinessSubscription,
 }
 
-impl RollCall {
+impl Membership {
     /// Watches the processes of a role, those already there first. Of more than `most` vehicles at once some are passed
     /// over, and the log says so: a flood of tokens must not become a flood of anything else.
     ///
     /// # Errors
     /// [`BusError::Zenoh`] when the session is closed.
     pub fn begin(bus: &Bus, role: Role, most: usize) -> Result<Self, BusError> {
-        let sightings = Arc::new(Mailbox::new(1, most));
+        let sightings = Arc::new(BoundedQueue::new(1, most));
         let watch = bus.watch(role, {
             let sightings = Arc::clone(&sightings);
             move |sighting| {
                 let (cav, is_there) = match sighting {
-                    Sighting::Appeared { cav, .. } => (cav, true),
-                    Sighting::Vanished { cav, .. } => (cav, false),
+                    LivelinessEvent::Appeared { cav, .. } => (cav, true),
+                    LivelinessEvent::Vanished { cav, .. } => (cav, false),
                 };
-                if let Pushed::NoLane(_) = sightings.push(cav.clone(), is_there) {
+                if let PushOutcome::NoLane(_) = sightings.push(cav.clone(), is_there) {
                     tracing::warn!(%cav, "more processes come and go than can be followed");
                 }
             }
@@ -42,8 +42,8 @@ impl RollCall {
     #[must_use]
     pub fn next(&self) -> Option<(CavId, bool)> {
         match self.sightings.take(Some(Instant::now())) {
-            Taken::Item(cav, is_there) => Some((cav, is_there)),
-            Taken::TimedOut | Taken::Closed => None,
+            Pop::Item(cav, is_there) => Some((cav, is_there)),
+            Pop::TimedOut | Pop::Closed => None,
         }
     }
 }

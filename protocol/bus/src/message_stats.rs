@@ -20,7 +20,7 @@ const KEPT_TIMINGS: usize = 2048;
 
 /// The books of one process. Cloning shares them. What is not booked ([`Topic::is_booked`]) leaves no trace in them.
 #[derive(Clone)]
-pub struct Books {
+pub struct MessageStats {
     process: ProcessId,
     state: Arc<Mutex<State>>,
 }
@@ -81,7 +81,7 @@ struct Timings {
     last: VecDeque<Duration>,
 }
 
-impl Books {
+impl MessageStats {
     /// Empty books of `process`.
     #[must_use]
     pub fn new(process: ProcessId) -> Self {
@@ -100,7 +100,7 @@ impl Books {
     }
 
     /// The network has taken a message that was offered.
-    pub fn handed_over(&self, topic: &Topic) {
+    pub fn delivered(&self, topic: &Topic) {
         self.note(topic, |state| state.pass(Account::published(topic.clone())));
     }
 
@@ -147,20 +147,20 @@ impl Books {
 
     /// The same of a notice: logged alone, as no sender counts what it says about itself.
     pub(super) fn limited_notice(&self, topic: &Topic, why: &'static str) {
-        self.complain(topic, DropReason::RateLimit, &why);
+        self.warn_once(topic, DropReason::RateLimit, &why);
     }
 
     /// A sound message says what is not its sender's to say; counted and logged like an unsound one.
-    pub(super) fn misused(&self, topic: &Topic, why: &'static str) {
+    pub(super) fn reject_invalid(&self, topic: &Topic, why: &'static str) {
         self.refused(topic, DropReason::Identity, &why);
     }
 
     fn refused(&self, topic: &Topic, reason: DropReason, why: &dyn fmt::Display) {
         self.dropped(topic, reason);
-        self.complain(topic, reason, why);
+        self.warn_once(topic, reason, why);
     }
 
-    fn complain(&self, topic: &Topic, reason: DropReason, why: &dyn fmt::Display) {
+    fn warn_once(&self, topic: &Topic, reason: DropReason, why: &dyn fmt::Display) {
         let times = {
             let mut state = self.lock();
             let has_room = state.refused.len() < MAX_ACCOUNTS || state.refused.contains_key(topic);
@@ -322,8 +322,8 @@ mod tests {
         "4279/bev".parse().unwrap()
     }
 
-    fn books(process: &str) -> Books {
-        Books::new(process.parse().unwrap())
+    fn books(process: &str) -> MessageStats {
+        MessageStats::new(process.parse().unwrap())
     }
 
     #[test]
@@ -334,8 +334,8 @@ mod tests {
             agent.offered(&topic());
         }
         agent.withheld(&topic(), DropReason::Superseded);
-        agent.handed_over(&topic());
-        agent.handed_over(&topic());
+        agent.delivered(&topic());
+        agent.delivered(&topic());
         ego.arrived(&topic());
         ego.arrived(&topic());
         ego.received(&topic());
@@ -353,7 +353,7 @@ mod tests {
         let agent = books("agent-4279");
         let topic: Topic = "4279/descriptor".parse().unwrap();
         agent.offered(&topic);
-        agent.handed_over(&topic);
+        agent.delivered(&topic);
         agent.rejected(&topic, &WireError::Kind { expected: protocol::Kind::Descriptor, found: protocol::Kind::Bev });
         assert!(agent.ledger().is_empty());
     }

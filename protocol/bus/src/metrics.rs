@@ -11,7 +11,7 @@ use prometheus_client::metrics::counter::ConstCounter;
 use prometheus_client::metrics::gauge::ConstGauge;
 use prometheus_client::registry::{Registry, Unit};
 
-use super::Books;
+use super::MessageStats;
 use crate::web::{Answer, WebServer};
 
 /// Serves the books of a process at `http://<address>/metrics` until dropped.
@@ -22,7 +22,7 @@ impl MetricsServer {
     ///
     /// # Errors
     /// When the address cannot be listened at.
-    pub fn start(address: SocketAddr, books: &Books) -> std::io::Result<Self> {
+    pub fn start(address: SocketAddr, books: &MessageStats) -> std::io::Result<Self> {
         let books = books.clone();
         let server = WebServer::start(address, move |request| match request.path.as_str() {
             "/metrics" => Answer::Page { content_type: CONTENT_TYPE, body: exposition(&books).into() },
@@ -42,7 +42,7 @@ const CONTENT_TYPE: &str = "application/openmetrics-text; version=1.0.0; charset
 
 /// The books in the OpenMetrics text format.
 #[must_use]
-pub fn exposition(books: &Books) -> String {
+pub fn exposition(books: &MessageStats) -> String {
     let process = (Cow::from("process"), Cow::from(books.process().to_string()));
     let mut registry = Registry::with_prefix_and_labels("v2vloc", [process].into_iter());
     registry.register_collector(Box::new(BooksCollector(books.clone())));
@@ -52,7 +52,7 @@ pub fn exposition(books: &Books) -> String {
     text
 }
 
-struct BooksCollector(Books);
+struct BooksCollector(MessageStats);
 
 impl fmt::Debug for BooksCollector {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
@@ -136,8 +136,8 @@ mod tests {
 
     use super::*;
 
-    fn books() -> Books {
-        let books = Books::new(ProcessId::new("agent-4279").unwrap());
+    fn books() -> MessageStats {
+        let books = MessageStats::new(ProcessId::new("agent-4279").unwrap());
         let cav = CavId::new("4279").unwrap();
         let [lidar, bev] = [Stream::Lidar, Stream::Bev].map(|stream| Topic::Stream { cav: cav.clone(), stream });
         books.subscribed(&lidar);

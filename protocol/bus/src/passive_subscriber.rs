@@ -7,13 +7,13 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicU64, AtomicUsize, Ordering};
 use std::time::Instant;
 
-use protocol::{Control, Key, Kind, Limits, Selector, Stream, Topic, wire};
+use protocol::{Control, Key, KeyExpr, Kind, Limits, Stream, Topic, wire};
 use zenoh::Wait;
 use zenoh::bytes::ZBytes;
 use zenoh::sample::Sample;
 
-use super::bounded_queue::{Mailbox, Pushed, Taken};
-use super::status_publisher::Notices;
+use super::bounded_queue::{BoundedQueue, Pop, PushOutcome};
+use super::status_publisher::StatusPublisher;
 use super::subscriber::has_notices;
 use super::{BusError, unix_nanos};
 
@@ -24,7 +24,7 @@ const MAX_WAITING: usize = 512 << 20;
 
 /// A message as it came by, unchecked but for its key.
 #[derive(Debug)]
-pub struct Overheard {
+pub struct RawMessage {
     /// Its key.
     pub key: Key,
     /// When it came, nanoseconds on the Unix clock.
@@ -32,7 +32,7 @@ pub struct Overheard {
     payload: ZBytes,
 }
 
-impl Overheard {
+impl RawMessage {
     /// The bytes, in the pieces they came in.
     #[must_use]
     pub fn pieces(&self) -> Vec<&[u8]> {
@@ -59,32 +59,32 @@ impl Overheard {
 }
 
 /// Everything on the keys of some selectors, in bounded lanes, one per key, in which the newest wins.
-pub struct Tap {
+pub struct PassiveSubscriber {
     shared: Arc<Shared>,
     _subscribers: Vec<zenoh::pubsub::Subscriber<()>>,
 }
 
 struct Shared {
-    mailbox: Mailbox<Topic, Overheard>,
+    mailbox: BoundedQueue<Topic, RawMessage>,
     waiting_bytes: AtomicUsize,
     overwritten: AtomicU64,
 }
 
-impl Tap {
+impl PassiveSubscriber {
     /// Listens to `selectors`; of each key `places` messages may wait. With `notices` probes are answered, so that a
     /// barrier can wait for the tap.
     pub(super) fn open(
         session: &zenoh::Session,
-        selectors: &[Selector],
+        selectors: &[KeyExpr],
         places: usize,
-        notices: &Notices,
+        notices: &StatusPublisher,
     ) -> Result<Self, BusError> {
         let shared = Arc::new(Shared {
-            mailbox: Mailbox::new(places, MAX_TOPICS),
+            mailbox: BoundedQueue::new(places, MAX_TOPICS),
             waiting_bytes: AtomicUsize::new(0),
             overwritten: AtomicU64::new(0),
         });
-        let subscribe = |selector: &Selector| {
+        let subscribe = |selector: &KeyExpr| {
             let (shared, notices) = (Arc::clone(&shared), notices.clone());
             let subscriber = session.declare_subscriber(selector.as_str());
             let subscriber = subscriber.callback(move |sample| shared.admit(&sample, &notices)).wait();
@@ -95,9 +95,9 @@ impl Tap {
     }
 
     /// The message that has waited longest, waiting until `deadline` for one.
-    pub fn take(&self, deadline: Option<Instant>) -> Taken<Topic, Overheard> {
+    pub fn take(&self, deadline: Option<Instant>) -> Pop<Topic, RawMessage> {
         let taken = self.shared.mailbox.take(deadline);
-        if let Taken::Item(_, overheard) = &taken {
+        if let Pop::Item(_, overheard) = &taken {
             self.shared.waiting_bytes.fetch_sub(overheard.len(), Ordering::Relaxed);
         }
         taken
@@ -117,8 +117,8 @@ impl Tap {
 }
 
 impl Shared {
-    /// Runs on zenoh's receive thread: looks at headers only and waits for nothing.
-    fn admit(&self, sample: &Sample, notices: &Notices) {
+    /// RunScope on zenoh's receive thread: looks at headers only and waits for nothing.
+    fn admit(&self, sample: &Sample, notices: &StatusPublisher) {
         let Ok(key) = sample.key_expr().as_str().parse::<Key>() else { return };
         if has_notices(&key.topic) && !is_json(&key.topic) {
             match wire::decode_header(sample.payload().slices()) {
@@ -128,18 +128,18 @@ impl Shared {
                 Err(_) => {}
             }
         }
-        self.keep(Overheard { key, arrived_nanos: unix_nanos(), payload: sample.payload().clone() });
+        self.keep(RawMessage { key, arrived_nanos: unix_nanos(), payload: sample.payload().clone() });
     }
 
-    fn keep(&self, overheard: Overheard) {
+    fn keep(&self, overheard: RawMessage) {
         let len = overheard.len();
         let waiting = self.waiting_bytes.fetch_add(len, Ordering::Relaxed);
         let lost = if waiting + len > MAX_WAITING {
             Some(len)
         } else {
             match self.mailbox.push(overheard.key.topic.clone(), overheard) {
-                Pushed::Queued => None,
-                Pushed::Displaced(lost) | Pushed::NoLane(lost) | Pushed::Closed(lost) => Some(lost.len()),
+                PushOutcome::Queued => None,
+                PushOutcome::Replaced(lost) | PushOutcome::NoLane(lost) | PushOutcome::Closed(lost) => Some(lost.len()),
             }
         };
         if let Some(len) = lost {
@@ -150,7 +150,7 @@ impl Shared {
 }
 
 /// Probes and ends are about the route, not of the run.
-fn note(topic: &Topic, sample: &Sample, notices: &Notices) {
+fn note(topic: &Topic, sample: &Sample, notices: &StatusPublisher) {
     if let Ok((_, Control::Probe)) = wire::decode(sample.payload().slices(), &Limits::DEFAULT) {
         notices.probed(topic);
     }
@@ -164,18 +164,18 @@ fn is_json(topic: &Topic) -> bool {
 mod tests {
     use super::*;
 
-    fn tap(places: usize) -> Tap {
+    fn tap(places: usize) -> PassiveSubscriber {
         let shared = Shared {
-            mailbox: Mailbox::new(places, MAX_TOPICS),
+            mailbox: BoundedQueue::new(places, MAX_TOPICS),
             waiting_bytes: AtomicUsize::new(0),
             overwritten: AtomicU64::new(0),
         };
-        Tap { shared: Arc::new(shared), _subscribers: Vec::new() }
+        PassiveSubscriber { shared: Arc::new(shared), _subscribers: Vec::new() }
     }
 
-    fn overheard(vehicle: usize, payload: &ZBytes) -> Overheard {
+    fn overheard(vehicle: usize, payload: &ZBytes) -> RawMessage {
         let key = format!("v2v/test/{vehicle}/lidar").parse().unwrap();
-        Overheard { key, arrived_nanos: 0, payload: payload.clone() }
+        RawMessage { key, arrived_nanos: 0, payload: payload.clone() }
     }
 
     #[test]
@@ -187,7 +187,7 @@ mod tests {
         (1..10).for_each(|vehicle| tap.shared.keep(overheard(vehicle, &payload)));
         assert_eq!(tap.overwritten(), 1 + 3, "eight of them fill the tap");
         let at_once = Some(Instant::now());
-        assert_eq!((0..9).filter(|_| matches!(tap.take(at_once), Taken::Item(..))).count(), 8);
+        assert_eq!((0..9).filter(|_| matches!(tap.take(at_once), Pop::Item(..))).count(), 8);
         assert_eq!(tap.shared.waiting_bytes.load(Ordering::Relaxed), 0);
         tap.shared.keep(overheard(9, &payload));
         assert_eq!(tap.overwritten(), 4, "there is room again");

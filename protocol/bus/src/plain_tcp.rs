@@ -32,7 +32,7 @@ impl PlainTcp {
     }
 
     /// Turns away those who wait, without reading a byte of theirs. How many it were so far.
-    pub(super) fn turn_away(&mut self) -> u64 {
+    pub(super) fn reject(&mut self) -> u64 {
         for _ in 0..MOST_AT_ONCE {
             // Whatever the error, the others can wait until the next time.
             let Ok((stranger, _)) = self.listener.accept() else { break };
@@ -56,9 +56,9 @@ mod tests {
         let router = Endpoint::loopback(free.port());
         assert!(PlainTcp::beside(&router).is_none(), "it takes TCP itself");
         let mut door = PlainTcp::beside(&router.secured()).unwrap();
-        assert_eq!(door.turn_away(), 0);
+        assert_eq!(door.reject(), 0);
         let mut strangers = [(); 3].map(|()| TcpStream::connect(free).unwrap());
-        assert_eq!(door.turn_away(), 3);
+        assert_eq!(door.reject(), 3);
         for stranger in &mut strangers {
             assert_eq!(stranger.read(&mut [0; 1]).unwrap(), 0, "nothing is said");
         }

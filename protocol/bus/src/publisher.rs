@@ -11,10 +11,10 @@ use zenoh::Wait;
 use zenoh::bytes::{Encoding, ZBytes};
 use zenoh::qos::{CongestionControl, Priority};
 
-use super::bounded_queue::{Mailbox, Pushed, Taken};
-use super::flush_barrier::Receipt;
+use super::bounded_queue::{BoundedQueue, Pop, PushOutcome};
+use super::flush_barrier::FlushBarrier;
 use super::session::LONGEST_MESSAGE;
-use super::{Arrival, Books, BusError};
+use super::{Arrival, BusError, MessageStats};
 use crate::batch_scheduling;
 use support::nanos;
 
@@ -90,8 +90,8 @@ struct Offer {
 pub struct Publisher {
     topic: Topic,
     overflow: Overflow,
-    queue: Arc<Mailbox<(), Offer>>,
-    books: Books,
+    queue: Arc<BoundedQueue<(), Offer>>,
+    books: MessageStats,
     /// Whether somebody listens, where that matters.
     audience: Option<Arc<AtomicBool>>,
     thread: Option<JoinHandle<()>>,
@@ -102,7 +102,7 @@ impl Publisher {
         session: &zenoh::Session,
         (key, cav): (&Key, &CavId),
         epoch: u64,
-        books: &Books,
+        books: &MessageStats,
         options: PublisherOptions,
     ) -> Result<Self, BusError> {
         let PublisherOptions { overflow, priority, express, is_for_onlookers } = options;
@@ -124,7 +124,7 @@ impl Publisher {
         };
         let audience = is_for_onlookers.then(|| audience(&publisher)).transpose();
         let audience = audience.map_err(|cause| BusError::zenoh(format!("asking who listens to {key}"), &cause))?;
-        let queue = Arc::new(Mailbox::new(places, 1));
+        let queue = Arc::new(BoundedQueue::new(places, 1));
         let sender = Sender {
             topic: topic.clone(),
             cav: cav.clone(),
@@ -134,7 +134,7 @@ impl Publisher {
             queue: Arc::clone(&queue),
             books: books.clone(),
             publisher,
-            receipt: Receipt::new(session, &key.run, priority),
+            receipt: FlushBarrier::new(session, &key.run, priority),
             is_one_at_a_time: matches!(overflow, Overflow::KeepNewest(_)) && !is_for_onlookers,
         };
         let thread = thread::Builder::new()
@@ -198,8 +198,8 @@ impl Publisher {
             Overflow::Wait(_) => self.queue.push_waiting((), offer),
         };
         match pushed {
-            Pushed::Queued => {}
-            Pushed::Displaced(_) | Pushed::NoLane(_) | Pushed::Closed(_) => {
+            PushOutcome::Queued => {}
+            PushOutcome::Replaced(_) | PushOutcome::NoLane(_) | PushOutcome::Closed(_) => {
                 self.books.withheld(&self.topic, DropReason::Superseded);
             }
         }
@@ -230,26 +230,26 @@ struct Sender {
     epoch: u64,
     sequence: u64,
     has_notices: bool,
-    queue: Arc<Mailbox<(), Offer>>,
-    books: Books,
+    queue: Arc<BoundedQueue<(), Offer>>,
+    books: MessageStats,
     publisher: zenoh::pubsub::Publisher<'static>,
-    receipt: Receipt,
+    receipt: FlushBarrier,
     /// Whether the router must have a large message before the next one is taken from the queue.
     is_one_at_a_time: bool,
 }
 
 impl Sender {
     fn run(mut self) {
-        batch_scheduling::let_others_finish();
+        batch_scheduling::use_batch_scheduling();
         if self.has_notices {
             self.notify(Control::Probe);
         }
         loop {
             let probing = self.has_notices && self.sequence == 0;
             match self.queue.take(probing.then(|| Instant::now() + PROBE_PERIOD)) {
-                Taken::Item((), offer) => self.send(offer),
-                Taken::TimedOut => self.notify(Control::Probe),
-                Taken::Closed => break,
+                Pop::Item((), offer) => self.send(offer),
+                Pop::TimedOut => self.notify(Control::Probe),
+                Pop::Closed => break,
             }
         }
         if self.has_notices {
@@ -266,13 +266,13 @@ impl Sender {
                 self.sequence += 1;
                 let is_large = bytes.len() >= SMALL_BYTES;
                 if self.put(bytes) {
-                    self.books.handed_over(&self.topic);
+                    self.books.delivered(&self.topic);
                     if is_large && self.is_one_at_a_time {
                         self.receipt.wait(LONGEST_MESSAGE);
                     }
                 } else {
                     // The session is closed: nothing carries it.
-                    self.books.withheld(&self.topic, DropReason::Away);
+                    self.books.withheld(&self.topic, DropReason::PeerOffline);
                 }
             }
             Err(error) => {
@@ -350,7 +350,7 @@ mod tests {
     #[test]
     fn what_zenoh_refuses_is_no_longer_in_flight() {
         let session = open(&BusOptions::router(Endpoint::loopback(0))).unwrap();
-        let (key, books): (Key, _) = ("v2v/test/7/gnss".parse().unwrap(), Books::new("replay".parse().unwrap()));
+        let (key, books): (Key, _) = ("v2v/test/7/gnss".parse().unwrap(), MessageStats::new("replay".parse().unwrap()));
         let cav = CavId::new("7").unwrap();
         let publisher = Publisher::new(&session, (&key, &cav), 1, &books, PublisherOptions::POSE).unwrap();
         session.close().wait().unwrap();
@@ -358,7 +358,7 @@ mod tests {
         let gnss = Gnss { world_from_lidar: Pose::IDENTITY, position_std_m: 0.0, heading_std_rad: 0.0, source };
         publisher.offer(5, gnss);
         publisher.finish();
-        let lost = Counts { sent: 1, dropped: [(DropReason::Away, 1)].into(), ..Counts::default() };
+        let lost = Counts { sent: 1, dropped: [(DropReason::PeerOffline, 1)].into(), ..Counts::default() };
         assert_eq!(books.ledger().get(&Account::published(key.topic)), Some(&lost));
     }
 }

@@ -12,11 +12,11 @@ use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use protocol::{CavId, Control, Limits, Party, ProcessId, Role, Selector, Topic};
+use protocol::{CavId, Control, KeyExpr, Limits, Principal, ProcessId, Role, Topic};
 use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 
-use super::bounded_queue::Taken;
+use super::bounded_queue::Pop;
 use super::{Bus, BusError, Event, Inbox, Subscription};
 
 /// Answers of one process that may wait: each repeats what the one before it said.
@@ -49,7 +49,7 @@ impl fmt::Display for Route {
 /// it (`replay`).
 #[must_use]
 pub fn process_id(role: Role, cav: &CavId) -> ProcessId {
-    Party::new(role, cav).name()
+    Principal::new(role, cav).name()
 }
 
 /// A text that is not a route.
@@ -117,19 +117,19 @@ impl Barrier {
     ///
     /// # Errors
     /// [`BusError`] when the bus is closed or the system gives no thread.
-    pub fn attend(self, bus: &Bus) -> Result<Attended, BusError> {
+    pub fn await_routes(self, bus: &Bus) -> Result<RoutesReady, BusError> {
         let (barrier, inbox) = (Arc::new(self), bus.inbox(PLACES, MAX_PROCESSES));
-        let subscription = bus.subscribe_all(&Selector::ready(&bus.identity().run), &inbox)?;
+        let subscription = bus.subscribe_all(&KeyExpr::ready(&bus.identity().run), &inbox)?;
         let attending = (Arc::clone(&barrier), Arc::clone(&inbox));
         thread::Builder::new()
             .name("readiness".into())
             .spawn(move || attending.0.listen(&attending.1))
             .map_err(|cause| BusError::Thread { what: "readiness".into(), cause })?;
-        Ok(Attended { barrier, inbox, _subscription: subscription })
+        Ok(RoutesReady { barrier, inbox, _subscription: subscription })
     }
 
     fn listen(&self, inbox: &Inbox) {
-        while let Taken::Item(topic, event) = inbox.take(None) {
+        while let Pop::Item(topic, event) = inbox.take(None) {
             let (Topic::Ready(sender), Event::Message(arrival)) = (&topic, event) else { continue };
             match inbox.decode(&arrival, &Limits::DEFAULT) {
                 // Nobody says for another what that one has heard.
@@ -138,7 +138,7 @@ impl Barrier {
                         self.heard(&Route { topic, receiver: sender.clone() });
                     }
                 }
-                Some(_) => inbox.misused(&topic, "not the sender's own notice of readiness"),
+                Some(_) => inbox.reject_invalid(&topic, "not the sender's own notice of readiness"),
                 None => {}
             }
         }
@@ -190,13 +190,13 @@ impl Barrier {
 }
 
 /// A [`Barrier`] that hears the answers to probes, until it is dropped.
-pub struct Attended {
+pub struct RoutesReady {
     barrier: Arc<Barrier>,
     inbox: Arc<Inbox>,
     _subscription: Subscription,
 }
 
-impl std::ops::Deref for Attended {
+impl std::ops::Deref for RoutesReady {
     type Target = Barrier;
 
     fn deref(&self) -> &Barrier {
@@ -204,7 +204,7 @@ impl std::ops::Deref for Attended {
     }
 }
 
-impl Drop for Attended {
+impl Drop for RoutesReady {
     fn drop(&mut self) {
         self.inbox.close();
     }

@@ -19,7 +19,7 @@ pub const STRANGER: &str = "stranger";
 
 /// Why a router did not pass something on.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
-pub struct Refusal {
+pub struct Rejection {
     /// Common name of the certificate, or the session's own id where there was none; [`STRANGER`] for those not let in.
     pub peer: String,
     /// `access-control`, `low-pass` or `handshake`.
@@ -33,15 +33,15 @@ const PLAIN_TCP: &str = "plain TCP";
 
 /// Counts of refused messages since the router opened; of peers that have left since as far as they were seen before.
 #[derive(Debug)]
-pub struct Refusals {
+pub struct RejectionLog {
     // zenoh forgets a connection that has ended.
-    seen: BTreeMap<(Refusal, String), u64>,
+    seen: BTreeMap<(Rejection, String), u64>,
     /// Handshakes that failed, by cause.
     strangers: BTreeMap<&'static str, u64>,
     plain_tcp: Option<PlainTcp>,
 }
 
-impl Refusals {
+impl RejectionLog {
     /// Nothing yet, of the router of this process, which listens at `router`. Where that takes QUIC, whoever comes over
     /// plain TCP is turned away by the next [`Self::update`].
     #[must_use]
@@ -52,7 +52,7 @@ impl Refusals {
     /// Asks the router of this process. What could not be asked stays as it was.
     pub fn update(&mut self, router: &Session) {
         self.strangers = handshake_failures::failed();
-        let plain = self.plain_tcp.as_mut().map_or(0, PlainTcp::turn_away);
+        let plain = self.plain_tcp.as_mut().map_or(0, PlainTcp::reject);
         if plain > 0 {
             self.strangers.insert(PLAIN_TCP, plain);
         }
@@ -73,14 +73,14 @@ impl Refusals {
 
     /// How much of what was refused to whom.
     #[must_use]
-    pub fn counts(&self) -> BTreeMap<Refusal, u64> {
+    pub fn counts(&self) -> BTreeMap<Rejection, u64> {
         let mut counts = BTreeMap::new();
         for ((refusal, _), count) in &self.seen {
             *counts.entry(refusal.clone()).or_default() += count;
         }
         counts.extend(self.strangers.iter().map(|(cause, count)| {
             let [peer, reason, message] = [STRANGER, "handshake", *cause].map(str::to_owned);
-            (Refusal { peer, reason, message }, *count)
+            (Rejection { peer, reason, message }, *count)
         }));
         counts
     }
@@ -91,7 +91,7 @@ const DROPPED: &str = "zenoh_rx_network_message_dropped_payload_per_transport_by
 
 /// Reads a line of zenoh's such as
 /// `zenoh_rx_network_message_dropped_payload_per_transport_bytes_count{message="put",reason="access-control",remote_cn="agent-1"} 3`.
-fn refused(line: &str) -> Option<((Refusal, String), u64)> {
+fn refused(line: &str) -> Option<((Rejection, String), u64)> {
     let (name, rest) = line.split_once('{')?;
     if name != DROPPED {
         return None;
@@ -106,7 +106,7 @@ fn refused(line: &str) -> Option<((Refusal, String), u64)> {
     let peer = label("remote_cn").filter(|name| !name.is_empty()).unwrap_or_else(|| zid.clone());
     // Each priority has a count of its own.
     let connection = format!("{zid} {}", label("priority")?);
-    let refusal = Refusal { peer, reason, message: label("message")? };
+    let refusal = Rejection { peer, reason, message: label("message")? };
     Some(((refusal, connection), count.trim().parse().ok()?))
 }
 

@@ -22,13 +22,13 @@ const TOPICS: usize = 1024;
 
 /// What is known of the senders on all topics of an inbox.
 #[derive(Debug, Default)]
-pub(super) struct Freshness {
+pub(super) struct ReplayWindow {
     topics: BTreeMap<Topic, Senders>,
 }
 
 /// Whether a message is news, and what to say of it.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub(super) struct Verdict {
+pub(super) struct Admission {
     /// Why it is not; none where it is.
     pub(super) dropped: Option<DropReason>,
     /// Whether the topic's senders are quarantined from now on, or not any more.
@@ -46,22 +46,22 @@ struct Senders {
 #[derive(Debug)]
 struct Sender {
     epoch: u64,
-    numbers: Numbers,
+    numbers: SequenceWindow,
     heard: Instant,
     /// When another epoch took its place.
     replaced: Instant,
 }
 
-/// Numbers that came: the highest, and which of the 64 before it.
+/// SequenceWindow that came: the highest, and which of the 64 before it.
 #[derive(Debug)]
-struct Numbers {
+struct SequenceWindow {
     highest: u64,
     came: u64,
 }
 
-impl Freshness {
+impl ReplayWindow {
     /// Takes note of a message and says whether it is news.
-    pub(super) fn admit(&mut self, topic: &Topic, epoch: u64, sequence: u64, now: Instant) -> Verdict {
+    pub(super) fn admit(&mut self, topic: &Topic, epoch: u64, sequence: u64, now: Instant) -> Admission {
         if let Some(senders) = self.topics.get_mut(topic) {
             return senders.admit(epoch, sequence, now);
         }
@@ -74,18 +74,18 @@ impl Freshness {
         let current = Sender::new(epoch, sequence, now);
         let senders = Senders { current, former: VecDeque::new(), starts: VecDeque::new(), quarantined_until: None };
         self.topics.insert(topic.clone(), senders);
-        Verdict { dropped: None, quarantine: None }
+        Admission { dropped: None, quarantine: None }
     }
 }
 
 impl Senders {
-    fn admit(&mut self, epoch: u64, sequence: u64, now: Instant) -> Verdict {
+    fn admit(&mut self, epoch: u64, sequence: u64, now: Instant) -> Admission {
         let was_quarantined = self.quarantined_until.is_some();
         self.quarantined_until = self.quarantined_until.filter(|until| now < *until);
         let dropped = self.judge(epoch, sequence, now);
         let is_quarantined = self.quarantined_until.is_some();
         let dropped = dropped.or(is_quarantined.then_some(DropReason::Identity));
-        Verdict { dropped, quarantine: (was_quarantined != is_quarantined).then_some(is_quarantined) }
+        Admission { dropped, quarantine: (was_quarantined != is_quarantined).then_some(is_quarantined) }
     }
 
     fn judge(&mut self, epoch: u64, sequence: u64, now: Instant) -> Option<DropReason> {
@@ -146,11 +146,11 @@ impl Senders {
 
 impl Sender {
     fn new(epoch: u64, sequence: u64, now: Instant) -> Self {
-        Self { epoch, numbers: Numbers { highest: sequence, came: 1 }, heard: now, replaced: now }
+        Self { epoch, numbers: SequenceWindow { highest: sequence, came: 1 }, heard: now, replaced: now }
     }
 }
 
-impl Numbers {
+impl SequenceWindow {
     /// Takes note of a number; why it is no news, where it is none. What was overtaken comes too late.
     fn note(&mut self, sequence: u64) -> Option<DropReason> {
         if sequence > self.highest {
@@ -173,17 +173,17 @@ mod tests {
     use super::*;
 
     struct Ear {
-        freshness: Freshness,
+        freshness: ReplayWindow,
         topic: Topic,
         begun: Instant,
     }
 
     impl Ear {
         fn new() -> Self {
-            Self { freshness: Freshness::default(), topic: "4279/bev".parse().unwrap(), begun: Instant::now() }
+            Self { freshness: ReplayWindow::default(), topic: "4279/bev".parse().unwrap(), begun: Instant::now() }
         }
 
-        fn hear(&mut self, epoch: u64, sequence: u64, at_ms: u64) -> Verdict {
+        fn hear(&mut self, epoch: u64, sequence: u64, at_ms: u64) -> Admission {
             self.freshness.admit(&self.topic, epoch, sequence, self.begun + Duration::from_millis(at_ms))
         }
 
@@ -208,7 +208,7 @@ mod tests {
         let mut ear = Ear::new();
         assert_eq!(ear.dropped(1, 100, 0), None);
         let again = ear.hear(2, 0, 100);
-        assert_eq!(again, Verdict { dropped: None, quarantine: None });
+        assert_eq!(again, Admission { dropped: None, quarantine: None });
         // A replay of old words, and the last of them on their way.
         assert_eq!(ear.dropped(1, 100, 5_000), Some(DropReason::Duplicate));
         assert_eq!(ear.dropped(2, 1, 5_000), None);
@@ -249,7 +249,7 @@ mod tests {
 
     #[test]
     fn the_memory_of_topics_is_bounded() {
-        let mut freshness = Freshness::default();
+        let mut freshness = ReplayWindow::default();
         let begun = Instant::now();
         for vehicle in 0..2 * TOPICS as u64 {
             let topic: Topic = format!("{vehicle}/bev").parse().unwrap();

@@ -6,7 +6,7 @@ use std::time::{Duration, Instant};
 use serde_json::{Value, json};
 use zenoh::{Config, Session, Wait};
 
-use super::access_control::{self, Guard};
+use super::access_control::{self, AccessControl};
 use super::credentials::{AUTHORITY_FILE, CERTIFICATE_FILE, Credentials, KEY_FILE};
 use super::endpoint::Endpoint;
 use super::error::BusError;
@@ -67,7 +67,7 @@ pub struct BusOptions {
     /// Keys: all traffic goes over QUIC, and both ends show certificates of the same authority.
     pub credentials: Option<Credentials>,
     /// What a router lets through, by certificate; everything when absent.
-    pub guard: Option<Guard>,
+    pub guard: Option<AccessControl>,
 }
 
 impl BusOptions {
@@ -108,7 +108,7 @@ impl BusOptions {
 
     /// The same as a router that lets nothing through but what `guard` says.
     #[must_use]
-    pub fn guarded_by(self, guard: Guard) -> Self {
+    pub fn with_access_control(self, guard: AccessControl) -> Self {
         Self { guard: Some(guard), ..self }
     }
 
@@ -308,8 +308,8 @@ mod tests {
     fn every_rule_reads_back() {
         let members = ["agent-1", "ego-1", "link-1", "replay", "scorer", "recorder", "viewer"];
         let members = members.map(|name| name.parse().unwrap()).into();
-        let guard = Guard { members, runs: protocol::Runs::Any };
-        let options = BusOptions::router(Endpoint::loopback(7447)).guarded_by(guard);
+        let guard = AccessControl { members, runs: protocol::RunScope::Any };
+        let options = BusOptions::router(Endpoint::loopback(7447)).with_access_control(guard);
         config(&options).unwrap();
         assert_eq!(options.for_zenohd()["transport"]["link"]["protocols"], json!(["tcp"]));
     }

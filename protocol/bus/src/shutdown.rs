@@ -43,7 +43,7 @@ impl Stop {
         self.lock().requested
     }
 
-    /// Runs `reaction` when someone asks, at once if that has happened. It must not wait for anything: it is meant for
+    /// RunScope `reaction` when someone asks, at once if that has happened. It must not wait for anything: it is meant for
     /// closing the mailbox a thread waits at.
     pub fn on_request(&self, reaction: impl FnOnce() + Send + 'static) {
         let mut state = self.lock();
@@ -141,7 +141,7 @@ pub struct Overdue {
     pub limit: Duration,
 }
 
-/// Runs `teardown` on a thread of its own and waits for it for at most `limit`.
+/// RunScope `teardown` on a thread of its own and waits for it for at most `limit`.
 ///
 /// Closing a zenoh session over a dead link takes 10 s and undeclaring has no limit at all, so neither may run on a
 /// thread that somebody waits for. An overdue teardown is left behind; the end of the process ends it.

@@ -12,10 +12,10 @@ use protocol::{CavId, Control, Key, Payload, RunId, Stamp, Stats, Topic, wire};
 use zenoh::qos::{CongestionControl, Priority};
 use zenoh::{Session, Wait};
 
-use super::bounded_queue::{Mailbox, Pushed, Taken};
+use super::bounded_queue::{BoundedQueue, Pop, PushOutcome};
 use super::publisher::{payload, unix_nanos};
-use super::watchdog::Pulse;
-use super::{Books, BusError};
+use super::watchdog::Watchdog;
+use super::{BusError, MessageStats};
 
 /// How often a process says how its books stand and which routes it has heard, beside every time it hears a probe.
 const PERIOD: Duration = Duration::from_millis(500);
@@ -31,20 +31,20 @@ enum Notice {
 
 /// A handle to the thread that speaks for this process.
 #[derive(Clone)]
-pub(super) struct Notices(Arc<Shared>);
+pub(super) struct StatusPublisher(Arc<Shared>);
 
 struct Shared {
     heard: Mutex<BTreeSet<Topic>>,
     // Many probes need one answer.
     answer_due: AtomicBool,
     // Of the thread that works, while it does.
-    pulse: Mutex<Option<Arc<Pulse>>>,
-    queue: Mailbox<(), Notice>,
+    pulse: Mutex<Option<Arc<Watchdog>>>,
+    queue: BoundedQueue<(), Notice>,
 }
 
-impl Notices {
+impl StatusPublisher {
     pub(super) fn new() -> Self {
-        let queue = Mailbox::new(PLACES, 1);
+        let queue = BoundedQueue::new(PLACES, 1);
         Self(Arc::new(Shared {
             heard: Mutex::default(),
             answer_due: AtomicBool::new(false),
@@ -75,7 +75,7 @@ impl Notices {
     }
 
     /// How the books stand is said only while this thread works; `None`: always.
-    pub(super) fn watch(&self, pulse: Option<Arc<Pulse>>) {
+    pub(super) fn watch(&self, pulse: Option<Arc<Watchdog>>) {
         *self.0.pulse.lock().unwrap_or_else(PoisonError::into_inner) = pulse;
     }
 
@@ -86,14 +86,17 @@ impl Notices {
 
     fn push(&self, notice: Notice) {
         match self.0.queue.push((), notice) {
-            Pushed::Displaced(Notice::Say { control, .. }) => {
+            PushOutcome::Replaced(Notice::Say { control, .. }) => {
                 tracing::error!("the network is stuck: {control:?} was not sent");
             }
-            Pushed::Queued | Pushed::Displaced(Notice::Ready) | Pushed::NoLane(_) | Pushed::Closed(_) => {}
+            PushOutcome::Queued
+            | PushOutcome::Replaced(Notice::Ready)
+            | PushOutcome::NoLane(_)
+            | PushOutcome::Closed(_) => {}
         }
     }
 
-    pub(super) fn speak(&self, speaker: Speaker) -> Result<JoinHandle<()>, BusError> {
+    pub(super) fn speak(&self, speaker: StatusSender) -> Result<JoinHandle<()>, BusError> {
         let shared = Arc::clone(&self.0);
         thread::Builder::new()
             .name("notices".into())
@@ -103,25 +106,25 @@ impl Notices {
 }
 
 /// The thread's side.
-pub(super) struct Speaker {
+pub(super) struct StatusSender {
     pub(super) session: Session,
     pub(super) run: RunId,
     pub(super) cav: CavId,
     pub(super) epoch: u64,
-    pub(super) books: Books,
+    pub(super) books: MessageStats,
 }
 
-impl Speaker {
+impl StatusSender {
     fn run(self, shared: &Shared) {
         let (mut sequence, mut beats) = (0, 0);
         let mut next = Instant::now() + PERIOD;
         loop {
             match shared.queue.take(Some(next)) {
-                Taken::Item((), Notice::Ready) => self.ready(shared, &mut sequence),
-                Taken::Item((), Notice::Say { control, capture_nanos }) => {
+                Pop::Item((), Notice::Ready) => self.ready(shared, &mut sequence),
+                Pop::Item((), Notice::Say { control, capture_nanos }) => {
                     self.control(control, capture_nanos, &mut sequence);
                 }
-                Taken::TimedOut => {
+                Pop::TimedOut => {
                     next = Instant::now() + PERIOD;
                     self.ready(shared, &mut sequence);
                     let pulse = shared.pulse.lock().unwrap_or_else(PoisonError::into_inner).clone();
@@ -129,7 +132,7 @@ impl Speaker {
                         self.stats(&mut sequence);
                     }
                 }
-                Taken::Closed => return self.stats(&mut sequence),
+                Pop::Closed => return self.stats(&mut sequence),
             }
         }
     }

@@ -4,18 +4,18 @@ use std::sync::atomic::{AtomicUsize, Ordering};
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Instant;
 
-use protocol::{Control, DropReason, Header, Key, Kind, Limits, Payload, Selector, Stream, Topic, WireError, wire};
+use protocol::{Control, DropReason, Header, Key, KeyExpr, Kind, Limits, Payload, Stream, Topic, WireError, wire};
 use zenoh::Wait;
 use zenoh::bytes::ZBytes;
 use zenoh::sample::Sample;
 
-use super::bounded_queue::{Mailbox, Pushed, Taken};
-use super::inbox_limits::{InboxLimits, Meters};
+use super::bounded_queue::{BoundedQueue, Pop, PushOutcome};
+use super::inbox_limits::{InboxLimits, RateLimiter};
 use super::publisher::unix_nanos;
-use super::replay_window::{Freshness, Verdict};
-use super::status_publisher::Notices;
-use super::watchdog::Pulse;
-use super::{Books, BusError};
+use super::replay_window::{Admission, ReplayWindow};
+use super::status_publisher::StatusPublisher;
+use super::watchdog::Watchdog;
+use super::{BusError, MessageStats};
 
 /// Where a message waits: data and notices of one topic apart, so that a notice never takes the place of data.
 #[derive(Debug, Clone, PartialEq, Eq, PartialOrd, Ord)]
@@ -84,27 +84,27 @@ impl Arrival {
 
 /// What a thread works on: the messages of all topics it subscribed to, in bounded lanes.
 pub struct Inbox {
-    mailbox: Mailbox<Lane, Event>,
-    freshness: Mutex<Freshness>,
-    books: Books,
-    meters: Meters,
+    mailbox: BoundedQueue<Lane, Event>,
+    freshness: Mutex<ReplayWindow>,
+    books: MessageStats,
+    meters: RateLimiter,
     max_waiting: usize,
     waiting_bytes: AtomicUsize,
-    pulse: Arc<Pulse>,
+    pulse: Arc<Watchdog>,
 }
 
 impl Inbox {
-    pub(super) fn new(places: usize, max_topics: usize, books: &Books) -> Arc<Self> {
+    pub(super) fn new(places: usize, max_topics: usize, books: &MessageStats) -> Arc<Self> {
         Self::within(InboxLimits::NONE, places, max_topics, books)
     }
 
-    pub(super) fn within(limits: InboxLimits, places: usize, max_topics: usize, books: &Books) -> Arc<Self> {
+    pub(super) fn within(limits: InboxLimits, places: usize, max_topics: usize, books: &MessageStats) -> Arc<Self> {
         Arc::new(Self {
             // Two lanes a topic: data and notices.
-            mailbox: Mailbox::new(places, max_topics.saturating_mul(2)),
+            mailbox: BoundedQueue::new(places, max_topics.saturating_mul(2)),
             freshness: Mutex::default(),
             books: books.clone(),
-            meters: Meters::new(limits),
+            meters: RateLimiter::new(limits),
             max_waiting: limits.waiting_bytes,
             waiting_bytes: AtomicUsize::new(0),
             pulse: Arc::default(),
@@ -118,19 +118,19 @@ impl Inbox {
     }
 
     /// The oldest event, waiting until `deadline` for one.
-    pub fn take(&self, deadline: Option<Instant>) -> Taken<Topic, Event> {
+    pub fn take(&self, deadline: Option<Instant>) -> Pop<Topic, Event> {
         match self.pulse.wait(|| self.mailbox.take(deadline)) {
-            Taken::Item(lane, event) => {
+            Pop::Item(lane, event) => {
                 self.waiting_bytes.fetch_sub(event.bytes(), Ordering::Relaxed);
-                Taken::Item(lane.topic, event)
+                Pop::Item(lane.topic, event)
             }
-            Taken::TimedOut => Taken::TimedOut,
-            Taken::Closed => Taken::Closed,
+            Pop::TimedOut => Pop::TimedOut,
+            Pop::Closed => Pop::Closed,
         }
     }
 
     /// Of the thread that takes.
-    pub(super) fn pulse(&self) -> &Arc<Pulse> {
+    pub(super) fn pulse(&self) -> &Arc<Watchdog> {
         &self.pulse
     }
 
@@ -145,8 +145,8 @@ impl Inbox {
     }
 
     /// `topic` brought what is not its sender's to say: counted and logged.
-    pub(super) fn misused(&self, topic: &Topic, why: &'static str) {
-        self.books.misused(topic, why);
+    pub(super) fn reject_invalid(&self, topic: &Topic, why: &'static str) {
+        self.books.reject_invalid(topic, why);
     }
 
     fn deliver(&self, topic: &Topic, event: Event, places: Option<usize>) {
@@ -164,8 +164,8 @@ impl Inbox {
             None => self.mailbox.push(lane, event),
         };
         let lost = match pushed {
-            Pushed::Queued => return,
-            Pushed::Displaced(event) | Pushed::NoLane(event) | Pushed::Closed(event) => event,
+            PushOutcome::Queued => return,
+            PushOutcome::Replaced(event) | PushOutcome::NoLane(event) | PushOutcome::Closed(event) => event,
         };
         self.waiting_bytes.fetch_sub(lost.bytes(), Ordering::Relaxed);
         if let Event::Message(arrival) = lost {
@@ -183,28 +183,30 @@ impl Subscription {
         session: &zenoh::Session,
         key: &Key,
         (inbox, places): (&Arc<Inbox>, Option<usize>),
-        notices: &Notices,
+        notices: &StatusPublisher,
     ) -> Result<Self, BusError> {
         inbox.books.subscribed(&key.topic);
         let topic = key.topic.clone();
-        Self::declare(session, &key.to_string(), Door::new(inbox, places, notices), move |_| Some(topic.clone()))
+        Self::declare(session, &key.to_string(), IngressFilter::new(inbox, places, notices), move |_| {
+            Some(topic.clone())
+        })
     }
 
     pub(super) fn to_all(
         session: &zenoh::Session,
-        selector: &Selector,
+        selector: &KeyExpr,
         inbox: &Arc<Inbox>,
-        notices: &Notices,
+        notices: &StatusPublisher,
     ) -> Result<Self, BusError> {
         // A key that is none of ours tells of no message of ours either.
         let topic = |sample: &Sample| sample.key_expr().as_str().parse::<Key>().ok().map(|key| key.topic);
-        Self::declare(session, selector.as_str(), Door::new(inbox, None, notices), topic)
+        Self::declare(session, selector.as_str(), IngressFilter::new(inbox, None, notices), topic)
     }
 
     fn declare(
         session: &zenoh::Session,
         key: &str,
-        door: Door,
+        door: IngressFilter,
         topic: impl Fn(&Sample) -> Option<Topic> + Send + Sync + 'static,
     ) -> Result<Self, BusError> {
         let subscriber = session.declare_subscriber(key).callback(move |sample| {
@@ -227,21 +229,21 @@ pub(super) fn has_notices(topic: &Topic) -> bool {
 
 /// The callback's side: runs on zenoh's receive thread, so it looks at headers only, waits for nothing and calls no
 /// zenoh.
-struct Door {
+struct IngressFilter {
     inbox: Arc<Inbox>,
     places: Option<usize>,
-    notices: Notices,
+    notices: StatusPublisher,
 }
 
-impl Door {
-    fn new(inbox: &Arc<Inbox>, places: Option<usize>, notices: &Notices) -> Self {
+impl IngressFilter {
+    fn new(inbox: &Arc<Inbox>, places: Option<usize>, notices: &StatusPublisher) -> Self {
         Self { inbox: Arc::clone(inbox), places, notices: notices.clone() }
     }
 
     fn admit(&self, topic: Topic, payload: &ZBytes) {
         // Before anything of it is looked at: a flood must cost next to nothing.
         if !self.inbox.meters.admit(&topic, payload.len(), Instant::now()) {
-            return self.turn_away(&topic, payload);
+            return self.reject(&topic, payload);
         }
         let header = match header_of(&topic, payload) {
             Ok(header) => header,
@@ -254,7 +256,7 @@ impl Door {
         if has_notices(&topic) {
             self.inbox.books.arrived(&topic);
             self.notices.heard(&topic);
-            if let Some(reason) = self.no_news(&topic, &header, at) {
+            if let Some(reason) = self.reject_stale(&topic, &header, at) {
                 return self.inbox.books.dropped(&topic, reason);
             }
         }
@@ -263,7 +265,7 @@ impl Door {
     }
 
     /// More than the sender may send. The header alone says whether that is in the sender's books.
-    fn turn_away(&self, topic: &Topic, payload: &ZBytes) {
+    fn reject(&self, topic: &Topic, payload: &ZBytes) {
         const WHY: &str = "more than its sender may send in that time";
         if header_of(topic, payload).is_ok_and(|header| is_notice(topic, &header)) {
             return self.inbox.books.limited_notice(topic, WHY);
@@ -290,9 +292,9 @@ impl Door {
     }
 
     /// Why a message is not to be used, where it is not news.
-    fn no_news(&self, topic: &Topic, header: &Header, at: Instant) -> Option<DropReason> {
+    fn reject_stale(&self, topic: &Topic, header: &Header, at: Instant) -> Option<DropReason> {
         let stamp = &header.stamp;
-        let Verdict { dropped, quarantine } = {
+        let Admission { dropped, quarantine } = {
             let mut freshness = self.inbox.freshness.lock().unwrap_or_else(PoisonError::into_inner);
             freshness.admit(topic, stamp.epoch, stamp.sequence, at)
         };
@@ -360,10 +362,10 @@ mod tests {
 
     #[test]
     fn of_what_is_beyond_the_limit_only_data_are_booked() {
-        let books = Books::new("ego-9".parse().unwrap());
+        let books = MessageStats::new("ego-9".parse().unwrap());
         let limits = InboxLimits { messages_per_s: 1e-3, ..InboxLimits::PEERS };
         let (inbox, topic) = (Inbox::within(limits, 4, 4, &books), "7/gnss".parse::<Topic>().unwrap());
-        let door = Door::new(&inbox, None, &Notices::new());
+        let door = IngressFilter::new(&inbox, None, &StatusPublisher::new());
         let counts = || books.ledger().get(&Account::towards(topic.clone(), books.process())).cloned();
         books.subscribed(&topic);
         for _ in 0..3 {

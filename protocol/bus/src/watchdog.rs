@@ -5,16 +5,16 @@
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 
-use super::status_publisher::Notices;
+use super::status_publisher::StatusPublisher;
 
 /// What an inbox knows of the thread that takes from it.
 #[derive(Debug, Default)]
-pub(super) struct Pulse {
+pub(super) struct Watchdog {
     beats: AtomicU64,
     waits: AtomicBool,
 }
 
-impl Pulse {
+impl Watchdog {
     /// The thread is here.
     pub(super) fn beat(&self) {
         self.beats.fetch_add(1, Ordering::Relaxed);
@@ -38,13 +38,13 @@ impl Pulse {
 
 /// A process that says how it is only while a thread works, see [`super::Bus::works_from`]; until this is dropped.
 #[must_use = "the work is over when this is dropped"]
-pub struct Working {
-    notices: Notices,
-    pulse: Arc<Pulse>,
+pub struct Heartbeat {
+    notices: StatusPublisher,
+    pulse: Arc<Watchdog>,
 }
 
-impl Working {
-    pub(super) fn begin(notices: &Notices, pulse: &Arc<Pulse>) -> Self {
+impl Heartbeat {
+    pub(super) fn begin(notices: &StatusPublisher, pulse: &Arc<Watchdog>) -> Self {
         notices.watch(Some(Arc::clone(pulse)));
         Self { notices: notices.clone(), pulse: Arc::clone(pulse) }
     }
@@ -55,7 +55,7 @@ impl Working {
     }
 }
 
-impl Drop for Working {
+impl Drop for Heartbeat {
     fn drop(&mut self) {
         self.notices.watch(None);
     }
@@ -67,7 +67,7 @@ mod tests {
 
     #[test]
     fn who_waits_or_came_by_is_alive_and_who_does_neither_is_not() {
-        let (pulse, mut beats) = (Pulse::default(), 0);
+        let (pulse, mut beats) = (Watchdog::default(), 0);
         assert!(!pulse.is_alive(&mut beats));
         pulse.wait(|| {
             assert!(pulse.is_alive(&mut 0));

@@ -78,7 +78,7 @@ pub enum Selection {
 /// How a body is packed.
 #[derive(Debug, Clone, Copy, PartialEq, Eq, Hash, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
-pub enum Packing {
+pub enum Compression {
     /// Not at all.
     Raw,
     /// One zstd frame that says how much it holds.
@@ -93,7 +93,7 @@ pub struct Codec {
     /// Which cells are there.
     pub selection: Selection,
     /// How the body is packed.
-    pub packing: Packing,
+    pub packing: Compression,
 }
 
 /// A feature map as it crosses the air.
@@ -124,7 +124,7 @@ pub struct DecodedFeatures {
 
 /// Encodes a map.
 ///
-/// Dense `f32` without packing moves the values and copies nothing. Packing that does not make the body smaller is left
+/// Dense `f32` without packing moves the values and copies nothing. Compression that does not make the body smaller is left
 /// out, so that a body never exceeds its budget.
 ///
 /// # Shapes
@@ -141,7 +141,7 @@ pub fn encode_features(
     confidence: Option<&[f32]>,
 ) -> Result<EncodedFeatures, WireError> {
     let BevFeatures { grid, channels, .. } = features;
-    let dense = Codec { dtype: config.dtype, selection: Selection::Dense, packing: Packing::Raw };
+    let dense = Codec { dtype: config.dtype, selection: Selection::Dense, packing: Compression::Raw };
     let layout = Layout::new(&grid, channels, &dense, &Limits::SENDER)?;
     let expected = layout.cells * channels as usize;
     let found = features.values.len();
@@ -186,7 +186,7 @@ fn encode_selected(
     };
     let packed = zstd_level.map(|level| compression::pack(body.as_bytes(), level)).transpose()?.flatten();
     let (codec, body) = match packed {
-        Some(packed) => (Codec { packing: Packing::Zstd, ..codec }, Body::Bytes(packed)),
+        Some(packed) => (Codec { packing: Compression::Zstd, ..codec }, Body::Bytes(packed)),
         None => (codec, body),
     };
     Ok(EncodedFeatures { grid, channels, code_of, codec, rate: None, body })
@@ -224,10 +224,10 @@ impl EncodedFeatures {
     ) -> Result<BodyShape, WireError> {
         let layout = Layout::new(grid, channels, codec, limits)?;
         Ok(match (codec.packing, codec.dtype, codec.selection) {
-            (Packing::Raw, Dtype::F32, Selection::Dense) => BodyShape::Floats((layout.values.len() / 4) as u64),
-            (Packing::Raw, ..) => BodyShape::Bytes { min: layout.len() as u64, max: layout.len() as u64 },
+            (Compression::Raw, Dtype::F32, Selection::Dense) => BodyShape::Floats((layout.values.len() / 4) as u64),
+            (Compression::Raw, ..) => BodyShape::Bytes { min: layout.len() as u64, max: layout.len() as u64 },
             // What would not get smaller is sent unpacked.
-            (Packing::Zstd, ..) => BodyShape::Bytes { min: 1, max: layout.len() as u64 },
+            (Compression::Zstd, ..) => BodyShape::Bytes { min: 1, max: layout.len() as u64 },
         })
     }
 
@@ -259,7 +259,10 @@ impl EncodedFeatures {
         let Self { grid, channels, code_of, codec, rate: _, body } = self;
         let layout = Layout::new(&grid, channels, &codec, limits)?;
         let body = match (body, codec) {
-            (Body::Floats(values), Codec { dtype: Dtype::F32, selection: Selection::Dense, packing: Packing::Raw }) => {
+            (
+                Body::Floats(values),
+                Codec { dtype: Dtype::F32, selection: Selection::Dense, packing: Compression::Raw },
+            ) => {
                 let (expected, found) = (layout.values.len() as u64 / 4, values.len() as u64);
                 if expected != found {
                     return Err(WireError::Shape { what: "features", expected, found });
@@ -286,14 +289,14 @@ impl EncodedFeatures {
 }
 
 /// The unpacked body, of exactly `expected` bytes.
-fn unpack(body: Body, packing: Packing, expected: usize) -> Result<Vec<u8>, WireError> {
+fn unpack(body: Body, packing: Compression, expected: usize) -> Result<Vec<u8>, WireError> {
     let bytes = match body {
         Body::Bytes(bytes) => bytes,
         other => other.as_bytes().to_vec(),
     };
     let bytes = match packing {
-        Packing::Raw => bytes,
-        Packing::Zstd => compression::unpack(bytes, expected)?,
+        Compression::Raw => bytes,
+        Compression::Zstd => compression::unpack(bytes, expected)?,
     };
     if bytes.len() == expected {
         return Ok(bytes);
@@ -316,9 +319,9 @@ mod tests {
         let config = CodecConfig { zstd_level: Some(3), ..CodecConfig::default() };
         let noise: Vec<f32> = (1..=8u8).map(|n| f32::from(n).sin()).collect();
         let encoded = encode_features(map(noise.clone()), &config, None).unwrap();
-        assert_eq!((encoded.codec.packing, encoded.body), (Packing::Raw, Body::Floats(noise)));
+        assert_eq!((encoded.codec.packing, encoded.body), (Compression::Raw, Body::Floats(noise)));
         let encoded = encode_features(map(vec![0.1; 800]), &config, None).unwrap();
-        assert_eq!(encoded.codec.packing, Packing::Zstd);
+        assert_eq!(encoded.codec.packing, Compression::Zstd);
         assert!(encoded.body.len() < 100);
     }
 

@@ -5,7 +5,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use super::{Codec, CodecConfig, Dtype, EncodedFeatures, Layout, Packing, Selection, encode_features, selection};
+use super::{Codec, CodecConfig, Compression, Dtype, EncodedFeatures, Layout, Selection, encode_features, selection};
 use crate::BevFeatures;
 use crate::Limits;
 use crate::WireError;
@@ -14,7 +14,7 @@ use crate::string_enum::named;
 /// Bytes of a message with a map that are kept free for header and metadata.
 pub const HEAD_BYTES: u64 = 256;
 /// From the most exact to the coarsest.
-const BY_EXACTNESS: [Dtype; 3] = [Dtype::F32, Dtype::F16, Dtype::I8];
+const DTYPES_BY_PRECISION: [Dtype; 3] = [Dtype::F32, Dtype::F16, Dtype::I8];
 /// Largest absolute value that half precision holds.
 const F16_MAX: f32 = 65_504.0;
 
@@ -69,7 +69,7 @@ pub struct RateChoice {
 
 /// What had to give.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-enum Gave {
+enum ReducedBy {
     Nothing,
     Exactness,
     Cells,
@@ -122,20 +122,23 @@ fn choose(
     config: &CodecConfig,
     budget: u64,
     confidence: Option<&[f32]>,
-) -> Result<(Dtype, Gave), WireError> {
+) -> Result<(Dtype, ReducedBy), WireError> {
     let wanted = wanted(features, config, confidence)?;
-    let coarser = BY_EXACTNESS.into_iter().skip_while(|dtype| *dtype != config.dtype);
+    let coarser = DTYPES_BY_PRECISION.into_iter().skip_while(|dtype| *dtype != config.dtype);
     for dtype in coarser {
         if body_bytes(features, dtype, wanted)? > budget {
             continue;
         }
-        let gave = if dtype == config.dtype { Gave::Nothing } else { Gave::Exactness };
+        let gave = if dtype == config.dtype { ReducedBy::Nothing } else { ReducedBy::Exactness };
         // Asked last: half precision that overflows is rare, and looking for it takes time.
-        if gave == Gave::Nothing || dtype != Dtype::F16 || features.values.iter().all(|value| value.abs() <= F16_MAX) {
+        if gave == ReducedBy::Nothing
+            || dtype != Dtype::F16
+            || features.values.iter().all(|value| value.abs() <= F16_MAX)
+        {
             return Ok((dtype, gave));
         }
     }
-    Ok((Dtype::I8, Gave::Cells))
+    Ok((Dtype::I8, ReducedBy::Cells))
 }
 
 /// What would be sent without a limit.
@@ -148,19 +151,19 @@ fn wanted(features: &BevFeatures, config: &CodecConfig, confidence: Option<&[f32
 }
 
 fn body_bytes(features: &BevFeatures, dtype: Dtype, selection: Selection) -> Result<u64, WireError> {
-    let codec = Codec { dtype, selection, packing: Packing::Raw };
+    let codec = Codec { dtype, selection, packing: Compression::Raw };
     Ok(Layout::new(&features.grid, features.channels, &codec, &Limits::SENDER)?.len() as u64)
 }
 
-fn reason(by: LimitedBy, gave: Gave) -> RateReason {
+fn reason(by: LimitedBy, gave: ReducedBy) -> RateReason {
     match (by, gave) {
-        (_, Gave::Nothing) => RateReason::Fits,
-        (LimitedBy::MessageSize, Gave::Exactness) => RateReason::SizeCoarser,
-        (LimitedBy::MessageSize, Gave::Cells) => RateReason::SizeFewerCells,
-        (LimitedBy::ByteRate, Gave::Exactness) => RateReason::RateCoarser,
-        (LimitedBy::ByteRate, Gave::Cells) => RateReason::RateFewerCells,
-        (LimitedBy::Queue, Gave::Exactness) => RateReason::QueueCoarser,
-        (LimitedBy::Queue, Gave::Cells) => RateReason::QueueFewerCells,
+        (_, ReducedBy::Nothing) => RateReason::Fits,
+        (LimitedBy::MessageSize, ReducedBy::Exactness) => RateReason::SizeCoarser,
+        (LimitedBy::MessageSize, ReducedBy::Cells) => RateReason::SizeFewerCells,
+        (LimitedBy::ByteRate, ReducedBy::Exactness) => RateReason::RateCoarser,
+        (LimitedBy::ByteRate, ReducedBy::Cells) => RateReason::RateFewerCells,
+        (LimitedBy::Queue, ReducedBy::Exactness) => RateReason::QueueCoarser,
+        (LimitedBy::Queue, ReducedBy::Cells) => RateReason::QueueFewerCells,
     }
 }
 
@@ -260,7 +263,7 @@ mod tests {
             by in prop::sample::select(vec![LimitedBy::MessageSize, LimitedBy::ByteRate, LimitedBy::Queue]),
         ) {
             let config =
-                CodecConfig { dtype: BY_EXACTNESS[dtype], zstd_level: level, budget_bytes: own, ..CodecConfig::default() };
+                CodecConfig { dtype: DTYPES_BY_PRECISION[dtype], zstd_level: level, budget_bytes: own, ..CodecConfig::default() };
             let (features, confidence) = map();
             let limit = ByteLimit { bytes, by };
             let once = encode_within(features.clone(), &config, &limit, Some(&confidence)).unwrap();

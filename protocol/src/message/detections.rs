@@ -7,9 +7,9 @@ use super::{
 };
 use crate::CavId;
 use crate::Detection;
-use crate::Doubt;
 use crate::DropReason;
 use crate::Limits;
+use crate::MisbehaviourReason;
 use crate::Stamp;
 use crate::WireError;
 
@@ -71,7 +71,7 @@ pub struct HeardNeighbour {
     /// How likely it is honest, 0..=1; `None` where the ego does not ask.
     pub trust: Option<f64>,
     /// Why it is left out, where it is not believed.
-    pub doubt: Option<Doubt>,
+    pub doubt: Option<MisbehaviourReason>,
     /// Its clock less the ego's, less the shortest time a message of it was under way, seconds; `None` where there is but
     /// one clock.
     pub clock_offset_s: Option<f64>,

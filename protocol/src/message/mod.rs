@@ -92,7 +92,7 @@ pub enum Message {
     Stats(Stats),
 }
 
-/// Runs `$body` with `$message` bound to the message inside, whatever its kind.
+/// RunScope `$body` with `$message` bound to the message inside, whatever its kind.
 macro_rules! for_message {
     ($any:expr, $message:ident => $body:expr) => {
         match $any {

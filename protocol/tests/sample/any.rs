@@ -132,7 +132,7 @@ fn any_detections() -> impl Strategy<Value = Detections> {
     );
     let skipped = (any_cav(), option::of(select(DropReason::ALL.to_vec())))
         .prop_map(|(cav, reason)| SkippedNeighbour { cav, reason });
-    let doubt = option::of(select(Doubt::ALL.to_vec()));
+    let doubt = option::of(select(MisbehaviourReason::ALL.to_vec()));
     let heard = (any_cav(), option::of(0.0..=1.0f64), doubt, option::of(-1e9..1e9f64))
         .prop_map(|(cav, trust, doubt, clock_offset_s)| HeardNeighbour { cav, trust, doubt, clock_offset_s });
     let neighbours = (vec(fused, 0..4), vec(skipped, 0..4), vec(heard, 0..4));

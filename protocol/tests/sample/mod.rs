@@ -109,7 +109,12 @@ pub(crate) fn detections() -> Detections {
         ],
         heard: vec![
             HeardNeighbour { cav: cav("4288"), trust: Some(0.75), doubt: None, clock_offset_s: Some(-0.002) },
-            HeardNeighbour { cav: cav("7"), trust: Some(0.0), doubt: Some(Doubt::Copied), clock_offset_s: None },
+            HeardNeighbour {
+                cav: cav("7"),
+                trust: Some(0.0),
+                doubt: Some(MisbehaviourReason::Duplicated),
+                clock_offset_s: None,
+            },
         ],
         stages: vec![StageTiming::new("fuse", Duration::from_millis(12))],
     }

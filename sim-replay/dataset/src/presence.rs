@@ -1,4 +1,4 @@
-//! Presence of agents: an agent takes part at the ego's ticks at which it has a frame.
+//! LivelinessToken of agents: an agent takes part at the ego's ticks at which it has a frame.
 
 use std::collections::{HashMap, HashSet};
 use std::sync::Arc;

@@ -156,7 +156,7 @@ pub enum QueueDrop {
 /// The law of the propagation delay, after the last bit was sent.
 #[derive(Debug, Clone, Copy, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
-pub enum DelayLaw {
+pub enum DelayModel {
     /// None.
     #[default]
     None,
@@ -194,7 +194,7 @@ pub enum DelayLaw {
 /// The law of loss.
 #[derive(Debug, Clone, PartialEq, Default, Serialize, Deserialize, JsonSchema)]
 #[serde(rename_all = "snake_case", deny_unknown_fields)]
-pub enum LossLaw {
+pub enum LossModel {
     /// Nothing is lost.
     #[default]
     None,
@@ -265,14 +265,14 @@ pub struct LinkConfig {
     /// Who waits, and who does not get to.
     pub queue: QueueConfig,
     /// How long a message is under way after its last bit was sent.
-    pub delay: DelayLaw,
+    pub delay: DelayModel,
     /// The time from publication to arrival is cut down to a multiple of this, milliseconds; 0 for none. OpenCOOD's
     /// evaluation knows only whole frames of 100 ms.
     pub floor_ms: f64,
     /// Whether jitter may not change the order of a sender's messages.
     pub keep_order: bool,
     /// What gets lost.
-    pub loss: LossLaw,
+    pub loss: LossModel,
     /// At a time.
     pub loss_unit: LossUnit,
     /// Messages that others overtake.
@@ -302,37 +302,37 @@ impl LinkConfig {
             bounded("clock.step.by_ms", by_ms, -MAX_MS, MAX_MS, "-600,000 to 600,000 ms")?;
         }
         match self.delay {
-            DelayLaw::None | DelayLaw::Trace => {}
-            DelayLaw::ConstantMs(ms) => time("delay", ms)?,
-            DelayLaw::UniformMs([low, high]) => {
+            DelayModel::None | DelayModel::Trace => {}
+            DelayModel::ConstantMs(ms) => time("delay", ms)?,
+            DelayModel::UniformMs([low, high]) => {
                 time("delay", low)?;
                 bounded("delay", high, low, MAX_MS, "from the lower bound to 600,000 ms")?;
             }
-            DelayLaw::Normal { mean_ms, std_ms } => {
+            DelayModel::Normal { mean_ms, std_ms } => {
                 time("delay.mean_ms", mean_ms)?;
                 time("delay.std_ms", std_ms)?;
             }
-            DelayLaw::BySize { overhead_ms, rate_mbps, fixed_ms } => {
+            DelayModel::BySize { overhead_ms, rate_mbps, fixed_ms } => {
                 time("delay.overhead_ms", overhead_ms)?;
                 bounded("delay.rate_mbps", rate_mbps, 1e-6, 1e6, "1e-6 to 1e6")?;
                 time("delay.fixed_ms", fixed_ms)?;
             }
-            DelayLaw::Lognormal { median_ms, sigma } => {
+            DelayModel::Lognormal { median_ms, sigma } => {
                 time("delay.median_ms", median_ms)?;
                 bounded("delay.sigma", sigma, 0.0, 5.0, "0 to 5")?;
             }
         }
         time("floor_ms", self.floor_ms)?;
         match &self.loss {
-            LossLaw::None | LossLaw::Trace => {}
-            LossLaw::Bernoulli(share) => probability("loss", *share)?,
-            LossLaw::GilbertElliott { to_bad, to_good, loss_good, loss_bad } => {
+            LossModel::None | LossModel::Trace => {}
+            LossModel::Bernoulli(share) => probability("loss", *share)?,
+            LossModel::GilbertElliott { to_bad, to_good, loss_good, loss_bad } => {
                 probability("loss.to_bad", *to_bad)?;
                 probability("loss.to_good", *to_good)?;
                 probability("loss.loss_good", *loss_good)?;
                 probability("loss.loss_bad", *loss_bad)?;
             }
-            LossLaw::Distance(points) => {
+            LossModel::Distance(points) => {
                 let mut last_m = 0.0;
                 for &[distance_m, share] in points {
                     bounded("loss.distance", distance_m, last_m, 1e6, "rising metres")?;
@@ -374,10 +374,10 @@ impl LinkConfig {
             CapacityConfig::Mahimahi(TraceConfig { path, .. }) => Some(Trace::read_mahimahi(&folder.join(path))?),
         };
         let has_steps = matches!(trace, Some(Trace::Steps(_)));
-        if self.delay == DelayLaw::Trace && !has_steps {
+        if self.delay == DelayModel::Trace && !has_steps {
             return Err(LinkError::NoTrace { field: "delay" });
         }
-        if self.loss == LossLaw::Trace && !has_steps {
+        if self.loss == LossModel::Trace && !has_steps {
             return Err(LinkError::NoTrace { field: "loss" });
         }
         Ok(trace)
@@ -414,7 +414,10 @@ mod tests {
         config.validate().unwrap();
         assert_eq!(config.medium, Medium::Shared);
         assert_eq!(config.queue.urgent_bytes, FRAGMENT_BYTES);
-        assert_eq!(config.loss, LossLaw::GilbertElliott { to_bad: 0.01, to_good: 0.2, loss_good: 0.0, loss_bad: 1.0 });
+        assert_eq!(
+            config.loss,
+            LossModel::GilbertElliott { to_bad: 0.01, to_good: 0.2, loss_good: 0.0, loss_bad: 1.0 }
+        );
         let written = serde_json::to_string(&config).unwrap();
         assert_eq!(serde_json::from_str::<LinkConfig>(&written).unwrap(), config);
         assert!(serde_saphyr::from_str::<LinkConfig>("dely: none\n").is_err());
@@ -425,15 +428,15 @@ mod tests {
         let message = |config: LinkConfig| config.validate().unwrap_err().to_string();
         let rate = CapacityConfig::TokenBucket { rate_mbps: 0.0, burst_bytes: 0 };
         assert!(message(LinkConfig { capacity: rate, ..LinkConfig::default() }).contains("rate_mbps is 0"));
-        let delay = DelayLaw::UniformMs([5.0, 2.0]);
+        let delay = DelayModel::UniformMs([5.0, 2.0]);
         assert!(message(LinkConfig { delay, ..LinkConfig::default() }).contains("delay is 2"));
         let clock = DeviceClock { offset_ms: f64::NAN, ..DeviceClock::default() };
         assert!(message(LinkConfig { clock, ..LinkConfig::default() }).contains("offset_ms is NaN"));
-        let loss = LossLaw::Bernoulli(f64::NAN);
+        let loss = LossModel::Bernoulli(f64::NAN);
         assert!(message(LinkConfig { loss, ..LinkConfig::default() }).contains("loss is NaN"));
-        let loss = LossLaw::Distance(vec![[50.0, 0.1], [20.0, 0.2]]);
+        let loss = LossModel::Distance(vec![[50.0, 0.1], [20.0, 0.2]]);
         assert!(message(LinkConfig { loss, ..LinkConfig::default() }).contains("rising"));
-        let config = LinkConfig { delay: DelayLaw::Trace, ..LinkConfig::default() };
+        let config = LinkConfig { delay: DelayModel::Trace, ..LinkConfig::default() };
         let message = config.read_trace(Path::new(".")).unwrap_err().to_string();
         assert!(message.contains("delay is trace"), "{message}");
     }

@@ -1,12 +1,12 @@
 //! Propagation delay.
 
-use super::config::DelayLaw;
+use super::config::DelayModel;
 use super::loss::SentMessage;
 use super::trace::Trace;
 use support::nanos;
 use support::random::SplitMix64;
 
-impl DelayLaw {
+impl DelayModel {
     /// Delay of one message, nanoseconds.
     pub(super) fn draw(self, random: &mut SplitMix64, trace: Option<&Trace>, message: &SentMessage) -> u64 {
         nanos::of_ms(match self {
@@ -30,12 +30,12 @@ mod tests {
 
     const COUNT: u64 = 20_000;
 
-    fn draws(law: DelayLaw) -> Vec<f64> {
+    fn draws(law: DelayModel) -> Vec<f64> {
         let message = SentMessage { bytes: 132_500, distance_m: 0.0, sent_nanos: 0 };
         (0..COUNT).map(|k| law.draw(&mut SplitMix64::derived(3, &[k]), None, &message) as f64 * 1e-6).collect()
     }
 
-    fn check(law: DelayLaw, mean: f64, std: f64) {
+    fn check(law: DelayModel, mean: f64, std: f64) {
         let draws = draws(law);
         let found = draws.iter().sum::<f64>() / COUNT as f64;
         let deviation = 3.0 * std / (COUNT as f64).sqrt();
@@ -44,21 +44,21 @@ mod tests {
 
     #[test]
     fn every_law_has_its_mean() {
-        check(DelayLaw::None, 0.0, 0.0);
-        check(DelayLaw::ConstantMs(12.5), 12.5, 0.0);
-        check(DelayLaw::UniformMs([20.0, 100.0]), 60.0, 80.0 / 12f64.sqrt());
+        check(DelayModel::None, 0.0, 0.0);
+        check(DelayModel::ConstantMs(12.5), 12.5, 0.0);
+        check(DelayModel::UniformMs([20.0, 100.0]), 60.0, 80.0 / 12f64.sqrt());
         // 1.06 Mbit at 27 Mbit/s take 39.26 ms.
-        let by_size = DelayLaw::BySize { overhead_ms: 100.0, rate_mbps: 27.0, fixed_ms: 10.0 };
+        let by_size = DelayModel::BySize { overhead_ms: 100.0, rate_mbps: 27.0, fixed_ms: 10.0 };
         check(by_size, 50.0 + 39.259_259 + 10.0, 100.0 / 12f64.sqrt());
         // Nine deviations from 0: nothing is cut off.
-        check(DelayLaw::Normal { mean_ms: 45.0, std_ms: 5.0 }, 45.0, 5.0);
+        check(DelayModel::Normal { mean_ms: 45.0, std_ms: 5.0 }, 45.0, 5.0);
         let (median, sigma) = (10.0, 0.5f64);
         let mean = median * (0.5 * sigma * sigma).exp();
-        check(DelayLaw::Lognormal { median_ms: median, sigma }, mean, mean * ((sigma * sigma).exp() - 1.0).sqrt());
+        check(DelayModel::Lognormal { median_ms: median, sigma }, mean, mean * ((sigma * sigma).exp() - 1.0).sqrt());
     }
 
     #[test]
     fn no_delay_is_below_zero() {
-        assert!(draws(DelayLaw::Normal { mean_ms: 1.0, std_ms: 10.0 }).iter().all(|&ms| ms >= 0.0));
+        assert!(draws(DelayModel::Normal { mean_ms: 1.0, std_ms: 10.0 }).iter().all(|&ms| ms >= 0.0));
     }
 }

@@ -11,14 +11,14 @@ use super::chance::{Chance, Purpose};
 use super::config::{CapacityConfig, LinkConfig, LinkError, Medium};
 use super::device_clock::DeviceClock;
 use super::loss::{LossState, SentMessage};
-use super::queue_server::{Left, Line, Rules};
+use super::queue_server::{Departure, QueueServer, Rules};
 use super::trace::Trace;
 use support::nanos;
 use support::random::derive_seed;
 
 /// A message as the air sees it.
 #[derive(Debug, Clone, PartialEq)]
-pub struct Parcel {
+pub struct Packet {
     /// The caller's name for it; the air does not look at it.
     pub id: u64,
     /// Who sends.
@@ -39,7 +39,7 @@ pub struct Parcel {
 
 /// What became of a parcel.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Fate {
+pub enum Delivery {
     /// It arrived.
     Arrived {
         /// Whether it had arrived before.
@@ -57,19 +57,19 @@ pub struct Outcome {
     /// Nanoseconds since the beginning of the scene: of the arrival or of the loss.
     pub nanos: u64,
     /// Which.
-    pub parcel: Parcel,
+    pub parcel: Packet,
     /// What became of it.
-    pub fate: Fate,
+    pub fate: Delivery,
 }
 
 /// The emulated air: parcels in, outcomes out, in the order of time.
 #[derive(Debug)]
-pub struct Air {
+pub struct LinkEmulator {
     config: LinkConfig,
     capacity: Capacity,
     trace: Option<Trace>,
     seed: u64,
-    lines: BTreeMap<Option<(CavId, CavId)>, Line>,
+    lines: BTreeMap<Option<(CavId, CavId)>, QueueServer>,
     directions: BTreeMap<(CavId, CavId), Direction>,
     under_way: BinaryHeap<Reverse<UnderWay>>,
     outcomes: Vec<Outcome>,
@@ -92,8 +92,8 @@ struct Direction {
 struct UnderWay {
     nanos: u64,
     number: u64,
-    parcel: Parcel,
-    fate: Fate,
+    parcel: Packet,
+    fate: Delivery,
 }
 
 impl PartialEq for UnderWay {
@@ -116,7 +116,7 @@ impl Ord for UnderWay {
     }
 }
 
-impl Air {
+impl LinkEmulator {
     /// The air that a preset or a YAML file describes; paths of traces start at the file's folder.
     ///
     /// # Errors
@@ -155,7 +155,7 @@ impl Air {
     }
 
     /// Takes a message. Times never go back: one that is offered before the last one counts as offered with it.
-    pub fn offer(&mut self, mut parcel: Parcel) {
+    pub fn offer(&mut self, mut parcel: Packet) {
         parcel.offered_nanos = parcel.offered_nanos.max(self.now_nanos);
         self.run(parcel.offered_nanos);
         let key = match self.config.medium {
@@ -210,14 +210,14 @@ impl Air {
     }
 
     /// Decides about a parcel that has left its queue.
-    fn settle(&mut self, left: Left) {
+    fn settle(&mut self, left: Departure) {
         match left {
-            Left::Dropped { parcel, reason, nanos } => self.schedule(nanos, parcel, Fate::Dropped(reason)),
-            Left::Sent { parcel, start_nanos, end_nanos } => self.propagate(parcel, start_nanos, end_nanos),
+            Departure::Dropped { parcel, reason, nanos } => self.schedule(nanos, parcel, Delivery::Dropped(reason)),
+            Departure::Sent { parcel, start_nanos, end_nanos } => self.propagate(parcel, start_nanos, end_nanos),
         }
     }
 
-    fn propagate(&mut self, parcel: Parcel, start_nanos: u64, end_nanos: u64) {
+    fn propagate(&mut self, parcel: Packet, start_nanos: u64, end_nanos: u64) {
         let Self { config, trace, seed, directions, .. } = self;
         let direction = directions.entry((parcel.from.clone(), parcel.to.clone())).or_insert_with(|| Direction {
             chance: Chance::new(*seed, &parcel.from, &parcel.to),
@@ -230,7 +230,7 @@ impl Air {
         let is_lost =
             direction.loss.loses(&config.loss, config.loss_unit, &message, trace.as_ref(), &mut random(Purpose::Loss));
         if is_lost || config.is_cut(start_nanos, end_nanos) {
-            self.schedule(end_nanos, parcel, Fate::Dropped(DropReason::LinkLoss));
+            self.schedule(end_nanos, parcel, Delivery::Dropped(DropReason::LinkLoss));
             return;
         }
         let delay_nanos = config.delay.draw(&mut random(Purpose::Delay), trace.as_ref(), &message);
@@ -251,14 +251,14 @@ impl Air {
         if config.duplicate > 0.0 && twice.chance(config.duplicate) {
             let again_nanos = config.delay.draw(&mut twice, trace.as_ref(), &message);
             let copy_nanos = arrival_nanos.saturating_add(again_nanos);
-            self.schedule(arrival_nanos, parcel.clone(), Fate::Arrived { is_copy: false, is_repeated: true });
-            self.schedule(copy_nanos, parcel, Fate::Arrived { is_copy: true, is_repeated: false });
+            self.schedule(arrival_nanos, parcel.clone(), Delivery::Arrived { is_copy: false, is_repeated: true });
+            self.schedule(copy_nanos, parcel, Delivery::Arrived { is_copy: true, is_repeated: false });
             return;
         }
-        self.schedule(arrival_nanos, parcel, Fate::Arrived { is_copy: false, is_repeated: false });
+        self.schedule(arrival_nanos, parcel, Delivery::Arrived { is_copy: false, is_repeated: false });
     }
 
-    fn schedule(&mut self, nanos: u64, parcel: Parcel, fate: Fate) {
+    fn schedule(&mut self, nanos: u64, parcel: Packet, fate: Delivery) {
         self.under_way.push(Reverse(UnderWay { nanos, number: self.next, parcel, fate }));
         self.next += 1;
     }

@@ -5,7 +5,7 @@
 //! process or in many.
 //!
 //! - [`LinkConfig`]: the stages, with [`LinkConfig::preset`] for links that others have described.
-//! - [`Air`]: takes [`Parcel`]s and says when and whether they arrive.
+//! - [`LinkEmulator`]: takes [`Packet`]s and says when and whether they arrive.
 //! - [`node`]: the same between the agents and an ego of a live run.
 //! - [`DeviceClock`]: offset and drift of the clock of those who send, by which their capture times are off.
 
@@ -22,11 +22,11 @@ mod trace;
 mod trace_config;
 
 pub use config::{
-    CapacityConfig, DelayLaw, LinkConfig, LinkError, LossLaw, LossUnit, Medium, Outage, QueueConfig, QueueDrop,
+    CapacityConfig, DelayModel, LinkConfig, LinkError, LossModel, LossUnit, Medium, Outage, QueueConfig, QueueDrop,
     ReorderConfig,
 };
 pub use device_clock::{ClockStep, DeviceClock};
-pub use emulator::{Air, Fate, Outcome, Parcel};
+pub use emulator::{Delivery, LinkEmulator, Outcome, Packet};
 pub use preset::PRESETS;
 pub use trace::{Step, Trace, TraceError};
 pub use trace_config::TraceConfig;

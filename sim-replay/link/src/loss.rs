@@ -1,6 +1,6 @@
 //! What gets lost.
 
-use super::config::{FRAGMENT_BYTES, LossLaw, LossUnit};
+use super::config::{FRAGMENT_BYTES, LossModel, LossUnit};
 use super::trace::Trace;
 use support::random::SplitMix64;
 
@@ -22,7 +22,7 @@ impl LossState {
     /// Whether a message is lost. Messages of a link are asked about in the order they are sent in.
     pub(super) fn loses(
         &mut self,
-        law: &LossLaw,
+        law: &LossModel,
         unit: LossUnit,
         message: &SentMessage,
         trace: Option<&Trace>,
@@ -38,11 +38,11 @@ impl LossState {
             random.unit() >= survives
         };
         match law {
-            LossLaw::None => false,
-            LossLaw::Bernoulli(share) => any(*share),
-            LossLaw::Distance(points) => any(interpolate(points, message.distance_m)),
-            LossLaw::Trace => any(trace.and_then(|trace| trace.at(message.sent_nanos)).map_or(0.0, |step| step.loss)),
-            LossLaw::GilbertElliott { to_bad, to_good, loss_good, loss_bad } => {
+            LossModel::None => false,
+            LossModel::Bernoulli(share) => any(*share),
+            LossModel::Distance(points) => any(interpolate(points, message.distance_m)),
+            LossModel::Trace => any(trace.and_then(|trace| trace.at(message.sent_nanos)).map_or(0.0, |step| step.loss)),
+            LossModel::GilbertElliott { to_bad, to_good, loss_good, loss_bad } => {
                 let mut is_lost = false;
                 for _ in 0..units {
                     let leaves = if self.is_bad { *to_good } else { *to_bad };
@@ -71,7 +71,7 @@ mod tests {
 
     const COUNT: u64 = 100_000;
 
-    fn losses(law: &LossLaw, unit: LossUnit, bytes: u64, distance_m: f64) -> f64 {
+    fn losses(law: &LossModel, unit: LossUnit, bytes: u64, distance_m: f64) -> f64 {
         let mut state = LossState::default();
         let message = SentMessage { bytes, distance_m, sent_nanos: 0 };
         let lost = (0..COUNT).filter(|&k| state.loses(law, unit, &message, None, &mut SplitMix64::derived(7, &[k])));
@@ -86,9 +86,9 @@ mod tests {
     fn a_message_survives_with_all_its_fragments() {
         for (bytes, fragments) in [(0, 1), (1, 1), (1400, 1), (1401, 2), (70_000, 50)] {
             let expected = 1.0 - 0.99f64.powi(fragments);
-            let found = losses(&LossLaw::Bernoulli(0.01), LossUnit::Fragment, bytes, 0.0);
+            let found = losses(&LossModel::Bernoulli(0.01), LossUnit::Fragment, bytes, 0.0);
             assert!((found - expected).abs() < three_sigma(expected), "{bytes}: {found}, not {expected}");
-            let found = losses(&LossLaw::Bernoulli(0.01), LossUnit::Message, bytes, 0.0);
+            let found = losses(&LossModel::Bernoulli(0.01), LossUnit::Message, bytes, 0.0);
             assert!((found - 0.01).abs() < three_sigma(0.01), "{found}");
         }
     }
@@ -96,7 +96,7 @@ mod tests {
     #[test]
     fn the_chain_has_its_stationary_loss() {
         let (to_bad, to_good, loss_good, loss_bad) = (0.02, 0.1, 0.001, 0.7);
-        let law = LossLaw::GilbertElliott { to_bad, to_good, loss_good, loss_bad };
+        let law = LossModel::GilbertElliott { to_bad, to_good, loss_good, loss_bad };
         let bad = to_bad / (to_bad + to_good);
         let expected = bad * loss_bad + (1.0 - bad) * loss_good;
         // Neighbours are correlated: the variance of the mean grows by (1 + r) / (1 - r) for the part that the state explains.
@@ -110,12 +110,12 @@ mod tests {
 
     #[test]
     fn distance_is_interpolated() {
-        let law = LossLaw::Distance(vec![[50.0, 0.0], [150.0, 0.5]]);
+        let law = LossModel::Distance(vec![[50.0, 0.0], [150.0, 0.5]]);
         for (distance_m, expected) in [(0.0, 0.0), (50.0, 0.0), (100.0, 0.25), (150.0, 0.5), (900.0, 0.5)] {
             let found = losses(&law, LossUnit::Message, 10, distance_m);
             assert!((found - expected).abs() <= three_sigma(expected), "{distance_m}: {found}, not {expected}");
         }
-        assert_eq!(losses(&LossLaw::Distance(Vec::new()), LossUnit::Message, 10, 5.0), 0.0);
-        assert_eq!(losses(&LossLaw::Bernoulli(1.0), LossUnit::Message, 10, 5.0), 1.0);
+        assert_eq!(losses(&LossModel::Distance(Vec::new()), LossUnit::Message, 10, 5.0), 0.0);
+        assert_eq!(losses(&LossModel::Bernoulli(1.0), LossUnit::Message, 10, 5.0), 1.0);
     }
 }

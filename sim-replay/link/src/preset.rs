@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use super::config::{CapacityConfig, DelayLaw, LinkConfig, LinkError, LossLaw, LossUnit, Medium, QueueConfig};
+use super::config::{CapacityConfig, DelayModel, LinkConfig, LinkError, LossModel, LossUnit, Medium, QueueConfig};
 use support::bounded_file;
 
 /// Every preset with one line about it.
@@ -52,10 +52,10 @@ impl LinkConfig {
         Ok(match name {
             "ideal" => Self::default(),
             // OpenCOOD's `wild_setting`, async_mode `sim`: async_overhead 100 ms.
-            "opencood-sim" => Self { delay: DelayLaw::ConstantMs(100.0), floor_ms: 100.0, ..Self::default() },
+            "opencood-sim" => Self { delay: DelayModel::ConstantMs(100.0), floor_ms: 100.0, ..Self::default() },
             // The same, async_mode `real`: transmission_speed 27 Mbit/s, backbone_delay 10 ms, U(0, async_overhead).
             "opencood-real" => Self {
-                delay: DelayLaw::BySize { overhead_ms: 100.0, rate_mbps: 27.0, fixed_ms: 10.0 },
+                delay: DelayModel::BySize { overhead_ms: 100.0, rate_mbps: 27.0, fixed_ms: 10.0 },
                 floor_ms: 100.0,
                 ..Self::default()
             },
@@ -66,9 +66,9 @@ impl LinkConfig {
                 medium: Medium::Shared,
                 capacity: shaped(6.0, 0),
                 queue: radio,
-                delay: DelayLaw::UniformMs([1.0, 5.0]),
+                delay: DelayModel::UniformMs([1.0, 5.0]),
                 keep_order: true,
-                loss: LossLaw::Distance(vec![[50.0, 0.0], [100.0, 0.001], [300.0, 0.02]]),
+                loss: LossModel::Distance(vec![[50.0, 0.0], [100.0, 0.001], [300.0, 0.02]]),
                 loss_unit: LossUnit::Fragment,
                 ..Self::default()
             },
@@ -78,9 +78,9 @@ impl LinkConfig {
                 medium: Medium::Shared,
                 capacity: shaped(8.0, 0),
                 queue: radio,
-                delay: DelayLaw::UniformMs([5.0, 35.0]),
+                delay: DelayModel::UniformMs([5.0, 35.0]),
                 keep_order: true,
-                loss: LossLaw::Distance(vec![[100.0, 0.0], [200.0, 0.001], [400.0, 0.01]]),
+                loss: LossModel::Distance(vec![[100.0, 0.0], [200.0, 0.001], [400.0, 0.01]]),
                 loss_unit: LossUnit::Fragment,
                 ..Self::default()
             },
@@ -89,9 +89,9 @@ impl LinkConfig {
             "5g-uu" => Self {
                 capacity: shaped(50.0, 64 << 10),
                 queue: radio,
-                delay: DelayLaw::Lognormal { median_ms: 20.0, sigma: 0.35 },
+                delay: DelayModel::Lognormal { median_ms: 20.0, sigma: 0.35 },
                 keep_order: true,
-                loss: LossLaw::GilbertElliott { to_bad: 0.0005, to_good: 0.1, loss_good: 0.0, loss_bad: 0.3 },
+                loss: LossModel::GilbertElliott { to_bad: 0.0005, to_good: 0.1, loss_good: 0.0, loss_bad: 0.3 },
                 ..Self::default()
             },
             _ => {

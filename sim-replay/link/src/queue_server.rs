@@ -6,24 +6,24 @@ use protocol::DropReason;
 
 use super::capacity::{Capacity, work};
 use super::config::{QueueConfig, QueueDrop};
-use super::emulator::Parcel;
+use super::emulator::Packet;
 
 /// A queue and its sender.
 #[derive(Debug, Clone, Default)]
-pub(super) struct Line {
+pub(super) struct QueueServer {
     /// All work up to here is used up: what is sent next ends later.
     used: u128,
     /// The same for urgent messages among themselves.
     urgent_used: u128,
     sending: Option<Sending>,
     urgent: VecDeque<Sending>,
-    waiting: VecDeque<Parcel>,
+    waiting: VecDeque<Packet>,
     waiting_bytes: u64,
 }
 
 #[derive(Debug, Clone)]
 struct Sending {
-    parcel: Parcel,
+    parcel: Packet,
     start_nanos: u64,
     /// Its last bit is sent when so much work could have been done.
     end: u128,
@@ -31,11 +31,11 @@ struct Sending {
 
 /// What became of a parcel here.
 #[derive(Debug, Clone)]
-pub(super) enum Left {
+pub(super) enum Departure {
     /// Its first and its last bit were sent at these times.
-    Sent { parcel: Parcel, start_nanos: u64, end_nanos: u64 },
+    Sent { parcel: Packet, start_nanos: u64, end_nanos: u64 },
     /// It never was.
-    Dropped { parcel: Parcel, reason: DropReason, nanos: u64 },
+    Dropped { parcel: Packet, reason: DropReason, nanos: u64 },
 }
 
 /// The rules of a line.
@@ -46,12 +46,12 @@ pub(super) struct Rules<'a> {
     pub(super) queue: &'a QueueConfig,
 }
 
-impl Line {
+impl QueueServer {
     /// Takes a parcel that is offered now. The line has been advanced to now.
-    pub(super) fn offer(&mut self, parcel: Parcel, rules: &Rules<'_>, left: &mut Vec<Left>) {
+    pub(super) fn offer(&mut self, parcel: Packet, rules: &Rules<'_>, left: &mut Vec<Departure>) {
         let nanos = parcel.offered_nanos;
         if *rules.capacity == Capacity::Unlimited {
-            left.push(Left::Sent { parcel, start_nanos: nanos, end_nanos: nanos });
+            left.push(Departure::Sent { parcel, start_nanos: nanos, end_nanos: nanos });
             return;
         }
         if self.sending.is_none() {
@@ -69,10 +69,10 @@ impl Line {
         while rules.queue.drop == QueueDrop::Head && is_full(self) {
             let Some(oldest) = self.waiting.pop_front() else { break };
             self.waiting_bytes -= oldest.bytes;
-            left.push(Left::Dropped { parcel: oldest, reason: DropReason::LinkQueue, nanos });
+            left.push(Departure::Dropped { parcel: oldest, reason: DropReason::LinkQueue, nanos });
         }
         if is_full(self) {
-            left.push(Left::Dropped { parcel, reason: DropReason::LinkQueue, nanos });
+            left.push(Departure::Dropped { parcel, reason: DropReason::LinkQueue, nanos });
             return;
         }
         self.waiting_bytes += parcel.bytes;
@@ -80,11 +80,11 @@ impl Line {
     }
 
     /// Goes on until `nanos`; who was sent by then is in `left`, in that order.
-    pub(super) fn advance(&mut self, nanos: u64, rules: &Rules<'_>, left: &mut Vec<Left>) {
+    pub(super) fn advance(&mut self, nanos: u64, rules: &Rules<'_>, left: &mut Vec<Departure>) {
         while let Some((end_nanos, is_urgent)) = self.next(rules).filter(|(end_nanos, _)| *end_nanos <= nanos) {
             let sent = if is_urgent { self.urgent.pop_front() } else { self.sending.take() };
             let Some(Sending { parcel, start_nanos, .. }) = sent else { return };
-            left.push(Left::Sent { parcel, start_nanos, end_nanos });
+            left.push(Departure::Sent { parcel, start_nanos, end_nanos });
             if !is_urgent && let Some(next) = self.waiting.pop_front() {
                 self.waiting_bytes -= next.bytes;
                 self.send(next, end_nanos, rules);
@@ -108,7 +108,7 @@ impl Line {
         }
     }
 
-    fn send(&mut self, parcel: Parcel, nanos: u64, rules: &Rules<'_>) {
+    fn send(&mut self, parcel: Packet, nanos: u64, rules: &Rules<'_>) {
         // What could have been sent before now is gone, but for the burst.
         let idle = rules.capacity.done_by(nanos).saturating_sub(work(rules.burst_bytes));
         self.used = self.used.max(idle) + work(parcel.bytes);
@@ -116,7 +116,7 @@ impl Line {
     }
 
     /// Puts an urgent parcel in between: whoever is being sent ends that much later.
-    fn cut_in(&mut self, parcel: Parcel, rules: &Rules<'_>) {
+    fn cut_in(&mut self, parcel: Packet, rules: &Rules<'_>) {
         let nanos = parcel.offered_nanos;
         let added = work(parcel.bytes);
         self.urgent_used = self.urgent_used.max(rules.capacity.done_by(nanos)) + added;
@@ -127,13 +127,13 @@ impl Line {
         self.urgent.push_back(Sending { parcel, start_nanos: nanos, end: self.urgent_used });
     }
 
-    fn supersede(&mut self, newer: &Parcel, left: &mut Vec<Left>) {
-        let is_same = |other: &Parcel| (&other.from, &other.to, other.stream) == (&newer.from, &newer.to, newer.stream);
+    fn supersede(&mut self, newer: &Packet, left: &mut Vec<Departure>) {
+        let is_same = |other: &Packet| (&other.from, &other.to, other.stream) == (&newer.from, &newer.to, newer.stream);
         while let Some(place) = self.waiting.iter().position(is_same) {
             let Some(older) = self.waiting.remove(place) else { return };
             self.waiting_bytes -= older.bytes;
             let nanos = newer.offered_nanos;
-            left.push(Left::Dropped { parcel: older, reason: DropReason::Superseded, nanos });
+            left.push(Departure::Dropped { parcel: older, reason: DropReason::Superseded, nanos });
         }
     }
 }

@@ -2,7 +2,7 @@
 
 use anyhow::Context;
 use bus::{Configured, STOP_LIMIT, log_to_stderr};
-use link::Air;
+use link::LinkEmulator;
 use protocol::Role;
 use sim_replay::config::LinkProcessConfig;
 use sim_replay::link_node::{self, LinkReport, NodeOptions};
@@ -27,7 +27,7 @@ pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
         Ok(config) => config,
         Err(error) => return Ok(Outcome::bad_input(&error)),
     };
-    let air = match Air::open(&config.link.model, config.link.seed) {
+    let air = match LinkEmulator::open(&config.link.model, config.link.seed) {
         Ok(air) => air,
         Err(error) => return Ok(Outcome::bad_input(&error)),
     };

@@ -47,7 +47,7 @@ pub(crate) fn run(args: Args) -> anyhow::Result<Outcome> {
             error @ (StreamError::NoAgent { .. }
             | StreamError::NoTick { .. }
             | StreamError::Rate(_)
-            | StreamError::Bookmark(_)
+            | StreamError::Checkpoint(_)
             | StreamError::Link(_)
             | StreamError::LinkInLockstep),
         ) => {

@@ -12,7 +12,7 @@ use super::SceneConfig;
 use crate::stream::StreamOptions;
 use bus::{BusConfig, ProcessConfig, Route};
 use dataset::LoadOptions;
-use link::{CapacityConfig, DelayLaw, LinkConfig, LossLaw};
+use link::{CapacityConfig, DelayModel, LinkConfig, LossModel};
 
 /// Configuration of `sim-replay stream`.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema, clap::Args)]
@@ -102,15 +102,15 @@ impl SensorLinkConfig {
         }
         Some(LinkConfig {
             delay: match (latency_ms, jitter_ms) {
-                (None, _) => DelayLaw::None,
-                (Some(mean_ms), None) => DelayLaw::ConstantMs(mean_ms),
-                (Some(mean_ms), Some(std_ms)) => DelayLaw::Normal { mean_ms, std_ms },
+                (None, _) => DelayModel::None,
+                (Some(mean_ms), None) => DelayModel::ConstantMs(mean_ms),
+                (Some(mean_ms), Some(std_ms)) => DelayModel::Normal { mean_ms, std_ms },
             },
             capacity: bandwidth_mbps.map_or(CapacityConfig::Unlimited, |rate_mbps| CapacityConfig::TokenBucket {
                 rate_mbps,
                 burst_bytes: 0,
             }),
-            loss: loss.map_or(LossLaw::None, LossLaw::Bernoulli),
+            loss: loss.map_or(LossModel::None, LossModel::Bernoulli),
             // A vehicle's own bus does not reorder.
             keep_order: true,
             ..LinkConfig::default()

@@ -9,7 +9,7 @@ use serde::{Deserialize, Serialize};
 
 use super::StreamReport;
 use super::schedule::Position;
-use bus::bounded_queue::{Mailbox, Pushed, Taken};
+use bus::bounded_queue::{BoundedQueue, Pop, PushOutcome};
 use support::atomic_file;
 use support::bounded_file;
 
@@ -97,16 +97,16 @@ pub enum BookmarkError {
 }
 
 /// Writes places down, on a thread of its own: the clock does not wait for a disk.
-pub(super) struct Bookmark {
-    newest: Arc<Mailbox<(), Place>>,
+pub(super) struct Checkpoint {
+    newest: Arc<BoundedQueue<(), Place>>,
     writing: Option<JoinHandle<()>>,
 }
 
-impl Bookmark {
+impl Checkpoint {
     /// # Errors
     /// When the system gives no thread.
     pub(super) fn open(path: PathBuf) -> std::io::Result<Self> {
-        let newest = Arc::new(Mailbox::new(1, 1));
+        let newest = Arc::new(BoundedQueue::new(1, 1));
         let writing = thread::Builder::new().name("bookmark".into()).spawn({
             let newest = Arc::clone(&newest);
             move || write_all(&path, &newest)
@@ -117,12 +117,12 @@ impl Bookmark {
     /// Has a place written down; one that still waits for the disk is out of date.
     pub(super) fn note(&self, place: Place) {
         match self.newest.push((), place) {
-            Pushed::Queued | Pushed::Displaced(_) | Pushed::NoLane(_) | Pushed::Closed(_) => {}
+            PushOutcome::Queued | PushOutcome::Replaced(_) | PushOutcome::NoLane(_) | PushOutcome::Closed(_) => {}
         }
     }
 }
 
-impl Drop for Bookmark {
+impl Drop for Checkpoint {
     fn drop(&mut self) {
         self.newest.close();
         if self.writing.take().is_some_and(|writing| writing.join().is_err()) {
@@ -131,9 +131,9 @@ impl Drop for Bookmark {
     }
 }
 
-fn write_all(path: &Path, places: &Mailbox<(), Place>) {
+fn write_all(path: &Path, places: &BoundedQueue<(), Place>) {
     let mut has_complained = false;
-    while let Taken::Item((), place) = places.take(None) {
+    while let Pop::Item((), place) = places.take(None) {
         match write(path, &place) {
             Ok(()) => has_complained = false,
             // Without it the replay goes on; only a next life cannot.
@@ -172,7 +172,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let path = folder.path().join("place.json");
         assert_eq!(Place::read(&path, "town1", 10).unwrap(), None);
-        let bookmark = Bookmark::open(path.clone()).unwrap();
+        let bookmark = Checkpoint::open(path.clone()).unwrap();
         for ticks in 0..=7 {
             bookmark.note(Place { ticks, ..place() });
         }
@@ -203,7 +203,7 @@ mod tests {
 
     #[test]
     fn a_file_that_cannot_be_written_ends_nothing() {
-        let bookmark = Bookmark::open(PathBuf::from("/nowhere/place.json")).unwrap();
+        let bookmark = Checkpoint::open(PathBuf::from("/nowhere/place.json")).unwrap();
         bookmark.note(place());
         drop(bookmark);
         assert!(Place::read(Path::new("/nowhere/place.json"), "town1", 10).unwrap().is_none());

@@ -28,7 +28,7 @@ impl ReplayClock {
         Self { rate, state: State::Running, anchor: None }
     }
 
-    /// Runs on from here, at another rate where one is given.
+    /// RunScope on from here, at another rate where one is given.
     pub fn resume(&mut self, rate: Option<f64>) {
         self.rate = rate.unwrap_or(self.rate);
         self.state = State::Running;

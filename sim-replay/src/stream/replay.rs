@@ -8,15 +8,15 @@ use std::time::{Duration, Instant};
 use protocol::{CavId, Control, Limits, Role, Stream, Topic, Truth, Verb};
 
 use super::ReplayClock;
-use super::checkpoint::{Bookmark, BookmarkError, Place};
+use super::checkpoint::{BookmarkError, Checkpoint, Place};
 use super::read_ahead::{ReadAhead, TickFrames};
 use super::report::StreamReport;
 use super::schedule::{Planned, Schedule};
-use super::sensor_link::{Held, SensorAir};
-use super::sensor_publisher::{Outlet, truth_of};
-use bus::bounded_queue::Taken;
+use super::sensor_link::{DelayedSweep, SensorAir};
+use super::sensor_publisher::{SensorPublisher, truth_of};
+use bus::bounded_queue::Pop;
 use bus::shutdown::Stop;
-use bus::{Barrier, Bus, BusError, Event, Inbox, NotReady, Presence, Route, Subscription, process_id};
+use bus::{Barrier, Bus, BusError, Event, Inbox, LivelinessToken, NotReady, Route, Subscription, process_id};
 use dataset::{LoadOptions, Scenario};
 use link::{LinkConfig, LinkError};
 
@@ -121,7 +121,7 @@ pub enum StreamError {
     LinkInLockstep,
     /// The place to go on from makes no sense.
     #[error("bookmark: {0}")]
-    Bookmark(#[from] BookmarkError),
+    Checkpoint(#[from] BookmarkError),
     /// Not every route came up.
     #[error("the fleet is not ready: {0}")]
     NotReady(#[from] NotReady),
@@ -139,19 +139,19 @@ pub struct Replay<'a> {
     options: StreamOptions,
     scenario: String,
     tick_count: usize,
-    bookmark: Option<Bookmark>,
+    bookmark: Option<Checkpoint>,
     is_resumed: bool,
     reading: ReadAhead,
     schedule: Schedule,
     /// Agents whose frames of the last tick were published.
     present: BTreeSet<CavId>,
     clock: ReplayClock,
-    outlet: Outlet,
+    outlet: SensorPublisher,
     air: Option<SensorAir>,
     inbox: Arc<Inbox>,
     stop: Stop,
     report: StreamReport,
-    _presence: Presence,
+    _presence: LivelinessToken,
     _subscriptions: Vec<Subscription>,
 }
 
@@ -197,13 +197,13 @@ impl<'a> Replay<'a> {
             bus,
             scenario: scenario.name.clone(),
             tick_count: scenario.ticks.len(),
-            bookmark: options.bookmark.clone().map(Bookmark::open).transpose().map_err(StreamError::Thread)?,
+            bookmark: options.bookmark.clone().map(Checkpoint::open).transpose().map_err(StreamError::Thread)?,
             is_resumed: place.is_some(),
             reading,
             schedule,
             present: BTreeSet::new(),
             clock,
-            outlet: Outlet::open(bus, &options.agents, options.load.radar, options.is_paced())?,
+            outlet: SensorPublisher::open(bus, &options.agents, options.load.radar, options.is_paced())?,
             _subscriptions: subscriptions.collect::<Result<_, _>>()?,
             air,
             inbox,
@@ -220,7 +220,7 @@ impl<'a> Replay<'a> {
     /// # Errors
     /// [`StreamError::NotReady`] names the routes that have not.
     pub fn wait_until_ready(&self) -> Result<(), StreamError> {
-        let barrier = Barrier::new(self.expected_routes()).attend(self.bus)?;
+        let barrier = Barrier::new(self.expected_routes()).await_routes(self.bus)?;
         let stop = self.stop.clone();
         let wait = |patience| barrier.wait_unless(patience, || stop.requested());
         if !self.is_resumed {
@@ -294,14 +294,14 @@ impl<'a> Replay<'a> {
                 _ => {}
             }
             match self.inbox.take(due.into_iter().chain(self.next_arrival()).min()) {
-                Taken::Item(_, Event::Message(arrival)) => {
+                Pop::Item(_, Event::Message(arrival)) => {
                     if let Ok(command) = arrival.decode(&Limits::DEFAULT) {
-                        self.obey(command);
+                        self.apply(command);
                         self.note_place();
                     }
                 }
-                Taken::Item(_, Event::End { .. }) | Taken::TimedOut => {}
-                Taken::Closed => return None,
+                Pop::Item(_, Event::End { .. }) | Pop::TimedOut => {}
+                Pop::Closed => return None,
             }
         }
     }
@@ -314,7 +314,7 @@ impl<'a> Replay<'a> {
     /// Publishes the frames that have crossed the air.
     fn deliver(&mut self) {
         let Some(air) = &mut self.air else { return };
-        for Held { agent, capture_nanos, frame } in air.arrived(Instant::now()) {
+        for DelayedSweep { agent, capture_nanos, frame } in air.arrived(Instant::now()) {
             self.outlet.offer(agent, capture_nanos, frame);
         }
     }
@@ -322,7 +322,7 @@ impl<'a> Replay<'a> {
     /// After the last tick: waits for the frames that are on their way, unless someone asks to stop.
     fn await_the_last(&mut self) {
         while let Some(next) = self.next_arrival().filter(|_| !self.stop.requested()) {
-            if matches!(self.inbox.take(Some(next)), Taken::Closed) {
+            if matches!(self.inbox.take(Some(next)), Pop::Closed) {
                 return;
             }
             self.deliver();
@@ -343,7 +343,7 @@ impl<'a> Replay<'a> {
         });
     }
 
-    fn obey(&mut self, command: Control) {
+    fn apply(&mut self, command: Control) {
         tracing::info!(?command, "asked to");
         match command {
             Control::Start { rate } => self.clock.resume(Some(rate)),
@@ -379,7 +379,7 @@ impl<'a> Replay<'a> {
                         None => self.outlet.offer(agent, capture_nanos, frame),
                         Some(air) => {
                             let cav = frame.cav.clone();
-                            air.offer(&cav, Held { agent, capture_nanos, frame }, Instant::now());
+                            air.offer(&cav, DelayedSweep { agent, capture_nanos, frame }, Instant::now());
                         }
                     }
                 }
@@ -404,24 +404,24 @@ impl<'a> Replay<'a> {
         let deadline = end_of(self.options.answer_patience);
         while !missing.is_empty() {
             match self.inbox.take(deadline) {
-                Taken::Item(Topic::Stream { cav, .. }, Event::Message(arrival)) => {
+                Pop::Item(Topic::Stream { cav, .. }, Event::Message(arrival)) => {
                     self.bus.books().received(&arrival.topic);
                     if arrival.header.stamp.capture_nanos >= capture_nanos {
                         missing.remove(&cav);
                     }
                 }
-                Taken::Item(_, Event::Message(arrival)) => {
+                Pop::Item(_, Event::Message(arrival)) => {
                     if let Ok(command) = arrival.decode(&Limits::DEFAULT) {
-                        self.obey(command);
+                        self.apply(command);
                     }
                 }
-                Taken::Item(_, Event::End { .. }) => {}
-                Taken::TimedOut => {
+                Pop::Item(_, Event::End { .. }) => {}
+                Pop::TimedOut => {
                     tracing::error!(capture_nanos, ?missing, "no detections within {:?}", self.options.answer_patience);
                     self.report.unanswered += 1;
                     break;
                 }
-                Taken::Closed => break,
+                Pop::Closed => break,
             }
         }
         // The fleet sets the pace: the next tick is not late because this one took long.

@@ -8,7 +8,7 @@ use protocol::{CavId, DropReason, HEADER_LEN, Stream};
 use serde::Serialize;
 
 use dataset::frame::Frame;
-use link::{Air, Fate, LinkConfig, LinkError, Outcome, Parcel};
+use link::{Delivery, LinkConfig, LinkEmulator, LinkError, Outcome, Packet};
 use support::nanos;
 
 /// x, y, z and intensity of a point, bytes; for a radar's its velocity.
@@ -27,7 +27,7 @@ pub struct AirReport {
 
 /// A frame on its way.
 #[derive(Debug, Clone)]
-pub(super) struct Held {
+pub(super) struct DelayedSweep {
     /// Place of the vehicle among those that take part.
     pub(super) agent: usize,
     pub(super) capture_nanos: u64,
@@ -36,8 +36,8 @@ pub(super) struct Held {
 
 /// Frames on their way to the agents.
 pub(super) struct SensorAir {
-    air: Air,
-    held: BTreeMap<u64, Held>,
+    air: LinkEmulator,
+    held: BTreeMap<u64, DelayedSweep>,
     next_id: u64,
     /// By vehicle, as its own messages are numbered: whether one is lost must not depend on who else is there.
     next_sequences: BTreeMap<CavId, u64>,
@@ -50,7 +50,7 @@ impl SensorAir {
     /// [`LinkError`] names the field that is wrong.
     pub(super) fn new(link: &LinkConfig, seed: u64) -> Result<Self, LinkError> {
         Ok(Self {
-            air: Air::new(link.clone(), Path::new("."), seed)?,
+            air: LinkEmulator::new(link.clone(), Path::new("."), seed)?,
             held: BTreeMap::new(),
             next_id: 0,
             next_sequences: BTreeMap::new(),
@@ -60,7 +60,7 @@ impl SensorAir {
     }
 
     /// Takes what the vehicle `cav` measured just now. What its sensors measured at a tick travels together.
-    pub(super) fn offer(&mut self, cav: &CavId, held: Held, now: Instant) {
+    pub(super) fn offer(&mut self, cav: &CavId, held: DelayedSweep, now: Instant) {
         let Frame { points, radar, .. } = &held.frame;
         let points = points.len() + radar.as_ref().map_or(0, |radar| radar.len());
         let bytes = HEADER_LEN as u64 + POINT_BYTES * points as u64;
@@ -72,7 +72,7 @@ impl SensorAir {
         self.report.offered += 1;
         self.held.insert(id, held);
         let (from, to, stream) = (cav.clone(), cav.clone(), Stream::Lidar);
-        self.air.offer(Parcel { id, from, to, stream, sequence, bytes, offered_nanos, distance_m: 0.0 });
+        self.air.offer(Packet { id, from, to, stream, sequence, bytes, offered_nanos, distance_m: 0.0 });
     }
 
     /// When the next frame can arrive; none while none is under way.
@@ -81,16 +81,16 @@ impl SensorAir {
     }
 
     /// What has arrived by now.
-    pub(super) fn arrived(&mut self, now: Instant) -> Vec<Held> {
+    pub(super) fn arrived(&mut self, now: Instant) -> Vec<DelayedSweep> {
         let mut arrived = Vec::new();
         for Outcome { parcel, fate, .. } in self.air.advance(nanos::between(self.began, now)) {
             match fate {
-                Fate::Dropped(reason) => {
+                Delivery::Dropped(reason) => {
                     self.held.remove(&parcel.id);
                     *self.report.dropped.entry(reason).or_default() += 1;
                 }
-                Fate::Arrived { is_repeated: true, .. } => arrived.extend(self.held.get(&parcel.id).cloned()),
-                Fate::Arrived { .. } => arrived.extend(self.held.remove(&parcel.id)),
+                Delivery::Arrived { is_repeated: true, .. } => arrived.extend(self.held.get(&parcel.id).cloned()),
+                Delivery::Arrived { .. } => arrived.extend(self.held.remove(&parcel.id)),
             }
         }
         self.report.arrived += arrived.len() as u64;
@@ -107,18 +107,18 @@ mod tests {
     use protocol::{Handedness, PointCloud};
 
     use super::*;
-    use link::{CapacityConfig, DelayLaw, LossLaw};
+    use link::{CapacityConfig, DelayModel, LossModel};
 
-    fn held(cav: &CavId, tick: u64) -> Held {
+    fn held(cav: &CavId, tick: u64) -> DelayedSweep {
         let points = PointCloud { xyzi: vec![[0.0; 4]; 1000] };
         let frame = Frame { points, ..Frame::empty(cav.clone(), tick, Handedness::Right) };
-        Held { agent: 0, capture_nanos: tick, frame }
+        DelayedSweep { agent: 0, capture_nanos: tick, frame }
     }
 
     #[test]
     fn what_a_vehicle_loses_does_not_depend_on_the_others() {
         let [cav, other] = ["7", "8"].map(|cav| CavId::new(cav).unwrap());
-        let lossy = LinkConfig { loss: LossLaw::Bernoulli(0.5), ..LinkConfig::default() };
+        let lossy = LinkConfig { loss: LossModel::Bernoulli(0.5), ..LinkConfig::default() };
         let arrived = |cavs: &[&CavId]| {
             let mut air = SensorAir::new(&lossy, 1).unwrap();
             let began = air.began;
@@ -137,7 +137,7 @@ mod tests {
         // 16 kB at 16 Mbit/s: 8 ms each, then 100 ms.
         let link = LinkConfig {
             capacity: CapacityConfig::TokenBucket { rate_mbps: 16.0, burst_bytes: 0 },
-            delay: DelayLaw::ConstantMs(100.0),
+            delay: DelayModel::ConstantMs(100.0),
             ..LinkConfig::default()
         };
         let mut air = SensorAir::new(&link, 1).unwrap();
@@ -153,7 +153,7 @@ mod tests {
         assert_eq!(air.next(), None);
 
         let mut lossy =
-            SensorAir::new(&LinkConfig { loss: LossLaw::Bernoulli(0.5), ..LinkConfig::default() }, 1).unwrap();
+            SensorAir::new(&LinkConfig { loss: LossModel::Bernoulli(0.5), ..LinkConfig::default() }, 1).unwrap();
         let began = lossy.began;
         (0..200).for_each(|tick| lossy.offer(&cav, held(&cav, tick), began));
         let arrived = lossy.arrived(began).len() as u64;

@@ -21,13 +21,13 @@ struct Sensors {
 }
 
 /// Everything a replay publishes.
-pub(super) struct Outlet {
+pub(super) struct SensorPublisher {
     sensors: Vec<Sensors>,
     truth: Publisher,
     sent: Vec<TopicCount>,
 }
 
-impl Outlet {
+impl SensorPublisher {
     /// Publishers for `agents`. Under `is_paced` the sender waits rather than that a sweep be superseded.
     pub(super) fn open(bus: &Bus, agents: &[CavId], with_radar: bool, is_paced: bool) -> Result<Self, BusError> {
         let options =
@@ -59,7 +59,7 @@ impl Outlet {
             count(&mut self.sent, sensors.gnss.topic());
         }
         if sensors.preview.is_wanted() {
-            sensors.preview.offer(capture_nanos, Lidar { points: frame.points.thinned(PREVIEW_POINTS) });
+            sensors.preview.offer(capture_nanos, Lidar { points: frame.points.decimate(PREVIEW_POINTS) });
         }
         sensors.lidar.offer(capture_nanos, Lidar { points: frame.points });
         count(&mut self.sent, sensors.lidar.topic());

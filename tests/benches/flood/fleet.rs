@@ -8,14 +8,15 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use anyhow::{Context, Result, bail};
-use bus::bounded_queue::Taken;
+use bus::bounded_queue::Pop;
 use bus::{
-    Bus, BusOptions, Credentials, Endpoint, Event, Guard, Identity, InboxLimits, PublisherOptions, open, unix_nanos,
+    AccessControl, Bus, BusOptions, Credentials, Endpoint, Event, Identity, InboxLimits, PublisherOptions, open,
+    unix_nanos,
 };
 use protocol::message::Bev;
 use protocol::{
-    Account, BevFeatures, BevGrid, CodecConfig, DropReason, Limits, Party, Pose, PoseEstimate, RunId, Runs, Stamp,
-    Topic, encode_features, wire,
+    Account, BevFeatures, BevGrid, CodecConfig, DropReason, Limits, Pose, PoseEstimate, Principal, RunId, RunScope,
+    Stamp, Topic, encode_features, wire,
 };
 use serde::{Deserialize, Serialize};
 use support::statistics;
@@ -64,7 +65,7 @@ pub(crate) fn quantile(values: &[f64], quantile: f64) -> f64 {
     statistics::quantile(&statistics::sorted(values), quantile).unwrap_or(f64::NAN)
 }
 
-/// Runs the fleet once.
+/// RunScope the fleet once.
 pub(crate) fn measure(setting: &Setting) -> Result<Measured> {
     let endpoint = Endpoint::loopback(free_port());
     let seconds = (setting.duration + WARM_UP).as_secs_f64();
@@ -182,7 +183,7 @@ impl Place {
     }
 
     fn join(&self, party: &str) -> Result<Bus> {
-        let known: Party = party.parse()?;
+        let known: Principal = party.parse()?;
         let identity = Identity { run: RunId::new("flood")?, process: known.name(), cav: known.cav };
         let options = self.with_memory(BusOptions::client(self.endpoint.clone()));
         let options = match &self.keys {
@@ -196,8 +197,8 @@ impl Place {
         let mut options = self.with_memory(BusOptions::router(self.endpoint.clone()));
         if let Some(keys) = &self.keys {
             let credentials = Credentials::read(&keys.join("router"))?;
-            let guard = Guard { members: credentials.members()?, runs: Runs::Any };
-            options = options.with_credentials(credentials).guarded_by(guard);
+            let guard = AccessControl { members: credentials.members()?, runs: RunScope::Any };
+            options = options.with_credentials(credentials).with_access_control(guard);
         }
         let session = open(&options)?;
         say("ready")?;
@@ -215,7 +216,7 @@ impl Place {
         let (began, mut measured) = (Instant::now(), Measured::default());
         let until = began + duration;
         while Instant::now() < until {
-            let Taken::Item(topic, Event::Message(arrival)) = inbox.take(Some(until)) else { continue };
+            let Pop::Item(topic, Event::Message(arrival)) = inbox.take(Some(until)) else { continue };
             let Some(map) = inbox.decode::<Bev>(&arrival, &Limits::DEFAULT) else { continue };
             map.features.decode(&Limits::DEFAULT)?;
             let took_ms = unix_nanos().saturating_sub(arrival.header.stamp.publish_nanos) as f64 / 1e6;

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use anyhow::Result;
 use bus::shutdown::Stop;
 use bus::{Barrier, Bus, BusOptions, Endpoint, Event, Identity, PublisherOptions, Route, open, unix_nanos};
-use link::{Air, CapacityConfig, LinkConfig, QueueConfig};
+use link::{CapacityConfig, LinkConfig, LinkEmulator, QueueConfig};
 use protocol::message::Bev;
 use protocol::{
     BevFeatures, BevGrid, CavId, CodecConfig, Ledger, Limits, Pose, PoseEstimate, ProcessId, Role, RunId, Stream,
@@ -81,7 +81,7 @@ fn between(cell: &Cell, router: &Endpoint) -> Result<Seen> {
         queue: QueueConfig { keep_newest: true, ..QueueConfig::default() },
         ..LinkConfig::default()
     };
-    let air = Air::new(config, Path::new("."), 1)?;
+    let air = LinkEmulator::new(config, Path::new("."), 1)?;
     let options = NodeOptions::new(cav("9"), vec![Stream::Bev]);
     let received = Topic::Received { ego: cav("9"), cav: cav("7"), stream: Stream::Bev };
     let stop = Stop::new();
@@ -117,7 +117,7 @@ pub(crate) fn send(agent: &Bus, cell: &Cell, routes: &[(Topic, &str)]) -> Result
     let presence = agent.announce(Role::Agent)?;
     let publisher = agent.publisher(sent_topic(), PublisherOptions::FEATURES)?;
     let routes = routes.iter().map(|(topic, receiver)| Ok(Route { topic: topic.clone(), receiver: receiver.parse()? }));
-    Barrier::new(routes.collect::<Result<Vec<_>>>()?).attend(agent)?.wait(PATIENCE)?;
+    Barrier::new(routes.collect::<Result<Vec<_>>>()?).await_routes(agent)?.wait(PATIENCE)?;
     let map = features(cell.bytes);
     let offers = at_10_hz(
         cell,
@@ -139,7 +139,7 @@ pub(crate) fn receive(ego: &Bus, topic: &Topic) -> Result<Vec<Arrived>> {
     let inbox = ego.inbox(64, 1);
     let _subscription = ego.subscribe(topic.clone(), &inbox)?;
     let mut arrivals = Vec::new();
-    while let bus::bounded_queue::Taken::Item(_, Event::Message(arrival)) = inbox.take(None) {
+    while let bus::bounded_queue::Pop::Item(_, Event::Message(arrival)) = inbox.take(None) {
         if inbox.decode::<Bev>(&arrival, &Limits::DEFAULT).is_some() {
             ego.books().received(topic);
             let capture_nanos = arrival.header.stamp.capture_nanos;

@@ -1,4 +1,4 @@
-//! Runs that are started and ended again and again, and runs that last.
+//! RunScope that are started and ended again and again, and runs that last.
 
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -87,7 +87,7 @@ pub struct Soak {
     pub balances: bool,
 }
 
-/// Runs a fleet of [`VEHICLES`] at 10 Hz for so long; `told` hears of every look.
+/// RunScope a fleet of [`VEHICLES`] at 10 Hz for so long; `told` hears of every look.
 ///
 /// # Panics
 /// When a process falls.

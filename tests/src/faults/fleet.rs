@@ -57,7 +57,7 @@ pub struct Report {
     /// What they do not add up by.
     pub differences: String,
     /// Messages of which nobody can tell what became of them, as one they concern was away.
-    pub excused: u64,
+    pub exempted: u64,
     /// From Ctrl-C to the end.
     pub stop: Duration,
     /// Files in shared memory that were not there before.
@@ -241,7 +241,7 @@ impl FaultyFleet {
             slowest,
             balances: ledger["balances"] == true,
             differences: ledger["balance"].to_string(),
-            excused: ledger["excused"].as_u64().unwrap_or(0),
+            exempted: ledger["exempted"].as_u64().unwrap_or(0),
             stop,
             left_over: shared_memory().difference(&self.shared_memory).cloned().collect(),
             growth: [growth_of(|usage| usage.descriptors), growth_of(|usage| usage.threads)],

@@ -26,7 +26,7 @@ pub struct Report {
     pub took: Duration,
 }
 
-/// Runs damaged messages from `seed` on.
+/// RunScope damaged messages from `seed` on.
 ///
 /// # Panics
 /// When a sound one is not accepted undamaged: then nothing behind the first check would be tried.
@@ -36,7 +36,7 @@ pub fn messages(cases: u64, seed: u64, meter: &PeakAlloc) -> Report {
     one(("messages", &seeds::messages()), cases, seed, meter, damage, &wire_target::read)
 }
 
-/// Runs damaged files of every format from `seed` on, one format after the other as reports are asked for.
+/// RunScope damaged files of every format from `seed` on, one format after the other as reports are asked for.
 ///
 /// # Panics
 /// As [`messages`].

@@ -4,7 +4,7 @@ use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, AtomicU64, Ordering};
 use std::time::{Duration, Instant};
 
-use bus::bounded_queue::Taken;
+use bus::bounded_queue::Pop;
 use bus::{Barrier, Bus, Event, Inbox, InboxLimits, PublisherOptions, Route};
 use protocol::{Account, DropReason, Lidar, Limits, PointCloud, Topic};
 use tests::bus::{PATIENCE, TestRouter, wait_for};
@@ -21,7 +21,7 @@ fn sweep(points: usize) -> Lidar {
 
 fn connect(sender: &Bus, ego: &Bus, topic: &Topic) {
     let route = Route { topic: topic.clone(), receiver: ego.identity().process.clone() };
-    Barrier::new([route]).attend(sender).unwrap().wait(PATIENCE).unwrap();
+    Barrier::new([route]).await_routes(sender).unwrap().wait(PATIENCE).unwrap();
 }
 
 /// Takes until every message of the honest sender has come; how many of both.
@@ -29,13 +29,13 @@ fn listen(inbox: &Inbox, books: &Bus) -> [u64; 2] {
     let (mut heard, deadline) = ([0; 2], Instant::now() + PATIENCE);
     while heard[0] < HONEST {
         match inbox.take(Some(deadline)) {
-            Taken::Item(topic, Event::Message(arrival)) => {
+            Pop::Item(topic, Event::Message(arrival)) => {
                 arrival.decode::<Lidar>(&Limits::DEFAULT).unwrap();
                 books.books().received(&topic);
                 heard[usize::from(topic.to_string() != "1/lidar")] += 1;
             }
-            Taken::Item(..) => {}
-            Taken::TimedOut | Taken::Closed => panic!("{heard:?} of {HONEST} came through"),
+            Pop::Item(..) => {}
+            Pop::TimedOut | Pop::Closed => panic!("{heard:?} of {HONEST} came through"),
         }
     }
     heard
@@ -109,7 +109,7 @@ fn what_waits_is_bounded_in_bytes() {
     wait_for("refusals", || dropped() == 8);
     assert!(inbox.waiting_bytes() <= 160_000, "{}", inbox.waiting_bytes());
     let taken = std::iter::from_fn(|| match inbox.take(Some(Instant::now())) {
-        Taken::Item(_, event) => Some(matches!(event, Event::Message(_))),
+        Pop::Item(_, event) => Some(matches!(event, Event::Message(_))),
         _ => None,
     });
     assert_eq!(taken.filter(|is_message| *is_message).count(), 2);

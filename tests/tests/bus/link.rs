@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use bus::shutdown::Stop;
 use bus::{Barrier, Bus, Event, InboxLimits, PublisherOptions, Route};
-use link::{Air, CapacityConfig, DelayLaw, DeviceClock, LinkConfig, LossLaw, TraceConfig};
+use link::{CapacityConfig, DelayModel, DeviceClock, LinkConfig, LinkEmulator, LossModel, TraceConfig};
 use protocol::message::Points;
 use protocol::{CavId, DropReason, Ledger, Limits, PointCloud, Pose, PoseEstimate, Role, Stream, Topic};
 use sim_replay::link_node::{self, LinkReport, NodeOptions};
@@ -39,7 +39,7 @@ fn options() -> NodeOptions {
 /// Waits until a topic of the bus's process reaches a receiver.
 fn wait_for_route(bus: &Bus, topic: &Topic, receiver: &str) {
     let route = Route { topic: topic.clone(), receiver: receiver.parse().unwrap() };
-    Barrier::new([route]).attend(bus).unwrap().wait(PATIENCE).unwrap();
+    Barrier::new([route]).await_routes(bus).unwrap().wait(PATIENCE).unwrap();
 }
 
 /// Sends all sweeps at once through a link.
@@ -47,7 +47,7 @@ fn cross(config: LinkConfig, options: &NodeOptions) -> Crossing {
     let router = TestRouter::open();
     let [agent, link, ego] =
         [("agent-7", "7"), ("link-9", "9"), ("ego-9", "9")].map(|(name, id)| router.join(name, id));
-    let air = Air::new(config, Path::new("."), 1).unwrap();
+    let air = LinkEmulator::new(config, Path::new("."), 1).unwrap();
     let (sent, received) = (
         Topic::Stream { cav: cav("7"), stream: Stream::Points },
         Topic::Received { ego: cav("9"), cav: cav("7"), stream: Stream::Points },
@@ -86,7 +86,7 @@ fn cross(config: LinkConfig, options: &NodeOptions) -> Crossing {
 #[test]
 fn messages_come_late_in_order_and_unchanged() {
     let capacity = CapacityConfig::TokenBucket { rate_mbps: 8.0, burst_bytes: 0 };
-    let config = LinkConfig { capacity, delay: DelayLaw::ConstantMs(30.0), ..LinkConfig::default() };
+    let config = LinkConfig { capacity, delay: DelayModel::ConstantMs(30.0), ..LinkConfig::default() };
     let Crossing { arrivals, report, ledger } = cross(config, &options());
     assert_eq!(arrivals.iter().map(|(tick, _)| *tick).collect::<Vec<_>>(), (0..COUNT).collect::<Vec<_>>());
     for (tick, late) in &arrivals {
@@ -101,7 +101,7 @@ fn messages_come_late_in_order_and_unchanged() {
 #[test]
 fn what_the_air_loses_is_booked_and_never_arrives() {
     let Crossing { arrivals, report, ledger } =
-        cross(LinkConfig { loss: LossLaw::Bernoulli(1.0), ..LinkConfig::default() }, &options());
+        cross(LinkConfig { loss: LossModel::Bernoulli(1.0), ..LinkConfig::default() }, &options());
     assert_eq!((arrivals.len(), report.arrived), (0, 0));
     assert_eq!(report.dropped, [(DropReason::LinkLoss, COUNT)].into());
     assert_eq!(ledger.total().dropped[&DropReason::LinkLoss], COUNT);
@@ -120,7 +120,7 @@ fn a_clock_that_is_off_shows_in_the_capture_times() {
 #[test]
 fn a_long_delay_keeps_no_more_than_it_may() {
     // Without a rate there is no queue that could be full. All are sent long before the first arrives.
-    let config = LinkConfig { delay: DelayLaw::ConstantMs(4000.0), ..LinkConfig::default() };
+    let config = LinkConfig { delay: DelayModel::ConstantMs(4000.0), ..LinkConfig::default() };
     let room_for_two = NodeOptions { max_kept_bytes: 40_000, ..options() };
     let Crossing { arrivals, report, ledger } = cross(config, &room_for_two);
     assert_eq!(arrivals.iter().map(|(tick, _)| *tick).collect::<Vec<_>>(), [0, 1]);
@@ -137,7 +137,7 @@ fn a_link_that_carries_nothing_says_so() {
     std::fs::write(folder.path().join("rates.csv"), "time_s,rate_mbps,delay_ms,loss\n0,27,0,0\n60,0,0,0\n").unwrap();
     let trace = TraceConfig { offset_s: 60.0, ..TraceConfig::new(Path::new("rates.csv")) };
     let config = LinkConfig { capacity: CapacityConfig::Trace(trace), ..LinkConfig::default() };
-    let air = Air::new(config, folder.path(), 1).unwrap();
+    let air = LinkEmulator::new(config, folder.path(), 1).unwrap();
     let (sent, stop, options) = (Topic::Stream { cav: cav("7"), stream: Stream::Points }, Stop::new(), options());
     let report = std::thread::scope(|scope| {
         let carrying = scope.spawn(|| link_node::run(&link, air, &options, &stop).unwrap());
@@ -159,7 +159,7 @@ fn a_link_that_carries_nothing_says_so() {
 fn a_flood_ends_in_front_of_the_air() {
     let router = TestRouter::open();
     let [agent, link] = [("agent-7", "7"), ("link-9", "9")].map(|(name, id)| router.join(name, id));
-    let air = Air::new(LinkConfig::default(), Path::new("."), 1).unwrap();
+    let air = LinkEmulator::new(LinkConfig::default(), Path::new("."), 1).unwrap();
     let (sent, stop) = (Topic::Stream { cav: cav("7"), stream: Stream::Points }, Stop::new());
     // Little more than the one that shows the route.
     let narrow = NodeOptions { inbox: InboxLimits { messages_per_s: 0.6, ..InboxLimits::PEERS }, ..options() };
@@ -193,7 +193,7 @@ fn an_agent_that_comes_back_is_carried_again() {
     std::thread::scope(|scope| {
         // While another agent is there the link does not end.
         let presence = other.announce(Role::Agent).unwrap();
-        let air = Air::new(LinkConfig::default(), Path::new("."), 1).unwrap();
+        let air = LinkEmulator::new(LinkConfig::default(), Path::new("."), 1).unwrap();
         let carrying = scope.spawn(|| link_node::run(&link, air, &options, &stop).unwrap());
         for ticks in [0..3, 3..6] {
             let agent = router.join("agent-7", "7");

@@ -6,9 +6,9 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use bus::shutdown::Stop;
-use bus::{Bus, Event, Inbox, PublisherOptions, Subscription, bounded_queue::Taken};
+use bus::{Bus, Event, Inbox, PublisherOptions, Subscription, bounded_queue::Pop};
 use dataset::{self, Scenario};
-use protocol::{CavId, Control, Gnss, Lidar, Limits, Selector, Stream, Topic, Truth, wire};
+use protocol::{CavId, Control, Gnss, KeyExpr, Lidar, Limits, Stream, Topic, Truth, wire};
 use sim_replay::stream::{Replay, StreamError, StreamOptions, StreamReport};
 use tests::bus::{PATIENCE, TestRouter, next_event, wait_for};
 use tests::scene;
@@ -125,28 +125,28 @@ fn previews_are_for_onlookers_alone() {
     let bus = router.join("replay", "replay");
     let preview = bus.publisher(topic("10", Stream::Preview), PublisherOptions::PREVIEW).unwrap();
     let recorder = router.join("recorder", "recorder");
-    let everything = recorder.tap(&[Selector::run(&recorder.identity().run)], 64).unwrap();
+    let everything = recorder.tap(&[KeyExpr::run(&recorder.identity().run)], 64).unwrap();
     assert!(!preview.is_wanted(), "a recorder has whole sweeps");
     let viewer = router.join("viewer", "viewer");
-    let looking = viewer.tap(&[Selector::stream(&viewer.identity().run, Stream::Preview)], 64).unwrap();
+    let looking = viewer.tap(&[KeyExpr::stream(&viewer.identity().run, Stream::Preview)], 64).unwrap();
     wait_for("somebody looks", || preview.is_wanted());
     let _listener = Listener::new(&router);
     play(&router, &scenario, StreamOptions::default());
 
     let at_once = || Some(Instant::now());
     let mut previews = 0;
-    while let Taken::Item(found, preview) = looking.take(at_once()) {
+    while let Pop::Item(found, preview) = looking.take(at_once()) {
         assert!(matches!(found, Topic::Stream { stream: Stream::Preview, .. }), "{found}");
         let (header, Lidar { points }) = wire::decode([preview.bytes().as_ref()], &Limits::DEFAULT).unwrap();
         let agent = AGENTS.iter().position(|cav| header.stamp.cav.as_str() == *cav).unwrap();
         let tick = scenario.ticks.iter().position(|tick| tick.capture_nanos == header.stamp.capture_nanos).unwrap();
         let frame = scenario.load(agent, tick, &dataset::LoadOptions::default()).unwrap();
-        assert_eq!(points, frame.points.thinned(4_000));
+        assert_eq!(points, frame.points.decimate(4_000));
         previews += 1;
     }
     assert!((1..=12).contains(&previews), "{previews}");
     let mut recorded = 0;
-    while let Taken::Item(found, _) = everything.take(at_once()) {
+    while let Pop::Item(found, _) = everything.take(at_once()) {
         assert!(!matches!(found, Topic::Stream { stream: Stream::Preview, .. }));
         recorded += 1;
     }
@@ -324,7 +324,7 @@ fn a_request_to_stop_ends_a_loop_without_end() {
     assert!(report.ticks >= 5);
     // Capture times rise over every loop.
     let mut last = 0;
-    while let Taken::Item(found, event) = listener.inbox.take(Some(Instant::now() + Duration::from_millis(200))) {
+    while let Pop::Item(found, event) = listener.inbox.take(Some(Instant::now() + Duration::from_millis(200))) {
         if let (Topic::Truth, Event::Message(arrival)) = (found, event) {
             assert!(arrival.header.stamp.capture_nanos > last);
             last = arrival.header.stamp.capture_nanos;

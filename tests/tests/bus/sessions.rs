@@ -4,8 +4,8 @@ use std::sync::mpsc;
 use std::time::{Duration, Instant};
 
 use bus::{
-    self, Barrier, Bus, BusError, BusOptions, Endpoint, Event, Overflow, Publisher, PublisherOptions, Route, Sighting,
-    bounded_queue::Taken,
+    self, Barrier, Bus, BusError, BusOptions, Endpoint, Event, LivelinessEvent, Overflow, Publisher, PublisherOptions,
+    Route, bounded_queue::Pop,
 };
 use protocol::{
     Account, CavId, Control, DropReason, Gnss, GnssSource, Ledger, Lidar, Limits, PointCloud, Pose, Role, Stamp,
@@ -41,7 +41,7 @@ fn sweep(count: u16) -> Lidar {
 fn connect(publisher: &Bus, receiver: &Bus, topic: &Topic) {
     let route = Route { topic: topic.clone(), receiver: receiver.identity().process.clone() };
     let barrier = Barrier::new([route]);
-    barrier.attend(publisher).unwrap().wait(PATIENCE).unwrap();
+    barrier.await_routes(publisher).unwrap().wait(PATIENCE).unwrap();
 }
 
 fn balanced(buses: &[&Bus]) -> Ledger {
@@ -97,7 +97,7 @@ fn no_first_frame_is_lost_in_twenty_cold_starts() {
             move || {
                 let publisher = replay.publisher(topic.clone(), PublisherOptions::SENSOR.lossless(8)).unwrap();
                 let route = Route { topic, receiver: "agent-7".parse().unwrap() };
-                Barrier::new([route]).attend(&replay).unwrap().wait(PATIENCE).unwrap();
+                Barrier::new([route]).await_routes(&replay).unwrap().wait(PATIENCE).unwrap();
                 (0..5).for_each(|tick| publisher.offer(tick, gnss(tick as f64)));
                 publisher.finish();
                 replay
@@ -119,13 +119,13 @@ fn a_process_whose_work_stands_still_falls_silent() {
     let (agent, watcher) = (router.join("agent-7", "7"), router.join("watcher", "watcher"));
     let told = watcher.inbox(64, 4);
     let _told = watcher.subscribe(topic("stats/agent-7"), &told).unwrap();
-    let says = |patience: Duration| matches!(told.take(Some(Instant::now() + patience)), Taken::Item(..));
+    let says = |patience: Duration| matches!(told.take(Some(Instant::now() + patience)), Pop::Item(..));
     assert!(says(PATIENCE), "it says how it is");
 
     let inbox = agent.inbox(1, 1);
     let working = agent.works_from(&inbox);
     // It waits for work, for longer than it takes to say anything.
-    assert!(matches!(inbox.take(Some(Instant::now() + Duration::from_millis(1200))), Taken::TimedOut));
+    assert!(matches!(inbox.take(Some(Instant::now() + Duration::from_millis(1200))), Pop::TimedOut));
     while says(Duration::from_millis(1)) {}
     // It has come by since the last time, which is said once; and does not come back.
     says(Duration::from_millis(700));
@@ -144,7 +144,7 @@ fn a_missing_pair_is_named() {
     let replay = router.join("replay", "replay");
     let _publisher = replay.publisher(topic("7/lidar"), PublisherOptions::SENSOR).unwrap();
     let routes = ["7/lidar>agent-7", "7/gnss>agent-7"].map(|route| route.parse::<Route>().unwrap());
-    let barrier = Barrier::new(routes).attend(&replay).unwrap();
+    let barrier = Barrier::new(routes).await_routes(&replay).unwrap();
     let error = barrier.wait(Duration::from_millis(200)).unwrap_err().to_string();
     assert!(error.contains("7/lidar>agent-7, 7/gnss>agent-7"), "{error}");
 }
@@ -154,7 +154,7 @@ fn nobody_says_for_another_what_that_one_has_heard() {
     let router = TestRouter::open();
     let (replay, agent) = (router.join("replay", "replay"), router.join("agent-8", "8"));
     let routes = ["7/lidar>agent-7", "7/lidar>agent-8"].map(|route| route.parse::<Route>().unwrap());
-    let barrier = Barrier::new(routes.clone()).attend(&replay).unwrap();
+    let barrier = Barrier::new(routes.clone()).await_routes(&replay).unwrap();
     let key = agent.key(Topic::Ready(agent.identity().process.clone())).to_string();
     let mut sequence = 0;
     let mut say = |process: &str| {
@@ -243,12 +243,12 @@ fn a_late_joiner_is_seen_hears_and_is_missed() {
             let _ = report.send(sighting);
         })
         .unwrap();
-    let seen = |sighting: Sighting| assert_eq!(sightings.recv_timeout(PATIENCE).unwrap(), sighting);
-    seen(Sighting::Appeared { role: Role::Agent, cav: cav("1") });
+    let seen = |sighting: LivelinessEvent| assert_eq!(sightings.recv_timeout(PATIENCE).unwrap(), sighting);
+    seen(LivelinessEvent::Appeared { role: Role::Agent, cav: cav("1") });
 
     let late = router.join("agent-2", "2");
     let presence = late.announce(Role::Agent).unwrap();
-    seen(Sighting::Appeared { role: Role::Agent, cav: cav("2") });
+    seen(LivelinessEvent::Appeared { role: Role::Agent, cav: cav("2") });
     let topic = topic("2/gnss");
     let inbox = ego.inbox(4, 4);
     let _subscription = ego.subscribe(topic.clone(), &inbox).unwrap();
@@ -258,10 +258,10 @@ fn a_late_joiner_is_seen_hears_and_is_missed() {
     assert!(matches!(next_event(&inbox), (found, Event::Message(_)) if found == topic));
 
     presence.withdraw().unwrap();
-    seen(Sighting::Vanished { role: Role::Agent, cav: cav("2") });
+    seen(LivelinessEvent::Vanished { role: Role::Agent, cav: cav("2") });
     // One that dies without a word is missed as well.
     early.session().close().wait().unwrap();
-    seen(Sighting::Vanished { role: Role::Agent, cav: cav("1") });
+    seen(LivelinessEvent::Vanished { role: Role::Agent, cav: cav("1") });
 }
 
 #[test]
@@ -311,7 +311,7 @@ fn wrong_bytes_are_counted_and_survived() {
     let mut sound_messages = 0;
     while sound_messages == 0 || ego.books().ledger().get(&account).unwrap().dropped_total() < count {
         match inbox.take(Some(Instant::now() + PATIENCE)) {
-            Taken::Item(_, Event::Message(arrival)) => {
+            Pop::Item(_, Event::Message(arrival)) => {
                 if let Some(gnss) = inbox.decode::<Gnss>(&arrival, &Limits::DEFAULT) {
                     assert_eq!(gnss.world_from_lidar.translation_m[0], 5.0);
                     ego.books().received(&topic);

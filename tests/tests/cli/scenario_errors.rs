@@ -8,7 +8,7 @@ use std::process::Command;
 use tests::fleet::{programs, write_scenario};
 use tests::locks::exclusive_lock;
 
-/// Runs `v2vloc up` and returns exit code and standard error.
+/// RunScope `v2vloc up` and returns exit code and standard error.
 fn up(program: &Path, folder: &Path, scenario: &Path) -> (Option<i32>, String) {
     let output = Command::new(program).arg("up").arg(scenario).arg("--runs").arg(folder.join("runs")).output().unwrap();
     (output.status.code(), String::from_utf8_lossy(&output.stderr).into_owned())

@@ -39,8 +39,8 @@ fn overlap(target: &PointCloud, source: &PointCloud, target_from_source: &Isomet
 fn follow(target: &PointCloud, source: &PointCloud, known: &Isometry3<f64>) {
     let config = IcpConfig::default();
     let planes = IcpTarget::of_sweep(&target.xyzi, &config);
-    let thinned = IcpSource::of_sweep(&source.xyzi, &config);
-    let found = icp::register(&thinned, &planes, &Isometry3::identity(), &config).unwrap().target_from_source;
+    let decimate = IcpSource::of_sweep(&source.xyzi, &config);
+    let found = icp::register(&decimate, &planes, &Isometry3::identity(), &config).unwrap().target_from_source;
     let (metres, degrees) = off(known, &found);
     assert!(metres < 0.25 && degrees < 0.6, "{metres} m, {degrees} degrees");
     let [before, by_known, by_found] =

@@ -10,7 +10,7 @@ use recording::Recording;
 use tests::fleet::{Up, programs, results, signal, write_scenario};
 use tests::locks::exclusive_lock;
 
-/// Runs `program` to its end; exit code and what it says on both outputs.
+/// RunScope `program` to its end; exit code and what it says on both outputs.
 fn said(command: &mut Command) -> (Option<i32>, String) {
     let Output { status, stdout, stderr } = command.stdin(Stdio::null()).output().unwrap();
     (status.code(), [stdout, stderr].map(|said| String::from_utf8_lossy(&said).into_owned()).concat())

@@ -6,7 +6,7 @@ use std::time::Instant;
 
 use agent::agent::{Agent, AgentInput};
 use agent::node as agent_node;
-use bus::bounded_queue::Taken;
+use bus::bounded_queue::Pop;
 use bus::shutdown::Stop;
 use bus::{Event, Route};
 use dataset::{self, LoadOptions};
@@ -134,7 +134,7 @@ fn live(folder: &Path, weights: &Path, of_neighbour: &Path) -> (Vec<Detections>,
         replay.leave(PATIENCE).unwrap();
         let mut results = Vec::new();
         while results.len() < TICKS
-            && let Taken::Item(_, Event::Message(arrival)) = inbox.take(Some(Instant::now() + PATIENCE))
+            && let Pop::Item(_, Event::Message(arrival)) = inbox.take(Some(Instant::now() + PATIENCE))
         {
             results.push(inbox.decode(&arrival, &Limits::DEFAULT).unwrap());
         }

@@ -9,7 +9,7 @@ use std::time::{Duration, Instant};
 use agent::agent::{Agent, AgentInput};
 use agent::node as agent_node;
 use agent::rate::RateConfig;
-use bus::bounded_queue::Taken;
+use bus::bounded_queue::Pop;
 use bus::shutdown::Stop;
 use bus::{Bus, Event, Inbox, PublisherOptions, Route, Subscription, process_id};
 use dataset::{self, LoadOptions, Scenario};
@@ -85,7 +85,7 @@ fn published(method: Method) -> Stream {
     }
 }
 
-/// Runs an agent on a session of its own until `stop`; gives its books.
+/// RunScope an agent on a session of its own until `stop`; gives its books.
 fn run_agent<'scope>(
     scope: &'scope Scope<'scope, '_>,
     router: &'scope TestRouter,
@@ -123,12 +123,12 @@ fn listen<'scope>(
         let mut results = Vec::new();
         loop {
             match inbox.take(Some(Instant::now() + PATIENCE)) {
-                Taken::Item(_, Event::Message(arrival)) => {
+                Pop::Item(_, Event::Message(arrival)) => {
                     let result: Detections = inbox.decode(&arrival, &Limits::DEFAULT).unwrap();
                     bus.books().received(&arrival.topic);
                     results.push((arrival.header.stamp.capture_nanos, result));
                 }
-                Taken::Item(_, Event::End { .. }) => break,
+                Pop::Item(_, Event::End { .. }) => break,
                 other => panic!("{other:?}"),
             }
         }
@@ -334,15 +334,15 @@ fn maps_that_keep_within_a_limit_are_fused_and_booked_with_the_reason() {
 }
 
 /// Sends a fleet's maps by hand, so that the test decides who is late, wrong or gone.
-struct Puppet {
+struct ScriptedAgent {
     bus: Bus,
     publisher: bus::Publisher,
     agent: Agent,
     index: usize,
-    _presence: bus::Presence,
+    _presence: bus::LivelinessToken,
 }
 
-impl Puppet {
+impl ScriptedAgent {
     fn new(router: &TestRouter, index: usize) -> Self {
         let bus = router.join(&format!("agent-{}", AGENTS[index]), AGENTS[index]);
         let publisher =
@@ -370,7 +370,7 @@ impl Puppet {
 
     fn wait_until_heard(&self, receiver: &str) {
         let route = Route { topic: self.publisher.topic().clone(), receiver: receiver.parse().unwrap() };
-        bus::Barrier::new([route]).attend(&self.bus).unwrap().wait(PATIENCE).unwrap();
+        bus::Barrier::new([route]).await_routes(&self.bus).unwrap().wait(PATIENCE).unwrap();
     }
 }
 
@@ -407,7 +407,7 @@ fn late_killed_and_lying_neighbours_are_named_and_the_ego_goes_on() {
     let scenario = dataset::open(folder.path()).unwrap().scenarios.remove(0);
     let router = TestRouter::open();
     let stop = Stop::new();
-    let mut fleet: Vec<Puppet> = (0..3).map(|index| Puppet::new(&router, index)).collect();
+    let mut fleet: Vec<ScriptedAgent> = (0..3).map(|index| ScriptedAgent::new(&router, index)).collect();
     let results = Results::of_10(&router);
 
     let ledger = std::thread::scope(|scope| {
@@ -477,7 +477,7 @@ fn maps_of_a_network_that_a_neighbour_names_as_another_are_left_out() {
     scene::write(folder.path(), &AGENTS, TICKS);
     let scenario = dataset::open(folder.path()).unwrap().scenarios.remove(0);
     let (router, stop) = (TestRouter::open(), Stop::new());
-    let mut fleet: Vec<Puppet> = (0..3).map(|index| Puppet::new(&router, index)).collect();
+    let mut fleet: Vec<ScriptedAgent> = (0..3).map(|index| ScriptedAgent::new(&router, index)).collect();
     let results = Results::of_10(&router);
     let own = Descriptor {
         model_hash: detector().model_hash(),
@@ -496,13 +496,13 @@ fn maps_of_a_network_that_a_neighbour_names_as_another_are_left_out() {
             leave(bus)
         });
         fleet.iter().for_each(|puppet| puppet.wait_until_heard("ego-10"));
-        let say = |puppet: &Puppet, descriptor: Descriptor| {
+        let say = |puppet: &ScriptedAgent, descriptor: Descriptor| {
             let publisher = puppet.bus.publisher(topic("20", Stream::Descriptor), PublisherOptions::POSE).unwrap();
             publisher.offer(0, descriptor);
             // It is on its way before the next map is.
             publisher.finish();
         };
-        let send_all = |fleet: &mut [Puppet], tick| [1, 2, 0].map(|index| fleet[index].send(&scenario, tick));
+        let send_all = |fleet: &mut [ScriptedAgent], tick| [1, 2, 0].map(|index| fleet[index].send(&scenario, tick));
 
         send_all(&mut fleet, 0);
         assert_eq!(fused(&results.next()), ["20", "30"], "nothing is known of anybody");
@@ -518,7 +518,7 @@ fn maps_of_a_network_that_a_neighbour_names_as_another_are_left_out() {
         // It was started again, with the right weights.
         let restarted = fleet.remove(1);
         restarted.bus.session().close().wait().unwrap();
-        fleet.insert(1, Puppet::new(&router, 1));
+        fleet.insert(1, ScriptedAgent::new(&router, 1));
         fleet[1].wait_until_heard("ego-10");
         say(&fleet[1], own);
         send_all(&mut fleet, 3);
@@ -545,7 +545,7 @@ fn an_agent_hears_its_own_sensors_only_and_says_so_when_it_has_no_pose() {
             |cav_id| replay.publisher(topic(cav_id, Stream::Lidar), PublisherOptions::SENSOR.lossless(8)).unwrap();
         let (own, other) = (lidar("20"), lidar("10"));
         let route = Route { topic: topic("20", Stream::Lidar), receiver: "agent-20".parse().unwrap() };
-        bus::Barrier::new([route]).attend(&replay).unwrap().wait(PATIENCE).unwrap();
+        bus::Barrier::new([route]).await_routes(&replay).unwrap().wait(PATIENCE).unwrap();
         let frame = scenario.load(1, 0, &LoadOptions::default()).unwrap();
         // A sweep whose pose never comes.
         other.offer(1, protocol::Lidar { points: frame.points.clone() });

@@ -12,7 +12,7 @@ use tests::fleet::{Up, programs, results, write_scenario};
 use tests::locks::exclusive_lock;
 use tests::{localizer, scene};
 
-/// Runs `agent eval` on the scene in `folder`; exit code, standard output and standard error.
+/// RunScope `agent eval` on the scene in `folder`; exit code, standard output and standard error.
 fn eval(folder: &Path, encoder: &Path, head: &Path, more: &[&str]) -> (Option<i32>, String, String) {
     let [encoder, head] =
         [("--encoder", encoder), ("--head", head)].map(|(name, file)| [name.as_ref(), file.as_os_str()]);

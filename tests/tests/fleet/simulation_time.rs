@@ -9,10 +9,10 @@ use agent::rate::RateConfig;
 use deploy::operate::run_fleet::{RunResult, UpOptions, up};
 use deploy::scenario::Scenario;
 use ego_fuser::pairing::PairingConfig;
-use ego_fuser_offline::evaluation::stepped::{ComputeTimes, Crew, SteppedConfig};
+use ego_fuser_offline::evaluation::stepped::{AgentPool, ComputeTimes, SteppedConfig};
 use ego_fuser_offline::evaluation::{EvaluateConfig, EvaluatedFrame, Evaluator};
 use fusion::Method;
-use link::{ClockStep, DelayLaw, DeviceClock, LinkConfig, LossLaw};
+use link::{ClockStep, DelayModel, DeviceClock, LinkConfig, LossModel};
 use localization::pose_source::PoseSourceConfig;
 use protocol::{CodecConfig, DropReason, Dtype};
 use serde_json::Value;
@@ -31,7 +31,7 @@ fn config(link: LinkConfig) -> SteppedConfig {
         deadline_nanos: 100 * MS,
         pairing: PairingConfig::with_max_age_nanos(300 * MS),
         compute: ComputeTimes::NONE,
-        crew: Crew::First(usize::MAX),
+        crew: AgentPool::First(usize::MAX),
         vehicles: Default::default(),
         ticks: 0..usize::MAX,
         lidar_variant: None,
@@ -62,7 +62,7 @@ fn evaluate_with(
     };
     let mut evaluator = Evaluator::new(config).unwrap();
     if let Some(stepped) = stepped {
-        evaluator = evaluator.over_link(stepped);
+        evaluator = evaluator.with_link(stepped);
     }
     let scenario = dataset::open(&folder.join("scene")).unwrap().scenarios.remove(0);
     let mut frames = Vec::new();
@@ -125,7 +125,7 @@ fn the_ego_fuses_exactly_what_has_come_by_its_deadline() {
     for (delay_ms, compute_ms, age_ms, first_tick) in
         [(0.0, 100.0, 0, 0), (0.0, 80.0, 0, 0), (30.0, 80.0, 100, 1), (120.0, 80.0, 100, 1), (250.0, 0.0, 200, 2)]
     {
-        let link = LinkConfig { delay: DelayLaw::ConstantMs(delay_ms), ..LinkConfig::default() };
+        let link = LinkConfig { delay: DelayModel::ConstantMs(delay_ms), ..LinkConfig::default() };
         let compute =
             ComputeTimes { pose_ms: 20.0f64.min(compute_ms), map_ms: (compute_ms - 20.0).max(0.0), fuse_ms: 5.0 };
         let (frames, ledger) = evaluate(folder.path(), Some(SteppedConfig { compute, ..config(link) }));
@@ -140,7 +140,7 @@ fn the_ego_fuses_exactly_what_has_come_by_its_deadline() {
         assert!(ledger.balance().is_exact(), "{:?}", ledger.balance());
     }
     // Older than may be fused.
-    let link = LinkConfig { delay: DelayLaw::ConstantMs(450.0), ..LinkConfig::default() };
+    let link = LinkConfig { delay: DelayModel::ConstantMs(450.0), ..LinkConfig::default() };
     let (frames, ledger) = evaluate(folder.path(), Some(config(link)));
     assert!(frames.iter().all(|frame| frame.result.fused.is_empty() && frame.result.skipped.len() == 2));
     assert!(ledger.total().dropped[&DropReason::Stale] > 0 && ledger.balance().is_exact());
@@ -189,7 +189,7 @@ fn a_clock_that_is_set_costs_its_vehicle_and_nobody_else() {
 #[test]
 fn fewer_vehicles_leave_the_truth_as_it_is() {
     let folder = scene();
-    let crew = |count| SteppedConfig { crew: Crew::First(count), ..config(LinkConfig::default()) };
+    let crew = |count| SteppedConfig { crew: AgentPool::First(count), ..config(LinkConfig::default()) };
     let (all, _) = evaluate(folder.path(), Some(crew(3)));
     let (two, _) = evaluate(folder.path(), Some(crew(2)));
     assert!(all.iter().zip(&two).all(|(all, two)| all.objects == two.objects));
@@ -200,7 +200,7 @@ fn fewer_vehicles_leave_the_truth_as_it_is() {
 #[test]
 fn losses_are_counted_and_come_from_the_seed() {
     let folder = scene();
-    let link = LinkConfig { loss: LossLaw::Bernoulli(0.4), duplicate: 0.3, ..LinkConfig::default() };
+    let link = LinkConfig { loss: LossModel::Bernoulli(0.4), duplicate: 0.3, ..LinkConfig::default() };
     let run = |seed| evaluate(folder.path(), Some(SteppedConfig { seed, ..config(link.clone()) }));
     let ((frames, ledger), (again, same)) = (run(1), run(1));
     assert_eq!(ledger, same);

@@ -29,7 +29,7 @@ use tests::tensors::{integer, number, pillars, tensor, values};
 const ATOL: f64 = 2e-4;
 const RTOL: f64 = 1e-4;
 
-/// Runs the converter: the converted file and its standard output, or its standard error.
+/// RunScope the converter: the converted file and its standard output, or its standard error.
 fn convert(state: &Path, arguments: &[&str]) -> Result<(PathBuf, String), String> {
     let script = Path::new(env!("CARGO_MANIFEST_DIR")).join("../deploy/tools/convert_opencood.py");
     let out = state.with_extension("converted.safetensors");

@@ -46,7 +46,7 @@ fn reaches(sender: &Bus, topic_text: &str, receiver: &Arc<Inbox>) {
     loop {
         assert!(Instant::now() < deadline, "nothing comes on {topic_text}");
         publisher.offer(7, estimate());
-        if let bus::bounded_queue::Taken::Item(came, Event::Message(arrival)) =
+        if let bus::bounded_queue::Pop::Item(came, Event::Message(arrival)) =
             receiver.take(Some(Instant::now() + Duration::from_millis(100)))
             && came == topic(topic_text)
         {
@@ -77,11 +77,11 @@ fn a_fleet_with_keys_says_what_it_has_to() {
             reaches(sender, text, &inbox);
         }
     }
-    let tap = recorder.tap(&[protocol::Selector::run(&recorder.identity().run)], 64).unwrap();
+    let tap = recorder.tap(&[protocol::KeyExpr::run(&recorder.identity().run)], 64).unwrap();
     let (inbox, _subscription) = subscribe(&agent, "1/gnss");
     let publisher = replay.publisher(topic("1/gnss"), PublisherOptions::SENSOR).unwrap();
     let route = Route { topic: topic("1/gnss"), receiver: agent.identity().process.clone() };
-    Barrier::new([route]).attend(&replay).unwrap().wait(PATIENCE).unwrap();
+    Barrier::new([route]).await_routes(&replay).unwrap().wait(PATIENCE).unwrap();
     let measured = Gnss {
         world_from_lidar: Pose::IDENTITY,
         position_std_m: 0.0,
@@ -91,7 +91,7 @@ fn a_fleet_with_keys_says_what_it_has_to() {
     publisher.offer(3, measured);
     let (_, Event::Message(_)) = next_event(&inbox) else { panic!("an end before the message") };
     // The barrier knows nothing of those who only listen: their route may come up later.
-    let is_gnss = |taken| matches!(taken, bus::bounded_queue::Taken::Item(heard, _) if heard == topic("1/gnss"));
+    let is_gnss = |taken| matches!(taken, bus::bounded_queue::Pop::Item(heard, _) if heard == topic("1/gnss"));
     wait_for("the recorder", || {
         publisher.offer(3, measured);
         is_gnss(tap.take(Some(Instant::now())))
@@ -99,12 +99,12 @@ fn a_fleet_with_keys_says_what_it_has_to() {
     publisher.finish();
 
     // The replay sees that somebody looks.
-    let looking = viewer.tap(&[protocol::Selector::stream(&viewer.identity().run, Stream::Preview)], 4).unwrap();
+    let looking = viewer.tap(&[protocol::KeyExpr::stream(&viewer.identity().run, Stream::Preview)], 4).unwrap();
     let preview = replay.publisher(topic("1/@preview"), PublisherOptions::PREVIEW).unwrap();
     wait_for("an onlooker", || preview.is_wanted());
     wait_for("a preview", || {
         preview.offer(3, Lidar::default());
-        matches!(looking.take(Some(Instant::now())), bus::bounded_queue::Taken::Item(..))
+        matches!(looking.take(Some(Instant::now())), bus::bounded_queue::Pop::Item(..))
     });
     preview.finish();
     drop(looking);

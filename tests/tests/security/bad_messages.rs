@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 
 use agent::agent::{Agent, AgentInput};
 use bus::shutdown::Stop;
-use bus::{Barrier, Bus, Event, Presence, PublisherOptions, Route, process_id, unix_nanos};
+use bus::{Barrier, Bus, Event, LivelinessToken, PublisherOptions, Route, process_id, unix_nanos};
 use dataset::{self, LoadOptions, Scenario};
 use ego_fuser::ego::Ego;
 use ego_fuser::node::{self, NodeOptions};
@@ -16,9 +16,9 @@ use perception::model_config::DetectorConfig;
 use perception::pillars::point_pillars::PointPillars;
 use protocol::message::Bev;
 use protocol::{
-    Account, BevFeatures, BevGrid, Body, CavId, Codec, CodecConfig, Counts, Detection, Detections, DropReason, Dtype,
-    EncodedFeatures, HEADER_LEN, Ledger, Limits, Packing, PoseEstimate, Role, Selection, Stamp, Stream, Topic,
-    encode_features, wire,
+    Account, BevFeatures, BevGrid, Body, CavId, Codec, CodecConfig, Compression, Counts, Detection, Detections,
+    DropReason, Dtype, EncodedFeatures, HEADER_LEN, Ledger, Limits, PoseEstimate, Role, Selection, Stamp, Stream,
+    Topic, encode_features, wire,
 };
 use tch::Device;
 use tch::nn::VarStore;
@@ -57,7 +57,7 @@ struct Neighbour {
     place: usize,
     sequence: u64,
     sent: Vec<Vec<u8>>,
-    _presence: Presence,
+    _presence: LivelinessToken,
 }
 
 impl Neighbour {
@@ -67,7 +67,7 @@ impl Neighbour {
         // It probes its route; what is said is put by hand.
         let publisher = bus.publisher(bev_of(name), PublisherOptions::FEATURES).unwrap();
         let route = Route { topic: bev_of(name), receiver: "ego-10".parse().unwrap() };
-        Barrier::new([route]).attend(&bus).unwrap().wait(PATIENCE).unwrap();
+        Barrier::new([route]).await_routes(&bus).unwrap().wait(PATIENCE).unwrap();
         drop(publisher);
         let agent = Agent::new(cav(name), Box::new(RecordedPose), network());
         Self { bus, agent, place, sequence: 0, sent: Vec::new(), _presence: presence }
@@ -180,7 +180,7 @@ fn with_number(mut bytes: Vec<u8>, old: [f64; 2], new: f64) -> Vec<u8> {
 /// A few kilobytes that unpack to 64 MiB, where 8 KiB are announced.
 fn bomb(stamp: &Stamp, pose: PoseEstimate, grid: BevGrid) -> Vec<u8> {
     let zeros = zstd::bulk::compress(&vec![0; 64 << 20], 1).unwrap();
-    let codec = Codec { dtype: Dtype::F32, selection: Selection::Dense, packing: Packing::Zstd };
+    let codec = Codec { dtype: Dtype::F32, selection: Selection::Dense, packing: Compression::Zstd };
     let features = EncodedFeatures { grid, channels: 1, code_of: None, codec, rate: None, body: Body::Bytes(zeros) };
     wire::encode(stamp, Bev { pose, features }).unwrap().to_vec()
 }

@@ -26,7 +26,7 @@ pub use encoder_config::{SceneEncoderConfig, VoxelInput};
 pub use error::LocalizerError;
 pub use head_config::{RefinerConfig, SceneHeadConfig};
 pub use localize::{Localization, Localize, Localizer, LocalizerTimes, SceneCoordinates, sigma};
-pub use pose_evidence::{PoseEvidence, SecondEvidence};
+pub use pose_evidence::{PoseEvidence, RefinementEvidence};
 pub use refinement_network::Refiner;
 pub use scene_encoder::{LocalFeatures, SceneEncoder, SceneFeatures};
 pub use scene_regression::{Regression, SceneHead};

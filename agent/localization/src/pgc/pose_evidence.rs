@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 use super::localize::{SceneCoordinates, sigma};
-use super::pose_refinement::SecondLook;
+use super::pose_refinement::RefinedPose;
 use super::pose_std::PoseStd;
 use crate::registration::Registration;
 
@@ -29,12 +29,12 @@ pub struct PoseEvidence {
     /// The same of the orientation, radians.
     pub rotation_std_rad: f64,
     /// What a second look had to say, where there was one.
-    pub second: Option<SecondEvidence>,
+    pub second: Option<RefinementEvidence>,
 }
 
 /// Facts about the cells when they were looked at again, with the pose known roughly.
 #[derive(Debug, Clone, Copy, PartialEq, Serialize, Deserialize)]
-pub struct SecondEvidence {
+pub struct RefinementEvidence {
     /// Share of the cells that agree with the sharpened pose.
     pub inlier_ratio: f64,
     /// Root mean square of their residuals, metres.
@@ -60,7 +60,7 @@ impl PoseEvidence {
     pub(super) fn gather(
         coordinates: &SceneCoordinates,
         registration: &Registration,
-        second: Option<&SecondLook>,
+        second: Option<&RefinedPose>,
     ) -> Self {
         let std = second.map_or_else(|| first_std(coordinates, registration), |second| second.std);
         Self {
@@ -73,7 +73,7 @@ impl PoseEvidence {
             inlier_sigma: mean_over(&registration.inliers, &coordinates.epsilon_m, |epsilon| f64::from(sigma(epsilon))),
             position_std_m: std.position_m,
             rotation_std_rad: std.rotation_rad,
-            second: second.map(|second| SecondEvidence::gather(registration, second)),
+            second: second.map(|second| RefinementEvidence::gather(registration, second)),
         }
     }
 
@@ -103,9 +103,9 @@ impl PoseEvidence {
     }
 }
 
-impl SecondEvidence {
-    fn gather(first: &Registration, second: &SecondLook) -> Self {
-        let SecondLook { registration, epsilon_m, residual_quartile_m, std, information_per_m2 } = second;
+impl RefinementEvidence {
+    fn gather(first: &Registration, second: &RefinedPose) -> Self {
+        let RefinedPose { registration, epsilon_m, residual_quartile_m, std, information_per_m2 } = second;
         let moved = registration.target_from_source.translation.vector - first.target_from_source.translation.vector;
         Self {
             inlier_ratio: registration.inlier_ratio,
@@ -143,10 +143,10 @@ fn first_std(coordinates: &SceneCoordinates, registration: &Registration) -> Pos
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::pgc::synthetic::SyntheticTown;
+    use crate::pgc::synthetic::SyntheticScene;
     use crate::registration::ransac::{RansacConfig, solve};
 
-    fn evidence(town: &SyntheticTown) -> PoseEvidence {
+    fn evidence(town: &SyntheticScene) -> PoseEvidence {
         let coordinates = town.coordinates(1);
         let found = solve(&coordinates.correspondences(), &RansacConfig::default()).unwrap();
         PoseEvidence::gather(&coordinates, &found, None)
@@ -154,8 +154,8 @@ mod tests {
 
     #[test]
     fn worse_cells_leave_worse_evidence() {
-        let good = evidence(&SyntheticTown::default());
-        let bad = evidence(&SyntheticTown { outliers: 0.7, noise_m: 0.6, ..SyntheticTown::default() });
+        let good = evidence(&SyntheticScene::default());
+        let bad = evidence(&SyntheticScene { outliers: 0.7, noise_m: 0.6, ..SyntheticScene::default() });
         assert!(good.inlier_ratio > bad.inlier_ratio && good.rms_m < bad.rms_m);
         assert!(good.position_std_m < bad.position_std_m && good.rotation_std_rad < bad.rotation_std_rad);
         assert!(good.inlier_epsilon_m < bad.inlier_epsilon_m && good.median_epsilon_m < bad.median_epsilon_m);
@@ -166,12 +166,12 @@ mod tests {
 
     #[test]
     fn a_second_look_decides_the_confidence_of_cells_and_not_their_share() {
-        let coordinates = SyntheticTown::default().coordinates(1);
+        let coordinates = SyntheticScene::default().coordinates(1);
         let pairs = coordinates.correspondences();
         let found = solve(&pairs, &RansacConfig::default()).unwrap();
         let mut sharper = Registration::judge(&pairs, found.target_from_source, 1.0);
         sharper.target_from_source.translation.vector.x += 0.3;
-        let second = SecondLook {
+        let second = RefinedPose {
             registration: sharper,
             epsilon_m: vec![0.0; pairs.len()],
             residual_quartile_m: 0.1,

@@ -28,7 +28,7 @@ pub struct SweepCells {
 
 /// A sharpened pose and the answers that it rests on.
 #[derive(Debug, Clone, PartialEq)]
-pub(super) struct SecondLook {
+pub(super) struct RefinedPose {
     /// `origin_from_sensor` and who agrees with it.
     pub(super) registration: Registration,
     /// `[N]`: predicted L1 error of each cell's last answer, metres.
@@ -49,13 +49,13 @@ pub(super) struct SecondLook {
 ///
 /// # Errors
 /// The tensor library's.
-pub(super) fn look_again(
+pub(super) fn refine(
     head: &SceneHead,
     cells: &SweepCells,
     start: &Isometry3<f64>,
     is_wide: bool,
     kind: Kind,
-) -> Result<Option<SecondLook>, TchError> {
+) -> Result<Option<RefinedPose>, TchError> {
     let Some(refiner) = head.refiner() else { return Ok(None) };
     let sensor_m = &cells.sensor_m;
     let cells = head.normalise(&cells.features)?;
@@ -99,7 +99,7 @@ pub(super) fn look_again(
         let std = PoseStd::of(&pose, weighted.into_iter());
         let registration = Registration::judge(&pairs, pose, AGREES_M);
         let residual_quartile_m = lower_quartile(pairs.iter().map(|pair| distance_m(pair, &pose)).collect());
-        answer = Some(SecondLook { registration, epsilon_m, residual_quartile_m, std, information_per_m2 });
+        answer = Some(RefinedPose { registration, epsilon_m, residual_quartile_m, std, information_per_m2 });
     }
     Ok(answer)
 }

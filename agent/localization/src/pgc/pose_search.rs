@@ -5,7 +5,7 @@ use std::time::{Duration, Instant};
 use tch::{Kind, TchError};
 
 use super::localize::SceneCoordinates;
-use super::pose_refinement::{SweepCells, look_again};
+use super::pose_refinement::{SweepCells, refine};
 use super::pose_solver::{FoundPose, PoseSolver, Solved};
 use super::scene_regression::SceneHead;
 use crate::registration::NoRegistration;
@@ -84,7 +84,7 @@ impl PoseSearch<'_> {
         };
         let start = Instant::now();
         let (pose, is_wide) = (rough.target_from_source, factor > 1.0);
-        let second = look_again(self.head, again, &pose, is_wide, self.kind)?;
+        let second = refine(self.head, again, &pose, is_wide, self.kind)?;
         let found = self.solver.judge(coordinates, &rough, second.as_ref());
         let agreement = second.map_or(rough.inlier_ratio, |second| second.registration.inlier_ratio);
         times.refine += start.elapsed();

@@ -6,7 +6,7 @@ use protocol::{NoPoseReason, PoseEstimate};
 use super::confidence::Confidence;
 use super::localize::SceneCoordinates;
 use super::pose_evidence::PoseEvidence;
-use super::pose_refinement::SecondLook;
+use super::pose_refinement::RefinedPose;
 use crate::registration::ransac::{self, RansacConfig};
 use crate::registration::sc2pcr::{self, Sc2PcrConfig};
 use crate::registration::{NoRegistration, Registration};
@@ -98,7 +98,7 @@ impl PoseSolver {
         &self,
         coordinates: &SceneCoordinates,
         registration: &Registration,
-        second: Option<&SecondLook>,
+        second: Option<&RefinedPose>,
     ) -> FoundPose {
         let evidence = PoseEvidence::gather(coordinates, registration, second);
         let sigma = self.confidence.sigma(&evidence);
@@ -130,11 +130,11 @@ pub fn estimate(solved: &Solved) -> PoseEstimate {
 mod tests {
     use super::*;
     use crate::pgc::confidence::ConfidenceModel;
-    use crate::pgc::synthetic::SyntheticTown;
+    use crate::pgc::synthetic::SyntheticScene;
 
     #[test]
     fn a_sweep_is_found_far_from_the_origin_of_the_world() {
-        let town = SyntheticTown::default();
+        let town = SyntheticScene::default();
         for solver in [Solver::default(), Solver::Sc2Pcr(Sc2PcrConfig::default())] {
             let solver = PoseSolver { solver, ..PoseSolver::default() };
             for seed in 0..5 {
@@ -150,7 +150,7 @@ mod tests {
 
     #[test]
     fn cells_that_are_metres_off_are_found_by_a_wider_search() {
-        let town = SyntheticTown { noise_m: 2.5, outliers: 0.3, ..SyntheticTown::default() };
+        let town = SyntheticScene { noise_m: 2.5, outliers: 0.3, ..SyntheticScene::default() };
         let solver = PoseSolver::default();
         let off_m = |factor| {
             let errors = (0..6).map(|seed| match solver.search_wider(&town.coordinates(seed), factor) {
@@ -168,24 +168,24 @@ mod tests {
 
     #[test]
     fn what_is_thin_is_no_pose_and_says_why() {
-        let reason = |town: &SyntheticTown| match estimate(&PoseSolver::default().solve(&town.coordinates(3))) {
+        let reason = |town: &SyntheticScene| match estimate(&PoseSolver::default().solve(&town.coordinates(3))) {
             PoseEstimate::NoPose { reason, .. } => Some(reason),
             PoseEstimate::Pose { .. } => None,
         };
-        let town = SyntheticTown::default();
+        let town = SyntheticScene::default();
         assert_eq!(reason(&town), None);
-        assert_eq!(reason(&SyntheticTown { cells: 0, ..town.clone() }), Some(NoPoseReason::TooFewPoints));
-        assert_eq!(reason(&SyntheticTown { cells: 10, ..town.clone() }), Some(NoPoseReason::TooFewPoints));
-        assert_eq!(reason(&SyntheticTown { outliers: 1.0, ..town }), Some(NoPoseReason::TooFewInliers));
+        assert_eq!(reason(&SyntheticScene { cells: 0, ..town.clone() }), Some(NoPoseReason::TooFewPoints));
+        assert_eq!(reason(&SyntheticScene { cells: 10, ..town.clone() }), Some(NoPoseReason::TooFewPoints));
+        assert_eq!(reason(&SyntheticScene { outliers: 1.0, ..town }), Some(NoPoseReason::TooFewInliers));
     }
 
     #[test]
     fn numbers_that_are_none_are_no_pose() {
-        let mut coordinates = SyntheticTown::default().coordinates(1);
+        let mut coordinates = SyntheticScene::default().coordinates(1);
         coordinates.world_m.iter_mut().for_each(|point| point[1] = f32::NAN);
         let none = estimate(&PoseSolver::default().solve(&coordinates));
         assert!(matches!(none, PoseEstimate::NoPose { reason: NoPoseReason::TooFewPoints, .. }));
-        let mut coordinates = SyntheticTown::default().coordinates(1);
+        let mut coordinates = SyntheticScene::default().coordinates(1);
         coordinates.epsilon_m.iter_mut().for_each(|epsilon| *epsilon = f32::NAN);
         assert!(PoseSolver::default().solve(&coordinates).is_err());
     }
@@ -194,7 +194,7 @@ mod tests {
     fn a_pose_that_little_speaks_for_is_withheld_with_its_inliers() {
         let strict = ConfidenceModel { withhold_below: 0.99, ..ConfidenceModel::example() };
         let solver = PoseSolver { confidence: Confidence::Calibrated(strict), ..PoseSolver::default() };
-        let town = SyntheticTown { outliers: 0.8, noise_m: 0.6, ..SyntheticTown::default() };
+        let town = SyntheticScene { outliers: 0.8, noise_m: 0.6, ..SyntheticScene::default() };
         let solved = solver.solve(&town.coordinates(1));
         let found = solved.as_ref().unwrap();
         let PoseEstimate::NoPose { reason, inlier_count } = estimate(&solved) else { panic!("{solved:?}") };

@@ -15,7 +15,7 @@ const ORIGIN_M: [f64; 3] = [500_000.0, 5_700_000.0, 100.0];
 
 /// What the cells of its sweeps are like.
 #[derive(Debug, Clone)]
-pub struct SyntheticTown {
+pub struct SyntheticScene {
     /// Cells of a sweep.
     pub cells: usize,
     /// Share of cells that are anywhere in town.
@@ -28,13 +28,13 @@ pub struct SyntheticTown {
     pub next_seed: u64,
 }
 
-impl Default for SyntheticTown {
+impl Default for SyntheticScene {
     fn default() -> Self {
         Self { cells: 300, outliers: 0.2, twins: 0.0, noise_m: 0.2, next_seed: 0 }
     }
 }
 
-impl SyntheticTown {
+impl SyntheticScene {
     /// Where the sweep of a seed was made.
     pub fn world_from_sensor(&self, seed: u64) -> Isometry3<f64> {
         let mut local = local_pose(seed);
@@ -71,7 +71,7 @@ impl SyntheticTown {
     }
 }
 
-impl Localize for SyntheticTown {
+impl Localize for SyntheticScene {
     fn localize(&mut self, _: &PointCloud) -> Result<Localization, LocalizerError> {
         self.next_seed += 1;
         let solved = PoseSolver::default().solve(&self.coordinates(self.next_seed - 1));

@@ -7,7 +7,7 @@ use schemars::JsonSchema;
 use serde::{Deserialize, Serialize};
 use tch::Device;
 
-use super::motion_gate::{MotionSanity, SanityConfig};
+use super::motion_gate::{MotionGate, MotionGateConfig};
 use super::{PoseInput, PoseSource};
 use crate::competitors::EndToEndLocalizer;
 use crate::pgc::{Localize, Localizer, LocalizerError};
@@ -25,7 +25,7 @@ pub struct PgcConfig {
     /// Motion that the vehicle is capable of.
     #[arg(skip)]
     #[serde(default)]
-    pub sanity: SanityConfig,
+    pub sanity: MotionGateConfig,
 }
 
 /// A network that was trained end to end, to compare a pose generator with.
@@ -38,14 +38,14 @@ pub struct EndToEndPoseConfig {
     /// Motion that the vehicle is capable of.
     #[arg(skip)]
     #[serde(default)]
-    pub sanity: SanityConfig,
+    pub sanity: MotionGateConfig,
 }
 
 /// Localises every sweep and judges the pose by those before it.
 #[derive(Debug)]
 pub struct LocalizedPose {
     localizer: Box<dyn Localize>,
-    sanity: MotionSanity,
+    sanity: MotionGate,
     times: Vec<StageTiming>,
 }
 
@@ -70,8 +70,8 @@ impl LocalizedPose {
 
     /// The same with another way to localise.
     #[must_use]
-    pub fn new(localizer: Box<dyn Localize>, sanity: SanityConfig) -> Self {
-        Self { localizer, sanity: MotionSanity::new(sanity), times: Vec::new() }
+    pub fn new(localizer: Box<dyn Localize>, sanity: MotionGateConfig) -> Self {
+        Self { localizer, sanity: MotionGate::new(sanity), times: Vec::new() }
     }
 }
 
@@ -112,7 +112,7 @@ mod tests {
     use protocol::{CavId, PointCloud, Pose};
 
     use super::*;
-    use crate::pgc::synthetic::SyntheticTown;
+    use crate::pgc::synthetic::SyntheticScene;
     use crate::pgc::{Localization, LocalizerTimes};
 
     fn estimates(source: &mut LocalizedPose, count: u64) -> Vec<PoseEstimate> {
@@ -127,8 +127,8 @@ mod tests {
 
     #[test]
     fn the_pose_comes_from_the_sweep_and_jumps_cost_confidence() {
-        let town = SyntheticTown::default();
-        let mut source = LocalizedPose::new(Box::new(town.clone()), SanityConfig::default());
+        let town = SyntheticScene::default();
+        let mut source = LocalizedPose::new(Box::new(town.clone()), MotionGateConfig::default());
         let found = estimates(&mut source, 2);
         for (seed, estimate) in found.iter().enumerate() {
             let off = town.world_from_sensor(seed as u64).inv_mul(&estimate.world_from_cav().unwrap().isometry());
@@ -152,14 +152,14 @@ mod tests {
     #[test]
     fn a_localizer_that_fails_gives_no_pose() {
         let none = PoseEstimate::NoPose { reason: NoPoseReason::Failed, inlier_count: 0 };
-        assert_eq!(estimates(&mut LocalizedPose::new(Box::new(Broken), SanityConfig::default()), 1), [none]);
+        assert_eq!(estimates(&mut LocalizedPose::new(Box::new(Broken), MotionGateConfig::default()), 1), [none]);
         assert_eq!(LocalizerTimes::default().stages().len(), 5);
     }
 
     #[test]
     fn no_pose_stays_no_pose() {
-        let empty = SyntheticTown { cells: 0, ..SyntheticTown::default() };
-        let found = estimates(&mut LocalizedPose::new(Box::new(empty), SanityConfig::default()), 3);
+        let empty = SyntheticScene { cells: 0, ..SyntheticScene::default() };
+        let found = estimates(&mut LocalizedPose::new(Box::new(empty), MotionGateConfig::default()), 3);
         assert!(found.iter().all(|estimate| estimate.world_from_cav().is_none()));
     }
 }

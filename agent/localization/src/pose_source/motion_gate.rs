@@ -18,7 +18,7 @@ const SPEED_BASE_S: f64 = 0.3;
 /// What a vehicle can do.
 #[derive(Debug, Clone, PartialEq, Serialize, Deserialize, JsonSchema)]
 #[serde(default, deny_unknown_fields)]
-pub struct SanityConfig {
+pub struct MotionGateConfig {
     /// Largest speed, metres per second.
     pub max_speed_mps: f64,
     /// Largest acceleration or deceleration, metres per second squared.
@@ -37,7 +37,7 @@ pub struct SanityConfig {
     pub penalty: f64,
 }
 
-impl Default for SanityConfig {
+impl Default for MotionGateConfig {
     /// A car, and poses that are right to a metre or so.
     fn default() -> Self {
         Self {
@@ -72,8 +72,8 @@ struct TimedPose {
 
 /// Remembers where a vehicle was.
 #[derive(Debug, Clone)]
-pub struct MotionSanity {
-    config: SanityConfig,
+pub struct MotionGate {
+    config: MotionGateConfig,
     /// Accepted poses of the last moments, oldest first.
     accepted: VecDeque<TimedPose>,
     /// Jumps in a row that can be reached from each other.
@@ -81,10 +81,10 @@ pub struct MotionSanity {
     jumps: u64,
 }
 
-impl MotionSanity {
+impl MotionGate {
     /// Remembers nothing yet.
     #[must_use]
-    pub fn new(config: SanityConfig) -> Self {
+    pub fn new(config: MotionGateConfig) -> Self {
         Self { config, accepted: VecDeque::new(), elsewhere: Vec::new(), jumps: 0 }
     }
 
@@ -190,14 +190,14 @@ mod tests {
     }
 
     /// The verdicts on poses a tenth of a second apart.
-    fn verdicts(sanity: &mut MotionSanity, poses: &[Isometry3<f64>]) -> Vec<Verdict> {
+    fn verdicts(sanity: &mut MotionGate, poses: &[Isometry3<f64>]) -> Vec<Verdict> {
         let capture = |step: usize| step as u64 * TENTH_NANOS;
         poses.iter().enumerate().map(|(step, pose)| sanity.judge(capture(step), pose)).collect()
     }
 
     #[test]
     fn a_drive_through_a_bend_is_no_jump() {
-        let mut sanity = MotionSanity::new(SanityConfig::default());
+        let mut sanity = MotionGate::new(MotionGateConfig::default());
         // 15 m/s, 30 degrees a second, with poses that shake by half a metre.
         let drive: Vec<_> = (0..80)
             .map(|step| {
@@ -213,7 +213,7 @@ mod tests {
 
     #[test]
     fn a_jump_is_counted_and_forgotten() {
-        let mut sanity = MotionSanity::new(SanityConfig::default());
+        let mut sanity = MotionGate::new(MotionGateConfig::default());
         let mut drive: Vec<_> = (0..12).map(|step| at(f64::from(step), 0.0, 0.0)).collect();
         drive[6] = at(6.0, 40.0, 0.0);
         drive[9] = at(9.0, 0.0, 180.0);
@@ -228,7 +228,7 @@ mod tests {
 
     #[test]
     fn poses_that_agree_on_a_new_place_are_believed() {
-        let mut sanity = MotionSanity::new(SanityConfig::default());
+        let mut sanity = MotionGate::new(MotionGateConfig::default());
         let mut drive = vec![at(500.0, 0.0, 0.0)];
         drive.extend((0..5).map(|step| at(f64::from(step), 0.0, 0.0)));
         use Verdict::{Jump, NewPlace, Reachable};
@@ -237,7 +237,7 @@ mod tests {
 
     #[test]
     fn jumps_that_do_not_agree_are_never_believed() {
-        let mut sanity = MotionSanity::new(SanityConfig::default());
+        let mut sanity = MotionGate::new(MotionGateConfig::default());
         let anywhere = (0..20).map(|step| at(f64::from((step * 7919) % 400), 100.0 + f64::from(step * 60), 0.0));
         let drive: Vec<_> = std::iter::once(at(0.0, 0.0, 0.0)).chain(anywhere).collect();
         assert!(verdicts(&mut sanity, &drive)[1..].iter().all(|&verdict| verdict == Verdict::Jump));
@@ -247,7 +247,7 @@ mod tests {
     #[test]
     fn a_step_is_judged_by_the_speed_before_it() {
         let standing: Vec<_> = (0..10).map(|_| at(0.0, 0.0, 0.0)).collect();
-        let mut sanity = MotionSanity::new(SanityConfig::default());
+        let mut sanity = MotionGate::new(MotionGateConfig::default());
         verdicts(&mut sanity, &standing);
         // A car at 50 m/s could be there, one that stood a moment ago cannot.
         assert_eq!(sanity.judge(10 * TENTH_NANOS, &at(5.0, 0.0, 0.0)), Verdict::Jump);
@@ -255,7 +255,7 @@ mod tests {
 
     #[test]
     fn a_scene_that_begins_anew_or_a_long_gap_forgets() {
-        let mut sanity = MotionSanity::new(SanityConfig::default());
+        let mut sanity = MotionGate::new(MotionGateConfig::default());
         assert_eq!(sanity.judge(90_000_000_000, &at(0.0, 0.0, 0.0)), Verdict::Reachable);
         assert_eq!(sanity.judge(0, &at(900.0, 0.0, 0.0)), Verdict::Reachable);
         assert_eq!(sanity.judge(60_000_000_000, &at(0.0, 0.0, 90.0)), Verdict::Reachable);

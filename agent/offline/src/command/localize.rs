@@ -4,7 +4,7 @@ use std::path::{Path, PathBuf};
 
 use dataset::{self, LeftOut, LoadOptions, Problem, Scenario};
 use indicatif::ProgressBar;
-use localization::pose_source::motion_gate::SanityConfig;
+use localization::pose_source::motion_gate::MotionGateConfig;
 use localization::pose_source::{LocalizedPose, PgcConfig, PoseInput, PoseRow, PoseSource, PoseTable};
 use protocol::PoseEstimate;
 use support::output;
@@ -75,7 +75,7 @@ impl Args {
         left_out: &mut LeftOut,
         bar: &ProgressBar,
     ) -> anyhow::Result<usize> {
-        let sanity = SanityConfig::default();
+        let sanity = MotionGateConfig::default();
         let config = PgcConfig { encoder: self.encoder.clone(), head: head.to_owned(), sanity };
         let mut rows: Vec<PoseRow<'_>> = Vec::new();
         for (agent, cav) in scenario.agents.iter().enumerate() {

@@ -215,7 +215,7 @@ fn outcome(estimate: &PoseEstimate) -> &'static str {
 #[cfg(test)]
 pub(super) mod tests {
     use super::*;
-    use localization::pgc::synthetic::SyntheticTown;
+    use localization::pgc::synthetic::SyntheticScene;
     use protocol::PointCloud;
 
     /// Sweeps of a town that gets harder and harder; every tenth is empty.
@@ -226,7 +226,7 @@ pub(super) mod tests {
                 let outliers = 0.1 + 0.85 * hardness;
                 let twins = 0.6 * hardness;
                 let cells = if seed % 10 == 9 { 0 } else { 300 };
-                let mut town = SyntheticTown { cells, outliers, twins, next_seed: seed, ..SyntheticTown::default() };
+                let mut town = SyntheticScene { cells, outliers, twins, next_seed: seed, ..SyntheticScene::default() };
                 EvaluatedSweep {
                     scenario: "town".into(),
                     cav: CavId::new("7").unwrap(),
@@ -257,7 +257,7 @@ pub(super) mod tests {
         let empty = tempfile::tempdir().unwrap();
         let options =
             EvaluationOptions { scenes: vec![empty.path().to_owned()], variant: None, every: 1, sweeps: None };
-        let error = evaluate(&mut SyntheticTown::default(), &options, &mut |_, _| {}).unwrap_err().to_string();
+        let error = evaluate(&mut SyntheticScene::default(), &options, &mut |_, _| {}).unwrap_err().to_string();
         assert!(error.contains(&empty.path().display().to_string()), "{error}");
     }
 }

@@ -10,7 +10,7 @@ use localization::pgc::{SceneEncoderConfig, SweepVoxels};
 /// Cells of a sweep that are learnt from.
 pub(super) const CELLS: usize = 400;
 
-/// A sweep, turned and thinned out.
+/// A sweep, turned and decimate out.
 pub(super) struct TurnedSweep {
     pub(super) voxels: SweepVoxels,
     /// Which of its cells are learnt from.

@@ -32,7 +32,7 @@ impl Default for AdamWConfig {
 #[derive(Debug, Clone, Copy, PartialEq)]
 pub enum Step {
     /// Parameters moved; the norm of the gradient before it was clipped.
-    Taken(f64),
+    Pop(f64),
     /// The gradient was not finite, so nothing moved.
     Skipped,
 }
@@ -106,7 +106,7 @@ impl AdamW {
                 let change = (&entry.mean * (learning_rate / mean_correction)).f_div_(&deviation)?;
                 let _ = entry.variable.f_sub_(&change)?;
             }
-            Ok(Step::Taken(norm))
+            Ok(Step::Pop(norm))
         })
     }
 
@@ -166,7 +166,7 @@ mod tests {
         for _ in 0..steps {
             optimizer.zero_grad();
             (point - Tensor::from_slice(&[1f32, -1.0])).square().sum(Kind::Float).backward();
-            assert!(matches!(optimizer.step(0.1).unwrap(), Step::Taken(_)));
+            assert!(matches!(optimizer.step(0.1).unwrap(), Step::Pop(_)));
         }
     }
 

@@ -21,7 +21,7 @@ const FOUND_IOU: f64 = 0.5;
 const SCENARIO_GAP_NANOS: u64 = 10_000_000_000;
 
 /// The score so far. Ticks are judged in the order of their capture times, whatever order their parts come in.
-pub struct Board {
+pub struct FrameScores {
     ego: CavId,
     rule: GroundTruthRule,
     nominal_values: u64,
@@ -38,7 +38,7 @@ pub struct Board {
     best: Option<JudgedFrame>,
 }
 
-impl Board {
+impl FrameScores {
     /// An empty board for the detections of `ego`, judged by `rule`; a feature map of the model has `nominal_values`
     /// numbers.
     #[must_use]

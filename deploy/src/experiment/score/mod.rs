@@ -12,7 +12,7 @@ mod stage_stamps;
 mod true_boxes;
 
 pub use frame_record::{FrameRecord, JudgedFrame};
-pub use frame_scores::Board;
+pub use frame_scores::FrameScores;
 pub use neighbours::NeighbourRecord;
 pub use node::{ProcessBooks, Progress, Scored, ScorerError, ScorerNode, scorer_cav};
 pub use stage_stamps::StageStamps;

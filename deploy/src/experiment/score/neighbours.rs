@@ -2,7 +2,7 @@
 
 use std::collections::BTreeMap;
 
-use protocol::{CavId, Detections, Doubt, DropReason};
+use protocol::{CavId, Detections, DropReason, MisbehaviourReason};
 use serde::{Deserialize, Serialize};
 
 /// Neighbours that are told apart: no scene has more.
@@ -16,7 +16,7 @@ pub struct NeighbourRecord {
     /// Frames that they are not in, by reason; those for which nothing came are not counted.
     pub left_out: BTreeMap<DropReason, u64>,
     /// Frames that it was left out of because it was not believed, by what spoke against it.
-    pub doubts: BTreeMap<Doubt, u64>,
+    pub doubts: BTreeMap<MisbehaviourReason, u64>,
     /// How likely the ego thought it honest at last, 0..=1; none where the ego does not ask.
     pub trust: Option<f64>,
     /// The least that it ever was.
@@ -24,7 +24,7 @@ pub struct NeighbourRecord {
     /// Its clock less the ego's, less the shortest time a message was under way, at last, seconds; none in virtual time.
     pub clock_offset_s: Option<f64>,
     /// Why it was not believed at last, if it was not.
-    pub doubt: Option<Doubt>,
+    pub doubt: Option<MisbehaviourReason>,
 }
 
 /// Adds what a result says of the neighbours.

@@ -6,18 +6,18 @@ use std::sync::{Arc, Mutex, PoisonError};
 use std::thread::{self, JoinHandle};
 use std::time::{Duration, Instant};
 
-use bus::bounded_queue::Taken;
-use bus::{Arrival, Bus, BusError, Event, Identity, Inbox, Presence, Subscription, process_id};
+use bus::bounded_queue::Pop;
+use bus::{Arrival, Bus, BusError, Event, Identity, Inbox, LivelinessToken, Subscription, process_id};
 use protocol::{
-    CavId, Detections, DetectionsReport, HeardNeighbour, Ledger, Limits, PoseEstimate, ProcessId, Role, RunId,
-    Selector, StageSummary, Stats, Stream, Topic, Truth,
+    CavId, Detections, DetectionsReport, HeardNeighbour, KeyExpr, Ledger, Limits, PoseEstimate, ProcessId, Role, RunId,
+    StageSummary, Stats, Stream, Topic, Truth,
 };
 use zenoh::Session;
 
-use super::Board;
+use super::FrameScores;
 use super::numbered_results::NumberedResults;
 use super::result_lines::ResultLines;
-use crate::operate::offline_intervals::Absences;
+use crate::operate::offline_intervals::OfflineIntervals;
 
 /// Name of the scorer in keys, ledgers and routes.
 const SCORER: &str = "scorer";
@@ -76,12 +76,12 @@ pub struct ProcessBooks {
 const MAX_LIVES: usize = 1024;
 
 /// The last books of every process and epoch.
-type Books = BTreeMap<(ProcessId, u64), ProcessBooks>;
+type ScoreStats = BTreeMap<(ProcessId, u64), ProcessBooks>;
 
 /// Everything the scorer has at the end.
 pub struct Scored {
     /// Detections against the truth.
-    pub board: Board,
+    pub board: FrameScores,
     /// The last word of every process, by process and life.
     pub books: Vec<ProcessBooks>,
     /// How it went.
@@ -111,10 +111,10 @@ pub struct ScorerNode {
     bus: Bus,
     inbox: Arc<Inbox>,
     progress: Arc<Mutex<Progress>>,
-    thread: JoinHandle<(Board, Books, u64)>,
-    absences: Absences,
+    thread: JoinHandle<(FrameScores, ScoreStats, u64)>,
+    absences: OfflineIntervals,
     _subscriptions: Vec<Subscription>,
-    _presence: Presence,
+    _presence: LivelinessToken,
 }
 
 impl ScorerNode {
@@ -128,7 +128,7 @@ impl ScorerNode {
         run: &RunId,
         agents: &[CavId],
         ego: &CavId,
-        board: Board,
+        board: FrameScores,
         detections_file: PathBuf,
     ) -> Result<Self, ScorerError> {
         let cav = scorer_cav();
@@ -139,13 +139,13 @@ impl ScorerNode {
         let mut subscriptions = vec![
             bus.subscribe(Topic::Truth, &inbox)?,
             bus.subscribe(detections, &inbox)?,
-            bus.subscribe_all(&Selector::stats(run), &inbox)?,
+            bus.subscribe_all(&KeyExpr::stats(run), &inbox)?,
         ];
         for cav in agents {
             subscriptions.push(bus.subscribe(Topic::Stream { cav: cav.clone(), stream: Stream::Pose }, &inbox)?);
         }
         let presence = bus.announce(Role::Scorer)?;
-        let absences = Absences::watch(&bus)?;
+        let absences = OfflineIntervals::watch(&bus)?;
         let io = |what: String| move |source| ScorerError::Io { what, source };
         let detections = ResultLines::create(&detections_file).map_err(io(detections_file.display().to_string()))?;
         let progress = Arc::<Mutex<Progress>>::default();
@@ -221,9 +221,9 @@ pub fn scorer_cav() -> CavId {
 /// The scorer's thread.
 struct Worker {
     inbox: Arc<Inbox>,
-    bus_books: bus::Books,
-    board: Board,
-    books: Books,
+    bus_books: bus::MessageStats,
+    board: FrameScores,
+    books: ScoreStats,
     progress: Arc<Mutex<Progress>>,
     detections: ResultLines,
     numbered: NumberedResults,
@@ -232,13 +232,13 @@ struct Worker {
 }
 
 impl Worker {
-    fn run(mut self) -> (Board, Books, u64) {
+    fn run(mut self) -> (FrameScores, ScoreStats, u64) {
         loop {
             match self.inbox.take(None) {
-                Taken::Item(topic, Event::Message(arrival)) => self.take(&topic, &arrival),
-                Taken::Item(Topic::Truth, Event::End { .. }) => self.note(|progress| progress.ended = true),
-                Taken::Item(_, Event::End { .. }) | Taken::TimedOut => {}
-                Taken::Closed => break,
+                Pop::Item(topic, Event::Message(arrival)) => self.take(&topic, &arrival),
+                Pop::Item(Topic::Truth, Event::End { .. }) => self.note(|progress| progress.ended = true),
+                Pop::Item(_, Event::End { .. }) | Pop::TimedOut => {}
+                Pop::Closed => break,
             }
         }
         self.write_results(true);

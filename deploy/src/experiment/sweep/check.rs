@@ -5,7 +5,7 @@ use std::fmt::Debug;
 use bus::InboxConfig;
 use dataset::Scenario;
 use fusion::Exchange;
-use link::{CapacityConfig, DelayLaw, LinkConfig, LossLaw};
+use link::{CapacityConfig, DelayModel, LinkConfig, LossModel};
 
 use super::spec::{CodecSpec, Experiment, Grid, NoiseSpec};
 use localization::pose_source::{NoiseMode, PoseSourceConfig};
@@ -98,13 +98,13 @@ fn contradictions(experiment: &Experiment, link: &LinkConfig) -> Result<(), Stri
     if experiment.noise_mode == NoiseMode::Replayed {
         return Err("noise_mode is replayed, which needs a table: name it in poses instead".into());
     }
-    if grid.latency_ms.is_some() && link.delay != DelayLaw::None {
+    if grid.latency_ms.is_some() && link.delay != DelayModel::None {
         return says("grid.latency_ms", "delay");
     }
     if grid.bandwidth_mbps.is_some() && link.capacity != CapacityConfig::Unlimited {
         return says("grid.bandwidth_mbps", "capacity");
     }
-    if grid.loss.is_some() && link.loss != LossLaw::None {
+    if grid.loss.is_some() && link.loss != LossModel::None {
         return says("grid.loss", "loss");
     }
     if grid.jitter_ms.is_some() && grid.latency_ms.is_none() {
@@ -141,8 +141,8 @@ fn contradictions(experiment: &Experiment, link: &LinkConfig) -> Result<(), Stri
 }
 
 fn is_random(link: &LinkConfig) -> bool {
-    let delay = !matches!(link.delay, DelayLaw::None | DelayLaw::ConstantMs(_) | DelayLaw::Trace);
-    delay || link.loss != LossLaw::None || link.reorder.is_some() || link.duplicate > 0.0
+    let delay = !matches!(link.delay, DelayModel::None | DelayModel::ConstantMs(_) | DelayModel::Trace);
+    delay || link.loss != LossModel::None || link.reorder.is_some() || link.duplicate > 0.0
 }
 
 /// Checks each value of an axis, and that there are some and none twice.

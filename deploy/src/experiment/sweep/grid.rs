@@ -5,9 +5,9 @@ use std::path::PathBuf;
 use agent::rate::RateConfig;
 use ego_fuser::config::EgoSettings;
 use ego_fuser::pairing::PairingConfig;
-use ego_fuser_offline::evaluation::stepped::{ComputeTimes, Crew, SteppedConfig};
+use ego_fuser_offline::evaluation::stepped::{AgentPool, ComputeTimes, SteppedConfig};
 use fusion::Method;
-use link::{CapacityConfig, DelayLaw, LinkConfig, LinkError, LossLaw};
+use link::{CapacityConfig, DelayModel, LinkConfig, LinkError, LossModel};
 use localization::pose_source::{NoisyPoseConfig, PoseSourceConfig};
 use protocol::{BevGrid, CodecConfig, Dtype};
 use serde::{Deserialize, Serialize};
@@ -111,15 +111,15 @@ impl Point {
         let (mut link, folder) = LinkConfig::open(&experiment.link)?;
         if let Some(mean_ms) = self.latency_ms {
             link.delay = match self.jitter_ms.unwrap_or(0.0) {
-                0.0 => DelayLaw::ConstantMs(mean_ms),
-                std_ms => DelayLaw::Normal { mean_ms, std_ms },
+                0.0 => DelayModel::ConstantMs(mean_ms),
+                std_ms => DelayModel::Normal { mean_ms, std_ms },
             };
         }
         if let Some(rate_mbps) = self.bandwidth_mbps {
             link.capacity = CapacityConfig::TokenBucket { rate_mbps, burst_bytes: 0 };
         }
         if let Some(share) = self.loss {
-            link.loss = LossLaw::Bernoulli(share);
+            link.loss = LossModel::Bernoulli(share);
         }
         link.validate()?;
         Ok((link, folder))
@@ -185,7 +185,7 @@ pub(super) fn stepped(
             ..ego.pairing()
         },
         compute,
-        crew: Crew::First(point.agents.unwrap_or(usize::MAX)),
+        crew: AgentPool::First(point.agents.unwrap_or(usize::MAX)),
         vehicles: std::collections::BTreeMap::new(),
         ticks: 0..usize::MAX,
         lidar_variant: None,
@@ -216,11 +216,11 @@ mod tests {
         let experiment = experiment(text);
         let points = points(&experiment.grid);
         let (first, _) = points[0].link(&experiment).unwrap();
-        assert_eq!((first.delay, first.capacity), (DelayLaw::ConstantMs(50.0), CapacityConfig::Unlimited));
+        assert_eq!((first.delay, first.capacity), (DelayModel::ConstantMs(50.0), CapacityConfig::Unlimited));
         let (last, _) = points[3].link(&experiment).unwrap();
-        assert_eq!(last.delay, DelayLaw::Normal { mean_ms: 50.0, std_ms: 10.0 });
+        assert_eq!(last.delay, DelayModel::Normal { mean_ms: 50.0, std_ms: 10.0 });
         assert_eq!(last.capacity, CapacityConfig::TokenBucket { rate_mbps: 6.0, burst_bytes: 0 });
-        assert_eq!(last.loss, LossLaw::Bernoulli(0.1));
+        assert_eq!(last.loss, LossModel::Bernoulli(0.1));
     }
 
     #[test]

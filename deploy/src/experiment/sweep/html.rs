@@ -37,7 +37,7 @@ pub(super) fn page(experiment: &Experiment, spec: &str, cells: &[Cell], figures:
     let cells_of = |tag: &str, fields: &mut dyn Iterator<Item = String>| {
         fields.map(|field| format!("<{tag}>{}</{tag}>", escaped(&field))).collect::<String>()
     };
-    page += "<h2>Runs</h2>\n<div class=\"wide\"><table><thead><tr>";
+    page += "<h2>RunScope</h2>\n<div class=\"wide\"><table><thead><tr>";
     page += &cells_of("th", &mut columns.iter().map(|column| column.trim().to_owned()));
     page += "</tr></thead><tbody>\n";
     for line in lines {

@@ -1,6 +1,6 @@
 //! Sweeps: a grid of runs in virtual time, one CSV, charts, a report.
 //!
-//! Runs are kept one by one under all that decides them, so that an interrupted sweep goes on where it was. The same
+//! RunScope are kept one by one under all that decides them, so that an interrupted sweep goes on where it was. The same
 //! experiment gives the same CSV, byte for byte, in one process or in many.
 
 mod cell;
@@ -167,7 +167,7 @@ impl Sweep {
         self.scenarios.iter().map(|scenario| scenario.ticks.len()).sum()
     }
 
-    /// Runs what is missing and writes table, charts and report.
+    /// RunScope what is missing and writes table, charts and report.
     ///
     /// # Errors
     /// [`SweepError`] at the first run that cannot be computed; those before it are kept.

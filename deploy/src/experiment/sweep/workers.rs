@@ -1,4 +1,4 @@
-//! Runs of a sweep in several processes, each with one thread that computes.
+//! RunScope of a sweep in several processes, each with one thread that computes.
 //!
 //! A worker is this program with `--worker`: it reads the number of a point from standard input, computes the run, keeps
 //! it, and answers on standard output: `frame` for each frame, then `done`, or `failed` with the reason.

@@ -5,7 +5,7 @@ use std::path::{Path, PathBuf};
 
 use agent::attack::AttackConfig;
 use dataset::evaluation_protocol::ProtocolConfig;
-use ego_fuser::misbehaviour::TrustConfig;
+use ego_fuser::misbehaviour::MisbehaviourConfig;
 use fusion::Method;
 use localization::pose_source::PoseSourceConfig;
 use protocol::text::hex;
@@ -44,7 +44,7 @@ pub struct CellKey {
     pub attack: Option<AttackConfig>,
     /// When the ego leaves out neighbours that it does not trust.
     #[serde(default, skip_serializing_if = "Option::is_none")]
-    pub trust: Option<TrustConfig>,
+    pub trust: Option<MisbehaviourConfig>,
     /// The protocol that was asked for.
     #[serde(default, skip_serializing_if = "is_default")]
     pub protocol: ProtocolConfig,

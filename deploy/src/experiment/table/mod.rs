@@ -23,7 +23,7 @@ pub use text::{csv, markdown};
 
 use crate::experiment::evaluation::{EvaluationError, EvaluationOptions, Part, evaluate};
 use crate::experiment::weights_choice::WeightsChoiceError;
-use ego_fuser::misbehaviour::TrustConfig;
+use ego_fuser::misbehaviour::MisbehaviourConfig;
 use training::feature_store::KeptMaps;
 
 /// Why a table came to nothing.
@@ -156,7 +156,7 @@ impl Run<'_> {
             frames: self.spec.frames,
             scenarios: table.scenarios,
             attack: column.attack,
-            trust: column.trust.then(TrustConfig::default),
+            trust: column.trust.then(MisbehaviourConfig::default),
             protocol: self.spec.protocol.clone(),
             score_threshold: SCORE_THRESHOLD,
             version: env!("CARGO_PKG_VERSION").to_owned(),
@@ -174,7 +174,7 @@ impl Run<'_> {
             rate: RateConfig::default(),
             delay_nanos: column.delay_ms.saturating_mul(1_000_000),
             attack: column.attack,
-            trust: column.trust.then(TrustConfig::default),
+            trust: column.trust.then(MisbehaviourConfig::default),
             maps: self.spec.maps.as_ref().map(|folder| KeptMaps {
                 folder: folder.clone(),
                 dtype: self.spec.dtype,

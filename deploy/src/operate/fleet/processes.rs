@@ -15,12 +15,12 @@ use sim_replay::config::{LinkProcessConfig, RecorderConfig, ReplayConfig, Sensor
 use super::{Fleet, RECORDER, REPLAY};
 use crate::operate::run_folder::{BOOKMARK, RECORDING, RunFolder, RunFolderError, SWEEP_LOG};
 use crate::operate::security::RunKeys;
-use crate::operate::supervise::{Life, ProcessSpec};
+use crate::operate::supervise::{ProcessSpec, RestartPolicy};
 use crate::scenario::Clock;
 
 /// Where the processes of a run meet, where their programs lie, and where they write.
 #[derive(Debug, Clone, Copy)]
-pub struct Meeting<'a> {
+pub struct SessionContext<'a> {
     /// The run that they join.
     pub run: &'a RunId,
     /// Of the router.
@@ -38,22 +38,24 @@ impl Fleet {
     ///
     /// # Errors
     /// [`RunFolderError::Write`] when the run folder cannot be written.
-    pub fn processes(&self, meeting: &Meeting<'_>) -> Result<Vec<ProcessSpec>, RunFolderError> {
+    pub fn processes(&self, meeting: &SessionContext<'_>) -> Result<Vec<ProcessSpec>, RunFolderError> {
         let mut planner = self.planner(meeting);
         self.plan_agents(&mut planner)?;
-        planner
-            .plan(format!("ego-{}", self.ego), "ego-fuser run", Life::Service, |bus| self.ego_config(meeting, bus))?;
+        planner.plan(format!("ego-{}", self.ego), "ego-fuser run", RestartPolicy::Service, |bus| {
+            self.ego_config(meeting, bus)
+        })?;
         if self.is_over_link() {
-            planner.plan(format!("link-{}", self.ego), "sim-replay link", Life::Service, |bus| {
+            planner.plan(format!("link-{}", self.ego), "sim-replay link", RestartPolicy::Service, |bus| {
                 self.link_config(meeting, bus)
             })?;
         }
-        planner.plan(REPLAY.into(), "sim-replay stream", Life::Task, |bus| self.replay_config(meeting, bus))?;
+        planner
+            .plan(REPLAY.into(), "sim-replay stream", RestartPolicy::Task, |bus| self.replay_config(meeting, bus))?;
         if let Some(record) = &self.scenario.record {
             let (run, out) = (meeting.run.clone(), meeting.folder.file(RECORDING));
             let config = |bus| RecorderConfig { run, out, record: record.clone(), keep_running: false, bus };
             // A recording cannot be resumed in the middle.
-            planner.plan(RECORDER.into(), "sim-replay record --json", Life::Optional, config)?;
+            planner.plan(RECORDER.into(), "sim-replay record --json", RestartPolicy::Optional, config)?;
         }
         Ok(planner.specs)
     }
@@ -62,13 +64,13 @@ impl Fleet {
     ///
     /// # Errors
     /// [`RunFolderError::Write`] when the run folder cannot be written.
-    pub fn agent_processes(&self, meeting: &Meeting<'_>) -> Result<Vec<ProcessSpec>, RunFolderError> {
+    pub fn agent_processes(&self, meeting: &SessionContext<'_>) -> Result<Vec<ProcessSpec>, RunFolderError> {
         let mut planner = self.planner(meeting);
         self.plan_agents(&mut planner)?;
         Ok(planner.specs)
     }
 
-    fn planner<'a>(&self, meeting: &'a Meeting<'a>) -> Planner<'a> {
+    fn planner<'a>(&self, meeting: &'a SessionContext<'a>) -> Planner<'a> {
         let bus = BusConfig {
             connect: meeting.endpoint.clone(),
             shared_memory_mib: self.scenario.network.shared_memory_mib,
@@ -81,13 +83,14 @@ impl Fleet {
     fn plan_agents(&self, planner: &mut Planner<'_>) -> Result<(), RunFolderError> {
         for cav in self.agents.iter().filter(|cav| !self.scenario.remote_agents.contains(cav)) {
             let meeting = planner.meeting;
-            planner
-                .plan(format!("agent-{cav}"), "agent run", Life::Service, |bus| self.agent_config(cav, meeting, bus))?;
+            planner.plan(format!("agent-{cav}"), "agent run", RestartPolicy::Service, |bus| {
+                self.agent_config(cav, meeting, bus)
+            })?;
         }
         Ok(())
     }
 
-    fn agent_config(&self, cav: &CavId, meeting: &Meeting<'_>, bus: BusConfig) -> AgentConfig {
+    fn agent_config(&self, cav: &CavId, meeting: &SessionContext<'_>, bus: BusConfig) -> AgentConfig {
         let mut settings = self.scenario.settings_of(cav);
         let scene = self.scenario.scene.scenario.as_deref().unwrap_or_default();
         settings.pose = settings.pose.for_scenario(scene);
@@ -112,7 +115,7 @@ impl Fleet {
         }
     }
 
-    fn ego_config(&self, meeting: &Meeting<'_>, bus: BusConfig) -> EgoConfig {
+    fn ego_config(&self, meeting: &SessionContext<'_>, bus: BusConfig) -> EgoConfig {
         EgoConfig {
             run: meeting.run.clone(),
             models: self.scenario.models.clone(),
@@ -126,7 +129,7 @@ impl Fleet {
         }
     }
 
-    fn link_config(&self, meeting: &Meeting<'_>, bus: BusConfig) -> LinkProcessConfig {
+    fn link_config(&self, meeting: &SessionContext<'_>, bus: BusConfig) -> LinkProcessConfig {
         LinkProcessConfig {
             run: meeting.run.clone(),
             ego: self.ego.clone(),
@@ -138,7 +141,7 @@ impl Fleet {
         }
     }
 
-    fn replay_config(&self, meeting: &Meeting<'_>, bus: BusConfig) -> ReplayConfig {
+    fn replay_config(&self, meeting: &SessionContext<'_>, bus: BusConfig) -> ReplayConfig {
         let scene = &self.scenario.scene;
         ReplayConfig {
             run: meeting.run.clone(),
@@ -163,7 +166,7 @@ impl Fleet {
 
 /// Processes so far, and what the next one has in common with them.
 struct Planner<'a> {
-    meeting: &'a Meeting<'a>,
+    meeting: &'a SessionContext<'a>,
     bus: BusConfig,
     /// Address of the process before; the next one takes the port behind it.
     metrics: Option<SocketAddr>,
@@ -176,10 +179,10 @@ impl Planner<'_> {
         &mut self,
         name: String,
         command: &str,
-        life: Life,
+        life: RestartPolicy,
         config: impl FnOnce(BusConfig) -> C,
     ) -> Result<(), RunFolderError> {
-        let Meeting { keys, programs, folder, .. } = self.meeting;
+        let SessionContext { keys, programs, folder, .. } = self.meeting;
         self.metrics = self.metrics.and_then(port_behind);
         let keys = keys.map(|keys| keys.of_process(&name));
         let bus = BusConfig { keys, metrics: self.metrics, ..self.bus.clone() };

@@ -30,14 +30,14 @@ pub struct ProcessSpec {
     /// Its arguments.
     pub args: Vec<OsString>,
     /// What its end means.
-    pub life: Life,
+    pub life: RestartPolicy,
     /// Where it serves its counters to Prometheus, if it does.
     pub metrics: Option<SocketAddr>,
 }
 
 /// What the end of a process means.
 #[derive(Debug, Clone, Copy, PartialEq, Eq)]
-pub enum Life {
+pub enum RestartPolicy {
     /// It works until the run is over; when it ends before, it is started again.
     Service,
     /// It has one job. When something ends it before that is done it is started again and takes it up where it was; when it
@@ -53,12 +53,12 @@ pub struct ProcessEvent {
     /// Name of the process.
     pub name: String,
     /// What happened.
-    pub what: Happening,
+    pub what: ProcessEventKind,
 }
 
 /// What happened to a process.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Happening {
+pub enum ProcessEventKind {
     /// It runs.
     Started {
         /// Its process id.

@@ -9,7 +9,7 @@ use super::*;
 
 const PATIENCE: Duration = Duration::from_secs(20);
 
-fn shell(name: &str, life: Life, script: &str) -> ProcessSpec {
+fn shell(name: &str, life: RestartPolicy, script: &str) -> ProcessSpec {
     let args = vec!["-c".into(), script.into()];
     ProcessSpec { name: name.into(), program: "/bin/sh".into(), args, life, metrics: None }
 }
@@ -20,68 +20,71 @@ fn start(spec: ProcessSpec, restarts: u32) -> (Supervisor, Receiver<ProcessEvent
     (Supervisor::start(vec![spec], folder.path(), restarts, &events).unwrap(), received, folder)
 }
 
-fn next(events: &Receiver<ProcessEvent>) -> Happening {
+fn next(events: &Receiver<ProcessEvent>) -> ProcessEventKind {
     events.recv_timeout(PATIENCE).unwrap().what
 }
 
 #[test]
 fn who_ends_well_is_done() {
-    let (supervisor, events, folder) = start(shell("job", Life::Task, "echo hello; exit 3"), 3);
-    assert!(matches!(next(&events), Happening::Started { .. }));
-    assert_eq!(next(&events), Happening::Said { line: "hello".into() });
-    assert_eq!(next(&events), Happening::Done { data_lost: true });
+    let (supervisor, events, folder) = start(shell("job", RestartPolicy::Task, "echo hello; exit 3"), 3);
+    assert!(matches!(next(&events), ProcessEventKind::Started { .. }));
+    assert_eq!(next(&events), ProcessEventKind::Said { line: "hello".into() });
+    assert_eq!(next(&events), ProcessEventKind::Done { data_lost: true });
     assert_eq!(std::fs::read_to_string(folder.path().join("job.log")).unwrap(), "hello\n");
     assert!(supervisor.stop(PATIENCE).killed.is_empty());
 }
 
 #[test]
 fn a_killed_service_is_started_again() {
-    let (supervisor, events, _folder) = start(shell("car", Life::Service, "exec sleep 600"), 3);
-    let Happening::Started { pid: first } = next(&events) else { panic!("not started") };
+    let (supervisor, events, _folder) = start(shell("car", RestartPolicy::Service, "exec sleep 600"), 3);
+    let ProcessEventKind::Started { pid: first } = next(&events) else { panic!("not started") };
     kill_process(Pid::from_raw(first as i32).unwrap(), Signal::KILL).unwrap();
-    let Happening::Fell { how, again_after, restart } = next(&events) else { panic!("not fallen") };
+    let ProcessEventKind::Fell { how, again_after, restart } = next(&events) else { panic!("not fallen") };
     assert_eq!((how.as_str(), again_after, restart), ("was ended by signal 9", FIRST_PAUSE, 1));
-    let Happening::Started { pid: second } = next(&events) else { panic!("not restarted") };
+    let ProcessEventKind::Started { pid: second } = next(&events) else { panic!("not restarted") };
     assert_ne!(first, second);
     assert!(supervisor.stop(PATIENCE).killed.is_empty(), "sleep ends on SIGTERM");
-    assert_eq!(next(&events), Happening::Done { data_lost: false });
+    assert_eq!(next(&events), ProcessEventKind::Done { data_lost: false });
 }
 
 #[test]
 fn how_it_ends_when_it_is_asked_to_is_told_with_its_last_words() {
     let waits = |code| format!("trap 'echo 7 missing; exit {code}' TERM; echo up; while :; do sleep 0.05; done");
     for (code, ended) in [
-        (0, Happening::Done { data_lost: false }),
-        (3, Happening::Done { data_lost: true }),
-        (1, Happening::Failed { how: "ended with code 1".into() }),
+        (0, ProcessEventKind::Done { data_lost: false }),
+        (3, ProcessEventKind::Done { data_lost: true }),
+        (1, ProcessEventKind::Failed { how: "ended with code 1".into() }),
     ] {
-        let (supervisor, events, _folder) = start(shell("recorder", Life::Optional, &waits(code)), 3);
-        assert!(matches!(next(&events), Happening::Started { .. }));
-        assert_eq!(next(&events), Happening::Said { line: "up".into() });
+        let (supervisor, events, _folder) = start(shell("recorder", RestartPolicy::Optional, &waits(code)), 3);
+        assert!(matches!(next(&events), ProcessEventKind::Started { .. }));
+        assert_eq!(next(&events), ProcessEventKind::Said { line: "up".into() });
         assert!(supervisor.stop(PATIENCE).killed.is_empty());
-        assert_eq!(next(&events), Happening::Said { line: "7 missing".into() });
+        assert_eq!(next(&events), ProcessEventKind::Said { line: "7 missing".into() });
         assert_eq!(next(&events), ended);
     }
 }
 
 #[test]
 fn a_service_that_keeps_falling_is_given_up_with_its_last_words() {
-    let (_supervisor, events, _folder) = start(shell("car", Life::Service, "echo no engine >&2; exit 1"), 1);
+    let (_supervisor, events, _folder) = start(shell("car", RestartPolicy::Service, "echo no engine >&2; exit 1"), 1);
     let happenings: Vec<_> = (0..4).map(|_| next(&events)).collect();
-    assert!(matches!(&happenings[1], Happening::Fell { again_after, .. } if *again_after == FIRST_PAUSE));
-    assert_eq!(happenings[3], Happening::GaveUp { how: "ended with code 1: no engine".into(), is_optional: false });
+    assert!(matches!(&happenings[1], ProcessEventKind::Fell { again_after, .. } if *again_after == FIRST_PAUSE));
+    assert_eq!(
+        happenings[3],
+        ProcessEventKind::GaveUp { how: "ended with code 1: no engine".into(), is_optional: false }
+    );
 }
 
 #[test]
 fn the_lifeline_holds_as_long_as_the_supervisor() {
-    let (supervisor, events, folder) = start(shell("car", Life::Service, "echo up; cat; echo cut off"), 3);
-    assert!(matches!(next(&events), Happening::Started { .. }));
+    let (supervisor, events, folder) = start(shell("car", RestartPolicy::Service, "echo up; cat; echo cut off"), 3);
+    assert!(matches!(next(&events), ProcessEventKind::Started { .. }));
     let log = folder.path().join("car.log");
     let began = Instant::now();
     while std::fs::read_to_string(&log).unwrap().is_empty() && began.elapsed() < PATIENCE {
         std::thread::yield_now();
     }
-    assert_eq!(next(&events), Happening::Said { line: "up".into() });
+    assert_eq!(next(&events), ProcessEventKind::Said { line: "up".into() });
     // Its input does not end, so neither does it.
     assert!(events.recv_timeout(Duration::from_millis(200)).is_err());
     drop(supervisor.stop(PATIENCE));
@@ -90,16 +93,19 @@ fn the_lifeline_holds_as_long_as_the_supervisor() {
 
 #[test]
 fn bad_input_is_not_tried_again() {
-    let (_supervisor, events, _folder) = start(shell("car", Life::Service, "echo bad map >&2; exit 2"), 5);
-    assert!(matches!(next(&events), Happening::Started { .. }));
-    assert_eq!(next(&events), Happening::GaveUp { how: "ended with code 2: bad map".into(), is_optional: false });
+    let (_supervisor, events, _folder) = start(shell("car", RestartPolicy::Service, "echo bad map >&2; exit 2"), 5);
+    assert!(matches!(next(&events), ProcessEventKind::Started { .. }));
+    assert_eq!(
+        next(&events),
+        ProcessEventKind::GaveUp { how: "ended with code 2: bad map".into(), is_optional: false }
+    );
 }
 
 #[test]
 fn who_ignores_the_request_is_killed_at_the_deadline() {
     let (supervisor, events, folder) =
-        start(shell("deaf", Life::Service, "trap '' TERM; echo up; while :; do sleep 0.05; done"), 3);
-    assert!(matches!(next(&events), Happening::Started { .. }));
+        start(shell("deaf", RestartPolicy::Service, "trap '' TERM; echo up; while :; do sleep 0.05; done"), 3);
+    assert!(matches!(next(&events), ProcessEventKind::Started { .. }));
     let log = folder.path().join("deaf.log");
     let began = Instant::now();
     while std::fs::read_to_string(&log).unwrap().is_empty() && began.elapsed() < PATIENCE {
@@ -113,7 +119,7 @@ fn who_ignores_the_request_is_killed_at_the_deadline() {
 #[test]
 fn a_missing_program_is_named() {
     let (events, _received) = channel();
-    let spec = ProcessSpec { program: "/nowhere/agent".into(), ..shell("agent", Life::Service, "") };
+    let spec = ProcessSpec { program: "/nowhere/agent".into(), ..shell("agent", RestartPolicy::Service, "") };
     let folder = tempfile::tempdir().unwrap();
     let error = Supervisor::start(vec![spec], folder.path(), 0, &events).err().unwrap();
     assert!(error.to_string().starts_with("/nowhere/agent is missing"), "{error}");
@@ -121,14 +127,14 @@ fn a_missing_program_is_named() {
 
 #[test]
 fn who_hangs_is_killed_and_started_again_even_if_stopped() {
-    let (supervisor, events, _folder) = start(shell("car", Life::Service, "exec sleep 600"), 3);
-    let Happening::Started { pid: first } = next(&events) else { panic!("not started") };
+    let (supervisor, events, _folder) = start(shell("car", RestartPolicy::Service, "exec sleep 600"), 3);
+    let ProcessEventKind::Started { pid: first } = next(&events) else { panic!("not started") };
     kill_process(Pid::from_raw(first as i32).unwrap(), Signal::STOP).unwrap();
     supervisor.replace("nobody", "is not here");
     supervisor.replace("car", "has said nothing for 5 s");
-    let Happening::Fell { how, .. } = next(&events) else { panic!("not fallen") };
+    let ProcessEventKind::Fell { how, .. } = next(&events) else { panic!("not fallen") };
     assert_eq!(how, "has said nothing for 5 s");
-    let Happening::Started { pid: second } = next(&events) else { panic!("not restarted") };
+    let ProcessEventKind::Started { pid: second } = next(&events) else { panic!("not restarted") };
     assert_ne!(first, second);
     kill_process(Pid::from_raw(second as i32).unwrap(), Signal::STOP).unwrap();
     assert!(supervisor.stop(PATIENCE).killed.is_empty(), "who is stopped is woken to end");
@@ -136,28 +142,31 @@ fn who_hangs_is_killed_and_started_again_even_if_stopped() {
 
 #[test]
 fn a_service_that_ends_well_but_too_early_is_started_again() {
-    let (_supervisor, events, _folder) = start(shell("car", Life::Service, "exit 0"), 1);
-    assert!(matches!(next(&events), Happening::Started { .. }));
-    assert!(matches!(next(&events), Happening::Fell { how, .. } if how.contains("nobody here had asked")));
+    let (_supervisor, events, _folder) = start(shell("car", RestartPolicy::Service, "exit 0"), 1);
+    assert!(matches!(next(&events), ProcessEventKind::Started { .. }));
+    assert!(matches!(next(&events), ProcessEventKind::Fell { how, .. } if how.contains("nobody here had asked")));
 }
 
 #[test]
 fn a_task_that_is_struck_down_takes_up_its_job_and_one_that_cannot_do_it_stays_down() {
-    let (supervisor, events, _folder) = start(shell("replay", Life::Task, "exec sleep 600"), 3);
-    let Happening::Started { pid } = next(&events) else { panic!("not started") };
+    let (supervisor, events, _folder) = start(shell("replay", RestartPolicy::Task, "exec sleep 600"), 3);
+    let ProcessEventKind::Started { pid } = next(&events) else { panic!("not started") };
     kill_process(Pid::from_raw(pid as i32).unwrap(), Signal::KILL).unwrap();
-    assert!(matches!(next(&events), Happening::Fell { restart: 1, .. }));
-    assert!(matches!(next(&events), Happening::Started { .. }));
+    assert!(matches!(next(&events), ProcessEventKind::Fell { restart: 1, .. }));
+    assert!(matches!(next(&events), ProcessEventKind::Started { .. }));
     assert!(supervisor.stop(PATIENCE).killed.is_empty());
 
-    let (_supervisor, events, _folder) = start(shell("replay", Life::Task, "echo no scene >&2; exit 1"), 3);
-    assert!(matches!(next(&events), Happening::Started { .. }));
-    assert_eq!(next(&events), Happening::GaveUp { how: "ended with code 1: no scene".into(), is_optional: false });
+    let (_supervisor, events, _folder) = start(shell("replay", RestartPolicy::Task, "echo no scene >&2; exit 1"), 3);
+    assert!(matches!(next(&events), ProcessEventKind::Started { .. }));
+    assert_eq!(
+        next(&events),
+        ProcessEventKind::GaveUp { how: "ended with code 1: no scene".into(), is_optional: false }
+    );
 }
 
 #[test]
 fn who_cannot_take_up_its_job_stays_down() {
-    let (_supervisor, events, _folder) = start(shell("recorder", Life::Optional, "kill -KILL $$"), 3);
-    assert!(matches!(next(&events), Happening::Started { .. }));
-    assert!(matches!(next(&events), Happening::GaveUp { is_optional: true, .. }));
+    let (_supervisor, events, _folder) = start(shell("recorder", RestartPolicy::Optional, "kill -KILL $$"), 3);
+    assert!(matches!(next(&events), ProcessEventKind::Started { .. }));
+    assert!(matches!(next(&events), ProcessEventKind::GaveUp { is_optional: true, .. }));
 }

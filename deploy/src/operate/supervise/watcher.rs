@@ -12,7 +12,7 @@ use tokio::process::{Child, Command};
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinHandle;
 
-use super::{Happening, Life, ProcessEvent, ProcessSpec, SuperviseError, said};
+use super::{ProcessEvent, ProcessEventKind, ProcessSpec, RestartPolicy, SuperviseError, said};
 
 /// Exit code of our programs for bad usage or input: starting again cannot help.
 const BAD_INPUT: i32 = 2;
@@ -68,17 +68,17 @@ pub(super) struct Watcher {
 }
 
 impl Watcher {
-    /// Runs until told to stop or the process stays down. Returns whether it had to be killed.
+    /// RunScope until told to stop or the process stays down. Returns whether it had to be killed.
     pub(super) async fn run(mut self) -> bool {
         loop {
             let born = Instant::now();
-            let mut can_go_on = self.spec.life != Life::Optional;
+            let mut can_go_on = self.spec.life != RestartPolicy::Optional;
             let how = match self.spawn() {
                 Err(error) => format!("cannot be started: {error}"),
                 Ok(mut child) => {
-                    // Taken out, as waiting for a child closes the input that it still holds.
+                    // Pop out, as waiting for a child closes the input that it still holds.
                     let _lifeline = child.stdin.take();
-                    self.tell(Happening::Started { pid: child.id().unwrap_or(0) });
+                    self.tell(ProcessEventKind::Started { pid: child.id().unwrap_or(0) });
                     let report = self.follow(&mut child);
                     let stop = self.stop.clone();
                     // A wish of an earlier life.
@@ -90,14 +90,14 @@ impl Watcher {
                             why
                         },
                         status = child.wait() => match heard_out(report, status).await {
-                            Ok(status) if is_done(status) && self.spec.life != Life::Service => {
-                                self.tell(Happening::Done { data_lost: !status.success() });
+                            Ok(status) if is_done(status) && self.spec.life != RestartPolicy::Service => {
+                                self.tell(ProcessEventKind::Done { data_lost: !status.success() });
                                 return false;
                             }
                             Ok(status) if is_done(status) => "ended, though nobody here had asked it to".into(),
                             Ok(status) if status.code() == Some(BAD_INPUT) => return self.give_up(&in_words(status)),
                             Ok(status) => {
-                                can_go_on &= self.spec.life == Life::Service || is_struck(status);
+                                can_go_on &= self.spec.life == RestartPolicy::Service || is_struck(status);
                                 in_words(status)
                             }
                             Err(error) => error.to_string(),
@@ -119,7 +119,7 @@ impl Watcher {
             }
             let pause = LONGEST_PAUSE.min(FIRST_PAUSE * (1 << (self.falls - 1).min(5)));
             self.restarted += 1;
-            self.tell(Happening::Fell { how, again_after: pause, restart: self.restarted });
+            self.tell(ProcessEventKind::Fell { how, again_after: pause, restart: self.restarted });
             tokio::select! {
                 () = tokio::time::sleep(pause) => {}
                 _ = asked_to_stop(self.stop.clone()) => return false,
@@ -145,9 +145,9 @@ impl Watcher {
             None => return true,
             // Before it listens to signals it has nothing to lose.
             Some(status) if is_done(status) || status.signal() == Some(Signal::TERM.as_raw()) => {
-                self.tell(Happening::Done { data_lost: status.code() == Some(DATA_LOST) });
+                self.tell(ProcessEventKind::Done { data_lost: status.code() == Some(DATA_LOST) });
             }
-            Some(status) => self.tell(Happening::Failed { how: in_words(status) }),
+            Some(status) => self.tell(ProcessEventKind::Failed { how: in_words(status) }),
         }
         false
     }
@@ -157,18 +157,18 @@ impl Watcher {
         let (output, log) = (child.stdout.take()?, self.log.file.try_clone().ok()?);
         let (events, name) = (self.events.clone(), self.spec.name.clone());
         Some(tokio::spawn(said::follow(output, log, move |line| {
-            let _ = events.send(ProcessEvent { name: name.clone(), what: Happening::Said { line } });
+            let _ = events.send(ProcessEvent { name: name.clone(), what: ProcessEventKind::Said { line } });
         })))
     }
 
     fn give_up(&self, how: &str) -> bool {
         let said = self.log.last_line().map_or(String::new(), |line| format!(": {line}"));
-        let is_optional = self.spec.life == Life::Optional;
-        self.tell(Happening::GaveUp { how: format!("{how}{said}"), is_optional });
+        let is_optional = self.spec.life == RestartPolicy::Optional;
+        self.tell(ProcessEventKind::GaveUp { how: format!("{how}{said}"), is_optional });
         false
     }
 
-    fn tell(&self, what: Happening) {
+    fn tell(&self, what: ProcessEventKind) {
         // Nobody listens any more once the run is over.
         let _ = self.events.send(ProcessEvent { name: self.spec.name.clone(), what });
     }

@@ -9,7 +9,7 @@ use protocol::{BevGrid, Pose};
 use tch::nn::{self, VarStore};
 use tch::{Device, TchError, Tensor};
 
-use crate::channel_mixing::{self, Steering};
+use crate::channel_mixing::{self, ChannelMixing};
 use crate::classes::Classes;
 use crate::f64_tensor::are_numbers;
 use crate::full_resolution::FullResolutionMap;
@@ -39,7 +39,7 @@ pub struct FusionStage {
     config: FusionConfig,
     requirements: Requirements,
     fusion: Box<dyn Fusion>,
-    steering: Option<Steering>,
+    steering: Option<ChannelMixing>,
     /// For a fusion that needs earlier maps at full resolution.
     classes: Option<Classes>,
     grid: BevGrid,
@@ -60,7 +60,7 @@ impl FusionStage {
         detector: &DetectorConfig,
     ) -> Result<Self, ConfigError> {
         let shares_maps = method.exchange() == Exchange::Features;
-        let steering = shares_maps.then(|| Steering::new(path, detector.feature_channels()));
+        let steering = shares_maps.then(|| ChannelMixing::new(path, detector.feature_channels()));
         let fusion = config.build(&(path / "fusion"))?;
         let sizes = [detector.feature_channels(), detector.anchors.yaws_deg.len() as i64];
         let requirements = config.requirements();

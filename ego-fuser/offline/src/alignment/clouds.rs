@@ -7,7 +7,7 @@ use protocol::{NoPoseReason, PointCloud, PoseEstimate};
 
 use super::method::{AlignError, AlignmentMethod, AlignmentSpec, NotAligned, Vehicle};
 
-/// Registers the neighbour's thinned sweep against the ego's own.
+/// Registers the neighbour's decimate sweep against the ego's own.
 #[derive(Debug, Clone)]
 pub struct CloudIcp {
     config: IcpConfig,
@@ -33,8 +33,8 @@ impl CloudIcp {
 
 impl AlignmentMethod for CloudIcp {
     fn prepare(&mut self, vehicle: &Vehicle<'_>) -> Result<Message, AlignError> {
-        let thinned = IcpSource::of_sweep(&vehicle.frame.points.xyzi, &self.config);
-        let xyzi = thinned.points_m().iter().map(|p| [p.x as f32, p.y as f32, p.z as f32, 0.0]).collect();
+        let decimate = IcpSource::of_sweep(&vehicle.frame.points.xyzi, &self.config);
+        let xyzi = decimate.points_m().iter().map(|p| [p.x as f32, p.y as f32, p.z as f32, 0.0]).collect();
         let measured = vehicle.frame.gnss_world_from_lidar().filter(|_| self.starts_at_gnss);
         let no_pose = PoseEstimate::NoPose { reason: NoPoseReason::NoSource, inlier_count: 0 };
         let pose = measured.map_or(no_pose, |pose| PoseEstimate::new(pose, 1.0));
@@ -46,7 +46,7 @@ impl AlignmentMethod for CloudIcp {
             return Err(NotAligned::Message);
         };
         let start = self.start(&own.pose, &received.pose)?;
-        // The ego has its own sweep in full: flatter planes than from a thinned one.
+        // The ego has its own sweep in full: flatter planes than from a decimate one.
         let target = IcpTarget::of_sweep(&ego.frame.points.xyzi, &self.config);
         let source = IcpSource::of_sweep(&received.points.xyzi, &self.config);
         Ok(icp::register(&source, &target, &start, &self.config)?.target_from_source)

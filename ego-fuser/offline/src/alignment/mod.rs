@@ -4,7 +4,7 @@
 //! paper's table is made of such pairs: time, bytes on the air, and the share that is right to 3 m.
 //!
 //! - [`poses`]: each vehicle sends its own pose, from any [`localization::pose_source::PoseSource`];
-//! - [`clouds`]: the neighbour sends its (thinned) sweep, which is registered against the ego's by ICP;
+//! - [`clouds`]: the neighbour sends its (decimate) sweep, which is registered against the ego's by ICP;
 //! - [`free_align`], [`box_icp`]: it sends its boxes, which are matched with the ego's;
 //!
 //! `evaluate::alignment` runs them over scenes and counts.

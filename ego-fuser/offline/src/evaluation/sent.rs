@@ -1,7 +1,7 @@
 //! What a vehicle says of a frame, through the same messages as in a live run.
 
 use agent::agent::AgentInput;
-use agent::attack::Overheard;
+use agent::attack::CapturedMessages;
 use dataset::frame::Frame;
 use protocol::message::{Bev, Boxes, Payload, Points};
 use protocol::{CavId, CodecConfig, HEADER_LEN, Header, Limits, PoseEstimate, RateChoice, Stamp, WireError, wire};
@@ -41,8 +41,8 @@ impl Sent {
     }
 
     /// As a vehicle that repeats it hears it.
-    pub(super) fn overheard(&self) -> Overheard {
-        let mut heard = Overheard::default();
+    pub(super) fn overheard(&self) -> CapturedMessages {
+        let mut heard = CapturedMessages::default();
         match self.content.clone() {
             Some(Content::Features(map)) => heard.features = Some(map.features),
             Some(Content::Boxes(found)) => heard.detections = Some(found),

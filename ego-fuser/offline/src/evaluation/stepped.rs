@@ -12,24 +12,24 @@ use std::collections::{BTreeMap, VecDeque};
 use std::ops::{ControlFlow, Range};
 use std::path::PathBuf;
 
-use agent::attack::Lie;
+use agent::attack::Falsification;
 use agent::rate::RateConfig;
 use dataset::frame::Frame;
 use dataset::ground_truth;
 use dataset::{LoadOptions, Scenario};
-use link::{Air, LinkConfig};
+use link::{LinkConfig, LinkEmulator};
 use localization::pose_source::PoseSourceConfig;
 use protocol::{CavId, CodecConfig, PoseEstimate, RateChoice, SkippedNeighbour, StageTiming, Stream};
 use support::random::derive_seed;
 
 pub use compute::ComputeTimes;
-pub use remote::{RemoteCrew, RemoteError};
+pub use remote::{RemoteError, RemotePool};
 
 use super::participant::Participant;
 use super::sent::{Sent, stamp, view};
 use super::sweeps::Sweep;
 use super::{EvaluateError, EvaluatedFrame, Evaluator, of_the_ego};
-use delayed_delivery::{Arrived, Courier, Letter};
+use delayed_delivery::{Arrived, DelayedDelivery, Envelope};
 use ego_fuser::ego::{Skipped, View};
 use ego_fuser::pairing::{Paired, Pairing, PairingConfig};
 use fusion::method::Exchange;
@@ -50,7 +50,7 @@ pub struct SteppedConfig {
     /// How long everyone computes.
     pub compute: ComputeTimes,
     /// Who takes part.
-    pub crew: Crew,
+    pub crew: AgentPool,
     /// Vehicles with settings of their own.
     pub vehicles: BTreeMap<CavId, VehicleConfig>,
     /// Which ticks of a scenario; clipped to those there are.
@@ -61,7 +61,7 @@ pub struct SteppedConfig {
 
 /// Who takes part.
 #[derive(Debug, Clone, PartialEq, Eq)]
-pub enum Crew {
+pub enum AgentPool {
     /// The first so many vehicles of a scenario, or all where it has fewer; the first is the ego. What the others see
     /// counts as there all the same, so that the truth does not depend on how many talk.
     First(usize),
@@ -79,10 +79,10 @@ pub struct VehicleConfig {
     /// What it fits them to. There is no queue to watch.
     pub rate: RateConfig,
     /// What it lies about; absent: nothing.
-    pub lie: Option<Lie>,
+    pub lie: Option<Falsification>,
 }
 
-/// Runs a scenario; `on_frame` may end it. Each frame's stamp says when the ego published it.
+/// RunScope a scenario; `on_frame` may end it. Each frame's stamp says when the ego published it.
 pub(super) fn run(
     evaluator: &mut Evaluator,
     config: &SteppedConfig,
@@ -135,13 +135,13 @@ struct Run<'a> {
     /// The ego first.
     crew: Vec<Member>,
     /// Places of those that are only asked what there is.
-    witnesses: Vec<usize>,
+    observers: Vec<usize>,
     /// The next tick to compute, and the one behind the last.
     next: usize,
     end: usize,
     computed: VecDeque<Computed>,
-    courier: Courier,
-    pairing: Pairing<Letter>,
+    courier: DelayedDelivery,
+    pairing: Pairing<Envelope>,
     /// When messages arrived, by vehicle: capture time and arrival.
     arrivals: BTreeMap<CavId, VecDeque<(u64, u64)>>,
     /// When the ego has done with what it fuses.
@@ -170,20 +170,20 @@ impl<'a> Run<'a> {
             let participant = evaluator.participant(scenario, cav, crew.is_empty(), own)?;
             crew.push(Member { place, cav: cav.clone(), pipeline: Pipeline::Here(Box::new(participant), codec) });
         }
-        let is_witness = |place: &usize| matches!(config.crew, Crew::First(_)) && !places.contains(place);
-        let witnesses = (0..scenario.agents.len()).filter(is_witness).collect();
+        let is_witness = |place: &usize| matches!(config.crew, AgentPool::First(_)) && !places.contains(place);
+        let observers = (0..scenario.agents.len()).filter(is_witness).collect();
         let ticks = config.ticks.start.min(scenario.ticks.len())..config.ticks.end.min(scenario.ticks.len());
         let began_nanos = scenario.ticks.get(ticks.start).map_or(0, |tick| tick.capture_nanos);
         let letters: Vec<u64> = scenario.name.bytes().map(u64::from).collect();
-        let air = Air::new(config.link.clone(), &config.link_folder, derive_seed(config.seed, &letters))?;
+        let air = LinkEmulator::new(config.link.clone(), &config.link_folder, derive_seed(config.seed, &letters))?;
         let ego = crew.first().map_or_else(|| scenario.agents[0].clone(), |ego| ego.cav.clone());
         Ok(Self {
-            courier: Courier::new(air, &ego, began_nanos),
+            courier: DelayedDelivery::new(air, &ego, began_nanos),
             evaluator,
             config,
             scenario,
             crew,
-            witnesses,
+            observers,
             next: ticks.start,
             end: ticks.end,
             computed: VecDeque::new(),
@@ -220,13 +220,13 @@ impl<'a> Run<'a> {
             } else if sent.content.is_some() && method.exchange() != Exchange::Nothing {
                 senders.push(sent.cav.clone());
                 let distance_m = distance_m(&frames[0], &frames[place]);
-                post(&mut self.courier, &self.config.compute, tick, sent, distance_m);
+                enqueue(&mut self.courier, &self.config.compute, tick, sent, distance_m);
             }
         }
         let blind = LoadOptions { points: false, ..load };
-        let witnesses = self.scenario.load_tick(tick, self.witnesses.iter().copied(), &blind);
-        self.evaluator.left_out.add_tick(&witnesses);
-        frames.extend(witnesses.frames.into_iter().map(|(_, frame)| frame));
+        let observers = self.scenario.load_tick(tick, self.observers.iter().copied(), &blind);
+        self.evaluator.left_out.add_tick(&observers);
+        frames.extend(observers.frames.into_iter().map(|(_, frame)| frame));
         self.computed.push_back(Computed { own, senders, frames, poses });
         Ok(())
     }
@@ -235,7 +235,7 @@ impl<'a> Run<'a> {
     fn perceive(&mut self, sweeps: &[Sweep]) -> Result<Vec<Sent>, EvaluateError> {
         if let Some(remote) = &self.evaluator.remote {
             let frames: Vec<&Frame> = sweeps.iter().map(|sweep| &sweep.frame).collect();
-            return Ok(remote.ask(&frames).map_err(Box::new)?);
+            return Ok(remote.request(&frames).map_err(Box::new)?);
         }
         let method = self.evaluator.ego.method();
         let mut all: Vec<Sent> = Vec::with_capacity(sweeps.len());
@@ -360,7 +360,7 @@ impl<'a> Run<'a> {
 }
 
 /// Hands over what a neighbour sends for a tick: its pose as soon as it is known, the rest when it is computed.
-fn post(courier: &mut Courier, compute: &ComputeTimes, tick: usize, sent: Sent, distance_m: f64) {
+fn enqueue(courier: &mut DelayedDelivery, compute: &ComputeTimes, tick: usize, sent: Sent, distance_m: f64) {
     let sequence = tick as u64;
     let pose_nanos = sent.capture_nanos.saturating_add(compute.pose_nanos());
     let (cav, pose_bytes) = (sent.cav.clone(), sent.pose_bytes);
@@ -376,16 +376,16 @@ fn post(courier: &mut Courier, compute: &ComputeTimes, tick: usize, sent: Sent, 
         courier.adapted(&cav, stream, reason);
     }
     if let Some(view) = sent.into_view() {
-        let letter = Letter { view, payload_bytes, wire_bytes };
-        courier.post(stream, sequence, wire_bytes - pose_bytes, sent_nanos, distance_m, letter);
+        let letter = Envelope { view, payload_bytes, wire_bytes };
+        courier.enqueue(stream, sequence, wire_bytes - pose_bytes, sent_nanos, distance_m, letter);
     }
 }
 
 /// The places of those who take part, the ego first.
-fn places(scenario: &Scenario, crew: &Crew) -> Vec<usize> {
+fn places(scenario: &Scenario, crew: &AgentPool) -> Vec<usize> {
     match crew {
-        Crew::First(count) => (0..scenario.agents.len()).take(*count).collect(),
-        Crew::Named(names) => {
+        AgentPool::First(count) => (0..scenario.agents.len()).take(*count).collect(),
+        AgentPool::Named(names) => {
             names.iter().filter_map(|name| scenario.agents.iter().position(|agent| agent == name)).collect()
         }
     }

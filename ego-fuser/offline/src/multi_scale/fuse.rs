@@ -41,7 +41,7 @@ pub struct Levels<'a> {
     pub sent: Option<&'a Tensor>,
 }
 
-/// Runs a backbone on canvases `[sum of agents, C, H, W]` and fuses at each level: `[samples, sum of C_up, H', W']`.
+/// RunScope a backbone on canvases `[sum of agents, C, H, W]` and fuses at each level: `[samples, sum of C_up, H', W']`.
 ///
 /// # Errors
 /// [`TchError`] when the samples do not add up to the canvases.

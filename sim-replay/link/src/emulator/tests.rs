@@ -2,14 +2,14 @@ use std::collections::BTreeSet;
 
 use proptest::prelude::*;
 
-use super::super::config::{DelayLaw, LossLaw, Outage, QueueConfig, QueueDrop, ReorderConfig};
+use super::super::config::{DelayModel, LossModel, Outage, QueueConfig, QueueDrop, ReorderConfig};
 use super::*;
 
 const MS: u64 = 1_000_000;
 
-fn parcel(from: &str, sequence: u64, bytes: u64, offered_nanos: u64) -> Parcel {
+fn parcel(from: &str, sequence: u64, bytes: u64, offered_nanos: u64) -> Packet {
     let cav = |name: &str| CavId::new(name).unwrap();
-    Parcel {
+    Packet {
         id: sequence,
         from: cav(from),
         to: cav("ego"),
@@ -25,21 +25,21 @@ fn shaped(rate_mbps: f64) -> LinkConfig {
     LinkConfig { capacity: CapacityConfig::TokenBucket { rate_mbps, burst_bytes: 0 }, ..LinkConfig::default() }
 }
 
-fn air(config: &LinkConfig) -> Air {
-    Air::new(config.clone(), Path::new("."), 5).unwrap()
+fn air(config: &LinkConfig) -> LinkEmulator {
+    LinkEmulator::new(config.clone(), Path::new("."), 5).unwrap()
 }
 
-fn all(config: &LinkConfig, parcels: impl IntoIterator<Item = Parcel>) -> Vec<Outcome> {
+fn all(config: &LinkConfig, parcels: impl IntoIterator<Item = Packet>) -> Vec<Outcome> {
     let mut air = air(config);
     parcels.into_iter().for_each(|parcel| air.offer(parcel));
     air.advance(u64::MAX / 4)
 }
 
-fn times_ms(outcomes: &[Outcome]) -> Vec<(u64, u64, Fate)> {
+fn times_ms(outcomes: &[Outcome]) -> Vec<(u64, u64, Delivery)> {
     outcomes.iter().map(|outcome| (outcome.parcel.sequence, outcome.nanos / MS, outcome.fate)).collect()
 }
 
-const ARRIVED: Fate = Fate::Arrived { is_copy: false, is_repeated: false };
+const ARRIVED: Delivery = Delivery::Arrived { is_copy: false, is_repeated: false };
 
 #[test]
 fn an_ideal_link_delivers_at_once_and_in_order() {
@@ -70,7 +70,7 @@ fn small_messages_do_not_wait_and_cost_their_time() {
 #[test]
 fn a_full_queue_drops_the_newcomer_or_the_oldest() {
     let parcels = || (0..4).map(|k| parcel("a", k, 20_000, k * MS));
-    let dropped = Fate::Dropped(DropReason::LinkQueue);
+    let dropped = Delivery::Dropped(DropReason::LinkQueue);
     let queue = QueueConfig { bytes: 40_000, ..QueueConfig::default() };
     let tail = LinkConfig { queue, ..shaped(8.0) };
     let expected = [(3, 3, dropped), (0, 20, ARRIVED), (1, 40, ARRIVED), (2, 60, ARRIVED)];
@@ -79,7 +79,7 @@ fn a_full_queue_drops_the_newcomer_or_the_oldest() {
     let expected = [(1, 3, dropped), (0, 20, ARRIVED), (2, 40, ARRIVED), (3, 60, ARRIVED)];
     assert_eq!(times_ms(&all(&head, parcels())), expected);
     let newest = LinkConfig { queue: QueueConfig { keep_newest: true, ..queue }, ..shaped(8.0) };
-    let superseded = Fate::Dropped(DropReason::Superseded);
+    let superseded = Delivery::Dropped(DropReason::Superseded);
     let expected = [(1, 2, superseded), (2, 3, superseded), (0, 20, ARRIVED), (3, 40, ARRIVED)];
     assert_eq!(times_ms(&all(&newest, parcels())), expected);
 }
@@ -105,7 +105,7 @@ fn the_long_run_rate_is_the_rate_and_the_burst_comes_once() {
 #[test]
 fn outages_lose_what_is_on_its_way() {
     let config = LinkConfig { outages: vec![Outage { from_s: 0.05, to_s: 0.1 }], ..shaped(8.0) };
-    let lost = Fate::Dropped(DropReason::LinkLoss);
+    let lost = Delivery::Dropped(DropReason::LinkLoss);
     let parcels = [parcel("a", 0, 20_000, 0), parcel("a", 1, 20_000, 40 * MS), parcel("a", 2, 20_000, 110 * MS)];
     assert_eq!(times_ms(&all(&config, parcels)), [(0, 20, ARRIVED), (1, 60, lost), (2, 130, ARRIVED)]);
 }
@@ -124,7 +124,7 @@ fn delays_are_cut_down_to_whole_frames_as_in_opencood() {
     assert!((frames(0) as f64 / 2000.0 - 0.507).abs() < 0.035, "{}", frames(0));
     for delay_ms in [0, 100, 200, 300, 400, 500] {
         let config = LinkConfig {
-            delay: DelayLaw::ConstantMs(delay_ms as f64 + 30.0),
+            delay: DelayModel::ConstantMs(delay_ms as f64 + 30.0),
             floor_ms: 100.0,
             ..LinkConfig::default()
         };
@@ -135,7 +135,7 @@ fn delays_are_cut_down_to_whole_frames_as_in_opencood() {
 
 #[test]
 fn jitter_reorders_unless_order_is_kept() {
-    let jitter = LinkConfig { delay: DelayLaw::UniformMs([0.0, 50.0]), ..LinkConfig::default() };
+    let jitter = LinkConfig { delay: DelayModel::UniformMs([0.0, 50.0]), ..LinkConfig::default() };
     let order = |config: &LinkConfig| -> Vec<u64> {
         all(config, (0..200).map(|k| parcel("a", k, 10, k * MS)))
             .iter()
@@ -152,8 +152,8 @@ fn jitter_reorders_unless_order_is_kept() {
 #[test]
 fn a_link_does_not_care_what_other_links_carry() {
     let config = LinkConfig {
-        delay: DelayLaw::Normal { mean_ms: 20.0, std_ms: 8.0 },
-        loss: LossLaw::Bernoulli(0.2),
+        delay: DelayModel::Normal { mean_ms: 20.0, std_ms: 8.0 },
+        loss: LossModel::Bernoulli(0.2),
         duplicate: 0.1,
         ..shaped(27.0)
     };
@@ -163,7 +163,7 @@ fn a_link_does_not_care_what_other_links_carry() {
     let alone = of_a(all(&config, (0..300).map(|k| parcel("a", k, 40_000, k * 10 * MS))));
     let together = (0..300).flat_map(|k| ["b", "a", "c"].map(|from| parcel(from, k, 40_000, k * 10 * MS)));
     assert_eq!(of_a(all(&config, together)), alone);
-    let other_seed = Air::new(config, Path::new("."), 6).map(|mut air| {
+    let other_seed = LinkEmulator::new(config, Path::new("."), 6).map(|mut air| {
         (0..300).for_each(|k| air.offer(parcel("a", k, 40_000, k * 10 * MS)));
         air.advance(u64::MAX / 4)
     });
@@ -181,20 +181,20 @@ proptest! {
         let config = LinkConfig {
             medium: if shared { Medium::Shared } else { Medium::PerPair },
             queue: QueueConfig { bytes, drop, keep_newest, ..QueueConfig::default() },
-            delay: DelayLaw::UniformMs([1.0, 60.0]),
-            loss: LossLaw::Bernoulli(0.1),
+            delay: DelayModel::UniformMs([1.0, 60.0]),
+            loss: LossModel::Bernoulli(0.1),
             duplicate: 0.1,
             ..shaped(6.0)
         };
         let mut offered_nanos = 0;
-        let parcels: Vec<Parcel> = sizes.iter().enumerate().map(|(k, &(bytes, gap_ms))| {
+        let parcels: Vec<Packet> = sizes.iter().enumerate().map(|(k, &(bytes, gap_ms))| {
             offered_nanos += gap_ms * MS;
             parcel(if k % 3 == 0 { "b" } else { "a" }, k as u64, bytes, offered_nanos)
         }).collect();
         let outcomes = all(&config, parcels.clone());
         prop_assert!(outcomes.is_sorted_by_key(|outcome| outcome.nanos));
         prop_assert!(outcomes.iter().all(|outcome| outcome.nanos >= outcome.parcel.offered_nanos));
-        let first = outcomes.iter().filter(|outcome| !matches!(outcome.fate, Fate::Arrived { is_copy: true, .. }));
+        let first = outcomes.iter().filter(|outcome| !matches!(outcome.fate, Delivery::Arrived { is_copy: true, .. }));
         let first: Vec<u64> = first.map(|outcome| outcome.parcel.sequence).collect();
         let unique: BTreeSet<u64> = first.iter().copied().collect();
         prop_assert_eq!((first.len(), unique.len()), (parcels.len(), parcels.len()));

@@ -137,7 +137,7 @@ fn measure(
             };
             match weather.echo((hit != MISS).then_some(depth_m), reflectivity, random) {
                 Echo::Target(kept) => (depth_m, kept * (-ATTENUATION_PER_M * depth_m).exp(), hit),
-                Echo::Air(range_m, intensity) => (range_m, intensity, MISS),
+                Echo::LinkEmulator(range_m, intensity) => (range_m, intensity, MISS),
                 Echo::Lost => return None,
             }
         }

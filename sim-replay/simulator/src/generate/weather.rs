@@ -38,7 +38,7 @@ pub(crate) enum Echo {
     /// The target, dimmed to this share of its intensity.
     Target(f32),
     /// A point in the air: its range in metres and its intensity.
-    Air(f32, f32),
+    LinkEmulator(f32, f32),
     /// Nothing.
     Lost,
 }
@@ -81,7 +81,7 @@ impl Weather {
             let product: f64 = (0..3).map(|_| 1.0 - random.unit()).product();
             let range_m = (1.0 - 1.8 * product.ln()) as f32;
             if target_m.is_none_or(|target_m| range_m < target_m) {
-                return Echo::Air(range_m, random.between(0.02, 0.12) as f32);
+                return Echo::LinkEmulator(range_m, random.between(0.02, 0.12) as f32);
             }
         }
         target.map_or(Echo::Lost, Echo::Target)
@@ -90,7 +90,7 @@ impl Weather {
     fn snow(target_m: Option<f32>, reflectivity: f32, random: &mut SplitMix64) -> Echo {
         let flake_m = (1.5 - 110.0 * (1.0 - random.unit()).ln()) as f32;
         if flake_m < 30.0 && target_m.is_none_or(|target_m| flake_m < target_m) && random.chance(0.7) {
-            return Echo::Air(flake_m, random.between(0.02, 0.25) as f32);
+            return Echo::LinkEmulator(flake_m, random.between(0.02, 0.25) as f32);
         }
         seen(target_m, reflectivity, 0.008).map_or(Echo::Lost, Echo::Target)
     }
@@ -117,7 +117,7 @@ mod tests {
     #[test]
     fn fog_hides_what_is_far_and_answers_itself() {
         let is_target = |echo: &Echo| matches!(echo, Echo::Target(_));
-        let is_air = |echo: &Echo| matches!(echo, Echo::Air(..));
+        let is_air = |echo: &Echo| matches!(echo, Echo::LinkEmulator(..));
         assert!(share(Weather::Fog, Some(15.0), is_target) > 0.95);
         assert_eq!(share(Weather::Fog, Some(60.0), is_target), 0.0);
         assert!((share(Weather::Fog, Some(60.0), is_air) - 0.3).abs() < 0.02);

@@ -148,12 +148,12 @@ pub enum TownError {
 pub fn build(source: &TownSource, town_seed: u64) -> Result<Town, TownError> {
     let name = source.name();
     match source {
-        TownSource::Town1 => Ok(furnish(name, &layout::town1(town_seed), town_seed)),
-        TownSource::Town4 => Ok(furnish(name, &layout::town4(town_seed), town_seed)),
+        TownSource::Town1 => Ok(place_roadside(name, &layout::town1(town_seed), town_seed)),
+        TownSource::Town4 => Ok(place_roadside(name, &layout::town4(town_seed), town_seed)),
         TownSource::OpenDrive(path) => {
             let Map { network, lanes } = read_map(path)?;
             check_extent(path, &network, &lanes)?;
-            Ok(furnish(name, &Layout { network, islands: Vec::new() }, town_seed))
+            Ok(place_roadside(name, &Layout { network, islands: Vec::new() }, town_seed))
         }
     }
 }
@@ -198,11 +198,11 @@ pub fn read_map(path: &Path) -> Result<Map, TownError> {
     Ok(Map { network, lanes })
 }
 
-fn furnish(name: String, layout: &Layout, town_seed: u64) -> Town {
+fn place_roadside(name: String, layout: &Layout, town_seed: u64) -> Town {
     let (lanes, _) = lane_builder::lane_graph(&layout.network);
     let surface = Surface::new(&layout.network);
     let ground = terrain::ground(&surface, town_seed);
-    let (solids, parking) = roadside::furnish(layout, &surface, &ground, town_seed);
+    let (solids, parking) = roadside::place_roadside(layout, &surface, &ground, town_seed);
     Town { name, lanes, ground, solids, parking, findings: layout.network.findings.clone() }
 }
 

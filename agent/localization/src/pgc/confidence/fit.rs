@@ -139,21 +139,21 @@ fn non_negative_regression(rows: &[[f64; FEATURES]], targets: &[f64]) -> (f64, [
 mod tests {
     use super::*;
     use crate::pgc::pose_solver::PoseSolver;
-    use crate::pgc::synthetic::SyntheticTown;
+    use crate::pgc::synthetic::SyntheticScene;
     use crate::statistics::spearman;
 
     /// Sweeps of a town in which some places are hard and a few hopeless.
     fn sweeps(seeds: std::ops::Range<u64>) -> Vec<Labelled> {
         let sweep = |seed: u64| {
             let hardness = (seed % 97) as f64 / 97.0;
-            let town = SyntheticTown {
+            let town = SyntheticScene {
                 outliers: 0.1 + 0.6 * hardness,
                 noise_m: 0.1 + 0.5 * hardness,
                 cells: 250,
-                ..SyntheticTown::default()
+                ..SyntheticScene::default()
             };
             let is_hopeless = seed.is_multiple_of(10);
-            let town = if is_hopeless { SyntheticTown { outliers: 0.85, twins: 1.0, ..town } } else { town };
+            let town = if is_hopeless { SyntheticScene { outliers: 0.85, twins: 1.0, ..town } } else { town };
             let found = PoseSolver::default().solve(&town.coordinates(seed)).ok()?;
             let off = town.world_from_sensor(seed).inv_mul(&found.world_from_sensor);
             Some(Labelled { evidence: found.evidence, error_m: off.translation.vector.norm() })

@@ -12,7 +12,7 @@ use serde::{Deserialize, Serialize};
 pub use fit::{BAD_M, FitError, FitReport, Labelled, check_good_loss, observed};
 pub use isotonic::MonotoneMap;
 
-use super::pose_evidence::{PoseEvidence, SecondEvidence};
+use super::pose_evidence::{PoseEvidence, RefinementEvidence};
 
 /// Number of features of [`PoseEvidence`].
 const FEATURES: usize = 14;
@@ -109,7 +109,8 @@ impl ConfidenceModel {
 fn features(evidence: &PoseEvidence) -> [f64; FEATURES] {
     let log = |value: f64| value.clamp(1e-3, 1e6).ln();
     // A head has a refiner or has none: features that are always 0 get no weight.
-    let again = |value: fn(&SecondEvidence) -> f64| evidence.second.as_ref().map_or(0.0, |second| log(value(second)));
+    let again =
+        |value: fn(&RefinementEvidence) -> f64| evidence.second.as_ref().map_or(0.0, |second| log(value(second)));
     [
         -log(evidence.inlier_ratio),
         -log(evidence.inliers as f64 / 100.0),
@@ -132,12 +133,12 @@ fn features(evidence: &PoseEvidence) -> [f64; FEATURES] {
 mod tests {
     use super::*;
     use crate::pgc::pose_solver::PoseSolver;
-    use crate::pgc::synthetic::SyntheticTown;
+    use crate::pgc::synthetic::SyntheticScene;
 
     #[test]
     fn sigma_falls_with_what_speaks_against_a_pose() {
         let sigma = |outliers, noise_m| {
-            let town = SyntheticTown { outliers, noise_m, ..SyntheticTown::default() };
+            let town = SyntheticScene { outliers, noise_m, ..SyntheticScene::default() };
             let found = PoseSolver::default().solve(&town.coordinates(1)).unwrap();
             ConfidenceModel::example().sigma(&found.evidence)
         };

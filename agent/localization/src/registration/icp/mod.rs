@@ -11,7 +11,7 @@ mod surfels;
 use nalgebra::{Isometry3, Matrix6, SymmetricEigen, Translation3, UnitQuaternion, Vector3, Vector6};
 use serde::{Deserialize, Serialize};
 
-use surfels::{Surfels, thinned};
+use surfels::{Surfels, decimate};
 
 /// Turns and shifts are made comparable by the way a turn of one radian moves a typical point, metres.
 const LEVER_M: f64 = 10.0;
@@ -38,7 +38,7 @@ pub struct IcpConfig {
     pub levels: Vec<IcpLevel>,
     /// Nearest and farthest points that take part, metres: nearer ones are hits on the vehicle itself.
     pub range_m: [f64; 2],
-    /// The source is thinned to one point per voxel of this side, metres.
+    /// The source is decimate to one point per voxel of this side, metres.
     pub source_voxel_m: f64,
     /// And at each level to about this many points.
     pub max_points: usize,
@@ -124,7 +124,7 @@ impl IcpSource {
     /// Thins a sweep.
     #[must_use]
     pub fn of_sweep(xyzi: &[[f32; 4]], config: &IcpConfig) -> Self {
-        Self { points_m: thinned(within(xyzi, config.range_m), config.source_voxel_m) }
+        Self { points_m: decimate(within(xyzi, config.range_m), config.source_voxel_m) }
     }
 
     /// The points that are left, in the frame of the sensor, metres.

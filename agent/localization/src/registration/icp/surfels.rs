@@ -134,7 +134,7 @@ impl Surfels {
 }
 
 /// One point for every occupied voxel: the mean of the points in it, in order of first appearance.
-pub(super) fn thinned(points_m: impl IntoIterator<Item = Vector3<f64>>, voxel_m: f64) -> Vec<Vector3<f64>> {
+pub(super) fn decimate(points_m: impl IntoIterator<Item = Vector3<f64>>, voxel_m: f64) -> Vec<Vector3<f64>> {
     let mut sites = Sites::default();
     let mut sums: Vec<(Vector3<f64>, f64)> = Vec::new();
     for point in points_m {
@@ -205,13 +205,13 @@ mod tests {
         surfels.fit();
         assert!(surfels.len() > 30);
         assert_eq!(surfels.near(&Vector3::new(f64::NAN, 0.0, 0.0)), None);
-        assert!(thinned([Vector3::new(f64::NAN, 0.0, 0.0)], 0.5).is_empty());
+        assert!(decimate([Vector3::new(f64::NAN, 0.0, 0.0)], 0.5).is_empty());
     }
 
     #[test]
     fn thinning_leaves_one_mean_a_voxel() {
         let points = [[0.1, 0.1, 0.1], [0.3, 0.1, 0.1], [0.6, 0.1, 0.1], [-0.1, 0.1, 0.1]].map(Vector3::from);
-        let thin = thinned(points, 0.5);
+        let thin = decimate(points, 0.5);
         let expected = [[0.2, 0.1, 0.1], [0.6, 0.1, 0.1], [-0.1, 0.1, 0.1]].map(Vector3::from);
         assert_eq!(thin.len(), 3);
         assert!(thin.iter().zip(&expected).all(|(a, b)| (a - b).norm() < 1e-12));

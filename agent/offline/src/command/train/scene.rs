@@ -47,7 +47,7 @@ pub(crate) struct Args {
     /// Leave the second look out.
     #[arg(long)]
     no_refiner: bool,
-    /// Copies of every sweep, all but the first turned and thinned out at random.
+    /// Copies of every sweep, all but the first turned and decimate out at random.
     #[arg(long, default_value_t = 1)]
     copies: usize,
     /// Largest turn of such copies, degrees.

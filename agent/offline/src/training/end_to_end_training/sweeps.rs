@@ -1,4 +1,4 @@
-//! Examples for a network that is trained as a whole: sweeps, turned and thinned out at random.
+//! Examples for a network that is trained as a whole: sweeps, turned and decimate out at random.
 
 use std::f64::consts::PI;
 use std::sync::Arc;

@@ -149,7 +149,7 @@ mod tests {
         }
         // Windows end after passes 5 and 10; from 84 % on, after pass 17, all are used again.
         assert_eq!([5, 6, 10, 11, 17, 18].map(|pass| cells_of_pass[pass]), [100, 80, 80, 60, 60, 100]);
-        assert_eq!(steps, 8 * 3 + 12 * 2, "three batches of a full pass, two of a thinned one");
+        assert_eq!(steps, 8 * 3 + 12 * 2, "three batches of a full pass, two of a decimate one");
     }
 
     #[test]

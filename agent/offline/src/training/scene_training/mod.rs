@@ -2,11 +2,11 @@
 
 mod cell_order;
 mod classifier;
+mod coarse_pose;
 mod config;
 mod features;
 mod lattice;
 mod losses;
-mod rough_pose;
 mod statistics;
 
 use std::collections::BTreeMap;
@@ -18,9 +18,9 @@ use tch::{Kind, Tensor, no_grad};
 pub use self::config::{SceneReport, SceneSummary, SceneTrainConfig};
 
 use self::cell_order::CellOrder;
+use self::coarse_pose::RoughPoses;
 use self::features::Features;
 use self::losses::{centre_loss, weighted_loss};
-use self::rough_pose::RoughPoses;
 use super::error::LocalizerTrainError;
 use super::feature_cache::FeatureCache;
 use super::kmeans::kmeans;

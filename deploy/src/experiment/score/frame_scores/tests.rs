@@ -1,5 +1,7 @@
 use dataset::class_set::ClassSet;
-use protocol::{AgentTruth, Detection, Doubt, FusedNeighbour, HeardNeighbour, SkippedNeighbour, TrueObject};
+use protocol::{
+    AgentTruth, Detection, FusedNeighbour, HeardNeighbour, MisbehaviourReason, SkippedNeighbour, TrueObject,
+};
 
 use super::super::open_ticks::MOST_OPEN;
 use super::*;
@@ -74,8 +76,8 @@ fn result(tick: u64, at_x: &[f64]) -> Detections {
     }
 }
 
-fn board() -> Board {
-    Board::new(cav("e"), RULE, 64 * 96 * 128)
+fn board() -> FrameScores {
+    FrameScores::new(cav("e"), RULE, 64 * 96 * 128)
 }
 
 #[test]
@@ -159,14 +161,14 @@ fn a_long_run_keeps_few_ticks_open() {
 
 #[test]
 fn neighbours_are_followed_over_the_run() {
-    let mut board = Board::new(cav("e"), RULE, 1);
+    let mut board = FrameScores::new(cav("e"), RULE, 1);
     let doubted = Detections {
         fused: vec![],
         skipped: vec![SkippedNeighbour { cav: cav("n"), reason: Some(DropReason::Distrusted) }],
         heard: vec![HeardNeighbour {
             cav: cav("n"),
             trust: Some(0.25),
-            doubt: Some(Doubt::Invented),
+            doubt: Some(MisbehaviourReason::GhostObjects),
             clock_offset_s: None,
         }],
         ..result(1, &[])
@@ -177,7 +179,10 @@ fn neighbours_are_followed_over_the_run() {
     }
     board.close();
     let record = &board.neighbours()[&cav("n")];
-    assert_eq!((record.fused, record.left_out[&DropReason::Distrusted], record.doubts[&Doubt::Invented]), (1, 1, 1));
+    assert_eq!(
+        (record.fused, record.left_out[&DropReason::Distrusted], record.doubts[&MisbehaviourReason::GhostObjects]),
+        (1, 1, 1)
+    );
     assert_eq!((record.trust, record.least_trust), (Some(0.25), Some(0.25)));
-    assert_eq!((record.doubt, record.clock_offset_s), (Some(Doubt::Invented), Some(0.125)));
+    assert_eq!((record.doubt, record.clock_offset_s), (Some(MisbehaviourReason::GhostObjects), Some(0.125)));
 }

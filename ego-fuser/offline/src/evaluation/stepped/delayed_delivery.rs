@@ -4,14 +4,14 @@
 use std::collections::{BTreeMap, BTreeSet};
 
 use bus::process_id;
-use link::{Air, Fate, Outcome, Parcel};
+use link::{Delivery, LinkEmulator, Outcome, Packet};
 use protocol::{Account, CavId, DropReason, Ledger, ProcessId, RateReason, Role, Stream, Topic};
 
 use ego_fuser::ego::View;
 
 /// A neighbour's message for the ego.
 #[derive(Debug, Clone)]
-pub(super) struct Letter {
+pub(super) struct Envelope {
     pub(super) view: View,
     pub(super) payload_bytes: u64,
     /// Headers and the pose's own message included.
@@ -22,24 +22,24 @@ pub(super) struct Letter {
 pub(super) struct Arrived {
     /// When, on the scene's clock.
     pub(super) nanos: u64,
-    pub(super) letter: Letter,
+    pub(super) letter: Envelope,
 }
 
 /// A message that was handed over; of a pose nothing is of use but its bytes.
 struct Kept {
     topic: Topic,
-    letter: Option<Letter>,
+    letter: Option<Envelope>,
 }
 
 /// Carries what neighbours send to the ego.
-pub(super) struct Courier {
-    air: Air,
+pub(super) struct DelayedDelivery {
+    air: LinkEmulator,
     ego: CavId,
     receiver: ProcessId,
     /// Time 0 of the air on the scene's clock.
     began_nanos: u64,
     /// What will be offered, by time and number.
-    posted: BTreeMap<(u64, u64), Parcel>,
+    posted: BTreeMap<(u64, u64), Packet>,
     /// What was handed over and has not come to its end.
     kept: BTreeMap<u64, Kept>,
     next_id: u64,
@@ -49,8 +49,8 @@ pub(super) struct Courier {
     sent_bytes: u64,
 }
 
-impl Courier {
-    pub(super) fn new(air: Air, ego: &CavId, began_nanos: u64) -> Self {
+impl DelayedDelivery {
+    pub(super) fn new(air: LinkEmulator, ego: &CavId, began_nanos: u64) -> Self {
         Self {
             air,
             receiver: process_id(Role::Ego, ego),
@@ -71,14 +71,14 @@ impl Courier {
     }
 
     /// Hands a message over that will be sent at `nanos`.
-    pub(super) fn post(
+    pub(super) fn enqueue(
         &mut self,
         stream: Stream,
         sequence: u64,
         bytes: u64,
         nanos: u64,
         distance_m: f64,
-        mut letter: Letter,
+        mut letter: Envelope,
     ) {
         self.stream = stream;
         let clock = self.air.clock();
@@ -101,14 +101,14 @@ impl Courier {
         bytes: u64,
         nanos: u64,
         distance_m: f64,
-        letter: Option<Letter>,
+        letter: Option<Envelope>,
     ) {
         let id = self.next_id;
         self.next_id += 1;
         self.kept.insert(id, Kept { topic: topic(from, stream), letter });
         let offered_nanos = nanos.saturating_sub(self.began_nanos);
         let (from, to) = (from.clone(), self.ego.clone());
-        let parcel = Parcel { id, from, to, stream, sequence, bytes, offered_nanos, distance_m };
+        let parcel = Packet { id, from, to, stream, sequence, bytes, offered_nanos, distance_m };
         self.posted.insert((offered_nanos, id), parcel);
     }
 
@@ -128,17 +128,17 @@ impl Courier {
         let Outcome { nanos, parcel, fate } = outcome;
         let account = Account::towards(topic(&parcel.from, parcel.stream), &self.receiver);
         let letter = match fate {
-            Fate::Dropped(reason) => {
+            Delivery::Dropped(reason) => {
                 self.kept.remove(&parcel.id);
                 self.ledger.dropped(&account, reason);
                 return None;
             }
-            Fate::Arrived { is_repeated: true, .. } => {
+            Delivery::Arrived { is_repeated: true, .. } => {
                 // The copy is one more message.
                 self.ledger.sent(&account);
                 self.kept.get(&parcel.id).and_then(|kept| kept.letter.clone())
             }
-            Fate::Arrived { .. } => self.kept.remove(&parcel.id).and_then(|kept| kept.letter),
+            Delivery::Arrived { .. } => self.kept.remove(&parcel.id).and_then(|kept| kept.letter),
         };
         match letter {
             Some(letter) => Some(Arrived { nanos: nanos.saturating_add(self.began_nanos), letter }),
@@ -159,7 +159,7 @@ impl Courier {
         self.ledger.dropped(&Account::towards(topic(cav, self.stream), &self.receiver), reason);
     }
 
-    /// Books what of a vehicle has not come to its end; `waiting` messages of it have arrived and were never used.
+    /// MessageStats what of a vehicle has not come to its end; `waiting` messages of it have arrived and were never used.
     pub(super) fn close(&mut self, cav: &CavId, waiting: u64) {
         let not_sent: BTreeSet<u64> = self.posted.values().map(|parcel| parcel.id).collect();
         for (stream, waiting) in [(Stream::Pose, 0), (self.stream, waiting)] {

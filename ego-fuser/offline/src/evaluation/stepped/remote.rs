@@ -8,7 +8,7 @@ use std::fmt;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
-use bus::bounded_queue::Taken;
+use bus::bounded_queue::Pop;
 use bus::shutdown::Stop;
 use bus::{
     Arrival, Barrier, Bus, BusError, Event, Inbox, NotReady, Publisher, PublisherOptions, Route, Subscription,
@@ -60,13 +60,13 @@ struct Sensors {
 }
 
 /// All vehicles of a run in virtual time, each a process.
-pub struct RemoteCrew {
+pub struct RemotePool {
     inbox: Arc<Inbox>,
     sensors: BTreeMap<CavId, Sensors>,
     _subscriptions: Vec<Subscription>,
 }
 
-impl fmt::Debug for RemoteCrew {
+impl fmt::Debug for RemotePool {
     fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
         f.debug_struct("RemoteCrew").field("vehicles", &self.sensors.keys()).finish_non_exhaustive()
     }
@@ -79,13 +79,18 @@ struct Answer {
     content: Option<(Content, u64, Option<RateChoice>)>,
 }
 
-impl RemoteCrew {
+impl RemotePool {
     /// Waits until the process of every vehicle is there, for `patience` at most. Each sends the stream named beside it.
     /// When `stop` is requested nobody is waited for any more.
     ///
     /// # Errors
     /// [`RemoteError`] names those that are not there.
-    pub fn meet(bus: &Bus, vehicles: &[(CavId, Stream)], patience: Duration, stop: &Stop) -> Result<Self, RemoteError> {
+    pub fn connect(
+        bus: &Bus,
+        vehicles: &[(CavId, Stream)],
+        patience: Duration,
+        stop: &Stop,
+    ) -> Result<Self, RemoteError> {
         let inbox = bus.inbox(2, 2 * vehicles.len());
         stop.on_request({
             let inbox = Arc::clone(&inbox);
@@ -105,7 +110,7 @@ impl RemoteCrew {
                 routes.push(route(stream, &here));
             }
         }
-        Barrier::new(routes).attend(bus)?.wait(patience)?;
+        Barrier::new(routes).await_routes(bus)?.wait(patience)?;
         Ok(Self { inbox, sensors, _subscriptions: subscriptions })
     }
 
@@ -115,7 +120,7 @@ impl RemoteCrew {
     }
 
     /// Hands out the sweeps of a tick and waits for all answers, in the same order.
-    pub(super) fn ask(&self, frames: &[&Frame]) -> Result<Vec<Sent>, RemoteError> {
+    pub(super) fn request(&self, frames: &[&Frame]) -> Result<Vec<Sent>, RemoteError> {
         for frame in frames {
             let Some(Sensors { gnss, lidar }) = self.sensors.get(&frame.cav) else { continue };
             if let Some(world_from_lidar) = frame.world_from_lidar {
@@ -131,7 +136,7 @@ impl RemoteCrew {
         let is_open = |(_, answer): &(&&CavId, &Answer)| answer.pose.is_none() || answer.content.is_none();
         while answers.iter().any(|entry| is_open(&entry)) {
             match self.inbox.take(Some(deadline)) {
-                Taken::Item(topic, Event::Message(arrival)) => {
+                Pop::Item(topic, Event::Message(arrival)) => {
                     let Topic::Stream { cav, stream } = &topic else { continue };
                     let asked = frames
                         .iter()
@@ -142,8 +147,8 @@ impl RemoteCrew {
                             .map_err(|source| RemoteError::Unsound { topic: topic.clone(), source })?;
                     }
                 }
-                Taken::Item(..) => {}
-                Taken::TimedOut | Taken::Closed => {
+                Pop::Item(..) => {}
+                Pop::TimedOut | Pop::Closed => {
                     let silent = answers.iter().filter(is_open).map(|(cav, _)| cav.to_string());
                     let cavs = silent.collect::<Vec<_>>().join(", ");
                     return Err(RemoteError::Silent {

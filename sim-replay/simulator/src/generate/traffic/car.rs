@@ -1,7 +1,7 @@
 //! One vehicle in traffic.
 
 use super::driver::{Driver, Obstacle};
-use super::lane_change::LaneMood;
+use super::lane_change::LaneChangeState;
 use super::path::Path;
 use super::rectangle::Rectangle;
 use super::roads::Roads;
@@ -23,7 +23,7 @@ pub(crate) struct Car {
     /// Who was ahead in the last step.
     pub(crate) leader: Option<Obstacle>,
     /// Whether it would rather be on another lane.
-    pub(crate) lane_mood: LaneMood,
+    pub(crate) lane_mood: LaneChangeState,
     /// The motion of the last step.
     pub(crate) motion: Sweep,
     /// Whether it is part of the scene.

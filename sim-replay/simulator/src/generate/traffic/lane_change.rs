@@ -63,18 +63,18 @@ impl Side {
 
 /// What makes a driver think of another lane.
 #[derive(Debug, Clone, Copy, PartialEq)]
-pub(crate) struct LaneMood {
+pub(crate) struct LaneChangeState {
     /// How long there has been somebody slower ahead, seconds.
     held_up_s: f64,
     /// The side wanted without need.
-    whim: Option<Side>,
-    /// Time until the whim passes, or until there may be the next one, seconds.
+    random_change: Option<Side>,
+    /// Time until the random_change passes, or until there may be the next one, seconds.
     whim_turns_in_s: f64,
 }
 
-impl LaneMood {
+impl LaneChangeState {
     pub(crate) fn random(random: &mut SplitMix64) -> Self {
-        Self { held_up_s: 0.0, whim: None, whim_turns_in_s: random.between(0.0, 50.0) }
+        Self { held_up_s: 0.0, random_change: None, whim_turns_in_s: random.between(0.0, 50.0) }
     }
 }
 
@@ -114,11 +114,11 @@ impl Traffic<'_> {
         if mood.whim_turns_in_s > 0.0 {
             return;
         }
-        // A whim passes; after the pause there may be another one.
-        let whim = if mood.whim.is_some() { None } else { self.whim(index) };
-        let turns_in_s = if whim.is_some() { WHIM_S } else { self.time_to_whim_s(index) };
+        // A random_change passes; after the pause there may be another one.
+        let random_change = if mood.random_change.is_some() { None } else { self.random_change(index) };
+        let turns_in_s = if random_change.is_some() { WHIM_S } else { self.time_to_whim_s(index) };
         let mood = &mut self.cars[index].lane_mood;
-        (mood.whim, mood.whim_turns_in_s) = (whim, turns_in_s);
+        (mood.random_change, mood.whim_turns_in_s) = (random_change, turns_in_s);
     }
 
     fn time_to_whim_s(&mut self, index: usize) -> f64 {
@@ -131,7 +131,7 @@ impl Traffic<'_> {
     }
 
     /// A side to change to without need; for an exploring focus, where that leads to the unknown.
-    fn whim(&mut self, index: usize) -> Option<Side> {
+    fn random_change(&mut self, index: usize) -> Option<Side> {
         let own = self.cars[index].path.lane();
         let sides = [Side::Left, Side::Right];
         let lane = self.roads.graph.lane(own);
@@ -173,7 +173,7 @@ impl Traffic<'_> {
         if car.lane_mood.held_up_s > PATIENCE_S {
             return Some(Reason::HeldUp);
         }
-        (car.lane_mood.whim == Some(side)).then_some(Reason::Whim)
+        (car.lane_mood.random_change == Some(side)).then_some(Reason::Whim)
     }
 
     /// How much harder a driver could accelerate on another way, metres per second squared.
@@ -247,7 +247,7 @@ impl Traffic<'_> {
     fn begin_change(&mut self, index: usize, path: Path) {
         let pause_s = self.time_to_whim_s(index);
         let car = &mut self.cars[index];
-        car.lane_mood = LaneMood { held_up_s: -REST_S, whim: None, whim_turns_in_s: pause_s };
+        car.lane_mood = LaneChangeState { held_up_s: -REST_S, random_change: None, whim_turns_in_s: pause_s };
         if let Some(explorer) = self.explorer.as_mut().filter(|_| index == 0) {
             // Lanes that were decided but will not be driven do not count.
             car.path.ahead(self.roads.graph).skip(1).for_each(|(lane, _)| explorer.give_up(lane));

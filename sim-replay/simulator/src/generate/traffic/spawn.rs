@@ -4,7 +4,7 @@ use super::car::Car;
 use super::driver::Driver;
 use super::explorer::Explorer;
 use super::junction::RightOfWay;
-use super::lane_change::LaneMood;
+use super::lane_change::LaneChangeState;
 use super::path::Path;
 use super::rectangle::{NeighbourIndex, Rectangle};
 use super::roads::{Roads, Spawn};
@@ -99,7 +99,7 @@ impl<'t> Traffic<'t> {
         let driver = Driver::random(&mut self.random);
         let path = Path::new(spawn.lane, spawn.s_m);
         let aside_m = self.random.between(-0.2, 0.2);
-        let lane_mood = LaneMood::random(&mut self.random);
+        let lane_mood = LaneChangeState::random(&mut self.random);
         let placement = path.placement(self.roads.graph, 0.0, 0.6 * vehicle.size_m[0], aside_m);
         let speed_mps = 0.6 * driver.pace * self.roads.speed_mps(spawn.lane, spawn.s_m);
         self.index.insert(self.cars.len() as u32, placement.position_m.xy().into());

@@ -7,7 +7,7 @@ use super::super::lane::wrap_angle;
 use super::super::surface::CrossSection;
 use super::super::{Solid, SolidKind};
 use super::frontage::{Side, Zone, sides};
-use super::parts::{Foot, wall};
+use super::parts::{PartFootprint, wall};
 use super::site::Site;
 
 /// Longest straight piece, metres.
@@ -142,7 +142,7 @@ fn piece(from: [f64; 3], to: [f64; 3], barrier: Barrier) -> Vec<Solid> {
                 let share = f64::from(post) * POST_M / length.max(0.1);
                 let at = |i: usize| from[i] + share * (to[i] - from[i]);
                 let pose = super::super::curve::Pose2::new(at(0), at(1), (b[1] - a[1]).atan2(b[0] - a[0]));
-                let foot = Foot::new(pose, at(2));
+                let foot = PartFootprint::new(pose, at(2));
                 parts.push(foot.cuboid(SolidKind::Barrier, [0.0, 0.0, -0.3], [0.1, 0.14, 1.02], 0.5));
             }
             parts

@@ -5,7 +5,7 @@ use super::super::curve::Pose2;
 use super::super::surface::CrossSection;
 use super::super::{Solid, SolidKind};
 use super::frontage::cut_at;
-use super::parts::{Foot, wall};
+use super::parts::{PartFootprint, wall};
 use super::site::{HEADROOM_M, Site};
 
 /// A road this far above the terrain stands on a bridge, metres.
@@ -105,7 +105,7 @@ fn pillars(site: &mut Site, cut: &CrossSection, thickness_m: f64) {
         if height < 2.0 {
             continue;
         }
-        let foot = Foot::new(Pose2::new(at[0], at[1], cut.pose.heading_rad), ground);
+        let foot = PartFootprint::new(Pose2::new(at[0], at[1], cut.pose.heading_rad), ground);
         let pillar = foot.cylinder(SolidKind::Pillar, [0.0, 0.0, -0.5], [0.55, height + 0.5], 0.4);
         let around = super::site::outline(&pillar).grown(0.5);
         // Clear of the lanes below; its own slab above does not count.

@@ -1,13 +1,13 @@
 //! Buildings, each composed of boxes and cylinders within its lot.
 //!
-//! A building stands on a [`Foot`] in the middle of its lot that looks along the street, with the street on its right:
+//! A building stands on a [`PartFootprint`] in the middle of its lot that looks along the street, with the street on its right:
 //! `u` runs along the street, `v` away from it. Nothing reaches beyond the lot.
 
 use rand::Rng;
 use rand_chacha::ChaCha8Rng;
 
 use super::super::{Solid, SolidKind};
-use super::parts::Foot;
+use super::parts::PartFootprint;
 
 /// How far buildings reach into the ground, so that none floats on a slope, metres.
 const FOOTING_M: f64 = 1.0;
@@ -29,7 +29,7 @@ pub(super) enum Style {
 /// A lot to build on.
 #[derive(Debug, Clone, Copy)]
 pub(super) struct Lot {
-    pub foot: Foot,
+    pub foot: PartFootprint,
     /// Length along the street, metres.
     pub width_m: f64,
     /// Length away from the street, metres.
@@ -74,7 +74,7 @@ pub(super) fn build(style: Style, lot: &Lot, rng: &mut ChaCha8Rng) -> Vec<Solid>
 
 /// A building while it grows.
 struct Draft {
-    foot: Foot,
+    foot: PartFootprint,
     reflectivity: f32,
     parts: Vec<Solid>,
 }
@@ -344,7 +344,7 @@ mod tests {
             for seed in 0..60 {
                 let mut rng = ChaCha8Rng::seed_from_u64(seed);
                 let [width_m, depth_m] = style.lot_m(&mut rng);
-                let lot = Lot { foot: Foot::new(Pose2::new(0.0, 0.0, 0.0), 0.0), width_m, depth_m };
+                let lot = Lot { foot: PartFootprint::new(Pose2::new(0.0, 0.0, 0.0), 0.0), width_m, depth_m };
                 let parts = build(style, &lot, &mut rng);
                 assert!(parts.len() > 1 || style == Tanks);
                 for part in parts {

@@ -7,7 +7,7 @@ use super::super::convex::Rectangle;
 use super::super::curve::Pose2;
 use super::buildings::{Lot, Style, build};
 use super::lots;
-use super::parts::Foot;
+use super::parts::PartFootprint;
 use super::plots::monument;
 use super::site::Site;
 use super::trees::{Species, plant};
@@ -23,7 +23,7 @@ const MAX_ATTEMPTS: u32 = 60_000;
 pub(super) fn place_islands(site: &mut Site, islands: &[[f64; 3]], rng: &mut ChaCha8Rng) {
     for &[x, y, radius] in islands {
         let middle = Pose2::new(x, y, rng.random_range(0.0..std::f64::consts::TAU));
-        let parts = monument(Foot::new(middle, site.ground_m([x, y])), rng);
+        let parts = monument(PartFootprint::new(middle, site.ground_m([x, y])), rng);
         site.try_place(&parts, 0.0, true);
         for _ in 0..rng.random_range(3..=9) {
             let pose =
@@ -74,7 +74,7 @@ fn second_row(site: &mut Site, pose: Pose2, rng: &mut ChaCha8Rng) {
     let [low, high] = site.ground_range_m(&rectangle);
     // Room for the street's own plots in front: six metres to everything.
     if high - low < 2.5 && site.is_free(&rectangle.grown(6.0), [low - 1.5, low + 40.0], true) {
-        let lot = Lot { foot: Foot::new(pose, low), width_m, depth_m };
+        let lot = Lot { foot: PartFootprint::new(pose, low), width_m, depth_m };
         let parts = build(style, &lot, rng);
         site.place(&parts);
         site.take(&lots::outline(&lot), [low - 1.5, low + 40.0]);

@@ -6,7 +6,7 @@ use rand_chacha::ChaCha8Rng;
 use super::super::convex::Rectangle;
 use super::super::{ParkingSpot, SolidKind};
 use super::buildings::Lot;
-use super::parts::Foot;
+use super::parts::PartFootprint;
 use super::site::Site;
 use super::trees::{Species, tree};
 
@@ -27,7 +27,7 @@ pub(super) fn fill(site: &mut Site, lot: &Lot, rng: &mut ChaCha8Rng) {
             let u = (f64::from(bay) + 0.5 - f64::from(count) / 2.0) * BAY_M[1];
             let pose = lot.foot.pose.moved(u, v, turn * std::f64::consts::FRAC_PI_2);
             if bay % island == island - 1 && rng.random_bool(0.6) {
-                let foot = Foot::new(pose, site.ground_m([pose.x, pose.y]));
+                let foot = PartFootprint::new(pose, site.ground_m([pose.x, pose.y]));
                 let parts = if rng.random_bool(0.6) {
                     tree(foot, Species::Broadleaf, rng.random_range(0.5..0.65), rng)
                 } else {
@@ -42,7 +42,7 @@ pub(super) fn fill(site: &mut Site, lot: &Lot, rng: &mut ChaCha8Rng) {
             site.parking.push(ParkingSpot { center_m, yaw_rad, roll_rad: 0.0, length_m: BAY_M[0], width_m: BAY_M[1] });
         }
     }
-    let back = Foot::new(lot.foot.pose.moved(0.0, lot.depth_m / 2.0 - 0.2, 0.0), lot.foot.z_m);
+    let back = PartFootprint::new(lot.foot.pose.moved(0.0, lot.depth_m / 2.0 - 0.2, 0.0), lot.foot.z_m);
     let height = rng.random_range(0.6..2.2);
     let wall = back.cuboid(SolidKind::Wall, [0.0, 0.0, -0.5], [lot.width_m - 0.2, 0.25, height + 0.5], 0.4);
     site.place(&[wall]);

@@ -26,7 +26,7 @@ use super::{ParkingSpot, Solid};
 use site::Site;
 
 /// Solids and parking spots of the town of a seed.
-pub(super) fn furnish(
+pub(super) fn place_roadside(
     layout: &Layout,
     surface: &Surface,
     ground: &Ground,

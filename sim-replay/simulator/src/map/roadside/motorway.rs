@@ -8,7 +8,7 @@ use super::super::{Solid, SolidKind};
 use super::buildings::{Lot, Style, build};
 use super::frontage::{Side, Zone, cut_at, sides};
 use super::lots;
-use super::parts::{Foot, wall};
+use super::parts::{PartFootprint, wall};
 use super::site::{HEADROOM_M, Site};
 use super::trees::{Species, plant};
 
@@ -47,7 +47,7 @@ fn gantry(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) {
     for t in [low, high] {
         let pose = cut.pose.moved(0.0, t, 0.0);
         let ground = site.ground_m([pose.x, pose.y]);
-        parts.push(Foot::new(pose, ground).cylinder(
+        parts.push(PartFootprint::new(pose, ground).cylinder(
             SolidKind::Pole,
             [0.0, 0.0, -0.3],
             [0.2, z + clear + 0.9 - ground],
@@ -58,7 +58,7 @@ fn gantry(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) {
     let boards = rng.random_range(1..=3);
     for board in 0..boards {
         let t = low + (high - low) * (f64::from(board) + 0.5) / f64::from(boards) + rng.random_range(-0.5..0.5);
-        let foot = Foot::new(cut.pose.moved(0.0, t, 0.0), z);
+        let foot = PartFootprint::new(cut.pose.moved(0.0, t, 0.0), z);
         let size = [0.15, rng.random_range(2.0..4.0), rng.random_range(1.2..2.6)];
         parts.push(foot.cuboid(SolidKind::Sign, [-0.35, 0.0, clear - 0.2], size, 0.95));
     }
@@ -85,7 +85,7 @@ fn footbridge(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) {
         if z - ground < 1.0 {
             return;
         }
-        let foot = Foot::new(pose, ground);
+        let foot = PartFootprint::new(pose, ground);
         parts.push(foot.cuboid(SolidKind::Pillar, [0.0, 0.0, -0.5], [width * 0.6, 0.7, z - ground + 0.5], 0.4));
     }
     site.try_place(&parts, 0.0, true);
@@ -106,8 +106,12 @@ fn noise_walls(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
             let near_road = (low - side.road_m(site.surface, site.network, s)).abs() < 3.0;
             if near_road {
                 let panel = wall(SolidKind::NoiseWall, [a.x, a.y], [b.x, b.y], [low - 0.3, high + own], 0.2, 0.35);
-                let post =
-                    Foot::new(a, ground[0]).cuboid(SolidKind::NoiseWall, [0.0, 0.0, -0.3], [0.3, 0.4, own + 0.6], 0.4);
+                let post = PartFootprint::new(a, ground[0]).cuboid(
+                    SolidKind::NoiseWall,
+                    [0.0, 0.0, -0.3],
+                    [0.3, 0.4, own + 0.6],
+                    0.4,
+                );
                 site.try_place(&[panel, post], 0.0, true);
             }
             s += step;
@@ -122,7 +126,7 @@ fn markers(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
     while s < side.length_m - 2.0 {
         let pose = side.beyond_kerb(site.surface, site.network, s, rng.random_range(1.1..1.9));
         let pose = if side.along { pose } else { pose.reversed() };
-        let foot = Foot::new(pose, site.ground_m([pose.x, pose.y]));
+        let foot = PartFootprint::new(pose, site.ground_m([pose.x, pose.y]));
         let parts: Vec<Solid> = match rng.random_range(0..6) {
             0 => {
                 let size = [0.1, rng.random_range(1.5..3.2), rng.random_range(1.0..2.4)];
@@ -187,7 +191,7 @@ fn large(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) {
     let rectangle = Rectangle { center_m: [pose.x, pose.y], half_m, yaw_rad: pose.heading_rad };
     let [low, high] = site.ground_range_m(&rectangle);
     if high - low < 3.0 && site.is_free(&rectangle.grown(0.5), [low - 1.5, low + 40.0], true) {
-        let lot = Lot { foot: Foot::new(pose, low), width_m, depth_m };
+        let lot = Lot { foot: PartFootprint::new(pose, low), width_m, depth_m };
         let parts = build(style, &lot, rng);
         site.place(&parts);
         site.take(&lots::outline(&lot), [low - 1.5, low + 40.0]);
@@ -197,7 +201,7 @@ fn large(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) {
 /// A mast for power lines or radio: legs and arms.
 fn mast(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) {
     let pose = side.beyond_paved(site.surface, site.network, s, rng.random_range(8.0..30.0));
-    let foot = Foot::new(pose.moved(0.0, 0.0, rng.random_range(0.0..3.1)), site.ground_m([pose.x, pose.y]));
+    let foot = PartFootprint::new(pose.moved(0.0, 0.0, rng.random_range(0.0..3.1)), site.ground_m([pose.x, pose.y]));
     let (height, spread) = (rng.random_range(14.0..28.0), rng.random_range(0.9..2.2));
     let mut parts = Vec::new();
     for (u, v) in [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)] {

@@ -5,12 +5,12 @@ use super::super::{Shape, Solid, SolidKind};
 
 /// Where a group of solids stands: plan pose and the height of its foot, metres.
 #[derive(Debug, Clone, Copy)]
-pub(super) struct Foot {
+pub(super) struct PartFootprint {
     pub pose: Pose2,
     pub z_m: f64,
 }
 
-impl Foot {
+impl PartFootprint {
     /// A foot at a pose and height.
     pub(super) fn new(pose: Pose2, z_m: f64) -> Self {
         Self { pose, z_m }

@@ -8,7 +8,7 @@ use super::super::{Solid, SolidKind};
 use super::buildings::{Lot, Style, build};
 use super::frontage::{Side, Zone, sides};
 use super::lots;
-use super::parts::{Foot, wall};
+use super::parts::{PartFootprint, wall};
 use super::site::Site;
 use super::trees::{Species, plant};
 
@@ -107,7 +107,7 @@ fn free_lot(site: &Site, side: &Side, s: f64, [width, depth]: [f64; 2], set_back
     let road = side.road_m(site.surface, site.network, middle);
     let fits = high - low < MAX_SLOPE_M && (low - road).abs() < 4.0;
     let free = fits && site.is_free(&rectangle.grown(0.4), [low - 1.5, low + LOT_HEIGHT_M], true);
-    free.then(|| Lot { foot: Foot::new(pose, low), width_m: width, depth_m: depth })
+    free.then(|| Lot { foot: PartFootprint::new(pose, low), width_m: width, depth_m: depth })
 }
 
 /// Builds, with a garden in front and trees behind; returns where the lot ends along the street.
@@ -162,8 +162,12 @@ fn front(site: &mut Site, lot: &Lot, set_back: f64, rng: &mut ChaCha8Rng) {
         if to - from > 0.8 {
             let middle = lot.foot.pose.moved((from + to) / 2.0, v, 0.0);
             let z = site.ground_m([middle.x, middle.y]);
-            let piece =
-                Foot::new(middle, z).cuboid(kind, [0.0, 0.0, -0.4], [to - from, thickness, height + 0.4], reflectivity);
+            let piece = PartFootprint::new(middle, z).cuboid(
+                kind,
+                [0.0, 0.0, -0.4],
+                [to - from, thickness, height + 0.4],
+                reflectivity,
+            );
             site.try_place(&[piece], 0.05, true);
         }
     }
@@ -196,12 +200,12 @@ fn green(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) -> Option<f
     }
     for _ in 0..rng.random_range(1..=3) {
         let pose = spot(rng);
-        let foot = Foot::new(pose, site.ground_m([pose.x, pose.y]));
+        let foot = PartFootprint::new(pose, site.ground_m([pose.x, pose.y]));
         site.try_place(&[foot.cuboid(SolidKind::StreetFurniture, [0.0, 0.0, -0.1], [1.8, 0.6, 0.9], 0.4)], 0.1, true);
     }
     if rng.random_bool(0.4) {
         let pose = lot.foot.pose;
-        let monument = monument(Foot::new(pose, site.ground_m([pose.x, pose.y])), rng);
+        let monument = monument(PartFootprint::new(pose, site.ground_m([pose.x, pose.y])), rng);
         site.try_place(&monument, 0.2, true);
     }
     site.take(&lots::outline(&lot), [lot.foot.z_m - 1.0, lot.foot.z_m + LOT_HEIGHT_M]);
@@ -209,7 +213,7 @@ fn green(site: &mut Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) -> Option<f
 }
 
 /// Something to remember a place by.
-pub(super) fn monument(foot: Foot, rng: &mut ChaCha8Rng) -> Vec<Solid> {
+pub(super) fn monument(foot: PartFootprint, rng: &mut ChaCha8Rng) -> Vec<Solid> {
     let base = rng.random_range(1.6..3.2);
     let mut parts = vec![foot.cuboid(SolidKind::StreetFurniture, [0.0, 0.0, -0.3], [base, base, 1.0], 0.5)];
     match rng.random_range(0..3) {

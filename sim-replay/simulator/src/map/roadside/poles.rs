@@ -7,7 +7,7 @@ use super::super::curve::Pose2;
 use super::super::road::{Road, RoadLink};
 use super::super::{Solid, SolidKind};
 use super::frontage::{Side, Zone, cut_at, sides};
-use super::parts::Foot;
+use super::parts::PartFootprint;
 use super::site::Site;
 
 /// Radius of ordinary posts, metres.
@@ -42,13 +42,13 @@ fn place_recorded(site: &mut Site, rng: &mut ChaCha8Rng) -> bool {
         for signal in &road.signals {
             lights |= signal.dynamic;
             let pose = beside_line(road, signal.s_m, signal.t_m, signal.heading_rad);
-            let foot = Foot::new(pose, site.ground_m([pose.x, pose.y]));
+            let foot = PartFootprint::new(pose, site.ground_m([pose.x, pose.y]));
             let parts = if signal.dynamic { light(foot) } else { sign(foot, rng) };
             beside_carriageway(site, &parts, signal.t_m);
         }
         for object in road.objects.iter().filter(|object| is_sign(&object.label)) {
             let pose = beside_line(road, object.s_m, object.t_m, object.heading_rad);
-            let foot = Foot::new(pose, site.ground_m([pose.x, pose.y]));
+            let foot = PartFootprint::new(pose, site.ground_m([pose.x, pose.y]));
             let parts = sign(foot, rng);
             beside_carriageway(site, &parts, object.t_m);
         }
@@ -88,7 +88,7 @@ fn is_sign(label: &str) -> bool {
         && !painted.iter().any(|word| label.contains(word))
 }
 
-fn light(foot: Foot) -> Vec<Solid> {
+fn light(foot: PartFootprint) -> Vec<Solid> {
     vec![
         foot.cylinder(SolidKind::Pole, [0.0, 0.0, -0.2], [0.1, 4.2], 0.5),
         foot.cuboid(SolidKind::Sign, [-0.2, 0.0, 2.9], [0.25, 0.45, 1.2], 0.6),
@@ -96,7 +96,7 @@ fn light(foot: Foot) -> Vec<Solid> {
 }
 
 /// A post with a plate; plates reflect strongly.
-fn sign(foot: Foot, rng: &mut ChaCha8Rng) -> Vec<Solid> {
+fn sign(foot: PartFootprint, rng: &mut ChaCha8Rng) -> Vec<Solid> {
     let height = rng.random_range(2.0..2.6);
     let [width, tall] = match rng.random_range(0..4) {
         0 => [0.6, 0.6],
@@ -128,7 +128,7 @@ fn lamps(
         let pose = side.beyond_kerb(site.surface, site.network, s, out);
         // The arm points over the road.
         let pose = pose.moved(0.0, 0.0, side.facing_rad());
-        let foot = Foot::new(pose, site.ground_m([pose.x, pose.y]));
+        let foot = PartFootprint::new(pose, site.ground_m([pose.x, pose.y]));
         let arm = height * 0.2;
         let parts = [
             foot.cylinder(SolidKind::Pole, [0.0, 0.0, -0.2], [POST_M + height * 0.006, height + 0.2], 0.5),
@@ -152,7 +152,7 @@ fn traffic_light(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
     }
     let pose = side.beyond_kerb(site.surface, site.network, s, 0.4);
     let pose = if side.along { pose } else { pose.reversed() };
-    let foot = Foot::new(pose, site.ground_m([pose.x, pose.y]));
+    let foot = PartFootprint::new(pose, site.ground_m([pose.x, pose.y]));
     let mut parts = light(foot);
     // Some carry a second head over the lane.
     if rng.random_bool(0.3) {
@@ -170,7 +170,7 @@ fn signs(site: &mut Site, side: &Side, distance_m: std::ops::Range<f64>, rng: &m
         let out = if side.zone == Zone::Street { rng.random_range(0.5..0.9) } else { rng.random_range(0.8..1.6) };
         let pose = side.beyond_kerb(site.surface, site.network, s, out);
         let pose = if side.along { pose } else { pose.reversed() };
-        let parts = sign(Foot::new(pose, site.ground_m([pose.x, pose.y])), rng);
+        let parts = sign(PartFootprint::new(pose, site.ground_m([pose.x, pose.y])), rng);
         site.try_place(&parts, 0.05, false);
         s += rng.random_range(distance_m.clone());
     }
@@ -183,7 +183,7 @@ fn small_things(site: &mut Site, side: &Side, rng: &mut ChaCha8Rng) {
         let pavement = side.pavement_m(site.surface, s);
         let out = if rng.random_bool(0.5) { 0.6 } else { (pavement - 0.4).max(0.6) };
         let pose = side.beyond_kerb(site.surface, site.network, s, out);
-        let foot = Foot::new(pose.moved(0.0, 0.0, side.facing_rad()), site.ground_m([pose.x, pose.y]));
+        let foot = PartFootprint::new(pose.moved(0.0, 0.0, side.facing_rad()), site.ground_m([pose.x, pose.y]));
         let kind = SolidKind::StreetFurniture;
         let parts = match rng.random_range(0..12) {
             0..=2 => vec![foot.cylinder(kind, [0.0, 0.0, -0.1], [0.25, 1.0], 0.4)],
@@ -206,7 +206,7 @@ fn shelter(site: &Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) -> Vec<Solid>
     let pavement = cut_at(site.surface, side.road, s);
     let depth = side.pavement_m(site.surface, pavement.s_m).clamp(1.2, 1.7);
     let pose = side.beyond_kerb(site.surface, site.network, s, 0.5 + depth / 2.0);
-    let foot = Foot::new(pose.moved(0.0, 0.0, side.facing_rad()), site.ground_m([pose.x, pose.y]));
+    let foot = PartFootprint::new(pose.moved(0.0, 0.0, side.facing_rad()), site.ground_m([pose.x, pose.y]));
     let length = rng.random_range(3.0..4.6);
     let kind = SolidKind::StreetFurniture;
     vec![
@@ -219,7 +219,7 @@ fn shelter(site: &Site, side: &Side, s: f64, rng: &mut ChaCha8Rng) -> Vec<Solid>
 
 fn kiosk(site: &Site, side: &Side, s: f64, pavement: f64, rng: &mut ChaCha8Rng) -> Vec<Solid> {
     let pose = side.beyond_kerb(site.surface, site.network, s, pavement + 1.3);
-    let foot = Foot::new(pose.moved(0.0, 0.0, side.facing_rad()), site.ground_m([pose.x, pose.y]));
+    let foot = PartFootprint::new(pose.moved(0.0, 0.0, side.facing_rad()), site.ground_m([pose.x, pose.y]));
     let kind = SolidKind::StreetFurniture;
     let width = rng.random_range(2.2..3.6);
     vec![

@@ -6,7 +6,7 @@ use rand_chacha::ChaCha8Rng;
 use super::super::curve::Pose2;
 use super::super::{Solid, SolidKind};
 use super::frontage::{Zone, sides};
-use super::parts::Foot;
+use super::parts::PartFootprint;
 use super::site::Site;
 
 /// Kinds of trees.
@@ -30,7 +30,7 @@ impl Species {
 }
 
 /// Trunk and crown; `size` is about 1 for a grown tree.
-pub(super) fn tree(foot: Foot, species: Species, size: f64, rng: &mut ChaCha8Rng) -> Vec<Solid> {
+pub(super) fn tree(foot: PartFootprint, species: Species, size: f64, rng: &mut ChaCha8Rng) -> Vec<Solid> {
     let leaves = rng.random_range(0.2..0.45);
     let trunk = |radius_m: f64, height_m: f64| {
         foot.cylinder(SolidKind::TreeTrunk, [0.0, 0.0, -0.3], [radius_m, height_m + 0.3], 0.25)
@@ -76,7 +76,7 @@ pub(super) fn tree(foot: Foot, species: Species, size: f64, rng: &mut ChaCha8Rng
 
 /// Plants a tree at a pose on the ground, if all of it finds room.
 pub(super) fn plant(site: &mut Site, pose: Pose2, species: Species, size: f64, rng: &mut ChaCha8Rng) -> bool {
-    let foot = Foot::new(pose, site.ground_m([pose.x, pose.y]));
+    let foot = PartFootprint::new(pose, site.ground_m([pose.x, pose.y]));
     let parts = tree(foot, species, size, rng);
     // Crowns may touch; the trunk keeps its distance from walls and poles by the crown around it.
     site.try_place(&parts, 0.0, false)

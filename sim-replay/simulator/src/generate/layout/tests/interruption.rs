@@ -1,4 +1,4 @@
-//! Runs that do not come to their end.
+//! RunScope that do not come to their end.
 
 use std::fs;
 

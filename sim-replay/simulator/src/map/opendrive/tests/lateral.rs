@@ -2,7 +2,7 @@
 
 use super::super::super::layout::Layout;
 use super::super::super::road::Road;
-use super::super::super::{LaneGraph, furnish};
+use super::super::super::{LaneGraph, place_roadside};
 use super::*;
 
 /// A road banked by 0.1 rad to the left, with a level pavement on its right, and one with crossfall and shape.
@@ -75,7 +75,7 @@ fn lanes_bank_with_their_road_to_either_side() {
 #[test]
 fn the_ground_meets_the_banked_surface() {
     let network = banked();
-    let town = furnish("banked".into(), &Layout { network: network.clone(), islands: Vec::new() }, 1);
+    let town = place_roadside("banked".into(), &Layout { network: network.clone(), islands: Vec::new() }, 1);
     for (road, ts) in network.roads.iter().zip([[-3.9, -2.0, 0.5, 3.9], [-3.5, -1.0, 1.5, 3.5]]) {
         for place in 2..40 {
             for t in ts {
