@@ -11,7 +11,6 @@ use agent_offline::icp_map::{IcpMapPose, read_map};
 use anyhow::Context;
 use clap::ValueEnum;
 use dataset::LeftOut;
-use indicatif::{ProgressBar, ProgressStyle};
 use localization::competitors::EndToEndLocalizer;
 use localization::pgc::confidence::{CONFIDENCE_KEY, Confidence, ConfidenceModel, FitReport, check_good_loss};
 use localization::pgc::pose_solver::{PoseSolver, Solver};
